@@ -109,7 +109,7 @@ train: $(VENV)/.installed-test
 	--seed 50 --textured 0.25 --contrast 80 --misstated 0.25 --out $(PARTS)/fifth
 	$(TRAIN) --start $(PARTS)/fifth/denoiser.safetensors --steps 1900 --fall 1.0 --rate 0.001 --side 80 --rim 8 \
 	--seed 52 --textured 0.25 --contrast 80 --misstated 0.15 --out $(PARTS)
-	cp $(PARTS)/denoiser.safetensors nlfilter_torch/nn/
+	cp $(PARTS)/denoiser.safetensors nlfilter_torch/nn/denoiser/
 	cp $(PARTS)/denoiser.json docs/
 	cp $(PARTS)/curve.png docs/denoiser.png
 	for part in first second third fourth fifth; do cp $(PARTS)/$$part/curve.png docs/denoiser_$$part.png; done

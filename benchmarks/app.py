@@ -27,11 +27,11 @@ import torch.nn.functional as F
 from benchmarks.memory import MIB, forget_peak, resident
 from benchmarks.preview import RECIPES
 from benchmarks.whole import measure
-from nlfilter_torch.app import drawing
-from nlfilter_torch.app.closeup import Closeup
-from nlfilter_torch.app.session import Session
-from nlfilter_torch.edits.presets import Recipe
-from nlfilter_torch.io.photographs import Photograph, write_photograph
+from nlfilter_torch.photo.app import drawing
+from nlfilter_torch.photo.app.closeup import Closeup
+from nlfilter_torch.photo.app.session import Session
+from nlfilter_torch.photo.declared.presets import Recipe
+from nlfilter_torch.photo.io.photographs import Photograph, write_photograph
 
 REPEATS = 20
 MOVES = 9  # of the sliders of the other edits

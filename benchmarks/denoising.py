@@ -36,8 +36,8 @@ from torch import Tensor
 from benchmarks.memory import forget_peak, resident
 from benchmarks.photographs import photograph, pictures
 from nlfilter_torch import NonlocalDenoiser, denoise, estimate_noise
-from nlfilter_torch.io.writing import open_beside
 from nlfilter_torch.operator.features import reduce_channels
+from nlfilter_torch.photo.io.writing import open_beside
 
 HELD_OUT = ("camera", "coffee", "chelsea", "retina", "page")
 LEFT_HALVES = ("retina", "page")

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.report import between, table
-from nlfilter_torch.io.writing import open_beside
+from nlfilter_torch.photo.io.writing import open_beside
 
 MARKERS = ("<!-- denoising: written by python -m benchmarks.denoising_tables -->", "<!-- end of denoising -->")
 SHOWN = ("ours", "ours, 4 turns", "plain", "BM3D")  # in the README

@@ -29,14 +29,14 @@ from benchmarks.detail_peers import clahe, detail_enhance, smoothers
 from benchmarks.photographs import pictures
 from benchmarks.unsharp import gaussian
 from nlfilter_torch import enhance
-from nlfilter_torch.edits.applying import apply_step
-from nlfilter_torch.edits.colour import edit_luminance
-from nlfilter_torch.edits.in_memory import InMemory
-from nlfilter_torch.edits.parameters import DETAIL
-from nlfilter_torch.edits.pixels import Fitted, part_of
-from nlfilter_torch.edits.presets import PRESETS
-from nlfilter_torch.edits.viewing import within_limits
 from nlfilter_torch.operator.features import reduce_channels
+from nlfilter_torch.photo.declared.parameters import DETAIL
+from nlfilter_torch.photo.declared.presets import PRESETS
+from nlfilter_torch.photo.edits.applying import apply_step
+from nlfilter_torch.photo.picture.colour import edit_luminance
+from nlfilter_torch.photo.picture.in_memory import InMemory
+from nlfilter_torch.photo.picture.pixels import Fitted, part_of
+from nlfilter_torch.photo.picture.viewing import within_limits
 
 CHOSEN_ON = ("astronaut", "coffee", "chelsea", "rocket")
 SIDE = 320

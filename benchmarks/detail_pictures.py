@@ -26,9 +26,9 @@ from skimage.filters import unsharp_mask
 from torch import Tensor
 
 from benchmarks.photographs import LETTERS
-from nlfilter_torch.edits.colour import edit_luminance
-from nlfilter_torch.edits.presets import PRESETS
-from nlfilter_torch.plotting import save_figure, show_images
+from nlfilter_torch.photo.declared.presets import PRESETS
+from nlfilter_torch.photo.picture.colour import edit_luminance
+from nlfilter_torch.photo.plotting import save_figure, show_images
 
 RADIUS = 2.0
 # Upper left corner of the part of each photograph that is shown at full size; measurements are of the whole.

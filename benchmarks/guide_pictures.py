@@ -29,10 +29,10 @@ from nlfilter_torch import (
     recolor,
     sharpen,
 )
-from nlfilter_torch.edits.colour import edit_luminance
-from nlfilter_torch.edits.presets import PRESETS
-from nlfilter_torch.io.writing import open_beside
-from nlfilter_torch.plotting import plot_response, show_eigenvectors, show_images, show_layers
+from nlfilter_torch.photo.declared.presets import PRESETS
+from nlfilter_torch.photo.io.writing import open_beside
+from nlfilter_torch.photo.picture.colour import edit_luminance
+from nlfilter_torch.photo.plotting import plot_response, show_eigenvectors, show_images, show_layers
 
 ALPHA = torch.tensor([3.0, 3.0, 4.0, 1.05])
 LEVELS = 255.0

@@ -16,8 +16,8 @@ from benchmarks.looks import EDITS, applied
 from benchmarks.memory import forget_peak, resident
 from benchmarks.whole import photograph
 from nlfilter_torch import fit_look
-from nlfilter_torch.edits.applying import apply_step
-from nlfilter_torch.edits.steps import Step
+from nlfilter_torch.photo.declared.steps import Step
+from nlfilter_torch.photo.edits.applying import apply_step
 
 ALPHA = (2.2, 1.6, 1.3, 1.02)
 SLIDERS = "sliders of this library"

@@ -16,7 +16,7 @@ from skimage.segmentation import random_walker
 from torch import Tensor
 
 from nlfilter_torch import diffusion_mask, nonlocal_operator, propagate_strokes
-from nlfilter_torch.edits.colour import colour_guide
+from nlfilter_torch.photo.picture.colour import colour_guide
 
 Mask = Callable[[Tensor, Tensor, Tensor], Tensor]
 COMPONENTS, FLOOR = 5, 4.0  # number of Gaussians in a mixture, and their smallest variance in squared Lab units

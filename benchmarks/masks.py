@@ -19,7 +19,7 @@ from benchmarks.mask_peers import PEERS
 from benchmarks.photographs import photograph
 from nlfilter_torch import region_mask
 from nlfilter_torch.core.precision import working_dtype
-from nlfilter_torch.edits.in_memory import InMemory
+from nlfilter_torch.photo.picture.in_memory import InMemory
 
 OURS = "region_mask"
 COUNTS = (1, 2, 4)

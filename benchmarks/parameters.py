@@ -11,13 +11,18 @@ from functools import cache
 from pathlib import Path
 
 import nlfilter_torch
-from nlfilter_torch.edits.declaration import UNITS, Edit, Parameter
-from nlfilter_torch.edits.parameters import EDITS
-from nlfilter_torch.edits.shared_parameters import FILTER
+from nlfilter_torch.photo.declared.declaration import UNITS, Edit, Parameter
+from nlfilter_torch.photo.declared.parameters import EDITS
+from nlfilter_torch.photo.declared.shared_parameters import FILTER
 
 PACKAGE = Path(nlfilter_torch.__file__).parent
 INTERFACES = ("cli", "app")  # folders whose files could declare parameters of any edit
-FILES = ("edits/presets.py", "edits/steps.py", "edits/applying.py", "tiled/recipe.py")
+FILES = (
+    "photo/declared/presets.py",
+    "photo/declared/steps.py",
+    "photo/edits/applying.py",
+    "photo/tiled/recipe.py",
+)
 HEAD = """# Parameters
 
 Every edit's parameters, with the names, units, ranges and defaults that its command, files for `apply` and the editor
@@ -62,7 +67,7 @@ def places(edit: Edit, parameter: Parameter) -> list[str]:
     for path in sorted(PACKAGE.rglob("*.py")):
         file = path.relative_to(PACKAGE).as_posix()
         own = file in FILES or path.stem == edit.name or path.parent.name in INTERFACES
-        if path.stem.endswith("parameters") and path.parent.name == "edits":
+        if path.stem.endswith("parameters") and path.parent.name == "declared":
             scopes = [
                 n for n in parsed(path).body if isinstance(n, ast.Assign) and named(n.targets[0]) in used(edit.name)
             ]
@@ -88,7 +93,7 @@ def written_in(path: Path) -> list[tuple[int, str]]:
 @cache
 def used(edit: str) -> set[str]:
     """Names used in the declaration of an edit, including its own."""
-    bodies = [parsed(path).body for path in (PACKAGE / "edits").glob("*parameters.py")]
+    bodies = [parsed(path).body for path in (PACKAGE / "photo" / "declared").glob("*parameters.py")]
     assigned = [node for body in bodies for node in body if isinstance(node, ast.Assign)]
     scope = next(node for node in assigned if named(node.targets[0]) == edit.upper())
     return {edit.upper()} | {node.id for node in ast.walk(scope.value) if isinstance(node, ast.Name)}

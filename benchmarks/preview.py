@@ -31,15 +31,15 @@ from torch import Tensor
 
 from benchmarks import editors
 from benchmarks.photographs import pictures
-from nlfilter_torch.app.preview import PIXELS
-from nlfilter_torch.app.session import Session
-from nlfilter_torch.edits import mask
-from nlfilter_torch.edits.parameters import VIEWING_SIZE
-from nlfilter_torch.edits.presets import Recipe
-from nlfilter_torch.edits.resizing import resize
-from nlfilter_torch.edits.scribbles import Stroke
-from nlfilter_torch.edits.steps import Step
-from nlfilter_torch.io.photographs import Photograph, read_photograph, write_photograph
+from nlfilter_torch.photo.app.preview import PIXELS
+from nlfilter_torch.photo.app.session import Session
+from nlfilter_torch.photo.declared.parameters import VIEWING_SIZE
+from nlfilter_torch.photo.declared.presets import Recipe
+from nlfilter_torch.photo.declared.steps import Step
+from nlfilter_torch.photo.declared.strokes import Stroke
+from nlfilter_torch.photo.io.photographs import Photograph, read_photograph, write_photograph
+from nlfilter_torch.photo.picture.resizing import resize
+from nlfilter_torch.photo.selections import mask
 
 NAMES = ("chelsea", "coffee", "rocket", "motorcycle", "astronaut", "retina")
 HERE, THERE = ((0.45, 0.5), (0.52, 0.5)), ((0.1, 0.1), (0.16, 0.1))

@@ -25,13 +25,13 @@ from numpy.typing import NDArray
 
 from benchmarks.memory import MIB, forget_peak, resident
 from nlfilter_torch import enhance, nonlocal_operator, polynomial_filter
-from nlfilter_torch.edits.colour import edit_luminance
-from nlfilter_torch.edits.steps import working_bytes
-from nlfilter_torch.io.rows import open_picture, write_picture
-from nlfilter_torch.tiled import stream_detail
-from nlfilter_torch.tiled.pictures import Picture
-from nlfilter_torch.tiled.source import Tiled
-from nlfilter_torch.tiled.tiles import SAMPLE, Passes, Statistics
+from nlfilter_torch.photo.declared.steps import working_bytes
+from nlfilter_torch.photo.io.rows import open_picture, write_picture
+from nlfilter_torch.photo.picture.colour import edit_luminance
+from nlfilter_torch.photo.tiled import stream_detail
+from nlfilter_torch.photo.tiled.pictures import Picture
+from nlfilter_torch.photo.tiled.source import Tiled
+from nlfilter_torch.photo.tiled.tiles import SAMPLE, Passes, Statistics
 
 ALPHA = torch.tensor([3.0, 3.0, 4.0, 1.05])
 PLAIN: dict[str, Any] = {  # the filter without limits or threshold, in pixels of the file

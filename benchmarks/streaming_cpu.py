@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from benchmarks.streaming import ALPHA, mosaic
 from benchmarks.streaming_strokes import Boxes
 from nlfilter_torch import recolor
-from nlfilter_torch.edits.detail import enhance
-from nlfilter_torch.tiled import stream_detail, stream_recolor
-from nlfilter_torch.tiled.pictures import stored_as
+from nlfilter_torch.photo.edits.detail import enhance
+from nlfilter_torch.photo.tiled import stream_detail, stream_recolor
+from nlfilter_torch.photo.tiled.pictures import stored_as
 
 Edit = Callable[[], NDArray[Any]]
 

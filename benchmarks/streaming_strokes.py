@@ -21,12 +21,12 @@ from numpy.typing import NDArray
 from benchmarks.memory import MIB, forget_peak, resident
 from benchmarks.streaming import mosaic, write_mosaic
 from nlfilter_torch import colorize, recolor
-from nlfilter_torch.edits.colour import colour_guide, split_luminance
-from nlfilter_torch.io.rows import open_picture, write_picture
-from nlfilter_torch.tiled import stream_colorize, stream_recolor
-from nlfilter_torch.tiled.pictures import Picture
-from nlfilter_torch.tiled.source import Tiled
-from nlfilter_torch.tiled.tiles import Passes
+from nlfilter_torch.photo.io.rows import open_picture, write_picture
+from nlfilter_torch.photo.picture.colour import colour_guide, split_luminance
+from nlfilter_torch.photo.tiled import stream_colorize, stream_recolor
+from nlfilter_torch.photo.tiled.pictures import Picture
+from nlfilter_torch.photo.tiled.source import Tiled
+from nlfilter_torch.photo.tiled.tiles import Passes
 
 VERBS: dict[str, Any] = {"recolor": recolor, "colorize": colorize}
 BOXES = (  # (top, left, height, width) as shares of the picture, and RGB

@@ -33,10 +33,10 @@ from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from benchmarks.denoiser_crops import CONTRASTS, MISSTATED, Crops
-from nlfilter_torch.io.writing import open_beside
-from nlfilter_torch.nn.denoiser import ADDED, PASSES, PLANES, SLOPE, WIDTH, Layer, NonlocalDenoiser, shapes_of
-from nlfilter_torch.nn.weights import read_weights
-from nlfilter_torch.plotting import save_figure
+from nlfilter_torch.nn.denoiser.network import ADDED, PASSES, PLANES, SLOPE, WIDTH, Layer, NonlocalDenoiser, shapes_of
+from nlfilter_torch.nn.denoiser.weights import read_weights
+from nlfilter_torch.photo.io.writing import open_beside
+from nlfilter_torch.photo.plotting import save_figure
 
 BATCH = 6  # crops in a step
 SIDE = 64  # pixels of a crop

@@ -22,10 +22,10 @@ import torch
 import torch.nn.functional as F
 
 from benchmarks import editors
-from nlfilter_torch.edits.parameters import EDITS
-from nlfilter_torch.edits.presets import Recipe
-from nlfilter_torch.edits.steps import Step
-from nlfilter_torch.io.photographs import Photograph, write_photograph
+from nlfilter_torch.photo.declared.parameters import EDITS
+from nlfilter_torch.photo.declared.presets import Recipe
+from nlfilter_torch.photo.declared.steps import Step
+from nlfilter_torch.photo.io.photographs import Photograph, write_photograph
 
 SCRIBBLE, OTHER = "45%,45%,6%,6%", "5%,5%,6%,6%"
 OPTIONS: dict[str, list[str]] = {

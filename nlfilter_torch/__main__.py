@@ -3,7 +3,7 @@
 import sys
 from collections.abc import Callable
 
-from nlfilter_torch import cli
+from nlfilter_torch.photo import cli
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -12,7 +12,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _editor() -> list[Callable[..., None]]:
-    from nlfilter_torch.app.command import app
+    from nlfilter_torch.photo.app.command import app
 
     return [app]
 

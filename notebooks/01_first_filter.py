@@ -27,8 +27,8 @@ from kornia.color import rgb_to_grayscale
 from skimage.transform import resize
 
 from nlfilter_torch import captured_energy, detail_layers, nonlocal_operator, polynomial_filter
-from nlfilter_torch.edits.colour import edit_luminance
-from nlfilter_torch.plotting import plot_response, show_eigenvectors, show_images, show_layers
+from nlfilter_torch.photo.picture.colour import edit_luminance
+from nlfilter_torch.photo.plotting import plot_response, show_eigenvectors, show_images, show_layers
 
 # %% [markdown]
 # ## 1. A photograph

@@ -25,7 +25,7 @@ from kornia.color import rgb_to_grayscale
 from skimage.transform import resize
 
 from nlfilter_torch import colorize, diffusion_mask, enhance, nonlocal_operator, recolor
-from nlfilter_torch.plotting import show_images, show_mask
+from nlfilter_torch.photo.plotting import show_images, show_mask
 
 pixels = resize(skimage.data.astronaut(), (200, 200), anti_aliasing=True)
 image = torch.from_numpy(pixels).float().permute(2, 0, 1)[None]

@@ -26,10 +26,10 @@ from skimage.filters import unsharp_mask
 from skimage.transform import resize
 
 from nlfilter_torch import estimate_bandwidth, fit_alpha, nonlocal_operator, polynomial_filter
-from nlfilter_torch.edits.colour import edit_luminance
-from nlfilter_torch.edits.presets import PRESETS, Recipe
-from nlfilter_torch.edits.steps import Step
-from nlfilter_torch.plotting import plot_response, show_images
+from nlfilter_torch.photo.declared.presets import PRESETS, Recipe
+from nlfilter_torch.photo.declared.steps import Step
+from nlfilter_torch.photo.picture.colour import edit_luminance
+from nlfilter_torch.photo.plotting import plot_response, show_images
 
 
 def load(name: str, height: int, width: int) -> torch.Tensor:

@@ -26,7 +26,7 @@ from skimage.color import rgb2gray
 from torch import nn
 
 from nlfilter_torch import NonlocalFilter
-from nlfilter_torch.plotting import show_images
+from nlfilter_torch.photo.plotting import show_images
 
 NOISE = 25 / 255
 

@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from nlfilter_torch.cli import main
-from nlfilter_torch.io.photographs import Photograph, write_photograph
+from nlfilter_torch.photo.cli import main
+from nlfilter_torch.photo.io.photographs import Photograph, write_photograph
 
 
 def small_photo(folder: Path) -> Path:

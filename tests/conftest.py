@@ -8,7 +8,7 @@ import torch
 from hypothesis import HealthCheck, settings
 
 if TYPE_CHECKING:
-    from nlfilter_torch.app.session import Session
+    from nlfilter_torch.photo.app.session import Session
 
 # Fixed examples, so that results are reproducible; no deadline, as shared machines are slow at times.
 settings.register_profile(
@@ -32,8 +32,8 @@ def generator() -> torch.Generator:
 def tiled(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> bool:
     """Whether commands and the editor work as for large photographs."""
     if request.param:
-        monkeypatch.setattr("nlfilter_torch.cli.editing.read_if_it_fits", lambda *_: None)
-        monkeypatch.setattr("nlfilter_torch.app.session.WHOLE", 0)
+        monkeypatch.setattr("nlfilter_torch.photo.cli.editing.read_if_it_fits", lambda *_: None)
+        monkeypatch.setattr("nlfilter_torch.photo.app.session.WHOLE", 0)
     return bool(request.param)
 
 
@@ -41,8 +41,8 @@ def tiled(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> bo
 def session(tmp_path: Path) -> "Session":
     """A session of the editor with a small photograph open: cat.png, in the folder that the session saves to."""
     # Imported here, so that tests of the filter run without the packages that read files.
-    from nlfilter_torch.app.session import Session
-    from nlfilter_torch.io.photographs import Photograph, write_photograph
+    from nlfilter_torch.photo.app.session import Session
+    from nlfilter_torch.photo.io.photographs import Photograph, write_photograph
     from tests.problems import cat
 
     write_photograph(Photograph(cat()), tmp_path / "cat.png")

@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch import FittedLook
-from nlfilter_torch.edits.steps import Step
+from nlfilter_torch.photo.declared.steps import Step
 
 ALPHA = (2.2, 1.6, 1.3, 1.02)
 SEPIA = (0.393, 0.769, 0.189, 0.349, 0.686, 0.168, 0.272, 0.534, 0.131)

@@ -15,12 +15,12 @@ import pytest
 import skimage.data
 from PIL import Image
 
-from nlfilter_torch.cli import folders, interrupts, main, workers
-from nlfilter_torch.cli.folders import RECORD, Tally, edit_folder, pictures, prepare
-from nlfilter_torch.cli.workers import DEATHS
-from nlfilter_torch.edits.presets import PRESETS, Recipe
-from nlfilter_torch.edits.steps import Step
-from nlfilter_torch.io.writing import open_beside
+from nlfilter_torch.photo.cli import folders, interrupts, main, workers
+from nlfilter_torch.photo.cli.folders import RECORD, Tally, edit_folder, pictures, prepare
+from nlfilter_torch.photo.cli.workers import DEATHS
+from nlfilter_torch.photo.declared.presets import PRESETS, Recipe
+from nlfilter_torch.photo.declared.steps import Step
+from nlfilter_torch.photo.io.writing import open_beside
 
 OPTIONS = ("--landmarks", "12", "--patch-size", "3", "--bandwidth", "20")
 ROOT = Path(__file__).parents[1]
@@ -253,7 +253,7 @@ def test_files_of_other_types_are_mentioned(
     for name in ("a.HEIC", "b.heic", "notes", "000.png.json", ".hidden.txt", "._000.png"):
         (tmp_path / "in" / name).touch()
     (tmp_path / "in" / "folder.dng").mkdir()
-    monkeypatch.setattr("nlfilter_torch.cli.folders.edit_folder", lambda *_, **__: None)
+    monkeypatch.setattr("nlfilter_torch.photo.cli.folders.edit_folder", lambda *_, **__: None)
     assert main(["batch", str(tmp_path / "in"), str(tmp_path / "out")]) == 0
     assert [path.name for path in pictures(tmp_path / "in")] == ["000.png"]
     assert capsys.readouterr().err == (
@@ -269,7 +269,7 @@ def test_interrupted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
         tally.done, tally.left = 1, 1
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("nlfilter_torch.cli.folders.edit_folder", interrupt)
+    monkeypatch.setattr("nlfilter_torch.photo.cli.folders.edit_folder", interrupt)
     assert main(["batch", str(tmp_path / "in"), str(tmp_path / "out")]) == 130
     captured = capsys.readouterr()
     told = (
@@ -285,9 +285,9 @@ def test_settings_and_workers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     fill(tmp_path / "in", 9)
     seen = {}
     monkeypatch.setattr(
-        "nlfilter_torch.cli.folders.edit_folder", lambda *args, **kwargs: seen.update(kwargs, args=args)
+        "nlfilter_torch.photo.cli.folders.edit_folder", lambda *args, **kwargs: seen.update(kwargs, args=args)
     )
-    monkeypatch.setattr("nlfilter_torch.cli.batch._cores", lambda: 12)
+    monkeypatch.setattr("nlfilter_torch.photo.cli.batch._cores", lambda: 12)
     arguments = ["batch", str(tmp_path / "in"), str(tmp_path / "out"), "--preset", "smooth", "--seed", "5"]
     assert main([*arguments, "--workers", "2", "--memory", "8"]) == 0
     assert (seen["workers"], seen["threads"]) == (2, 6)

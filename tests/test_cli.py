@@ -18,9 +18,9 @@ from PIL import ExifTags, Image, ImageCms
 
 import nlfilter_torch
 from nlfilter_torch import NonlocalFilter, nonlocal_operator, polynomial_filter
-from nlfilter_torch.cli import main
-from nlfilter_torch.edits.colour import edit_luminance
-from nlfilter_torch.io.photographs import Depth, Photograph, read_photograph, write_photograph
+from nlfilter_torch.photo.cli import main
+from nlfilter_torch.photo.io.photographs import Depth, Photograph, read_photograph, write_photograph
+from nlfilter_torch.photo.picture.colour import edit_luminance
 
 PROFILE = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
 
@@ -291,7 +291,7 @@ def test_as_a_program(photo: Path, tmp_path: Path) -> None:
 
 
 def test_without_the_extra(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delitem(sys.modules, "nlfilter_torch.cli.application")
+    monkeypatch.delitem(sys.modules, "nlfilter_torch.photo.cli.application")
     monkeypatch.setitem(sys.modules, "typer", None)
     assert main(["--version"]) == 2
     assert "needs typer, which is not installed; install it with: pip install 'nlfilter-torch[cli]'" in (
@@ -324,7 +324,7 @@ def test_interrupted_work_says_so(
     def interrupt(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("nlfilter_torch.cli.editing.read_photograph", interrupt)
+    monkeypatch.setattr("nlfilter_torch.photo.cli.editing.read_photograph", interrupt)
     assert main(["tone", str(photo), str(tmp_path / "out.png")]) == 130
     assert capsys.readouterr().err.strip() == "nlfilter-torch: interrupted; no file is half written"
 
@@ -350,7 +350,7 @@ def test_an_interrupt_that_python_loses_comes_again(
         for _ in range(1000):
             time.sleep(0.01)
 
-    monkeypatch.setattr("nlfilter_torch.cli.editing.read_photograph", work)
+    monkeypatch.setattr("nlfilter_torch.photo.cli.editing.read_photograph", work)
     assert main(["tone", str(photo), str(tmp_path / "out.png")]) == 130
     assert capsys.readouterr().err.strip() == "nlfilter-torch: interrupted; no file is half written"
 
@@ -365,7 +365,7 @@ def test_other_errors_of_destructors_are_told_as_ever(
     told: list[BaseException | None] = []
     monkeypatch.setattr("sys.unraisablehook", lambda lost: told.append(lost.exc_value))
     monkeypatch.setattr(
-        "nlfilter_torch.cli.editing.read_photograph", lambda *_, **__: Faulty() and read_photograph(photo)
+        "nlfilter_torch.photo.cli.editing.read_photograph", lambda *_, **__: Faulty() and read_photograph(photo)
     )
     assert main(["tone", str(photo), str(tmp_path / "out.png")]) == 0
     assert [str(error) for error in told] == ["of its own"]

@@ -18,9 +18,9 @@ import torch
 import zarr
 from PIL import Image
 
-from nlfilter_torch.cli import main
-from nlfilter_torch.io.photographs import Photograph, read_photograph, write_photograph
-from nlfilter_torch.io.tiff import TiffRows
+from nlfilter_torch.photo.cli import main
+from nlfilter_torch.photo.io.photographs import Photograph, read_photograph, write_photograph
+from nlfilter_torch.photo.io.tiff import TiffRows
 from tests.test_streaming_files import PROFILE, Array, cat
 
 LITTLE = "0.03"  # gigabytes: less than the whole picture needs, more than small blocks of rows need
@@ -29,8 +29,8 @@ LITTLE = "0.03"  # gigabytes: less than the whole picture needs, more than small
 @pytest.fixture(autouse=True)
 def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
     """Reduce samples and blocks in proportion to small pictures."""
-    monkeypatch.setattr("nlfilter_torch.tiled.sampling.PILOT", 8000)
-    monkeypatch.setattr("nlfilter_torch.tiled.pictures.STATISTICS_PIXELS", 6000)
+    monkeypatch.setattr("nlfilter_torch.photo.tiled.sampling.PILOT", 8000)
+    monkeypatch.setattr("nlfilter_torch.photo.tiled.pictures.STATISTICS_PIXELS", 6000)
 
 
 @pytest.fixture
@@ -149,7 +149,7 @@ def test_zarr_is_needed_for_zarr(
 def test_report_of_progress_is_drawn_on_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
     from rich.console import Console
 
-    from nlfilter_torch.cli import progress
+    from nlfilter_torch.photo.cli import progress
 
     shown = Console(force_terminal=True, width=80, record=True, file=open(os.devnull, "w"))  # noqa: SIM115
     monkeypatch.setattr(progress, "Console", lambda stderr: shown)
@@ -269,7 +269,7 @@ def test_interrupted_work_leaves_nothing_that_looks_finished(
         "import signal, sys, time\n"
         # Background jobs of a shell, and so their children, ignore this signal; these tests may be such a job.
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
-        "from nlfilter_torch.tiled import pictures, tiles\n"
+        "from nlfilter_torch.photo.tiled import pictures, tiles\n"
         "def slow(original):\n"
         "    def edited(tiling, tile):\n"
         "        time.sleep(0.2 * tiling.transparent)\n"  # in the last pass, which writes
@@ -277,7 +277,7 @@ def test_interrupted_work_leaves_nothing_that_looks_finished(
         "    return edited\n"
         "tiles.Tiling._edited, tiles.TILE_PIXELS = slow(tiles.Tiling._edited), 300\n"
         "tiles.sampling.PILOT = pictures.STATISTICS_PIXELS = 8000\n"
-        "from nlfilter_torch.cli import main\n"
+        "from nlfilter_torch.photo.cli import main\n"
         "sys.exit(main(sys.argv[1:]))\n"
     )
     arguments = ["detail", str(photo), str(tmp_path / target), "--landmarks", "40", "--memory", LITTLE]

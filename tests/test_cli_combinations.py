@@ -9,9 +9,10 @@ import tifffile
 import torch
 from PIL import Image
 
-from nlfilter_torch.cli import main
-from nlfilter_torch.edits.presets import Recipe
-from nlfilter_torch.edits.steps import Step
+from nlfilter_torch.photo.cli import main
+from nlfilter_torch.photo.declared.presets import Recipe
+from nlfilter_torch.photo.declared.steps import Step
+from nlfilter_torch.photo.edits.applying import apply_recipe
 from tests.commands import refused
 from tests.problems import colour
 
@@ -24,7 +25,7 @@ GREYS = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)  # a matrix that leaves co
 @pytest.fixture(params=[False, True], ids=["in memory", "in tiles"])
 def tiled(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> bool:
     if request.param:
-        monkeypatch.setattr("nlfilter_torch.cli.editing.read_if_it_fits", lambda *_: None)
+        monkeypatch.setattr("nlfilter_torch.photo.cli.editing.read_if_it_fits", lambda *_: None)
     return bool(request.param)
 
 
@@ -108,7 +109,7 @@ def test_steps_of_integers_are_limited_to_black_and_white() -> None:
     weak = Step("look", matrix=tuple(0.5 * value for value in GREYS))
     image = torch.rand(2, 3, 24, 24, generator=torch.Generator().manual_seed(0))
     image[1] *= 3
-    found = Recipe((strong, weak)).apply(image)
+    found = apply_recipe(Recipe((strong, weak)), image)
     assert found[0].max() == 0.5
     assert found[1].max() == pytest.approx(0.5 * float(image[1].max()))
 

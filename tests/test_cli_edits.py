@@ -8,12 +8,12 @@ import torch
 from PIL import Image
 
 from nlfilter_torch import abstract, adjust_tone, colorize, defocus, denoise, enhance, recolor, sharpen
-from nlfilter_torch.cli import main
-from nlfilter_torch.cli.scribbles import Rectangle, selection
-from nlfilter_torch.edits.declaration import Edit
-from nlfilter_torch.edits.parameters import EDITS, MASK
-from nlfilter_torch.io.photographs import Photograph, read_photograph, write_photograph
-from nlfilter_torch.io.rows import open_picture
+from nlfilter_torch.photo.cli import main
+from nlfilter_torch.photo.cli.scribbles import Rectangle, selection
+from nlfilter_torch.photo.declared.declaration import Edit
+from nlfilter_torch.photo.declared.parameters import EDITS, MASK
+from nlfilter_torch.photo.io.photographs import Photograph, read_photograph, write_photograph
+from nlfilter_torch.photo.io.rows import open_picture
 
 HEIGHT, WIDTH = 48, 64
 LANDMARKS = ("--landmarks", "40")

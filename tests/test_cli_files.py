@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 import tifffile
 
-from nlfilter_torch.cli import main
-from nlfilter_torch.io import writing as files
-from nlfilter_torch.io.photographs import read_photograph
-from nlfilter_torch.io.writing import open_beside
+from nlfilter_torch.photo.cli import main
+from nlfilter_torch.photo.io import writing as files
+from nlfilter_torch.photo.io.photographs import read_photograph
+from nlfilter_torch.photo.io.writing import open_beside
 from tests.commands import refused, small_photo
 
 

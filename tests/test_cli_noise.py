@@ -8,8 +8,8 @@ import pytest
 import torch
 from PIL import Image
 
-from nlfilter_torch.cli import main
-from nlfilter_torch.io.photographs import Photograph, write_photograph
+from nlfilter_torch.photo.cli import main
+from nlfilter_torch.photo.io.photographs import Photograph, write_photograph
 
 
 def write(path: Path, noise: float, *, alpha: bool = False) -> Path:

@@ -6,11 +6,13 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
 import nlfilter_torch
-from nlfilter_torch.edits.declaration import shown
+import nlfilter_torch.photo
+from nlfilter_torch.photo.declared.declaration import shown
 from tests.commands import refused, small_photo
 
 LONG = "9" * 400
@@ -114,7 +116,7 @@ def test_memory_of_large_patches_is_asked_for(
         asked.append(bytes_per_pixel)
         raise ValueError("enough")
 
-    monkeypatch.setattr("nlfilter_torch.cli.editing.read_photograph", read)
+    monkeypatch.setattr("nlfilter_torch.photo.cli.editing.read_photograph", read)
     refused(capsys, "apply", photo, tmp_path / "out.png", "--preset", preset)
     assert asked[0] > 4 * 2 * 99**2
 
@@ -152,24 +154,17 @@ def test_commands_that_need_no_filter_import_none(arguments: list[str]) -> None:
     assert finished.stdout.splitlines()[-1].split() == ["imported:"]
 
 
-def test_public_names_are_one_table() -> None:
-    """Names seen by type checkers are those that :func:`__getattr__` returns."""
-    tree = ast.parse(Path(nlfilter_torch.__file__).read_text())
-    typed = {
-        alias.asname: statement.module
-        for block in tree.body
-        if isinstance(block, ast.If)
-        for statement in block.body
-        if isinstance(statement, ast.ImportFrom)
-        for alias in statement.names
+@pytest.mark.parametrize("package", [nlfilter_torch, nlfilter_torch.photo], ids=lambda package: package.__name__)
+def test_public_names_are_those_of_the_stub(package: ModuleType) -> None:
+    stub = ast.parse(Path(package.__file__ or "").with_suffix(".pyi").read_text())
+    names = {
+        alias.name for statement in stub.body if isinstance(statement, ast.ImportFrom) for alias in statement.names
     }
-    table = {name: f"nlfilter_torch.{module}" for name, module in nlfilter_torch._DEFINED_IN.items()}
-    assert typed == table
-    assert set(nlfilter_torch.__all__) == set(table) <= set(dir(nlfilter_torch))
-    for name in table:
-        assert getattr(nlfilter_torch, name).__name__ == name
-    with pytest.raises(AttributeError, match="has no attribute 'sharpenn'"):
-        _ = nlfilter_torch.sharpenn
+    assert set(package.__all__) == names <= set(dir(package))
+    for name in names:
+        assert name == "PRESETS" or getattr(package, name).__name__ == name
+    with pytest.raises(AttributeError, match="sharpenn"):
+        _ = package.sharpenn
 
 
 def test_errors_of_the_system(photo: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
@@ -183,7 +178,7 @@ def test_errors_of_the_system(photo: Path, monkeypatch: pytest.MonkeyPatch, caps
         def fail(*_: object, error: OSError = error, **__: object) -> None:
             raise error
 
-        monkeypatch.setattr("nlfilter_torch.cli.editing.edit_file", fail)
+        monkeypatch.setattr("nlfilter_torch.photo.cli.editing.edit_file", fail)
         assert refused(capsys, "tone", photo, photo.with_name("out.png")) == f"nlfilter-torch: {sentence}\n"
 
 

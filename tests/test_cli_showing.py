@@ -7,9 +7,9 @@ import pytest
 import torch
 from PIL import Image
 
-from nlfilter_torch.cli import main
-from nlfilter_torch.cli.scribbles import Rectangle
-from nlfilter_torch.io.photographs import Photograph, read_photograph, write_photograph
+from nlfilter_torch.photo.cli import main
+from nlfilter_torch.photo.cli.scribbles import Rectangle
+from nlfilter_torch.photo.io.photographs import Photograph, read_photograph, write_photograph
 
 
 @pytest.fixture

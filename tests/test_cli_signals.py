@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from nlfilter_torch.cli import main
+from nlfilter_torch.photo.cli import main
 from tests.commands import small_photo
 
 
@@ -34,7 +34,7 @@ def test_signals_while_modules_are_imported(
     program = (
         "import signal, sys\n"
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # background jobs of a shell ignore it
-        "from nlfilter_torch.cli import main\n"
+        "from nlfilter_torch.photo.cli import main\n"
         f"sys.path.insert(0, {str(tmp_path)!r})\n"
         "sys.exit(main(sys.argv[1:]))\n"
     )
@@ -71,7 +71,7 @@ def test_signals_while_a_file_is_written(
             raise AssertionError("the signal was lost")
         os.kill(os.getpid(), number)
 
-    monkeypatch.setattr("nlfilter_torch.io.photographs.encode", interrupted)
+    monkeypatch.setattr("nlfilter_torch.photo.io.photographs.encode", interrupted)
     try:
         signal.signal(signal.SIGINT, signal.default_int_handler)
         signal.signal(signal.SIGTERM, signal.SIG_DFL)

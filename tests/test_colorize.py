@@ -6,9 +6,9 @@ import torch
 import torch.nn.functional as F
 
 from nlfilter_torch import colorize
-from nlfilter_torch.edits.colorize import bandwidth_ratio, colorize_guide, limit_saturation, weighted_mean
-from nlfilter_torch.edits.colour import merge_luminance, split_luminance
-from nlfilter_torch.edits.in_memory import InMemory
+from nlfilter_torch.photo.edits.colorize import bandwidth_ratio, colorize_guide, limit_saturation, weighted_mean
+from nlfilter_torch.photo.picture.colour import merge_luminance, split_luminance
+from nlfilter_torch.photo.picture.in_memory import InMemory
 from tests.problems import box, colour, luminance, noise, paint
 
 

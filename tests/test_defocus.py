@@ -5,7 +5,7 @@ import torch
 import torch.nn.functional as F
 
 from nlfilter_torch import defocus
-from nlfilter_torch.edits.defocus import REACH, ROWS, convolve
+from nlfilter_torch.photo.edits.defocus import REACH, ROWS, convolve
 from tests.problems import box, colour
 
 

@@ -10,8 +10,8 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from nlfilter_torch import detail_layers, nonlocal_operator
-from nlfilter_torch.cli import main
-from nlfilter_torch.plotting import save_figure, show_eigenvectors, show_images, show_layers, show_mask
+from nlfilter_torch.photo.cli import main
+from nlfilter_torch.photo.plotting import save_figure, show_eigenvectors, show_images, show_layers, show_mask
 
 
 def rendered(figure: Figure, folder: Path) -> np.ndarray:

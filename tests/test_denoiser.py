@@ -5,8 +5,11 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch import NonlocalDenoiser, denoise
-from nlfilter_torch.nn import denoiser as module
-from nlfilter_torch.nn.denoiser import PIXELS, SIDE, STEP, WIDTH, in_tiles, join_colours, noise_map, split_colours
+from nlfilter_torch.nn.denoiser import tiles
+from nlfilter_torch.nn.denoiser.colours import join_colours, split_colours
+from nlfilter_torch.nn.denoiser.network import PIXELS, WIDTH
+from nlfilter_torch.nn.denoiser.noise import noise_map
+from nlfilter_torch.nn.denoiser.tiles import SIDE, STEP, in_tiles
 from tests.problems import colour, decibels, noisy, seeded
 
 TRAINED_ONE = NonlocalDenoiser.trained()
@@ -65,11 +68,11 @@ def test_tiles_put_together_what_they_took_apart(size: tuple[int, int]) -> None:
 
 def test_tiles_cover_images_of_every_size() -> None:
     for length in range(1, 600):
-        tiles = module._divided(length)
-        assert [tile.start for tile in tiles] == [STEP * n for n in range(len(tiles))]
-        assert tiles[-1].stop >= length + 2 * module.BORDER
-        assert all(tile.stop - tile.start == SIDE for tile in tiles[:-1])
-        assert tiles[-1].stop - tiles[-1].start <= SIDE
+        parts = tiles._divided(length)
+        assert [tile.start for tile in parts] == [STEP * n for n in range(len(parts))]
+        assert parts[-1].stop >= length + 2 * tiles.BORDER
+        assert all(tile.stop - tile.start == SIDE for tile in parts[:-1])
+        assert parts[-1].stop - parts[-1].start <= SIDE
 
 
 def test_rows_that_begin_at_a_tile_are_those_of_the_whole() -> None:
@@ -267,9 +270,9 @@ def test_tiles_are_as_large_as_the_documentation_says(monkeypatch: pytest.Monkey
     image = torch.zeros(1, 1, 400, 300)
     in_tiles(image, noise_map(0.1, image), watched)
     sides = {side for size in seen for side in size[1:]}
-    assert min(sides) >= module.SMALLEST
-    assert max(sides) == module.SIDE
-    assert max(size[0] for size in seen) <= module.TILE_BATCH
+    assert min(sides) >= tiles.SMALLEST
+    assert max(sides) == tiles.SIDE
+    assert max(size[0] for size in seen) <= tiles.TILE_BATCH
 
 
 @pytest.mark.parametrize("channels", [1, 3])

@@ -8,8 +8,8 @@ import torch
 
 from benchmarks.train_denoiser import PlainDenoiser
 from nlfilter_torch import NonlocalDenoiser
-from nlfilter_torch.nn import denoiser as module
-from nlfilter_torch.nn.denoiser import TRAINED
+from nlfilter_torch.nn.denoiser import network as module
+from nlfilter_torch.nn.denoiser.network import TRAINED
 from tests.problems import colour, decibels, noisy
 
 TRAINED_ONE = NonlocalDenoiser.trained()

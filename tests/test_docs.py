@@ -15,8 +15,8 @@ from PIL import Image
 
 import nlfilter_torch
 from benchmarks import accuracy, guide_pictures, support
-from nlfilter_torch.cli import main
-from nlfilter_torch.edits.presets import PRESETS, PURPOSES
+from nlfilter_torch.photo.cli import main
+from nlfilter_torch.photo.declared.presets import PRESETS, PURPOSES
 from tests.pages import DOCS, ROOT, Page
 
 CLIENTS = (

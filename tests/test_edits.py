@@ -16,9 +16,9 @@ from nlfilter_torch import (
     region_mask,
     sharpen,
 )
-from nlfilter_torch.edits.in_memory import InMemory
-from nlfilter_torch.edits.pixels import Fitted, strips_of
-from nlfilter_torch.edits.source import Guide
+from nlfilter_torch.photo.picture.in_memory import InMemory
+from nlfilter_torch.photo.picture.pixels import Fitted, strips_of
+from nlfilter_torch.photo.picture.source import Guide
 from tests.problems import box, noise, paint
 
 GREY = 0.2 + 0.6 * noise(2, 1, 20, 22, dtype=torch.float32)
@@ -97,7 +97,7 @@ def test_edits_of_a_picture_in_strips_are_those_of_the_whole(name: str, monkeypa
         pieces.append(image.shape)
         return 7
 
-    monkeypatch.setattr("nlfilter_torch.edits.pixels._rows_at_once", rows)
+    monkeypatch.setattr("nlfilter_torch.photo.picture.pixels._rows_at_once", rows)
     torch.testing.assert_close(edit(image), wanted, atol=1e-12, rtol=0)
     assert pieces
 
@@ -106,7 +106,7 @@ def test_pictures_are_divided_if_they_are_large(monkeypatch: pytest.MonkeyPatch)
     image = torch.rand(1, 3, 40, 50)
     source = InMemory(image)
     assert strips_of(source) == [source]
-    monkeypatch.setattr("nlfilter_torch.edits.pixels.STRIP", 300 // torch.get_num_threads())
+    monkeypatch.setattr("nlfilter_torch.photo.picture.pixels.STRIP", 300 // torch.get_num_threads())
     parts = strips_of(source)
     assert torch.equal(torch.cat([part.image for part in parts], dim=2), image)
     assert [(part.first, part.width) for part in parts] == [(300 * i, 50) for i in range(7)]

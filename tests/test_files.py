@@ -15,8 +15,8 @@ import tifffile
 import torch
 from PIL import ExifTags, Image, ImageCms, ImageOps
 
-from nlfilter_torch.io.photographs import Photograph, read_photograph, write_photograph
-from nlfilter_torch.io.writing import check_folder
+from nlfilter_torch.photo.io.photographs import Photograph, read_photograph, write_photograph
+from nlfilter_torch.photo.io.writing import check_folder
 
 PROFILE = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
 INTEGERS = ("uint8", "uint16")

@@ -9,9 +9,9 @@ import skimage.data
 import tifffile
 from PIL import ExifTags, Image, ImageCms
 
-from nlfilter_torch.cli import main
-from nlfilter_torch.io.cameras import is_heic
-from nlfilter_torch.io.photographs import TooLarge, read_photograph
+from nlfilter_torch.photo.cli import main
+from nlfilter_torch.photo.io.cameras import is_heic
+from nlfilter_torch.photo.io.photographs import TooLarge, read_photograph
 
 SCENE = skimage.data.astronaut()[60:124, 130:210]
 PROFILE = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()

@@ -8,9 +8,9 @@ import pytest
 import tifffile
 from PIL import Image, PngImagePlugin
 
-from nlfilter_torch.cli import main
-from nlfilter_torch.io.extras import JPEG_LIMIT, Extras, read_extras
-from nlfilter_torch.io.photographs import Photograph, read_photograph, write_photograph
+from nlfilter_torch.photo.cli import main
+from nlfilter_torch.photo.io.extras import JPEG_LIMIT, Extras, read_extras
+from nlfilter_torch.photo.io.photographs import Photograph, read_photograph, write_photograph
 from tests.problems import cat
 
 XMP = (

@@ -9,8 +9,8 @@ import tifffile
 import torch
 from PIL import ExifTags, Image, PngImagePlugin
 
-from nlfilter_torch.io.exif import writable
-from nlfilter_torch.io.photographs import read_photograph, write_photograph
+from nlfilter_torch.photo.io.exif import writable
+from nlfilter_torch.photo.io.photographs import read_photograph, write_photograph
 from tests.test_files import photograph, stored_values, tags
 
 

@@ -15,14 +15,14 @@ import skimage.data
 import torch
 from av.video.reformatter import Interpolation
 
-from nlfilter_torch.cli import main
-from nlfilter_torch.edits.applying import apply_step
-from nlfilter_torch.edits.presets import Recipe
-from nlfilter_torch.edits.scribbles import Stroke
-from nlfilter_torch.edits.steps import Step
-from nlfilter_torch.io.films import display_matrix, open_film, write_film
-from nlfilter_torch.tiled.film import UNLIMITED_BANDWIDTH, FilmEdit
-from nlfilter_torch.tiled.tiles import Passes
+from nlfilter_torch.photo.cli import main
+from nlfilter_torch.photo.declared.presets import Recipe
+from nlfilter_torch.photo.declared.steps import Step
+from nlfilter_torch.photo.declared.strokes import Stroke
+from nlfilter_torch.photo.edits.applying import apply_step
+from nlfilter_torch.photo.io.films import display_matrix, open_film, write_film
+from nlfilter_torch.photo.tiled.film import UNLIMITED_BANDWIDTH, FilmEdit
+from nlfilter_torch.photo.tiled.tiles import Passes
 
 PASSES = Passes("float32")
 SCENE = skimage.data.astronaut().astype(np.float32) / 255

@@ -8,10 +8,10 @@ import pytest
 import torch
 
 from nlfilter_torch import apply_look
-from nlfilter_torch.cli import main
-from nlfilter_torch.edits.presets import Recipe
-from nlfilter_torch.edits.steps import Step
-from nlfilter_torch.io.photographs import Photograph, read_photograph, write_photograph
+from nlfilter_torch.photo.cli import main
+from nlfilter_torch.photo.declared.presets import Recipe
+from nlfilter_torch.photo.declared.steps import Step
+from nlfilter_torch.photo.io.photographs import Photograph, read_photograph, write_photograph
 from tests.looks import ALPHA, CAT, CUP, SEPIA, explained, in_bytes, rgb
 
 
@@ -283,7 +283,9 @@ def test_it_refuses_what_does_not_belong_together(tmp_path: Path, capsys: pytest
 def test_large_photographs_are_judged_at_the_viewing_size(
     before: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("nlfilter_torch.cli.fit.step_of", lambda *_: Step("look", viewing_size=0.003, landmarks=40))
+    monkeypatch.setattr(
+        "nlfilter_torch.photo.cli.fit.step_of", lambda *_: Step("look", viewing_size=0.003, landmarks=40)
+    )
     height, width = CAT.shape[-2:]
     write_photograph(Photograph(CAT**1.3), before.with_name("after.png"))
     seen = before.with_name("seen.png")

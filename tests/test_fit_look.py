@@ -15,13 +15,13 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch import apply_look, fit_look
-from nlfilter_torch.edits.alignment import align
-from nlfilter_torch.edits.applying import apply_step
-from nlfilter_torch.edits.look_pixels import EditedPhotograph
-from nlfilter_torch.edits.presets import Recipe
-from nlfilter_torch.edits.steps import Step
-from nlfilter_torch.filtering.look_fit import MOST, nonnegative, sample
 from nlfilter_torch.operator.features import reduce_channels
+from nlfilter_torch.photo.declared.presets import Recipe
+from nlfilter_torch.photo.declared.steps import Step
+from nlfilter_torch.photo.edits.applying import apply_step
+from nlfilter_torch.photo.look_fitting.alignment import align
+from nlfilter_torch.photo.look_fitting.look_fit import MOST, nonnegative, sample
+from nlfilter_torch.photo.look_fitting.look_pixels import EditedPhotograph
 from tests.looks import ALPHA, CAT, CUP, FEW, SEPIA, SUIT, explained, in_bytes, one, rgb
 
 
@@ -126,8 +126,8 @@ def test_a_sampled_pair_and_a_whole_one_have_the_same_look() -> None:
 
 
 def test_layers_of_a_sample_are_nearly_those_of_all_pixels(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("nlfilter_torch.filtering.look_fit.MOST", 2000)
-    monkeypatch.setattr("nlfilter_torch.edits.look_pixels.MOST", 2000)
+    monkeypatch.setattr("nlfilter_torch.photo.look_fitting.look_fit.MOST", 2000)
+    monkeypatch.setattr("nlfilter_torch.photo.look_fitting.look_pixels.MOST", 2000)
     photograph = EditedPhotograph(CAT[0], (CAT[0] ** 0.7), None, FEW, 3, None)
     found = photograph.regions_of_sample()
     assert found is not None

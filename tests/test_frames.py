@@ -9,15 +9,15 @@ import skimage.data
 import torch
 
 from nlfilter_torch import detail_layers, filter_frames, fit_filter, nonlocal_operator, polynomial_filter
-from nlfilter_torch.cli import main
-from nlfilter_torch.edits.applying import apply_step
-from nlfilter_torch.edits.colour import edit_luminance
-from nlfilter_torch.edits.presets import PRESETS, Recipe
-from nlfilter_torch.edits.steps import Step
-from nlfilter_torch.io.photographs import Photograph, read_photograph, write_photograph
 from nlfilter_torch.operator.features import reduce_channels
-from nlfilter_torch.tiled.film import FilmEdit
-from nlfilter_torch.tiled.tiles import Passes
+from nlfilter_torch.photo.cli import main
+from nlfilter_torch.photo.declared.presets import PRESETS, Recipe
+from nlfilter_torch.photo.declared.steps import Step
+from nlfilter_torch.photo.edits.applying import apply_step
+from nlfilter_torch.photo.io.photographs import Photograph, read_photograph, write_photograph
+from nlfilter_torch.photo.picture.colour import edit_luminance
+from nlfilter_torch.photo.tiled.film import FilmEdit
+from nlfilter_torch.photo.tiled.tiles import Passes
 from tests.problems import build, noise, picture
 
 ALPHA = torch.tensor([3.0, 3.0, 4.0, 1.05], dtype=torch.float64)

@@ -1,4 +1,4 @@
-"""The layout of the package: top-level modules, imports in their order only, no cycles, and the depth of imports."""
+"""The layout of the package: its rooms, imports in their order only, no cycles, and the depth of imports."""
 
 import ast
 from pathlib import Path
@@ -8,20 +8,21 @@ import pytest
 import nlfilter_torch
 
 PACKAGE = "nlfilter_torch"
-ROOMS = (
-    "core",
-    "operator",
-    "filtering",
-    "nn",
+ROOMS = ("version", "core", "operator", "filtering", "nn", "photo")
+PHOTO_ROOMS = (
+    "declared",
+    "picture",
+    "selections",
+    "looks",
     "edits",
+    "look_fitting",
     "tiled",
     "io",
     "plotting",
     "app",
     "cli",
 )
-INTERFACES = ("app", "cli")  # each counts as one module for the depth
-DEEPEST = 9  # levels of imports
+DEEPEST = 17  # levels of imports
 Imports = dict[str, set[str]]
 
 
@@ -29,14 +30,16 @@ def imports_of(sources: dict[str, str]) -> Imports:
     """Modules of the package that each module imports anywhere in its source."""
     imports: Imports = {}
     for module, text in sources.items():
-        found: set[str] = set()
+        targets: set[str] = set()
         for node in ast.walk(ast.parse(text)):
-            if isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[0] == PACKAGE:
+            if isinstance(node, ast.ImportFrom) and node.level:  # of a stub, relative to its package
+                targets.add(f"{module}.{node.module}")
+            elif isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[0] == PACKAGE:
                 names = [f"{node.module}.{alias.name}" for alias in node.names]
-                found |= {name if name in sources else node.module for name in names}
+                targets |= {name if name in sources else node.module for name in names}
             elif isinstance(node, ast.Import):
-                found |= {alias.name for alias in node.names if alias.name in sources}
-        imports[module] = found - {module, PACKAGE}
+                targets |= {alias.name for alias in node.names if alias.name in sources}
+        imports[module] = targets - {module}
     return imports
 
 
@@ -45,22 +48,29 @@ def package() -> Imports:
     sources = {}
     for path in sorted(root.rglob("*.py")):
         parts = (PACKAGE, *path.relative_to(root).with_suffix("").parts)
-        sources[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path.read_text(encoding="utf-8")
+        stub = path.with_suffix(".pyi")  # lists the names that a package imports when they are used
+        text = path.read_text(encoding="utf-8") + (stub.read_text(encoding="utf-8") if stub.exists() else "")
+        sources[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = text
     return imports_of(sources)
 
 
-def room(module: str) -> str:
-    return module.split(".")[1] if "." in module else ""
+def room(module: str, level: int = 1) -> str:
+    """The room of a module at a level: 1 is that of the package, 2 that of the application."""
+    parts = module.split(".")
+    return parts[level] if len(parts) > level else ""
 
 
-def upward(imports: Imports) -> list[str]:
-    """Imports of a room that comes later in the list."""
-    places = {name: place for place, name in enumerate(ROOMS)}
+def upward(imports: Imports, rooms: tuple[str, ...] = ROOMS, level: int = 1) -> list[str]:
+    """Imports of a room that comes later in the list; the package itself comes last."""
+    places = {name: place for place, name in enumerate(rooms)}
+    inside = ".".join((PACKAGE, "photo")[:level])
     return [
         f"{module} imports {other}"
         for module, others in imports.items()
+        if module.startswith(inside)
         for other in sorted(others)
-        if places.get(room(other), -1) > places.get(room(module), len(ROOMS))
+        if other.startswith(inside)
+        and places.get(room(other, level), len(rooms)) > places.get(room(module, level), len(rooms))
     ]
 
 
@@ -82,30 +92,27 @@ def depth(imports: Imports) -> int:
     return max(levels(module, ()) for module in imports)
 
 
-def folded(imports: Imports) -> Imports:
-    """Return the imports with each interface as one module, and without the top-level module of public names."""
-    whole: Imports = {}
-    for module, others in imports.items():
-        if room(module) not in ("", "__main__"):
-            targets = {f"{PACKAGE}.{room(m)}" if room(m) in INTERFACES else m for m in (module, *others)}
-            name = f"{PACKAGE}.{room(module)}" if room(module) in INTERFACES else module
-            whole.setdefault(name, set()).update(targets - {name})
-    return whole
-
-
 def test_the_package_has_its_rooms_and_no_others() -> None:
     root = Path(nlfilter_torch.__file__).parent
-    found = {path.stem for path in root.iterdir() if path.suffix == ".py" or (path / "__init__.py").exists()}
-    assert found == {*ROOMS, "__init__", "__main__"}
+    for folder, rooms in ((root, ROOMS), (root / "photo", PHOTO_ROOMS)):
+        names = {path.stem for path in folder.iterdir() if path.suffix == ".py" or (path / "__init__.py").exists()}
+        assert names - {"__init__", "__main__"} == set(rooms)
 
 
 def test_imports_only_go_down() -> None:
     assert not upward(package())
+    assert not upward(package(), PHOTO_ROOMS, level=2)
+
+
+def test_the_library_does_not_import_the_application() -> None:
+    outside = (PACKAGE, f"{PACKAGE}.__main__", f"{PACKAGE}.photo")
+    for module, others in package().items():
+        if module not in outside and not module.startswith(f"{PACKAGE}.photo."):
+            assert not any(other.startswith(f"{PACKAGE}.photo") for other in others), module
 
 
 def test_imports_have_no_cycles_and_are_not_deep() -> None:
-    depth(package())
-    assert depth(folded(package())) <= DEEPEST
+    assert depth(package()) <= DEEPEST
 
 
 def test_an_upward_import_is_noticed() -> None:

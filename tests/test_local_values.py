@@ -10,14 +10,14 @@ from torch import Tensor
 
 from benchmarks.levin import propagate
 from nlfilter_torch import colorize
-from nlfilter_torch.edits import local_values
-from nlfilter_torch.edits.in_memory import InMemory
-from nlfilter_torch.edits.local_values import ABSOLUTE, RELATIVE, Links, LocalValues
-from nlfilter_torch.edits.source import luminance
-from nlfilter_torch.tiled import stream_colorize
-from nlfilter_torch.tiled.pictures import Picture
-from nlfilter_torch.tiled.source import Tiled
-from nlfilter_torch.tiled.tiles import Passes
+from nlfilter_torch.photo.picture.in_memory import InMemory
+from nlfilter_torch.photo.picture.source import luminance
+from nlfilter_torch.photo.selections import local_values
+from nlfilter_torch.photo.selections.local_values import ABSOLUTE, RELATIVE, Links, LocalValues
+from nlfilter_torch.photo.tiled import stream_colorize
+from nlfilter_torch.photo.tiled.pictures import Picture
+from nlfilter_torch.photo.tiled.source import Tiled
+from nlfilter_torch.photo.tiled.tiles import Passes
 from tests.problems import box, colour
 from tests.problems import luminance as grey_of
 
@@ -110,7 +110,7 @@ def test_pictures_of_one_pixel_and_of_one_row(links: Links) -> None:
 
 @pytest.mark.parametrize("step", [1, 3, 7])
 def test_blocks_of_tiles_are_those_of_the_whole(monkeypatch: pytest.MonkeyPatch, step: int) -> None:
-    monkeypatch.setattr("nlfilter_torch.tiled.pictures.STATISTICS_PIXELS", 500)
+    monkeypatch.setattr("nlfilter_torch.photo.tiled.pictures.STATISTICS_PIXELS", 500)
     picture = np.random.default_rng(0).random((83, 61, 3), np.float32)
     tiled = Tiled(Picture(picture), Passes("float32"))
     image = torch.from_numpy(picture).permute(2, 0, 1)[None]
@@ -123,7 +123,9 @@ def test_blocks_of_tiles_are_those_of_the_whole(monkeypatch: pytest.MonkeyPatch,
 @pytest.mark.parametrize("rows", [1, 11, 90])
 def test_reduced_pictures_are_coloured_in_tiles_as_in_memory(monkeypatch: pytest.MonkeyPatch, rows: int) -> None:
     for name in ("ABSOLUTE", "RELATIVE"):
-        monkeypatch.setattr(f"nlfilter_torch.edits.colorize.{name}", replace(getattr(local_values, name), pixels=600))
+        monkeypatch.setattr(
+            f"nlfilter_torch.photo.edits.colorize.{name}", replace(getattr(local_values, name), pixels=600)
+        )
     image = colour("coffee", 60, 90).double()
     mask = (box(10, 10, 5, 5, size=(60, 90)) + box(40, 60, 5, 5, size=(60, 90))).double()
     options: dict[str, Any] = {"num_landmarks": 30}

@@ -11,11 +11,11 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch import Look, apply_look, enhance, fit_look
-from nlfilter_torch.edits.applying import apply_step
-from nlfilter_torch.edits.steps import Step
-from nlfilter_torch.filtering.look import bands_of, tone_curve
-from nlfilter_torch.tiled.recipe import edit_rows
-from nlfilter_torch.tiled.tiles import Passes
+from nlfilter_torch.photo.declared.steps import Step
+from nlfilter_torch.photo.edits.applying import apply_step
+from nlfilter_torch.photo.looks.look_filter import bands_of, tone_curve
+from nlfilter_torch.photo.tiled.recipe import edit_rows
+from nlfilter_torch.photo.tiled.tiles import Passes
 from tests.looks import ALPHA, CAT, CUP, FEW, SEPIA, in_bytes, one
 
 BENT = tuple((i / 16) ** 0.7 for i in range(17))

@@ -9,9 +9,9 @@ import tifffile
 from PIL import Image
 
 from nlfilter_torch import region_mask
-from nlfilter_torch.cli import main
-from nlfilter_torch.edits.parameters import MASK
-from nlfilter_torch.edits.source import seeded
+from nlfilter_torch.photo.cli import main
+from nlfilter_torch.photo.declared.parameters import MASK
+from nlfilter_torch.photo.picture.source import seeded
 from tests.problems import box, colour
 
 SIZE = (64, 80)
@@ -90,7 +90,7 @@ def test_a_rough_mask_becomes_a_soft_one(photograph: Path, tmp_path: Path) -> No
 
 
 def test_tiles(photograph: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("nlfilter_torch.cli.editing.read_if_it_fits", lambda *_: None)
+    monkeypatch.setattr("nlfilter_torch.photo.cli.editing.read_if_it_fits", lambda *_: None)
     assert run(photograph, tmp_path / "out.tif") == 0
     found = tifffile.imread(tmp_path / "out.tif")
     assert found.shape == SIZE

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from nlfilter_torch.filtering.neighbours import SIDES, neighbour_weights
+from nlfilter_torch.photo.selections.neighbours import SIDES, neighbour_weights
 
 
 def test_weights_of_neighbours_are_those_of_pairs() -> None:

@@ -10,10 +10,10 @@ from torch import Tensor
 
 import nlfilter_torch
 from benchmarks import parameters
-from nlfilter_torch.edits.declaration import Edit, Parameter
-from nlfilter_torch.edits.parameters import EDITS, MASK
-from nlfilter_torch.edits.shared_parameters import FILTER
-from nlfilter_torch.edits.source import Source
+from nlfilter_torch.photo.declared.declaration import Edit, Parameter
+from nlfilter_torch.photo.declared.parameters import EDITS, MASK
+from nlfilter_torch.photo.declared.shared_parameters import FILTER
+from nlfilter_torch.photo.picture.source import Source
 from tests.pages import ROOT
 
 EVERY = [(edit, parameter) for edit in EDITS.values() for parameter in edit]
@@ -25,7 +25,7 @@ def test_the_page_is_up_to_date() -> None:
 
 def test_each_is_declared_once(capsys: pytest.CaptureFixture[str]) -> None:
     assert parameters.main([]) == 0
-    assert "recolor reach: 1 (edits/parameters.py:" in capsys.readouterr().out
+    assert "recolor reach: 1 (photo/declared/parameters.py:" in capsys.readouterr().out
 
 
 def test_another_default_counts_as_a_declaration() -> None:

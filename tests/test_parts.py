@@ -9,13 +9,13 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from nlfilter_torch.edits.applying import fit_step
-from nlfilter_torch.edits.local_values import ABSOLUTE, RELATIVE
-from nlfilter_torch.edits.presets import Recipe
-from nlfilter_torch.edits.steps import Step
-from nlfilter_torch.tiled import recipe as whole_edit
-from nlfilter_torch.tiled.parts import Parts, Rectangle
-from nlfilter_torch.tiled.tiles import Passes
+from nlfilter_torch.photo.declared.presets import Recipe
+from nlfilter_torch.photo.declared.steps import Step
+from nlfilter_torch.photo.edits.applying import fit_step
+from nlfilter_torch.photo.selections.local_values import ABSOLUTE, RELATIVE
+from nlfilter_torch.photo.tiled import recipe as whole_edit
+from nlfilter_torch.photo.tiled.parts import Parts, Rectangle
+from nlfilter_torch.photo.tiled.tiles import Passes
 from tests.problems import cat
 from tests.test_whole_edit import COLORIZE, DETAIL, IN, RECOLOR, rows_of
 
@@ -58,10 +58,10 @@ def test_a_part_is_that_of_the_whole(
     name: str, options: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if "sample" in options:  # and in blocks, like a large picture
-        monkeypatch.setattr("nlfilter_torch.edits.mask.SOLVED", 2000)
+        monkeypatch.setattr("nlfilter_torch.photo.selections.mask.SOLVED", 2000)
         for kind, links in (("ABSOLUTE", ABSOLUTE), ("RELATIVE", RELATIVE)):
-            monkeypatch.setattr(f"nlfilter_torch.edits.colorize.{kind}", replace(links, pixels=2000))
-        monkeypatch.setattr("nlfilter_torch.tiled.parts.STRIP_PIXELS", 1000)
+            monkeypatch.setattr(f"nlfilter_torch.photo.edits.colorize.{kind}", replace(links, pixels=2000))
+        monkeypatch.setattr("nlfilter_torch.photo.tiled.parts.STRIP_PIXELS", 1000)
     source, passes = rows_of(cat(5)), Passes("float32", folder=tmp_path, **options)
     wanted = whole(EDITS[name], source, passes)
     parts = Parts(source, "scan.tif")
@@ -80,7 +80,7 @@ def test_only_what_a_change_affects_is_fitted_again(monkeypatch: pytest.MonkeyPa
         fitted.append(step.edit)
         return fit_step(step, *arguments)
 
-    monkeypatch.setattr("nlfilter_torch.tiled.parts.fit_step", counted)
+    monkeypatch.setattr("nlfilter_torch.photo.tiled.parts.fit_step", counted)
     source, passes, place = rows_of(cat(5)), Passes("float32", "full"), PLACES[1]
     parts = Parts(source, "scan.tif")
     detail, tone, recolor = Step("detail", alpha=(2.0, 1.0), landmarks=40), Step("tone", landmarks=40), RECOLOR

@@ -6,10 +6,11 @@ import pytest
 import skimage.data
 import torch
 
-from nlfilter_torch.cli import main
-from nlfilter_torch.edits.presets import PRESETS, PURPOSES, Recipe, find_recipe
-from nlfilter_torch.edits.steps import Step
-from nlfilter_torch.io.photographs import Photograph, read_photograph, write_photograph
+from nlfilter_torch.photo.cli import main
+from nlfilter_torch.photo.declared.presets import PRESETS, PURPOSES, Recipe, find_recipe
+from nlfilter_torch.photo.declared.steps import Step
+from nlfilter_torch.photo.edits.applying import apply_recipe
+from nlfilter_torch.photo.io.photographs import Photograph, read_photograph, write_photograph
 
 
 @pytest.fixture
@@ -28,7 +29,7 @@ def grain(pixels: torch.Tensor) -> torch.Tensor:
 def test_command_and_function_agree(photo: Path, name: str) -> None:
     out = photo.with_name("out.png")
     assert main(["detail", str(photo), str(out), "--preset", name]) == 0
-    expected = PRESETS[name].apply(read_photograph(photo).pixels).clamp(0, 1)
+    expected = apply_recipe(PRESETS[name], read_photograph(photo).pixels).clamp(0, 1)
     assert (read_photograph(out).pixels - expected).abs().max() <= 0.51 / 255
 
 
@@ -36,7 +37,7 @@ def test_each_does_what_it_says(photo: Path) -> None:
     """Grain is measured in the flatter half of the pixels, contrast in all."""
     pixels = read_photograph(photo).pixels
     calm = grain(pixels) <= grain(pixels).median()
-    edited = {name: preset.apply(pixels) for name, preset in PRESETS.items()}
+    edited = {name: apply_recipe(preset, pixels) for name, preset in PRESETS.items()}
     finer = {name: float(grain(y)[calm].mean() / grain(pixels)[calm].mean()) for name, y in edited.items()}
     contrast = {name: float(y.std() / pixels.std()) for name, y in edited.items()}
     assert min(finer[name] for name in ("crisp", "texture", "dramatic")) > 2
@@ -51,7 +52,7 @@ def test_each_does_what_it_says(photo: Path) -> None:
 @pytest.mark.parametrize("name", PRESETS)
 def test_none_takes_light_or_shadow_away(name: str) -> None:
     pixels = torch.from_numpy(skimage.data.rocket()[::4, ::4].copy()).permute(2, 0, 1)[None].float() / 255
-    stored = (255 * PRESETS[name].apply(pixels).clamp(0, 1)).round() / 255
+    stored = (255 * apply_recipe(PRESETS[name], pixels).clamp(0, 1)).round() / 255
     newly = ((stored == 0) & (pixels > 4 / 255)) | ((stored == 1) & (pixels < 1 - 4 / 255))
     assert newly.any(1).float().mean() < 0.001
     assert (stored - pixels).mean().abs() < 1 / 255
@@ -94,6 +95,6 @@ def test_one_is_printed_as_a_file(capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_gradient_reaches_the_image() -> None:
     image = torch.rand(1, 3, 24, 24, generator=torch.Generator().manual_seed(0)).requires_grad_()
-    PRESETS["glow"].apply(image).square().mean().backward()
+    apply_recipe(PRESETS["glow"], image).square().mean().backward()
     assert image.grad is not None
     assert image.grad.abs().max() > 0

@@ -15,15 +15,15 @@ import pytest
 import zarr
 from torch import Tensor
 
-from nlfilter_torch.cli import main, processes
-from nlfilter_torch.cli.processes import ZarrProcesses, zarr_processes
-from nlfilter_torch.cli.workers import DEATHS, Workers
-from nlfilter_torch.edits.presets import Recipe
-from nlfilter_torch.edits.scribbles import Stroke
-from nlfilter_torch.edits.steps import Step
-from nlfilter_torch.io.rows import open_picture, write_picture
-from nlfilter_torch.tiled.pictures import Picture, Tile
-from nlfilter_torch.tiled.tiles import Passes, Tiling
+from nlfilter_torch.photo.cli import main, processes
+from nlfilter_torch.photo.cli.processes import ZarrProcesses, zarr_processes
+from nlfilter_torch.photo.cli.workers import DEATHS, Workers
+from nlfilter_torch.photo.declared.presets import Recipe
+from nlfilter_torch.photo.declared.steps import Step
+from nlfilter_torch.photo.declared.strokes import Stroke
+from nlfilter_torch.photo.io.rows import open_picture, write_picture
+from nlfilter_torch.photo.tiled.pictures import Picture, Tile
+from nlfilter_torch.photo.tiled.tiles import Passes, Tiling
 from tests.test_streaming_files import cat
 
 FEW = ("--landmarks", "20")
@@ -41,8 +41,10 @@ def picture(tmp_path: Path) -> Path:
 
 @pytest.fixture(autouse=True)
 def small_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("nlfilter_torch.io.rows.CHUNK", 32)
-    monkeypatch.setattr("nlfilter_torch.tiled.tiles.CHUNK_PIXELS", 7 * 50)  # such that chunks begin in the midst of one
+    monkeypatch.setattr("nlfilter_torch.photo.io.rows.CHUNK", 32)
+    monkeypatch.setattr(
+        "nlfilter_torch.photo.tiled.tiles.CHUNK_PIXELS", 7 * 50
+    )  # such that chunks begin in the midst of one
 
 
 @pytest.fixture
@@ -206,7 +208,7 @@ def test_refusals(
 ) -> None:
     pytest.importorskip("distributed")
     monkeypatch.chdir(picture.parent)
-    monkeypatch.setattr("nlfilter_torch.cli.workers.CONNECTING", 0.2)
+    monkeypatch.setattr("nlfilter_torch.photo.cli.workers.CONNECTING", 0.2)
     assert main(["detail", *options]) == 2
     (told,) = capsys.readouterr().err.splitlines()
     assert message in told

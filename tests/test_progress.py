@@ -5,11 +5,11 @@ from pathlib import Path
 
 import pytest
 
-from nlfilter_torch.app.session import Session
-from nlfilter_torch.cli import editing, main, progress
 from nlfilter_torch.core.progress import Progress
-from nlfilter_torch.io import rows
-from nlfilter_torch.io.photographs import Photograph, read_photograph, write_photograph
+from nlfilter_torch.photo.app.session import Session
+from nlfilter_torch.photo.cli import editing, main, progress
+from nlfilter_torch.photo.io import rows
+from nlfilter_torch.photo.io.photographs import Photograph, read_photograph, write_photograph
 from tests.problems import LINE, cat, difference
 
 
@@ -101,7 +101,7 @@ def test_saving_in_the_editor_reports_its_progress(session: Session, monkeypatch
     session.add_stroke("recolor", LINE, 0.03, "#2040e0")
     found = []
     for name, memory, in_tiles in (("small.png", 10**9, False), ("large.png", 0, True)):
-        monkeypatch.setattr("nlfilter_torch.app.session.WHOLE", memory)
+        monkeypatch.setattr("nlfilter_torch.photo.app.session.WHOLE", memory)
         stages: list[str] = []
         found.append(read_photograph(session.save(name, lambda stage, *_, told=stages: told.append(stage))).pixels)
         assert stages[-1] == "Writing"

@@ -16,7 +16,7 @@ from nlfilter_torch import (
 )
 from nlfilter_torch.operator.balancing import balance
 from nlfilter_torch.operator.scaling import LARGEST, KernelMatrix, PixelScaling, Solution, damped, scaling_from_moment
-from nlfilter_torch.tiled import stream_detail
+from nlfilter_torch.photo.tiled import stream_detail
 from tests import reference
 from tests.problems import noise, picture, seeded
 

@@ -9,7 +9,7 @@ import pytest
 import skimage.data
 from PIL import Image
 
-from nlfilter_torch.cli import main
+from nlfilter_torch.photo.cli import main
 from tests.pages import README, ROOT
 
 

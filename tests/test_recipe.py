@@ -10,16 +10,18 @@ import skimage.data
 import torch
 
 from nlfilter_torch import abstract, adjust_tone, colorize, defocus, denoise, enhance, recolor, region_mask, sharpen
-from nlfilter_torch.cli import main
-from nlfilter_torch.edits.colour import edit_luminance
-from nlfilter_torch.edits.parameters import CRISP, EDITS
-from nlfilter_torch.edits.presets import PRESETS, Recipe, find_recipe
-from nlfilter_torch.edits.scribbles import Stroke, cover, mask_of, paint, thin
-from nlfilter_torch.edits.steps import Step, working_bytes
 from nlfilter_torch.filtering.filters import polynomial_filter
-from nlfilter_torch.io.photographs import Photograph, read_photograph, write_photograph
 from nlfilter_torch.operator.build import nonlocal_operator
 from nlfilter_torch.operator.features import reduce_channels
+from nlfilter_torch.photo.cli import main
+from nlfilter_torch.photo.declared.parameters import CRISP, EDITS
+from nlfilter_torch.photo.declared.presets import PRESETS, Recipe, find_recipe
+from nlfilter_torch.photo.declared.steps import Step, working_bytes
+from nlfilter_torch.photo.declared.strokes import Stroke, thin
+from nlfilter_torch.photo.edits.applying import apply_recipe
+from nlfilter_torch.photo.io.photographs import Photograph, read_photograph, write_photograph
+from nlfilter_torch.photo.picture.colour import edit_luminance
+from nlfilter_torch.photo.picture.painting import cover, mask_of, paint
 
 SIZE = (48, 64)
 LINE = ((0.25, 0.25), (0.5, 0.25))
@@ -83,12 +85,12 @@ def test_thinning_keeps_the_ends() -> None:
 
 def test_detail(pixels: torch.Tensor) -> None:
     wanted = enhance(pixels, torch.tensor(ALPHA), photometric_bandwidth=30 / 255, generator=seeded())
-    assert torch.equal(Recipe((Step("detail", alpha=ALPHA, bandwidth=30.0),)).apply(pixels), wanted)
+    assert torch.equal(apply_recipe(Recipe((Step("detail", alpha=ALPHA, bandwidth=30.0),)), pixels), wanted)
 
 
 def test_detail_in_a_region_and_elsewhere(pixels: torch.Tensor) -> None:
     plain = DETAIL.changed(limits="none", threshold=0.0)
-    found = Recipe((plain,)).apply(pixels)
+    found = apply_recipe(Recipe((plain,)), pixels)
     regions = mask_of([IN], SIZE), mask_of([OUT], SIZE)
     mask = region_mask(pixels, *regions, reach=0.7, generator=seeded())
     operator = nonlocal_operator(
@@ -105,16 +107,16 @@ def test_detail_in_a_region_and_elsewhere(pixels: torch.Tensor) -> None:
 
     assert torch.allclose(found, edit_luminance(pixels, edit), atol=1e-5)
     # With the same sliders inside and outside, the edit is that of the whole picture.
-    same = Recipe((plain.changed(inside=ALPHA),)).apply(pixels)
+    same = apply_recipe(Recipe((plain.changed(inside=ALPHA),)), pixels)
     whole = Step("detail", alpha=ALPHA, bandwidth=30.0, limits="none", threshold=0.0)
-    assert torch.allclose(same, Recipe((whole,)).apply(pixels), atol=1e-5)
+    assert torch.allclose(same, apply_recipe(Recipe((whole,)), pixels), atol=1e-5)
 
 
 @pytest.mark.parametrize("step", [DETAIL, COLORIZE, Step("defocus", (IN,))])
 def test_strokes_outside_the_picture_are_refused(step: Step, pixels: torch.Tensor) -> None:
     beside = tuple(Stroke(((1.5, 1.5),), stroke.radius, stroke.paint) for stroke in step.strokes)
     with pytest.raises(ValueError, match=f"strokes of {step.edit} must cover a pixel of the photograph, got none"):
-        Recipe((step.changed(strokes=beside),)).apply(pixels)
+        apply_recipe(Recipe((step.changed(strokes=beside),)), pixels)
 
 
 def test_colours(pixels: torch.Tensor) -> None:
@@ -122,7 +124,7 @@ def test_colours(pixels: torch.Tensor) -> None:
     grey = reduce_channels(pixels, "luminance")
     wanted = colorize(grey, strokes, painted, strength=0.5, generator=seeded())
     for image in (pixels, grey):
-        assert torch.equal(Recipe((COLORIZE,)).apply(image), wanted)
+        assert torch.equal(apply_recipe(Recipe((COLORIZE,)), image), wanted)
     kept = recolor(
         pixels,
         strokes,
@@ -132,21 +134,21 @@ def test_colours(pixels: torch.Tensor) -> None:
         photometric_bandwidth=0.2,
         generator=seeded(),
     )
-    assert torch.equal(Recipe((RECOLOR,)).apply(pixels), kept)
+    assert torch.equal(apply_recipe(Recipe((RECOLOR,)), pixels), kept)
     with pytest.raises(ValueError, match="recolor needs a colour photograph"):
-        Recipe((RECOLOR,)).apply(grey)
+        apply_recipe(Recipe((RECOLOR,)), grey)
 
 
 def test_blur_and_painting(pixels: torch.Tensor) -> None:
     blurred = defocus(pixels, mask_of([IN], SIZE), radius=0.04 * 48, generator=seeded())
-    assert torch.equal(Recipe((DEFOCUS,)).apply(pixels), blurred)
+    assert torch.equal(apply_recipe(Recipe((DEFOCUS,)), pixels), blurred)
     behind = defocus(pixels, mask_of([IN], SIZE), background=mask_of([OUT], SIZE), radius=0.04 * 48, generator=seeded())
-    assert torch.equal(Recipe((DEFOCUS.changed(strokes=(IN, OUT)),)).apply(pixels), behind)
+    assert torch.equal(apply_recipe(Recipe((DEFOCUS.changed(strokes=(IN, OUT)),)), pixels), behind)
     assert not torch.equal(behind, blurred)
     for line, width in ((0.3, 0.3), (2.0, 0.96)):  # lines have a minimum width in pixels
         step = ABSTRACT.changed(edge_width=line)
         wanted = abstract(pixels, power=0.2, edges=0.5, edge_width=width, tones=5, generator=seeded())
-        assert torch.equal(Recipe((step,)).apply(pixels), wanted)
+        assert torch.equal(apply_recipe(Recipe((step,)), pixels), wanted)
 
 
 def test_steps_follow_one_another(pixels: torch.Tensor) -> None:
@@ -155,19 +157,21 @@ def test_steps_follow_one_another(pixels: torch.Tensor) -> None:
     for steps in ((crisp, DEFOCUS), (DEFOCUS, crisp), (crisp, Step("tone", clarity=2.0), crisp)):
         wanted = pixels
         for step in steps:
-            wanted = Recipe((step,)).apply(wanted.clamp(0, 1))
-        assert torch.equal(Recipe(steps).apply(pixels), wanted)
+            wanted = apply_recipe(Recipe((step,)), wanted.clamp(0, 1))
+        assert torch.equal(apply_recipe(Recipe(steps), pixels), wanted)
         assert Recipe.from_json(Recipe(steps).to_json(), "edit.json") == Recipe(steps)
 
 
 def test_the_other_edits_are_steps(pixels: torch.Tensor) -> None:
     sharp = sharpen(pixels, amount=6.0, guide_blur=0.8, patch_size=3, generator=seeded())
-    assert torch.equal(Recipe((Step("sharpen", amount=6.0, guide_blur=0.8, patch_size=3),)).apply(pixels), sharp)
+    assert torch.equal(
+        apply_recipe(Recipe((Step("sharpen", amount=6.0, guide_blur=0.8, patch_size=3),)), pixels), sharp
+    )
     toned = adjust_tone(pixels, contrast=1.2, clarity=2.0, generator=seeded())
-    assert torch.equal(Recipe((Step("tone", clarity=2.0),)).apply(pixels), toned)
+    assert torch.equal(apply_recipe(Recipe((Step("tone", clarity=2.0),)), pixels), toned)
     for level in (None, 12.0):
         clean = denoise(pixels, noise_level=None if level is None else level / 255, generator=seeded())
-        assert torch.equal(Recipe((Step("denoise", noise_level=level),)).apply(pixels), clean)
+        assert torch.equal(apply_recipe(Recipe((Step("denoise", noise_level=level),)), pixels), clean)
 
 
 def test_all_options_of_detail_are_in_files(pixels: torch.Tensor) -> None:
@@ -175,20 +179,20 @@ def test_all_options_of_detail_are_in_files(pixels: torch.Tensor) -> None:
     assert Recipe.from_json(Recipe((step,)).to_json(), "edit.json") == Recipe((step,))
     alpha = torch.tensor(CRISP)
     wanted = enhance(pixels, alpha, residual=0.5, channels="all", patch_size=3, generator=seeded())
-    assert torch.equal(Recipe((step,)).apply(pixels), wanted)
+    assert torch.equal(apply_recipe(Recipe((step,)), pixels), wanted)
 
 
 @pytest.mark.parametrize("edit", EDITS)
 def test_idle_steps_change_nothing(edit: str, pixels: torch.Tensor) -> None:
     assert not Step.idle(edit).changes()
-    assert Recipe((Step.idle(edit),)).apply(pixels) is pixels
+    assert apply_recipe(Recipe((Step.idle(edit),)), pixels) is pixels
     changed: dict[str, Any] = {"matrix": (0.5,) * 9} if edit == "look" else {}  # the default look changes nothing
     assert Step(edit, (BLUE, IN), **changed).changes()
 
 
 def test_what_changes_nothing_is_left_out(pixels: torch.Tensor) -> None:
     idle = Recipe((Step.idle("detail").changed(inside=INSIDE), Step("recolor", (KEEP,))))
-    assert idle.apply(pixels) is pixels
+    assert apply_recipe(idle, pixels) is pixels
     assert Recipe.from_json(idle.to_json(), "edit.json") == Recipe()
 
 
@@ -299,7 +303,7 @@ def test_apply(pixels: torch.Tensor, tmp_path: Path) -> None:
     recipe = Recipe((DETAIL, Step("tone"), DEFOCUS))
     edit.write_text(recipe.to_json())
     assert main(["apply", str(photo), str(out), "--preset", str(edit)]) == 0
-    assert (read_photograph(out).pixels - recipe.apply(pixels).clamp(0, 1)).abs().max() < 0.6 / 255
+    assert (read_photograph(out).pixels - apply_recipe(recipe, pixels).clamp(0, 1)).abs().max() < 0.6 / 255
 
     assert main(["apply", str(photo), str(out), "--preset", "crisp", "--depth", "16"]) == 0
     assert main(["detail", str(photo), str(tmp_path / "same.png"), "--preset", "crisp", "--depth", "16"]) == 0

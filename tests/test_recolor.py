@@ -5,7 +5,7 @@ import torch
 import torch.nn.functional as F
 
 from nlfilter_torch import recolor
-from nlfilter_torch.edits.colour import colour_guide, group_colours, region_means, split_luminance
+from nlfilter_torch.photo.picture.colour import colour_guide, group_colours, region_means, split_luminance
 from tests.problems import BACKGROUND, SUIT, box, colour, luminance, noise, paint
 
 

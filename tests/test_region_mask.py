@@ -8,14 +8,14 @@ import pytest
 import torch
 
 from nlfilter_torch import nonlocal_operator, region_mask
-from nlfilter_torch.edits import mask as masks
-from nlfilter_torch.edits import matting
-from nlfilter_torch.edits.in_memory import InMemory, InMemoryOperator
-from nlfilter_torch.edits.resizing import enlarged
-from nlfilter_torch.tiled import sampling
-from nlfilter_torch.tiled.pictures import Picture
-from nlfilter_torch.tiled.source import Tiled
-from nlfilter_torch.tiled.tiles import Passes
+from nlfilter_torch.photo.picture.in_memory import InMemory, InMemoryOperator
+from nlfilter_torch.photo.picture.resizing import enlarged
+from nlfilter_torch.photo.selections import mask as masks
+from nlfilter_torch.photo.selections import matting
+from nlfilter_torch.photo.tiled import sampling
+from nlfilter_torch.photo.tiled.pictures import Picture
+from nlfilter_torch.photo.tiled.source import Tiled
+from nlfilter_torch.photo.tiled.tiles import Passes
 from tests.problems import box, colour, noise, seeded
 from tests.test_strokes import kriging
 
@@ -172,7 +172,7 @@ def test_gradients() -> None:
 @pytest.mark.parametrize("tile_rows", [16, 40])
 def test_tiles_are_as_in_memory(tile_rows: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sampling, "CHUNK", 300)
-    monkeypatch.setattr("nlfilter_torch.tiled.pictures.STATISTICS_PIXELS", 2500)
+    monkeypatch.setattr("nlfilter_torch.photo.tiled.pictures.STATISTICS_PIXELS", 2500)
     monkeypatch.setattr(masks, "SOLVED", 5000)
     image = colour("coffee", 110, 130)
     front, back = box(50, 50, 8, 12, size=(110, 130)), box(4, 8, 8, 12, size=(110, 130))

@@ -5,9 +5,15 @@ import heapq
 import pytest
 import torch
 
-from nlfilter_torch.edits import scribbled_colours
-from nlfilter_torch.edits.scribbled_colours import colour_likelihood, density, evenness, every_nth, linked_evenly
-from nlfilter_torch.edits.scribbled_pixels import Scribbles
+from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles
+from nlfilter_torch.photo.selections import scribbled_colours
+from nlfilter_torch.photo.selections.scribbled_colours import (
+    colour_likelihood,
+    density,
+    evenness,
+    every_nth,
+    linked_evenly,
+)
 from tests.problems import noise
 
 

@@ -11,18 +11,18 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from nlfilter_torch import nonlocal_operator, polynomial_filter, region_mask
-from nlfilter_torch.edits.colour import edit_luminance
-from nlfilter_torch.edits.source import Guide
 from nlfilter_torch.filtering.filters import filter_regions
 from nlfilter_torch.operator import landmarks as landmarks_module
 from nlfilter_torch.operator.features import reduce_channels
 from nlfilter_torch.operator.landmarks import candidate_pixels
-from nlfilter_torch.tiled import sampling, stream_detail
-from nlfilter_torch.tiled.pictures import Picture
-from nlfilter_torch.tiled.sampling import ColumnCache, Draws, GuidePicture, draw, over_all
-from nlfilter_torch.tiled.source import Tiled
-from nlfilter_torch.tiled.statistics import Block, Guess, balance_by_passes
-from nlfilter_torch.tiled.tiles import Passes
+from nlfilter_torch.photo.picture.colour import edit_luminance
+from nlfilter_torch.photo.picture.source import Guide
+from nlfilter_torch.photo.tiled import sampling, stream_detail
+from nlfilter_torch.photo.tiled.pictures import Picture
+from nlfilter_torch.photo.tiled.sampling import ColumnCache, Draws, GuidePicture, draw, over_all
+from nlfilter_torch.photo.tiled.source import Tiled
+from nlfilter_torch.photo.tiled.statistics import Block, Guess, balance_by_passes
+from nlfilter_torch.photo.tiled.tiles import Passes
 
 Array = NDArray[Any]
 ALPHA = torch.tensor([3.0, 3.0, 4.0, 1.05])
@@ -80,7 +80,7 @@ def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
     """Reduce samples and blocks in proportion to a small picture."""
     monkeypatch.setattr(sampling, "PILOT", 2000)
     monkeypatch.setattr(sampling, "CHUNK", 1500)
-    monkeypatch.setattr("nlfilter_torch.tiled.pictures.STATISTICS_PIXELS", 2500)
+    monkeypatch.setattr("nlfilter_torch.photo.tiled.pictures.STATISTICS_PIXELS", 2500)
 
 
 @pytest.mark.usefixtures("small_blocks")
@@ -244,7 +244,7 @@ def test_tiles_of_any_size_give_the_same(statistics: str) -> None:
 
 
 def test_source_is_read_a_few_rows_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("nlfilter_torch.tiled.pictures.STATISTICS_PIXELS", 600)
+    monkeypatch.setattr("nlfilter_torch.photo.tiled.pictures.STATISTICS_PIXELS", 600)
     picture = cat(90, 60)
     source, edited = Rows(picture, most=10 + 4), np.empty_like(picture)
     options = PLAIN | {"num_landmarks": 30}
@@ -324,7 +324,7 @@ def test_more_landmarks_than_pixels_are_reduced() -> None:
 
 
 def test_balancing_that_does_not_settle_warns(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("nlfilter_torch.tiled.statistics.MAX_PASSES", 1)
+    monkeypatch.setattr("nlfilter_torch.photo.tiled.statistics.MAX_PASSES", 1)
     picture = GuidePicture(Picture(cat(30, 40)), Guide({}))
     pilot = sampling.take_pilot(picture, silent, num_landmarks=20)
     with pytest.warns(UserWarning, match="balancing still changed by .* after 1 passes"):

@@ -13,12 +13,12 @@ import zarr
 from numpy.typing import NDArray
 from PIL import ExifTags, Image, ImageCms
 
-from nlfilter_torch.io import rows as streaming_files
-from nlfilter_torch.io import tiff
-from nlfilter_torch.io.exif import upright
-from nlfilter_torch.io.photographs import read_photograph
-from nlfilter_torch.io.rows import StoredPicture, open_picture, write_picture
-from nlfilter_torch.io.tiff import TiffRows
+from nlfilter_torch.photo.io import rows as streaming_files
+from nlfilter_torch.photo.io import tiff
+from nlfilter_torch.photo.io.exif import upright
+from nlfilter_torch.photo.io.photographs import read_photograph
+from nlfilter_torch.photo.io.rows import StoredPicture, open_picture, write_picture
+from nlfilter_torch.photo.io.tiff import TiffRows
 
 Array = NDArray[Any]
 PLENTY = 1 << 30

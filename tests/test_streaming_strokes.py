@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from nlfilter_torch import colorize, recolor
-from nlfilter_torch.cli import main
-from nlfilter_torch.edits.colour import split_luminance
-from nlfilter_torch.io.photographs import read_photograph
-from nlfilter_torch.tiled import sampling, stream_colorize, stream_recolor, tiles
-from nlfilter_torch.tiled.pictures import Picture
-from nlfilter_torch.tiled.scribbles import read_scribbles
+from nlfilter_torch.photo.cli import main
+from nlfilter_torch.photo.io.photographs import read_photograph
+from nlfilter_torch.photo.picture.colour import split_luminance
+from nlfilter_torch.photo.tiled import sampling, stream_colorize, stream_recolor, tiles
+from nlfilter_torch.photo.tiled.pictures import Picture
+from nlfilter_torch.photo.tiled.scribbles import read_scribbles
 from tests.test_streaming import FEW, LEVEL, Rows, Shrinking, cat
 
 Array = NDArray[Any]
@@ -28,7 +28,7 @@ def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
     """Reduce samples and blocks in proportion to a small picture."""
     monkeypatch.setattr(sampling, "PILOT", 2000)
     monkeypatch.setattr(sampling, "CHUNK", 300)
-    monkeypatch.setattr("nlfilter_torch.tiled.pictures.STATISTICS_PIXELS", 2500)
+    monkeypatch.setattr("nlfilter_torch.photo.tiled.pictures.STATISTICS_PIXELS", 2500)
 
 
 def paint(height: int, width: int) -> tuple[Array, Array, Array]:
@@ -161,7 +161,7 @@ def test_a_guide_that_is_kept_changes_nothing() -> None:
 
 
 def test_everything_is_read_a_few_rows_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("nlfilter_torch.tiled.pictures.STATISTICS_PIXELS", 600)
+    monkeypatch.setattr("nlfilter_torch.photo.tiled.pictures.STATISTICS_PIXELS", 600)
     picture = cat(240, 60)
     painted = paint(240, 60)
     settings = {"tile_rows": 10, "sample": 2000, "num_landmarks": 30, "memory": FEW}
@@ -310,7 +310,7 @@ LITTLE = "0.014"  # gigabytes: less than the whole picture needs, more than smal
 def photo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A file of 16 bits, 180x150, beside strokes over it in two files, and a copy in grey."""
     monkeypatch.setattr(sampling, "PILOT", 8000)
-    monkeypatch.setattr("nlfilter_torch.tiled.pictures.STATISTICS_PIXELS", 6000)
+    monkeypatch.setattr("nlfilter_torch.photo.tiled.pictures.STATISTICS_PIXELS", 6000)
     picture = skimage.data.chelsea()[20:170, 90:270].astype(np.uint16) * 257
     tifffile.imwrite(tmp_path / "in.tif", picture, photometric="rgb", tile=(64, 64), compression="zlib")
     tifffile.imwrite(tmp_path / "grey.tif", picture[..., 1], photometric="minisblack")

@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch import colorize
-from nlfilter_torch.edits.colorize import (
+from nlfilter_torch.photo.edits.colorize import (
     FEW_STROKES,
     MOST_WEIGHT,
     SAME_ERROR,
@@ -14,11 +14,11 @@ from nlfilter_torch.edits.colorize import (
     compared,
     extended,
 )
-from nlfilter_torch.edits.in_memory import InMemory
-from nlfilter_torch.edits.local_values import ABSOLUTE, RELATIVE, Links, LocalValues
-from nlfilter_torch.edits.scribbled_pixels import Scribbles
-from nlfilter_torch.edits.source import Guide, Operator, luminance
-from nlfilter_torch.edits.stroke_groups import GROUPS, StrokeGroups
+from nlfilter_torch.photo.picture.in_memory import InMemory
+from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles
+from nlfilter_torch.photo.picture.source import Guide, Operator, luminance
+from nlfilter_torch.photo.selections.local_values import ABSOLUTE, RELATIVE, Links, LocalValues
+from nlfilter_torch.photo.selections.stroke_groups import GROUPS, StrokeGroups
 from tests.problems import box
 
 SIZE = (20, 30)

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from nlfilter_torch import abstract, adjust_tone, enhance, nonlocal_operator, polynomial_filter, sharpen
-from nlfilter_torch.edits.colour import split_luminance
+from nlfilter_torch.photo.picture.colour import split_luminance
 from tests.problems import BACKGROUND, SUIT, box, colour, luminance
 
 #: The filter of the paper, without limits.

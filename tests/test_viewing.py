@@ -8,18 +8,18 @@ import torch
 import torch.nn.functional as F
 
 from nlfilter_torch import adjust_tone, enhance, sharpen
-from nlfilter_torch.cli import main
-from nlfilter_torch.edits.changes import limit_by_activity, split_sliders
-from nlfilter_torch.edits.in_memory import InMemory
-from nlfilter_torch.edits.limits import Balance, Limits
-from nlfilter_torch.edits.pixels import Fitted, part_of
-from nlfilter_torch.edits.resizing import resize, resized
-from nlfilter_torch.edits.viewing import viewed_size, within_limits
-from nlfilter_torch.io.photographs import Photograph, read_photograph, write_photograph
-from nlfilter_torch.tiled import stream_detail
-from nlfilter_torch.tiled.pictures import Picture
-from nlfilter_torch.tiled.source import Tiled
-from nlfilter_torch.tiled.tiles import Passes
+from nlfilter_torch.photo.cli import main
+from nlfilter_torch.photo.io.photographs import Photograph, read_photograph, write_photograph
+from nlfilter_torch.photo.picture.changes import limit_by_activity, split_sliders
+from nlfilter_torch.photo.picture.in_memory import InMemory
+from nlfilter_torch.photo.picture.limits import Balance, Limits
+from nlfilter_torch.photo.picture.pixels import Fitted, part_of
+from nlfilter_torch.photo.picture.resizing import resize, resized
+from nlfilter_torch.photo.picture.viewing import viewed_size, within_limits
+from nlfilter_torch.photo.tiled import stream_detail
+from nlfilter_torch.photo.tiled.pictures import Picture
+from nlfilter_torch.photo.tiled.source import Tiled
+from nlfilter_torch.photo.tiled.tiles import Passes
 from tests.problems import colour, luminance
 
 ALPHA = torch.tensor([2.2, 2.2, 2.2, 1.0])

@@ -10,18 +10,21 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from nlfilter_torch.cli import main
-from nlfilter_torch.edits.matting import pyramid_levels
-from nlfilter_torch.edits.noise import estimate_noise, noise_of
-from nlfilter_torch.edits.presets import Recipe
-from nlfilter_torch.edits.scribbles import Stroke, cover, mask_of, paint
-from nlfilter_torch.edits.steps import Step
-from nlfilter_torch.io.photographs import Photograph, read_photograph, write_photograph
-from nlfilter_torch.tiled import recipe as whole_edit
-from nlfilter_torch.tiled import stream_detail
-from nlfilter_torch.tiled.pictures import Picture
-from nlfilter_torch.tiled.source import Tiled
-from nlfilter_torch.tiled.tiles import Passes
+from nlfilter_torch.nn.denoiser.noise import estimate_noise
+from nlfilter_torch.photo.cli import main
+from nlfilter_torch.photo.declared.presets import Recipe
+from nlfilter_torch.photo.declared.steps import Step
+from nlfilter_torch.photo.declared.strokes import Stroke
+from nlfilter_torch.photo.edits.applying import apply_recipe
+from nlfilter_torch.photo.edits.noise import noise_of
+from nlfilter_torch.photo.io.photographs import Photograph, read_photograph, write_photograph
+from nlfilter_torch.photo.picture.painting import cover, mask_of, paint
+from nlfilter_torch.photo.selections.matting import pyramid_levels
+from nlfilter_torch.photo.tiled import recipe as whole_edit
+from nlfilter_torch.photo.tiled import stream_detail
+from nlfilter_torch.photo.tiled.pictures import Picture
+from nlfilter_torch.photo.tiled.source import Tiled
+from nlfilter_torch.photo.tiled.tiles import Passes
 from tests.problems import cat, difference
 from tests.test_streaming import cat as photograph
 
@@ -53,7 +56,7 @@ def test_denoising_by_a_sample_is_within_a_grey_level() -> None:
     picture = (photograph(200, 260) + noise).clip(0, 1).astype(np.float32)
     step, options = Recipe((Step("denoise", landmarks=60),)), {"sample": 4096}
     rows = [rows for _, rows in whole_edit.edit_rows(Passes("float32", **options), picture, step.steps, "scan.tif")]
-    assert difference(from_rows(np.concatenate(rows)), step.apply(from_rows(picture))) < 1  # grey level
+    assert difference(from_rows(np.concatenate(rows)), apply_recipe(step, from_rows(picture))) < 1  # grey level
 
 
 @pytest.mark.parametrize("rows", [slice(0, 1), slice(3, 11), slice(7, 48), slice(0, 48)])
@@ -92,7 +95,7 @@ def test_an_edit_by_rows_is_the_one_in_memory(recipe: Recipe, tmp_path: Path) ->
     # Differences of 1e-5 before recolouring may change its landmarks, so its input is that of the steps by rows.
     before, last = recipe.steps[:-1], recipe.steps[-1:]
     given = from_rows(by_rows(Recipe(before), rows_of(image), tmp_path, tile_rows=17)) if before else image
-    wanted = rows_of(Recipe(last).apply(given))
+    wanted = rows_of(apply_recipe(Recipe(last), given))
     # In memory the balancing stops at 1e-5.
     assert np.abs(edited - wanted).max() < (1e-4 if RECOLOR in last else 2e-5)
     assert not list(tmp_path.iterdir())
@@ -103,15 +106,15 @@ def test_a_mask_by_a_pyramid_is_the_same_by_rows(tmp_path: Path) -> None:
     assert pyramid_levels(97) == 1
     recipe = Recipe((Step("defocus", (IN,), landmarks=60, radius=3.0),))
     edited = by_rows(recipe, rows_of(image), tmp_path, tile_rows=17)
-    assert np.abs(edited - rows_of(recipe.apply(image))).max() < 2e-5
+    assert np.abs(edited - rows_of(apply_recipe(recipe, image))).max() < 2e-5
 
 
 def test_tiles_and_their_margins_fit_the_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     image, recipe = cat(), Recipe((Step("abstract", landmarks=20, edges=1.0),))
-    monkeypatch.setattr("nlfilter_torch.tiled.source.FINISH_FLOATS", 4000)  # 2.4 MB a row
+    monkeypatch.setattr("nlfilter_torch.photo.tiled.source.FINISH_FLOATS", 4000)  # 2.4 MB a row
     few = by_rows(recipe, rows_of(image), tmp_path, memory=60_000_000)  # and so two tiles or more
     assert np.abs(few - by_rows(recipe, rows_of(image), tmp_path)).max() < 1e-5
-    monkeypatch.setattr("nlfilter_torch.tiled.source.FINISH_FLOATS", 20_000)
+    monkeypatch.setattr("nlfilter_torch.photo.tiled.source.FINISH_FLOATS", 20_000)
     with pytest.raises(MemoryError, match=r"scan.tif needs at least \d+ MB of memory, but only 60 MB may be used"):
         by_rows(recipe, rows_of(image), tmp_path, memory=60_000_000)
 
@@ -129,13 +132,13 @@ def test_grey_becomes_colour_and_transparency_stays(tmp_path: Path) -> None:
     edited = by_rows(Recipe((detail, colorize)), source, tmp_path)
     # Differences of 1e-5 before colorizing may change its landmarks, so its input is that of the first step by rows.
     given = from_rows(by_rows(Recipe((detail,)), rows_of(grey), tmp_path))
-    assert np.abs(edited[..., :3] - rows_of(Recipe((colorize,)).apply(given))).max() < 2e-5
+    assert np.abs(edited[..., :3] - rows_of(apply_recipe(Recipe((colorize,)), given))).max() < 2e-5
     np.testing.assert_allclose(edited[..., 3], source[..., 1], atol=1e-7)
 
 
 def test_the_command_line_goes_by_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("nlfilter_torch.tiled.sampling.PILOT", 4000)
-    monkeypatch.setattr("nlfilter_torch.tiled.pictures.STATISTICS_PIXELS", 6000)
+    monkeypatch.setattr("nlfilter_torch.photo.tiled.sampling.PILOT", 4000)
+    monkeypatch.setattr("nlfilter_torch.photo.tiled.pictures.STATISTICS_PIXELS", 6000)
     photo, preset = tmp_path / "in.tif", tmp_path / "edit.json"
     write_photograph(Photograph(cat().repeat(1, 1, 2, 2), "uint16"), photo)  # more than tiles need
     preset.write_text(Recipe((DETAIL, RECOLOR)).to_json())
@@ -161,7 +164,7 @@ def test_no_room_between_two_steps_is_named(tmp_path: Path, monkeypatch: pytest.
         def write(self, _: bytes) -> None:
             raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr("nlfilter_torch.tiled.tiles.TemporaryFile", lambda **_: Full())
+    monkeypatch.setattr("nlfilter_torch.photo.tiled.tiles.TemporaryFile", lambda **_: Full())
     sentence = "No space left on device, for a temporary file of 1 MB"
     with pytest.raises(OSError, match=sentence) as raised:
         by_rows(Recipe((Step("detail", alpha=(2.0, 1.0), landmarks=30), RECOLOR)), rows_of(cat()), tmp_path)

@@ -10,7 +10,7 @@ import torch
 
 from nlfilter_torch.core.kernels import library
 from nlfilter_torch.core.kernels.tall_skinny import moment, spread
-from nlfilter_torch.tiled.workers import in_order, single_threaded
+from nlfilter_torch.photo.tiled.workers import in_order, single_threaded
 
 
 @pytest.fixture(autouse=True)

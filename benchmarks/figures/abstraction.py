@@ -5,9 +5,9 @@ from torch import Tensor
 
 from benchmarks.figures.scenes import SIDE, SIZE, Numbers, luminance, rounded, scene
 from nlfilter_torch import abstract
-from nlfilter_torch.edits.abstract import edge_lines, quantize
-from nlfilter_torch.edits.colour import merge_luminance, split_luminance
-from nlfilter_torch.plotting import show_images
+from nlfilter_torch.photo.edits.abstract import edge_lines, quantize
+from nlfilter_torch.photo.picture.colour import merge_luminance, split_luminance
+from nlfilter_torch.photo.plotting import show_images
 
 TONES, LINES = 8, 0.8
 PART = (95, 10, 170)  # left, top, side

@@ -8,8 +8,8 @@ from torch import Tensor
 from benchmarks.colorize import levin, psnr
 from benchmarks.figures.scenes import SIDE, SIZE, Box, Numbers, luminance, painted_over, rounded, scene, spots, strokes
 from nlfilter_torch import colorize, diffusion_mask, nonlocal_operator, recolor
-from nlfilter_torch.edits.colour import merge_luminance, split_luminance
-from nlfilter_torch.plotting import show_images
+from nlfilter_torch.photo.picture.colour import merge_luminance, split_luminance
+from nlfilter_torch.photo.plotting import show_images
 
 BLUE, GREEN, VIOLET = (0.1, 0.3, 0.85), (0.1, 0.55, 0.3), (0.5, 0.2, 0.75)
 TRUE: tuple[Box, ...] = (

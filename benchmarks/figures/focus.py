@@ -8,9 +8,9 @@ from torch import Tensor
 
 from benchmarks.figures.scenes import SIDE, SIZE, Box, Numbers, marked, rounded, scene, spots
 from nlfilter_torch import defocus, region_mask
-from nlfilter_torch.edits.defocus import blur_behind, focus_of
-from nlfilter_torch.edits.parameters import DEFOCUS
-from nlfilter_torch.plotting import show_images
+from nlfilter_torch.photo.declared.parameters import DEFOCUS
+from nlfilter_torch.photo.edits.defocus import blur_behind, focus_of
+from nlfilter_torch.photo.plotting import show_images
 
 PORTRAIT: tuple[Box, ...] = (
     (190, 70, 70, 90),

@@ -5,7 +5,7 @@ from matplotlib.figure import Figure
 
 from benchmarks.figures.scenes import SIDE, SIZE, Box, Numbers, marked, rounded, scene, spots
 from nlfilter_torch import diffusion_mask, nonlocal_operator
-from nlfilter_torch.plotting import show_images
+from nlfilter_torch.photo.plotting import show_images
 
 TIMES = (0.5, 1.0, 2.0, 4.0)
 BANDWIDTH = 25 / 255

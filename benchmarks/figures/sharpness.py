@@ -10,8 +10,8 @@ from benchmarks import unsharp
 from benchmarks.detail_pictures import fine_part, halo, noise_gain
 from benchmarks.figures.scenes import SIDE, SIZE, Box, Numbers, luminance, marked, rounded, scene, spots
 from nlfilter_torch import diffusion_mask, nonlocal_operator, polynomial_filter
-from nlfilter_torch.edits.colour import edit_luminance
-from nlfilter_torch.plotting import show_images
+from nlfilter_torch.photo.picture.colour import edit_luminance
+from nlfilter_torch.photo.plotting import show_images
 
 ALPHA = torch.tensor([3.0, 3.0, 4.0, 1.0])
 BANDWIDTH = 25 / 255

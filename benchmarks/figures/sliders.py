@@ -7,8 +7,8 @@ from torch import Tensor
 from benchmarks.detail_pictures import clipped, fine_part
 from benchmarks.figures.scenes import SIDE, SIZE, Numbers, luminance, rounded, scene
 from nlfilter_torch import nonlocal_operator, polynomial_filter, polynomial_response
-from nlfilter_torch.edits.colour import edit_luminance
-from nlfilter_torch.plotting import show_images
+from nlfilter_torch.photo.picture.colour import edit_luminance
+from nlfilter_torch.photo.plotting import show_images
 
 Sliders = tuple[float, float, float, float]
 

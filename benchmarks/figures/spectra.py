@@ -7,7 +7,7 @@ from torch import Tensor
 
 from benchmarks.figures.scenes import SIDE, SIZE, Numbers, luminance, rounded, scene
 from nlfilter_torch import Spectrum, nonlocal_operator
-from nlfilter_torch.plotting import show_images
+from nlfilter_torch.photo.plotting import show_images
 
 SHOWN = (2, 3, 10, 25, 50)
 LANDMARKS = 100

@@ -391,7 +391,7 @@ def warn(message: str) -> None:
 
 def called_by_edit() -> bool:
     """Whether the caller is an edit, which has checked the image already."""
-    edits = ("nlfilter_torch.edits", "nlfilter_torch.filtering.fitted")
+    edits = ("nlfilter_torch.photo.", "nlfilter_torch.filtering.fitted")
     return any(module.startswith(edits) for module in _modules_inside())
 
 

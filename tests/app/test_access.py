@@ -5,7 +5,7 @@ import socket
 import pytest
 from starlette.datastructures import Headers
 
-from nlfilter_torch.app.access import LARGEST, names_of, refusal
+from nlfilter_torch.photo.app.access import LARGEST, names_of, refusal
 
 OWN = "127.0.0.1:8080"
 

@@ -10,16 +10,17 @@ import pytest
 import torch
 from playwright.sync_api import Browser
 
-from nlfilter_torch.app import at_rest
-from nlfilter_torch.app.at_rest import AtRest
-from nlfilter_torch.app.preview import PIXELS
-from nlfilter_torch.app.session import Session
 from nlfilter_torch.core.progress import Progress
-from nlfilter_torch.edits.presets import Recipe
-from nlfilter_torch.edits.resizing import resize
-from nlfilter_torch.edits.scribbles import Stroke
-from nlfilter_torch.edits.steps import Step
-from nlfilter_torch.io.photographs import Photograph, read_photograph, write_photograph
+from nlfilter_torch.photo.app import at_rest
+from nlfilter_torch.photo.app.at_rest import AtRest
+from nlfilter_torch.photo.app.preview import PIXELS
+from nlfilter_torch.photo.app.session import Session
+from nlfilter_torch.photo.declared.presets import Recipe
+from nlfilter_torch.photo.declared.steps import Step
+from nlfilter_torch.photo.declared.strokes import Stroke
+from nlfilter_torch.photo.edits.applying import apply_recipe
+from nlfilter_torch.photo.io.photographs import Photograph, read_photograph, write_photograph
+from nlfilter_torch.photo.picture.resizing import resize
 from tests.app.browser import TIMEOUT, Tab, difference, running
 from tests.problems import cat
 
@@ -87,7 +88,7 @@ def test_it_is_shown_once_nothing_changes(page: Page, large: Session) -> None:
     large.load(LINES)
     page.draw(large)
     assert len(page.shown) == 1
-    assert difference(page.shown[0], resize(LINES.apply(cat(1)).clamp(0, 1), large.preview.size)) < 0.01
+    assert difference(page.shown[0], resize(apply_recipe(LINES, cat(1)).clamp(0, 1), large.preview.size)) < 0.01
     page.session = None  # another photograph, a part at full size, or a slider that moves
     page.draw(large)
     assert len(page.shown) == 1
@@ -104,7 +105,7 @@ def test_an_edit_that_changes_interrupts_it(page: Page, large: Session) -> None:
     page.before_work = change
     page.draw(large)
     assert len(page.shown) == 1
-    wanted = RECIPES["recolor"].apply(cat(1)).clamp(0, 1)
+    wanted = apply_recipe(RECIPES["recolor"], cat(1)).clamp(0, 1)
     assert difference(page.shown[0], resize(wanted, large.preview.size)) < 0.05
 
 
@@ -129,7 +130,7 @@ def test_in_the_browser(browser: Browser, tmp_path: Path) -> None:
         tab.wait_until_ready()
         tab.load_edit(tmp_path / "lines.json")
         size = (tab.picture().shape[-2], tab.picture().shape[-1])
-        saved = resize(LINES.apply(photograph.pixels).clamp(0, 1), size)
+        saved = resize(apply_recipe(LINES, photograph.pixels).clamp(0, 1), size)
         deadline = time.monotonic() + TIMEOUT / 1000
         while (left := difference(tab.picture(), saved)) > 1.5:  # pictures of the page are JPEGs
             assert time.monotonic() < deadline, left

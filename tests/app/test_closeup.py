@@ -11,15 +11,16 @@ import pytest
 import torch
 from PIL import Image
 
-from nlfilter_torch.app import closeup
-from nlfilter_torch.app.closeup import CELL, Closeup
-from nlfilter_torch.app.session import Session
 from nlfilter_torch.core.progress import Progress
-from nlfilter_torch.edits.presets import Recipe
-from nlfilter_torch.edits.scribbles import Stroke
-from nlfilter_torch.edits.steps import Step
-from nlfilter_torch.io.photographs import Photograph, read_photograph, write_photograph
-from nlfilter_torch.tiled.parts import Rectangle
+from nlfilter_torch.photo.app import closeup
+from nlfilter_torch.photo.app.closeup import CELL, Closeup
+from nlfilter_torch.photo.app.session import Session
+from nlfilter_torch.photo.declared.presets import Recipe
+from nlfilter_torch.photo.declared.steps import Step
+from nlfilter_torch.photo.declared.strokes import Stroke
+from nlfilter_torch.photo.edits.applying import apply_recipe
+from nlfilter_torch.photo.io.photographs import Photograph, read_photograph, write_photograph
+from nlfilter_torch.photo.tiled.parts import Rectangle
 from tests.problems import cat
 
 PLACE = Rectangle(range(21, 83), range(33, 120))
@@ -147,7 +148,7 @@ def test_an_edit_that_changes_takes_its_pieces_with_it(page: Page, large: Sessio
     page.finish()
     assert page.told == ["closeup.add('piece-2', 0, 0, 128, 128)"]
     found = pixels(page.closeup.file("piece-2"))
-    wanted = large.recipe.apply(cat(1)).clamp(0, 1)[..., :128, :128]
+    wanted = apply_recipe(large.recipe, cat(1)).clamp(0, 1)[..., :128, :128]
     assert (found - wanted).abs().max() <= 1 / 255
     page.told.clear()
     page.closeup.follow()  # nothing has changed
@@ -162,7 +163,7 @@ def test_what_is_worked_out_for_an_edit_that_has_changed_is_not_shown(page: Page
     page.before_work = lambda: next(meanwhile, lambda: None)()
     assert page.look(0, 0, 64, 64) == ["closeup.add('piece-1', 0, 0, 64, 64)"]
     assert len(page.parts) == 2
-    wanted = large.recipe.apply(cat(1)).clamp(0, 1)[..., :64, :64]
+    wanted = apply_recipe(large.recipe, cat(1)).clamp(0, 1)[..., :64, :64]
     assert (pixels(page.closeup.file("piece-1")) - wanted).abs().max() <= 1 / 255
 
 

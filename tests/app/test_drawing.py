@@ -7,11 +7,11 @@ import pytest
 import torch
 from PIL import Image
 
-from nlfilter_torch.app import controls, drawing
-from nlfilter_torch.app.panel import entries_of
-from nlfilter_torch.edits.presets import PRESETS, Recipe
-from nlfilter_torch.edits.scribbles import Stroke
-from nlfilter_torch.edits.steps import Step
+from nlfilter_torch.photo.app import controls, drawing
+from nlfilter_torch.photo.app.panel import entries_of
+from nlfilter_torch.photo.declared.presets import PRESETS, Recipe
+from nlfilter_torch.photo.declared.steps import Step
+from nlfilter_torch.photo.declared.strokes import Stroke
 from tests.problems import cat
 
 

@@ -5,9 +5,10 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import expect
 
-from nlfilter_torch.cli import main
-from nlfilter_torch.edits.presets import Recipe, find_recipe
-from nlfilter_torch.io.photographs import read_photograph
+from nlfilter_torch.photo.cli import main
+from nlfilter_torch.photo.declared.presets import Recipe, find_recipe
+from nlfilter_torch.photo.edits.applying import apply_recipe
+from nlfilter_torch.photo.io.photographs import read_photograph
 from tests.app.browser import Tab, difference
 from tests.problems import cat
 
@@ -24,7 +25,7 @@ def test_picture_follows_a_slider_and_undo(opened: Tab) -> None:
     opened.wait_for_picture(before)  # while the button is held
     opened.page.mouse.up()
     expect(opened.page.get_by_text("4.00 ×")).to_be_visible()
-    wanted = Recipe().apply(cat())
+    wanted = apply_recipe(Recipe(), cat())
     opened.page.wait_for_timeout(300)
     assert difference(opened.picture(), wanted) > 8
     before = opened.source()
@@ -81,7 +82,7 @@ def test_saved_files_are_what_the_library_and_the_command_line_make(opened: Tab,
     assert recipe.last("detail")["inside"] == (1.0, 3.0, 1.0, 1.0)
     assert recipe.last("recolor").strokes[0].paint == "#8a46c8"
     saved = read_photograph(folder / "out.png").pixels
-    assert (saved - recipe.apply(cat()).clamp(0, 1)).abs().max() <= 1 / 255
+    assert (saved - apply_recipe(recipe, cat()).clamp(0, 1)).abs().max() <= 1 / 255
     assert main(["apply", str(folder / "cat.png"), str(folder / "cli.png"), "--preset", str(folder / "edit.json")]) == 0
     assert (saved - read_photograph(folder / "cli.png").pixels).abs().max() <= 1 / 255
     assert difference(opened.picture(), saved) < 5

@@ -10,12 +10,13 @@ import psutil
 import pytest
 from PIL import Image
 
-import nlfilter_torch.io.photographs
+import nlfilter_torch.photo.io.photographs
 from nlfilter_torch.__main__ import main
-from nlfilter_torch.app.session import Session
-from nlfilter_torch.edits.presets import find_recipe
-from nlfilter_torch.io.photographs import Photograph, read_photograph, write_photograph
 from nlfilter_torch.operator.features import reduce_channels
+from nlfilter_torch.photo.app.session import Session
+from nlfilter_torch.photo.declared.presets import find_recipe
+from nlfilter_torch.photo.edits.applying import apply_recipe
+from nlfilter_torch.photo.io.photographs import Photograph, read_photograph, write_photograph
 from tests.problems import LINE, cat, difference
 
 
@@ -38,7 +39,7 @@ def test_saving_is_what_the_command_line_does(session: Session, photo: Path) -> 
     assert find_recipe(str(edit)) == session.recipe
     assert main(["apply", str(photo), str(photo.with_name("cli.png")), "--preset", str(edit)]) == 0
     assert difference(saved, read_photograph(photo.with_name("cli.png")).pixels) <= 1
-    assert difference(saved, session.recipe.apply(cat())) <= 1
+    assert difference(saved, apply_recipe(session.recipe, cat())) <= 1
 
 
 def test_sliders_alone_are_a_preset_of_detail(session: Session, photo: Path) -> None:
@@ -141,7 +142,7 @@ def test_an_interrupted_save_leaves_the_old_file(session: Session, monkeypatch: 
         stream.write(before[:100])
         raise OSError("no space left on device")
 
-    monkeypatch.setattr(nlfilter_torch.io.photographs.Image.Image, "save", break_off)
+    monkeypatch.setattr(nlfilter_torch.photo.io.photographs.Image.Image, "save", break_off)
     with pytest.raises(OSError, match="no space left"):
         session.save("out.png")
     assert target.read_bytes() == before
@@ -157,7 +158,7 @@ def test_app_says_what_it_lacks(
         port = str(taken.getsockname()[1])
         assert main(["app", "--out", str(tmp_path), "--port", port, "--no-open"]) == 2
     assert f"cannot listen on --host 127.0.0.1 --port {port}" in capsys.readouterr().err
-    monkeypatch.delitem(sys.modules, "nlfilter_torch.app.server")
+    monkeypatch.delitem(sys.modules, "nlfilter_torch.photo.app.server")
     monkeypatch.setitem(sys.modules, "nicegui", None)
     assert main(["app", "--out", str(tmp_path), "--no-open"]) == 2
     assert "the editor needs nicegui, which is not installed" in capsys.readouterr().err

@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Browser, Dialog, expect
 
-from nlfilter_torch.edits.presets import Recipe
-from nlfilter_torch.io.photographs import Photograph, write_photograph
+from nlfilter_torch.photo.declared.presets import Recipe
+from nlfilter_torch.photo.io.photographs import Photograph, write_photograph
 from tests.app.browser import Editor, Tab
 from tests.problems import cat
 

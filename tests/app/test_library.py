@@ -5,11 +5,12 @@ from pathlib import Path
 
 import pytest
 
-from nlfilter_torch.app.library import Library
-from nlfilter_torch.app.session import Session
-from nlfilter_torch.cli import main
-from nlfilter_torch.edits.presets import Recipe
-from nlfilter_torch.io.photographs import Photograph, read_photograph, write_photograph
+from nlfilter_torch.photo.app.library import Library
+from nlfilter_torch.photo.app.session import Session
+from nlfilter_torch.photo.cli import main
+from nlfilter_torch.photo.declared.presets import Recipe
+from nlfilter_torch.photo.edits.applying import apply_recipe
+from nlfilter_torch.photo.io.photographs import Photograph, read_photograph, write_photograph
 from tests.problems import LINE, cat, difference
 
 
@@ -51,7 +52,7 @@ def test_the_file_is_one_for_apply(shots: Path) -> None:
     edit(session)
     kept = shots / "cat.png.edit.json"
     assert main(["apply", str(shots / "cat.png"), str(shots / "out.png"), "--preset", str(kept)]) == 0
-    assert difference(read_photograph(shots / "out.png").pixels, session.recipe.apply(cat())) <= 1
+    assert difference(read_photograph(shots / "out.png").pixels, apply_recipe(session.recipe, cat())) <= 1
     while session.undo():
         pass
     assert not kept.exists()  # nothing to store
@@ -91,7 +92,7 @@ def test_what_the_browser_sends_is_the_file_if_it_is_the_same(shots: Path, tmp_p
 
 
 def test_a_folder_that_cannot_be_written_to(shots: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("nlfilter_torch.app.sidecar.os.access", lambda *_: False)
+    monkeypatch.setattr("nlfilter_torch.photo.app.sidecar.os.access", lambda *_: False)
     recipe = edit(Library(shots).open(shots / "cat.png"))
     assert [path.name for path in shots.iterdir()] == ["cat.png"]
     assert Library(shots).open(shots / "cat.png").recipe == recipe
@@ -105,7 +106,7 @@ def test_a_full_disk_loses_nothing_that_was_kept(shots: Path, monkeypatch: pytes
         def full(*_: object) -> None:
             raise OSError(28, "No space left on device")
 
-        patched.setattr("nlfilter_torch.app.sidecar.open_beside", full)
+        patched.setattr("nlfilter_torch.photo.app.sidecar.open_beside", full)
         session.set("tone", contrast=1.6)
         session.commit()
         assert session.trouble is not None

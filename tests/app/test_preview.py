@@ -7,17 +7,18 @@ import torch
 import torch.nn.functional as F
 
 from nlfilter_torch import estimate_bandwidth, nonlocal_operator, polynomial_filter, region_mask
-from nlfilter_torch.app.preview import PIXELS, Preview, reduce, sampled_operator
-from nlfilter_torch.app.session import Session
-from nlfilter_torch.edits.applying import apply_step, prepare
-from nlfilter_torch.edits.parameters import EDITS
-from nlfilter_torch.edits.presets import Recipe
-from nlfilter_torch.edits.resizing import block_means, enlarged, resize
-from nlfilter_torch.edits.scribbles import Stroke, mask_of
-from nlfilter_torch.edits.source import seeded
-from nlfilter_torch.edits.steps import Step
-from nlfilter_torch.edits.viewing import enlarged_and_reduced, viewed_size
 from nlfilter_torch.operator.features import reduce_channels
+from nlfilter_torch.photo.app.preview import PIXELS, Preview, reduce, sampled_operator
+from nlfilter_torch.photo.app.session import Session
+from nlfilter_torch.photo.declared.parameters import EDITS
+from nlfilter_torch.photo.declared.presets import Recipe
+from nlfilter_torch.photo.declared.steps import Step
+from nlfilter_torch.photo.declared.strokes import Stroke
+from nlfilter_torch.photo.edits.applying import apply_recipe, apply_step, prepare
+from nlfilter_torch.photo.picture.painting import mask_of
+from nlfilter_torch.photo.picture.resizing import block_means, enlarged, resize
+from nlfilter_torch.photo.picture.source import seeded
+from nlfilter_torch.photo.picture.viewing import enlarged_and_reduced, viewed_size
 from tests.problems import cat, difference
 
 FEW = {"landmarks": 60}
@@ -42,7 +43,7 @@ def test_what_is_shown_is_what_is_saved(colour: bool) -> None:
         Recipe((Step("detail", alpha=(2.0, 1.0, 1.0, 1.0), **FEW), Step("defocus", (region,)))),
         Recipe((Step("denoise"), Step("detail", residual=1.0, **FEW), Step("tone", **FEW), Step("sharpen", **FEW))),
     ):
-        assert difference(preview.render(recipe), recipe.apply(image)) < 1
+        assert difference(preview.render(recipe), apply_recipe(recipe, image)) < 1
 
 
 def counted(monkeypatch: pytest.MonkeyPatch) -> dict[str, list[str]]:
@@ -54,7 +55,7 @@ def counted(monkeypatch: pytest.MonkeyPatch) -> dict[str, list[str]]:
         edit = prepare(step, image, stride=stride)
         return lambda other: events[step.edit].append("edit") or edit(other)  # type: ignore[func-returns-value]
 
-    monkeypatch.setattr("nlfilter_torch.app.preview.prepare", spied)
+    monkeypatch.setattr("nlfilter_torch.photo.app.preview.prepare", spied)
     return events
 
 
@@ -95,7 +96,7 @@ def test_more_strokes_need_no_other_filter(name: str, session: Session, monkeypa
     wanted = apply_step(second, session.preview.pixels).clamp(0, 1)
     session.load(Recipe((first,)))
     session.render()
-    monkeypatch.setattr("nlfilter_torch.edits.in_memory.nonlocal_operator", None)
+    monkeypatch.setattr("nlfilter_torch.photo.picture.in_memory.nonlocal_operator", None)
     session.load(Recipe((second,)))
     assert torch.equal(session.render(), wanted)
 
@@ -106,7 +107,9 @@ def test_another_radius_needs_no_other_mask(session: Session, monkeypatch: pytes
     session.load(Recipe((first,)))
     session.render()
     for function in ("fit_borders", "colour_likelihood"):
-        monkeypatch.setattr(f"nlfilter_torch.edits.mask.{function}", lambda *_: pytest.fail("computed again"))
+        monkeypatch.setattr(
+            f"nlfilter_torch.photo.selections.mask.{function}", lambda *_: pytest.fail("computed again")
+        )
     session.set("defocus", radius=4.0)
     assert torch.equal(session.render(), wanted)
 
@@ -117,7 +120,7 @@ def test_other_sliders_need_no_other_layers(session: Session, monkeypatch: pytes
         session.load(Recipe((step,)))
         session.render()
         with monkeypatch.context() as patch:
-            patch.setattr("nlfilter_torch.edits.in_memory.detail_layers", None)
+            patch.setattr("nlfilter_torch.photo.picture.in_memory.detail_layers", None)
             patch.setattr("nlfilter_torch.operator.spectrum.Spectrum.coefficients", None)
             session.set(step.edit, **change)
             assert torch.equal(session.render(), wanted)
@@ -146,7 +149,7 @@ def test_another_tolerance_or_picture_needs_another_filter(session: Session, mon
         ("colorize", {"strokes": PAIRS["colorize"][0].strokes}),
     ):
         session.set(step, **change)
-        assert difference(session.render(), session.recipe.apply(cat())) < 1
+        assert difference(session.render(), apply_recipe(session.recipe, cat())) < 1
     assert events == ["filter", "edit"] * 4
 
 
@@ -175,9 +178,9 @@ def test_strokes_beside_the_photograph_are_refused(session: Session) -> None:
 def test_a_slider_moves_without_the_operator(session: Session, monkeypatch: pytest.MonkeyPatch) -> None:
     session.set("detail", alpha=(3.0, 1.0, 1.0, 1.0))
     session.render()
-    monkeypatch.setattr("nlfilter_torch.app.preview.sampled_operator", None)
+    monkeypatch.setattr("nlfilter_torch.photo.app.preview.sampled_operator", None)
     session.set("detail", alpha=(2.0, 1.0, 1.0, 1.0))
-    assert difference(session.render(), session.recipe.apply(cat())) < 1
+    assert difference(session.render(), apply_recipe(session.recipe, cat())) < 1
     session.set("detail", bandwidth=12.0)
     with pytest.raises(TypeError):
         session.render()
@@ -250,7 +253,7 @@ def test_preview_of_a_large_photograph_shows_what_saving_gives(step: Step, limit
     image, recipe = resize(cat(1), (140, 209)).clamp(0, 1), Recipe((step,))
     preview = Preview(image, pixels=4000)
     assert preview.stride == pytest.approx(2.7, rel=0.02)
-    saved = resize(recipe.apply(image).clamp(0, 1), preview.size).clamp(0, 1)
+    saved = resize(apply_recipe(recipe, image).clamp(0, 1), preview.size).clamp(0, 1)
     assert rms(preview.pixels, saved) > 3
     assert rms(preview.render(recipe), saved) < limit
 
@@ -269,10 +272,10 @@ def test_preview_of_a_large_photograph_shows_what_saving_gives(step: Step, limit
     ids=lambda step: step.edit,
 )
 def test_preview_of_a_soft_photograph_shows_what_saving_gives(step: Step, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("nlfilter_torch.edits.mask.VIEWED", LOOKED_AT["viewing_size"])
+    monkeypatch.setattr("nlfilter_torch.photo.selections.mask.VIEWED", LOOKED_AT["viewing_size"])
     image, recipe = 0.3 + 0.4 * resize(cat(1), (140, 209)).clamp(0, 1), Recipe((step,))
     preview = Preview(image, pixels=4000)
-    saved = resize(recipe.apply(image), preview.size)
+    saved = resize(apply_recipe(recipe, image), preview.size)
     assert rms(preview.pixels, saved) > 1.5
     assert rms(preview.render(recipe), saved) < 0.1
 
@@ -304,7 +307,7 @@ def test_masks_are_those_of_the_library_and_need_no_other_filter(monkeypatch: py
     inner, outer = mask_of((first,), size), mask_of((second,), size)
     wanted = [region_mask(image, inner, generator=seeded()), region_mask(image, inner, outer, generator=seeded())]
     assert torch.equal(preview.mask(Step("detail", (first,))), wanted[0])
-    monkeypatch.setattr("nlfilter_torch.edits.in_memory.nonlocal_operator", None)
+    monkeypatch.setattr("nlfilter_torch.photo.picture.in_memory.nonlocal_operator", None)
     assert torch.equal(preview.mask(Step("detail", (first, second), landmarks=400)), wanted[1])
     assert not torch.equal(preview.mask(Step("detail", (first, second), reach=0.9)), wanted[1])
     with pytest.raises(TypeError):

@@ -14,9 +14,10 @@ import skimage.data
 import torch
 from playwright.sync_api import Browser, expect
 
-from nlfilter_torch.edits.presets import Recipe, find_recipe
-from nlfilter_torch.edits.steps import Step
-from nlfilter_torch.io.photographs import Photograph, read_photograph, write_photograph
+from nlfilter_torch.photo.declared.presets import Recipe, find_recipe
+from nlfilter_torch.photo.declared.steps import Step
+from nlfilter_torch.photo.edits.applying import apply_recipe
+from nlfilter_torch.photo.io.photographs import Photograph, read_photograph, write_photograph
 from tests.app.browser import TIMEOUT, Editor, Tab, difference
 from tests.problems import cat
 
@@ -108,11 +109,11 @@ def test_two_tabs_edit_two_photographs(opened: Tab, browser: Browser, editor: Ed
     other.save("Save photo", "b.png")
     other.close()
     for name, alpha, image in (("a.png", 3.0, cat()), ("b.png", 4.5, coffee)):
-        wanted = Recipe().apply(image)
+        wanted = apply_recipe(Recipe(), image)
         recipe = find_recipe("crisp")
         recipe = Recipe((Step("detail", alpha=(alpha, 1.0, 1.0, 1.0)),))
-        assert (read_photograph(folder / name).pixels - recipe.apply(image).clamp(0, 1)).abs().max() <= 1 / 255
-        assert difference(recipe.apply(image), wanted) > 5
+        assert (read_photograph(folder / name).pixels - apply_recipe(recipe, image).clamp(0, 1)).abs().max() <= 1 / 255
+        assert difference(apply_recipe(recipe, image), wanted) > 5
 
 
 def test_foreign_names_of_this_machine_are_refused(editor: Editor) -> None:

@@ -7,10 +7,10 @@ import skimage.data
 import torch
 from PIL import Image
 
-from nlfilter_torch.app.session import Session
-from nlfilter_torch.edits.presets import Recipe
-from nlfilter_torch.edits.scribbles import Stroke
-from nlfilter_torch.edits.steps import Step
+from nlfilter_torch.photo.app.session import Session
+from nlfilter_torch.photo.declared.presets import Recipe
+from nlfilter_torch.photo.declared.steps import Step
+from nlfilter_torch.photo.declared.strokes import Stroke
 from tests.problems import LINE, difference
 
 

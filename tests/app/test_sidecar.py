@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from nlfilter_torch.app.sidecar import Sidecar
-from nlfilter_torch.edits.presets import Recipe
-from nlfilter_torch.edits.steps import Step
+from nlfilter_torch.photo.app.sidecar import Sidecar
+from nlfilter_torch.photo.declared.presets import Recipe
+from nlfilter_torch.photo.declared.steps import Step
 
 
 @pytest.mark.parametrize("stem", ["x" * 233, "x" * 246, "写" * 81])

@@ -1,0 +1,59 @@
+"""The picture of a page at rest: what a file would hold, in place of the preview."""
+
+import asyncio
+from collections.abc import Callable
+from contextlib import suppress
+from functools import partial
+
+from torch import Tensor
+
+from nlfilter_torch.core.progress import Progress
+from nlfilter_torch.photo.app.closeup import OutdatedError, Run, Start, interrupted
+from nlfilter_torch.photo.app.session import Session
+from nlfilter_torch.photo.declared.presets import Recipe
+
+QUIET = 1.0  # seconds without a change, after which the whole photograph is edited
+
+
+class AtRest:
+    """Replaces the preview by the photograph under the edit, reduced, once nothing has changed for a second.
+
+    ``wanted`` says whether a session and its current edit are what the page shows as a preview, ``show`` shows the
+    result.
+    """
+
+    def __init__(
+        self, run: Run, start: Start, wanted: Callable[[Session], bool], show: Callable[[Tensor], None]
+    ) -> None:
+        self._run, self._start, self._wanted, self._show = run, start, wanted, show
+        self._working = False
+        self._again: Session | None = None
+
+    def drawn(self, session: Session) -> None:
+        """Begin anew: the preview of a session has been drawn."""
+        if session.preview.stride > 1 and session.recipe.acting:
+            self._again = session
+            if not self._working:
+                self._start(self._work())
+
+    async def _work(self) -> None:
+        self._working = True
+        try:
+            while self._again is not None:
+                session, self._again = self._again, None
+                await asyncio.sleep(QUIET)
+                with suppress(OutdatedError):
+                    await self._edit(session, session.recipe)
+        finally:
+            self._working = False
+
+    async def _edit(self, session: Session, recipe: Recipe) -> None:
+        def is_outdated() -> bool:
+            return self._again is not None or session.recipe.acting != recipe.acting or not self._wanted(session)
+
+        progress = Progress()
+        report = interrupted(progress, is_outdated)
+        report("Full size", 0, 1)
+        picture = await self._run("Full size", partial(session.at_rest, recipe, report), progress)
+        report("Full size", 1, 1)
+        self._show(picture)

@@ -1,0 +1,212 @@
+"""The large picture with its overlays, and the brush that draws on it."""
+
+from collections.abc import Callable
+
+from nicegui import ui
+from torch import Tensor
+
+from nlfilter_torch.photo.app import drawing
+from nlfilter_torch.photo.app.panel import BRUSHES, Brush
+from nlfilter_torch.photo.app.session import Opened, Session
+from nlfilter_torch.photo.declared.strokes import Stroke
+
+
+class Canvas:
+    """A photograph with its mask, its scribbles and the version before the edit, built into the open element.
+
+    Pictures are image files, by their kind, at addresses that hold the token. ``drawn`` is called when a stroke is
+    complete, ``show_error`` with a sentence for the user. ``session`` may be replaced by another.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        brush: Brush,
+        token: str,
+        drawn: Callable[[], None],
+        show_error: Callable[[str], None],
+    ) -> None:
+        self.pictures: dict[str, bytes] = {}
+        self.session = session
+        self._brush = brush
+        self._token = token
+        self._drawn = drawn
+        self._frame = 0
+        self.histogram = ""
+        self.clipped = self.clipped_before = (0.0, 0.0)  # shares of white and of black, after and before the edit
+        self._flashes = 0
+        self._mask_shown: bytes | None = None  # the mask that was shown last
+        self._step = "detail"  # the step whose strokes are shown
+        self._line: list[tuple[float, float]] = []  # of the stroke that is being drawn
+        with ui.element("div").classes("canvas"):
+            with ui.element("div").classes("welcome") as self._welcome:
+                ui.icon("photo", size="64px")
+                ui.label("Open a photograph to begin").classes("text-h6 q-mt-sm")
+                ui.label("PNG, JPEG, TIFF, WebP or AVIF. It stays on this machine.").classes("hint")
+            self._photo = ui.interactive_image(
+                events=["pointerdown", "pointermove", "pointerup", "pointerleave"], sanitize=False
+            ).classes("photo")
+            with self._photo:
+                ui.element("div").classes("over pieces")
+                self._mask = ui.element("img").classes("over mask").props('alt="mask"')
+                self._clipped = ui.element("img").classes("over").props('alt="clipped"')
+                self._before = ui.element("img").classes("over before").props('alt="before"')
+                ui.element("div").classes("over before originals")
+                ui.element("div").classes("edge")
+                ui.label("before").classes("tag")
+            _build_zoom()
+            # Moves without a pressed button are not sent.
+            self._photo.on(
+                "mouse",
+                lambda event: self._pointer(*event.args),
+                js_handler="(e) => { if (e.buttons || e.mouse_event_type != 'pointermove') "
+                "emit([e.mouse_event_type, e.image_x, e.image_y]) }",
+            )
+        self._photo.set_visibility(False)
+        self._clipped.set_visibility(False)
+        self._mask.set_visibility(False)
+        self._welcome.on("pointerdown", lambda: show_error("open a photograph first; there is nothing to paint on"))
+        with ui.row().classes("bar"):
+            ui.label("Before").classes("hint wide")
+            wipe = ui.slider(min=0, max=100, value=0).style("max-width: 320px")
+            wipe.props('dense aria-label="Before and after"')
+            wipe.on("update:model-value", js_handler="(v) => closeup.wipe(v)")
+            self._show_strokes = ui.checkbox("Strokes", value=True, on_change=self.draw_strokes).props("dense")
+            self._show_mask = ui.checkbox("Mask", value=False, on_change=lambda: self.draw_mask()).props("dense")
+            self._show_mask.tooltip(
+                "Keep the mask of the region in sight; otherwise it shows for a second after a stroke"
+            )
+            self._show_clipped = ui.checkbox("Clipped", value=False, on_change=lambda: self._draw_clipped())
+            self._show_clipped.props("dense").tooltip("Mark what has become white (red) or black (blue)")
+            ui.space()
+            self._size = ui.label("").classes("hint wide")
+
+    def open(self, opened: Opened) -> None:
+        """Show a photograph that was opened."""
+        preview = opened.preview
+        self._edited = preview.pixels.clamp(0, 1)
+        height, width = opened.photograph.size
+        self._size.set_text(f"{width}\u00d7{height} pixels, shown at {preview.size[1]}\u00d7{preview.size[0]}")
+        fitting = f"min(100cqw, calc(100cqh * {preview.size[1] / preview.size[0]:.4f}))"
+        self._photo.style(f"width: var(--photo-width, {fitting})")
+        ui.run_javascript(f"closeup.open({width}, {height}, '/picture/{self._token}')")
+        self._mask_shown = None
+        self.pictures = {"before": drawing.picture(self._edited)}
+        self.clipped_before = drawing.clipped_shares(self._edited)
+        self._show("before", self._before)
+        self._show("before", self._photo)
+        self._welcome.set_visibility(False)
+        self._photo.set_visibility(True)
+
+    def switch(self, step: str) -> None:
+        """Show the strokes of another step."""
+        self._step = step
+        ui.run_javascript(f"closeup.brush({'true' if step in BRUSHES else 'false'})")
+        self.draw_strokes()
+        self.draw_mask()
+
+    def draw(self, upto: str | None) -> None:
+        """Compute the picture after a step, or after the last one, and its mask; may run in a thread."""
+        self.take(self.session.render(upto))
+        mask = self.session.mask()
+        self.pictures["mask"] = b"" if mask is None else drawing.mask_picture(mask)
+
+    def take(self, edited: Tensor) -> None:
+        """Take the edited picture (1, C, h, w), in [0, 1], that is shown next."""
+        self._edited = edited
+        self.pictures["after"] = drawing.picture(edited)
+        self.pictures["clipped"] = drawing.clipped_picture(edited) if self._show_clipped.value else b""
+        self.histogram, self.clipped = drawing.histogram_svg(edited), drawing.clipped_shares(edited)
+
+    def show(self) -> None:
+        """Show the picture that was computed."""
+        self._show("after", self._photo)
+        self._draw_clipped()
+
+    def draw_mask(self, *, moving: bool = False) -> None:
+        """Show the mask, except while a slider is moving; for a second, if it is new and not to be kept in sight."""
+        mask = self.pictures.get("mask") if self._step == "detail" else None
+        new = mask != self._mask_shown
+        keep = bool(self._show_mask.value)
+        if not mask or moving or not (keep or new):
+            self._mask.set_visibility(False)
+            self._mask_shown = mask if not moving else self._mask_shown
+            return
+        self._mask_shown = mask
+        self._flashes += 1
+        # An animation begins again if its name changes.
+        self._mask.classes(remove="flash-0 flash-1", add="" if keep else f"flash-{self._flashes % 2}")
+        self._show("mask", self._mask)
+        self._mask.set_visibility(True)
+
+    def _draw_clipped(self) -> None:
+        """Show what is clipped, if it is asked for."""
+        wanted = bool(self._show_clipped.value) and self.session.opened is not None
+        if wanted and not self.pictures.get("clipped"):
+            self.pictures["clipped"] = drawing.clipped_picture(self._edited)
+        if wanted:
+            self._show("clipped", self._clipped)
+        self._clipped.set_visibility(wanted)
+
+    def draw_strokes(self) -> None:
+        """Show the strokes of the step and the one being drawn, unless strokes are hidden."""
+        strokes: tuple[Stroke, ...] = ()
+        if self.session.opened is not None and self._show_strokes.value:
+            strokes = self.session.recipe.last(self._step).strokes
+            if self._line:
+                height, width = self.session.preview.size
+                points = tuple((x / width, y / height) for x, y in self._line)
+                strokes += (Stroke(points, self._brush.radius[self._step], self._brush.paint(self._step)),)
+            self._photo.set_content(drawing.strokes_svg(strokes, self.session.preview.size))
+
+    def _pointer(self, kind: str, x: float, y: float) -> None:
+        """Begin, continue or end a stroke."""
+        if self._step not in BRUSHES or self.session.opened is None:
+            return
+        if kind == "pointerdown":
+            self._line = [(x, y)]
+        elif not self._line:
+            return
+        elif kind == "pointermove":
+            self._line.append((x, y))
+        else:
+            line, self._line = self._line, []
+            self.session.add_stroke(self._step, line, self._brush.radius[self._step], self._brush.paint(self._step))
+            self._drawn()
+        self.draw_strokes()
+
+    def drop_stroke(self) -> None:
+        """Forget the stroke that is being drawn."""
+        self._line = []
+        self.draw_strokes()
+
+    def _show(self, kind: str, element: ui.element) -> None:
+        self._frame += 1
+        address = f"/picture/{self._token}/{kind}?{self._frame}"
+        if isinstance(element, ui.interactive_image):
+            element.set_source(address)
+        else:
+            element.props(f'src="{address}"')
+
+
+def _build_zoom() -> None:
+    """Buttons for what :mod:`nlfilter_torch.photo.app.script` does."""
+
+    def button(label: str, icon: str, tip: str, action: str) -> ui.button:
+        found = ui.button(icon=icon).props(f'flat dense color=white aria-label="{label}"').tooltip(tip)
+        return found.on("click", js_handler=f"() => closeup.{action}")
+
+    with ui.element("div").classes("zoom").props('role="group" aria-label="Zoom"'):
+        button("Zoom out", "remove", "The minus key, or the wheel", "step(-1)")
+        ui.label("").classes("zoom-level").props('aria-live="polite"')
+        button("Zoom in", "add", "The plus key, or the wheel", "step(1)")
+        button("Fit", "fit_screen", "The whole photograph; the key 0", "fit()")
+        button("Full size", "crop_free", "One pixel of the photograph for each of the screen; the key 1", "full()")
+        hand = button(
+            "Move",
+            "pan_tool",
+            "Drag the photograph in place of the brush; also the space bar, the middle "
+            "button, two fingers and the arrow keys",
+            "hand()",
+        )
+        hand.classes("grab").props('aria-pressed="false"')

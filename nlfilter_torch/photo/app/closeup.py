@@ -1,0 +1,215 @@
+"""The part of a photograph that is seen at full size, in pieces that the page lays over the preview."""
+
+from collections.abc import Awaitable, Callable
+from functools import partial
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from nlfilter_torch.core.progress import Progress
+from nlfilter_torch.photo.app import drawing
+from nlfilter_torch.photo.app.session import Session
+from nlfilter_torch.photo.declared.presets import Recipe
+from nlfilter_torch.photo.tiled.parts import Rectangle
+from nlfilter_torch.photo.tiled.sampling import Report
+
+CELL = 64  # pixels; pieces consist of squares of that size
+PIECE = 1 << 19  # pixels of a piece, at most
+KEPT = 24_000_000  # pixels of all pieces; those that are not seen go first
+LARGEST = 40_000_000  # pixels that a page may ask for at once
+
+
+Run = Callable[[str, Callable[[], Any], Progress], Awaitable[Any]]  # in a thread, while the page says what it does
+Start = Callable[[Awaitable[None]], None]  # a task in the background, whose failure is reported
+
+
+class OutdatedError(Exception):
+    """The edit has changed meanwhile."""
+
+
+def interrupted(report: Report, is_outdated: Callable[[], bool]) -> Report:
+    """Pass reports on, and raise OutdatedError at the first one after something is outdated."""
+
+    def interrupting(stage: str, done: int, total: int) -> None:
+        if is_outdated():
+            raise OutdatedError
+        report(stage, done, total)
+
+    return interrupting
+
+
+class Closeup:
+    """What of a photograph a page shows at full size.
+
+    ``tell`` runs JavaScript in the page.
+    """
+
+    def __init__(self, run: Run, start: Start, tell: Callable[[str], object]) -> None:
+        self.session: Session | None = None
+        self._run, self._start, self._tell = run, start, tell
+        self._view: Rectangle | None = None
+        self._recipe = Recipe()
+        self._held = False  # a slider is moving: the preview alone follows
+        self._working = False
+        self._number = 0
+        self._pieces: dict[str, tuple[Rectangle, bytes]] = {}  # in the order in which they were made
+        self._covered = torch.zeros(0, 0, dtype=torch.bool)  # cells
+
+    def open(self, session: Session) -> None:
+        """Show a photograph that was opened."""
+        assert session.opened is not None  # for mypy
+        self.session, self._view = session, None
+        height, width = session.opened.photograph.size
+        self._covered = torch.zeros(-(-height // CELL), -(-width // CELL), dtype=torch.bool)
+        self._forget()
+
+    @property
+    def is_busy(self) -> bool:
+        """Whether a part is shown at full size, or a slider is moving."""
+        return self._held or self._view is not None
+
+    def look(self, view: Any) -> None:
+        """Show a part: left, top, right and bottom in pixels of the photograph, or None for no part."""
+        self._view = None if view is None else self._part(view)
+        self._wake()
+
+    def hold(self) -> None:
+        """Show no pieces until :meth:`follow` is called."""
+        self._held = True
+        self._forget()
+
+    def stop(self) -> None:
+        """Work no more: the page is gone."""
+        self._held = True
+
+    def follow(self) -> None:
+        """Show the edit of the session, after a change or not."""
+        self._held = False
+        if self.session is not None and self.session.recipe.acting != self._recipe.acting:
+            self._forget()
+        self._wake()
+
+    def file(self, name: str) -> bytes | None:
+        """A piece as a PNG file."""
+        found = self._pieces.get(name)
+        return None if found is None else found[1]
+
+    def original(self, place: str) -> bytes | None:
+        """A part of the photograph before the edit as a PNG file; ``place`` as of :meth:`look`, with commas."""
+        try:
+            part = self._part([int(number) for number in place.split(",")])
+        except ValueError:
+            return None
+        if self.session is None or self.session.opened is None or part is None:
+            return None
+        return drawing.lossless(self.session.opened.parts.original(part))
+
+    def _part(self, view: Any) -> Rectangle | None:
+        """What a page asks for, as far as the photograph has it."""
+        if self.session is None or self.session.opened is None or len(view) != 4:
+            return None
+        height, width = self.session.opened.photograph.size
+        left, top, right, bottom = (int(number) for number in view)
+        part = Rectangle(range(max(0, top), min(height, bottom)), range(max(0, left), min(width, right)))
+        return part if 0 < len(part.rows) * len(part.columns) <= LARGEST else None
+
+    def _forget(self) -> None:
+        """Forget all pieces: they are of another edit."""
+        self._covered.zero_()
+        if self._pieces:
+            self._pieces = {}
+            self._tell("closeup.clear()")
+
+    def _wake(self) -> None:
+        if not self._working and self._next() is not None:
+            self._start(self._work())
+
+    async def _work(self) -> None:
+        """Make pieces until all that is seen is there."""
+        self._working = True
+        try:
+            while (part := self._next()) is not None:
+                session = self.session
+                assert session is not None  # for mypy
+                recipe = session.recipe
+                if recipe.acting != self._recipe.acting:
+                    self._forget()
+                self._recipe = recipe
+                try:
+                    progress = Progress()
+                    work = partial(self._work_out, session, recipe, part, progress)
+                    content: bytes = await self._run("Full size", work, progress)
+                except OutdatedError:
+                    continue
+                if not self._is_outdated(session, recipe):
+                    self._add(part, content)
+        finally:
+            self._working = False
+
+    def _is_outdated(self, session: Session, recipe: Recipe) -> bool:
+        return self._held or self.session is not session or session.recipe.acting != recipe.acting
+
+    def _work_out(self, session: Session, recipe: Recipe, part: Rectangle, progress: Progress) -> bytes:
+        """A piece; runs in a thread."""
+        report = interrupted(progress, lambda: self._is_outdated(session, recipe))
+        return drawing.lossless(session.part(part, recipe, report))
+
+    def _add(self, part: Rectangle, content: bytes) -> None:
+        self._number += 1
+        name = f"piece-{self._number}"
+        self._pieces[name] = (part, content)
+        self._cells(part).fill_(True)
+        rows, columns = part.rows, part.columns
+        self._tell(f"closeup.add('{name}', {columns.start}, {rows.start}, {columns.stop}, {rows.stop})")
+        total = sum(len(p.rows) * len(p.columns) for p, _ in self._pieces.values())
+        for old, (other, _) in list(self._pieces.items()):
+            if total <= KEPT:
+                return
+            if self._view is not None and not other.meets(self._view):
+                del self._pieces[old]
+                self._cells(other).fill_(False)
+                self._tell(f"closeup.drop('{old}')")
+                total -= len(other.rows) * len(other.columns)
+
+    def _cells(self, part: Rectangle) -> Tensor:
+        """Which cells that a part touches are covered."""
+        rows, columns = (slice(axis.start // CELL, -(-axis.stop // CELL)) for axis in (part.rows, part.columns))
+        return self._covered[rows, columns]
+
+    def _next(self) -> Rectangle | None:
+        """A piece that is seen but not there, or None."""
+        if self._view is None or self._held:
+            return None
+        height, width = self.session.opened.photograph.size  # type: ignore[union-attr]
+        missing = ~self._cells(self._view)
+        found = first_block(missing, PIECE // CELL**2)
+        if found is None:
+            return None
+        top, left = self._view.rows.start // CELL, self._view.columns.start // CELL
+        rows, columns = found
+        return Rectangle(
+            range((top + rows.start) * CELL, min((top + rows.stop) * CELL, height)),
+            range((left + columns.start) * CELL, min((left + columns.stop) * CELL, width)),
+        )
+
+
+def first_block(missing: Tensor, most: int) -> tuple[range, range] | None:
+    """Rows and columns of the first block of cells (h, w) that are all missing, of at most about ``most`` cells.
+
+    >>> cells = torch.tensor([[0, 1, 1], [0, 1, 1], [1, 1, 1]], dtype=torch.bool)
+    >>> first_block(cells, 100), first_block(cells, 2), first_block(~cells, 100)
+    ((range(0, 3), range(1, 3)), (range(0, 1), range(1, 3)), (range(0, 2), range(0, 1)))
+    """
+    places = missing.nonzero()
+    if len(places) == 0:
+        return None
+    top, left = places[0].tolist()
+    row = missing[top, left:]
+    width = len(row) if bool(row.all()) else int(row.int().argmin())
+    bottom = top + 1
+    while bottom < len(missing) and (bottom - top + 1) * width <= most:
+        if not bool(missing[bottom, left : left + width].all()):
+            break
+        bottom += 1
+    return range(top, bottom), range(left, left + width)

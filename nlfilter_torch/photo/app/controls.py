@@ -1,0 +1,144 @@
+"""The sliders of the editor: what each of them sets, and the widget that shows and changes it."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from nicegui import ui
+
+from nlfilter_torch.photo.declared import declaration
+from nlfilter_torch.photo.declared.declaration import Parameter
+from nlfilter_torch.photo.declared.parameters import EDITS
+from nlfilter_torch.photo.declared.presets import Recipe
+
+Change = Callable[[str, dict[str, Any], bool], None]  # step, entries, whether the change is complete
+UNITS = {"gain": "\u00d7", "%": "%"}
+
+
+@dataclass(frozen=True)
+class Control:
+    """A slider for a parameter of a step.
+
+    Attributes:
+        edit: name of the step.
+        parameter: what it sets.
+        slider: its range and label.
+        help: a sentence.
+        index: which number the slider sets, if the parameter is a list of them.
+    """
+
+    edit: str
+    parameter: Parameter
+    slider: declaration.Slider
+    help: str
+    index: int | None = None
+
+    def read(self, recipe: Recipe) -> float:
+        """The slider's value for an edit."""
+        value = self._value(recipe)
+        if self.index is not None:
+            value = value[self.index]
+        if value is None:
+            return self.slider.low if self.slider.none is None else self.slider.none
+        return float(value)
+
+    def _value(self, recipe: Recipe) -> Any:
+        step = recipe.last(self.edit)
+        return step.sliders_inside if self.parameter.name == "inside" else step[self.parameter.name]
+
+    def entries(self, recipe: Recipe, value: float) -> dict[str, Any]:
+        """The entries of the step for a value of the slider."""
+        name = self.parameter.name
+        if self.slider.none is not None:
+            return {name: None if value == self.slider.none else round(value)}
+        value = round(value, 4)
+        if self.index is None:
+            return {name: value}
+        numbers = list(self._value(recipe))
+        numbers[self.index] = value
+        return {name: tuple(numbers)}
+
+    def show(self, value: float) -> str:
+        """The value as text.
+
+        >>> [control.show(2) for control in (*OF_EDIT["defocus"], OF_EDIT["abstract"][-1])]
+        ['2.0 %', '2']
+        """
+        if value == self.slider.none:
+            return "all"
+        places = len(f"{self.slider.step:g}".partition(".")[2])
+        return f"{value:.{places}f} {UNITS.get(self.parameter.unit, '')}".rstrip()
+
+
+LAYERS = (
+    ("Texture", "The finest detail: hair, cloth, grain."),
+    ("Fine detail", "Small shapes: wrinkles, leaves, letters."),
+    ("Large detail", "Light and shade within objects."),
+)
+
+
+def detail_sliders(name: str, count: int) -> tuple[Control, ...]:
+    """A slider for each layer of the details; ``name`` is ``alpha`` or ``inside``."""
+    layers = LAYERS if count == 4 else tuple((f"Layer {i + 1}", "Fine to coarse.") for i in range(count - 1))
+    parameter = EDITS["detail"][name]
+    finer = [
+        Control("detail", parameter, declaration.Slider(label, 0, 5, 0.05), text + " 1 leaves it, 0 removes it.", i)
+        for i, (label, text) in enumerate(layers)
+    ]
+    shading = "The smooth rest: overall brightness and contrast. 1 leaves it."
+    last = declaration.Slider("Shading", 0.7, 1.3, 0.01)
+    return (*finer, Control("detail", parameter, last, shading, count - 1))
+
+
+#: Sliders of the parameters that declare one, of every edit.
+OF_EDIT: dict[str, tuple[Control, ...]] = {
+    edit.name: tuple(Control(edit.name, p, p.slider, p.help) for p in edit if p.slider is not None)
+    for edit in EDITS.values()
+}
+
+
+class SteadySlider(ui.slider):
+    """A slider to which the server does not send values back: a late one would move it away from the pointer."""
+
+    LOOPBACK = False
+
+
+class Slider:
+    """A slider on the page that shows the current edit and calls ``change`` with changes.
+
+    For screen readers ``suffix`` is appended to the label, where two sliders have the same one.
+    """
+
+    def __init__(self, control: Control, recipe: Callable[[], Recipe], change: Change, suffix: str = "") -> None:
+        self._control, self._recipe, self._change = control, recipe, change
+        self._following = False
+        with ui.column().classes("control gap-0"):
+            with ui.row().classes("w-full justify-between items-center"):
+                ui.label(control.slider.label).tooltip(control.help)
+                self._value = ui.label().classes("value")
+            value = control.read(recipe())
+            self._slider = SteadySlider(
+                min=control.slider.low, max=control.slider.high, step=control.slider.step, value=value
+            )
+            self._slider.props(f'aria-label="{control.slider.label}{suffix}" dense')
+            self._slider.on_value_change(lambda event: self._moved(event.value))
+            self._slider.on("change", lambda event: self._released(float(event.args)))
+        self._value.set_text(control.show(value))
+
+    def follow(self) -> None:
+        """Show the current edit."""
+        value = self._control.read(self._recipe())
+        self._following = True
+        self._slider.set_value(value)
+        self._following = False
+        self._value.set_text(self._control.show(value))
+
+    def _moved(self, value: float | None) -> None:
+        if self._following or value is None:
+            return
+        self._value.set_text(self._control.show(value))
+        if self._control.slider.live:
+            self._change(self._control.edit, self._control.entries(self._recipe(), value), False)
+
+    def _released(self, value: float) -> None:
+        self._change(self._control.edit, self._control.entries(self._recipe(), value), True)

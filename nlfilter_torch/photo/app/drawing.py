@@ -1,0 +1,146 @@
+"""Pictures as image files, strokes and curves as SVG, for the browser."""
+
+import io
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+import torch
+from PIL import Image
+from torch import Tensor
+
+from nlfilter_torch.filtering.filters import polynomial_response
+from nlfilter_torch.photo.declared.strokes import Stroke
+
+QUALITY = 95
+TINT, OPACITY = (255, 40, 80), 120  # of the mask
+WORDS = {"in": "#22c55e", "out": "#ef4444", "keep": "#9ca3af"}  # colours of strokes that have a meaning instead
+
+
+WHITE_TINT, BLACK_TINT = (255, 60, 60, 255), (60, 120, 255, 255)  # where a picture is clipped
+BINS = 64  # of a histogram
+
+
+def _bytes(image: Tensor) -> Tensor:
+    """An image (1, C, H, W) in [0, 1] as (C, H, W) of 8 bits."""
+    return (image[0] * 255).round_().to(torch.uint8)
+
+
+def picture(image: Tensor) -> bytes:
+    """An image (1, 1 or 3, H, W) in [0, 1] as a JPEG."""
+    values = _bytes(image).permute(1, 2, 0).numpy()
+    return _encode(Image.fromarray(np.ascontiguousarray(values.squeeze())), "JPEG", quality=QUALITY, subsampling=0)
+
+
+def lossless(image: Tensor) -> bytes:
+    """An image (1, 1 or 3, H, W) in [0, 1] as a PNG."""
+    values = _bytes(image).permute(1, 2, 0).numpy()
+    values = values[..., 0] if values.shape[2] == 1 else values
+    return _encode(Image.fromarray(np.ascontiguousarray(values)), "PNG", compress_level=1)
+
+
+def mask_picture(mask: Tensor) -> bytes:
+    """A mask (1, 1, H, W) in [0, 1] as a tinted, transparent PNG."""
+    alpha = (mask[0, 0] * OPACITY).round().to(torch.uint8).numpy()
+    layer = np.empty((*alpha.shape, 4), np.uint8)
+    layer[..., :3], layer[..., 3] = TINT, alpha
+    return _encode(Image.fromarray(layer), "PNG", compress_level=1)
+
+
+def clipped_picture(image: Tensor) -> bytes:
+    """Where an image (1, C, H, W) has lost light or shade, as a transparent PNG: red and blue."""
+    values = _bytes(image)
+    layer = np.zeros((*values.shape[1:], 4), np.uint8)
+    layer[(values == 0).any(0).numpy()] = BLACK_TINT
+    layer[(values == 255).any(0).numpy()] = WHITE_TINT
+    return _encode(Image.fromarray(layer), "PNG", compress_level=1)
+
+
+def clipped_shares(image: Tensor) -> tuple[float, float]:
+    """Shares of the pixels of which a channel is white, and of those of which one is black.
+
+    >>> clipped_shares(torch.tensor([1.0, 0.999, 0.5, 0.0]).view(1, 1, 2, 2))
+    (0.5, 0.25)
+    """
+    values = _bytes(image)
+    return float((values == 255).any(0).float().mean()), float((values == 0).any(0).float().mean())
+
+
+def histogram_svg(image: Tensor) -> str:
+    """SVG of the histogram of each channel of an image (1, C, H, W), on a scale that a spike does not flatten."""
+    values = _bytes(image)
+    counts = torch.stack([torch.bincount(plane.flatten().int() * BINS // 256, minlength=BINS) for plane in values])
+    shares = counts.float() / values[0].numel()
+    top = max(float(shares.flatten().quantile(0.98)), 1e-9)
+    colours = ("#ef4444", "#22c55e", "#60a5fa") if len(values) == 3 else ("#cbd5e1",)
+    parts = [
+        '<svg viewBox="0 0 300 60" class="histogram" role="img" aria-label="histogram" preserveAspectRatio="none">'
+    ]
+    for colour, bins in zip(colours, shares.tolist(), strict=True):
+        places = [(300 * (i + 0.5) / BINS, 60 - 58 * min(share / top, 1)) for i, share in enumerate(bins)]
+        line = " ".join(f"{x:.1f},{y:.1f}" for x, y in places)
+        parts.append(f'<polygon points="0,60 {line} 300,60" fill="{colour}" stroke="{colour}" class="bins" />')
+    return "".join([*parts, "</svg>"])
+
+
+def _encode(image: Image.Image, kind: str, **options: object) -> bytes:
+    stream = io.BytesIO()
+    image.save(stream, format=kind, **options)
+    return stream.getvalue()
+
+
+def strokes_svg(strokes: Iterable[Stroke], size: tuple[int, int]) -> str:
+    """Strokes as SVG in pixels of a preview of ``size`` (height, width).
+
+    >>> strokes_svg([Stroke(((0.5, 0.5), (1.0, 0.5)), 0.1, "#ff0000")], (100, 200))
+    '<path d="M100.0 50.0L200.0 50.0" stroke="#ff0000" stroke-width="20.0" class="stroke" />'
+    """
+    height, width = size
+    paths = []
+    for stroke in strokes:
+        points = stroke.points if len(stroke.points) > 1 else stroke.points * 2  # a dot is a line of no length
+        line = "L".join(f"{x * width:.1f} {y * height:.1f}" for x, y in points)
+        colour, thickness = WORDS.get(stroke.paint, stroke.paint), 2 * stroke.radius * min(size)
+        paths.append(f'<path d="M{line}" stroke="{colour}" stroke-width="{thickness:.1f}" class="stroke" />')
+    return "".join(paths)
+
+
+def response_svg(eigenvalues: Tensor, curves: Sequence[tuple[str, Sequence[float]]]) -> str:
+    """SVG of the sliders' gain f(lambda), with the eigenvalues (R,) of the filter marked; curves: (colour, sliders)."""
+    left, right, top, bottom = 26, 292, 10, 112
+    steps = torch.linspace(0, 1, 101)
+    gains = [polynomial_response(steps, torch.tensor(tuple(alpha))).tolist() for _, alpha in curves]
+    low = min(0.0, *(min(gain) for gain in gains))
+    high = max(2.0, *(max(gain) for gain in gains))
+
+    def x(eigenvalue: float) -> float:
+        return left + (right - left) * eigenvalue
+
+    def y(gain: float) -> float:
+        return bottom - (bottom - top) * (gain - low) / (high - low)
+
+    parts = ['<svg viewBox="0 0 300 142" class="response" role="img" aria-label="response of the sliders">']
+    for level in _levels(low, high):
+        style = "unit" if level == 1 else "grid"
+        parts.append(f'<line x1="{left}" x2="{right}" y1="{y(level):.1f}" y2="{y(level):.1f}" class="{style}" />')
+        parts.append(f'<text x="{left - 4}" y="{y(level) + 3:.1f}" text-anchor="end">{level:g}</text>')
+    parts += [
+        f'<line x1="{x(v):.1f}" x2="{x(v):.1f}" y1="{bottom}" y2="{bottom + 5}" class="mark" />'
+        for v in eigenvalues.tolist()
+    ]
+    for (colour, alpha), gain in zip(curves, gains, strict=True):
+        line = " ".join(f"{x(v):.1f},{y(g):.1f}" for v, g in zip(steps.tolist(), gain, strict=True))
+        parts.append(f'<polyline points="{line}" stroke="{colour}" class="curve" />')
+        dots = polynomial_response(eigenvalues, torch.tensor(tuple(alpha))).tolist()
+        parts += [
+            f'<circle cx="{x(v):.1f}" cy="{y(g):.1f}" r="1.6" fill="{colour}" />'
+            for v, g in zip(eigenvalues.tolist(), dots, strict=True)
+        ]
+    parts.append(f'<text x="{left}" y="130">texture, \u03bb = 0</text>')
+    parts.append(f'<text x="{right}" y="130" text-anchor="end">shading, \u03bb = 1</text></svg>')
+    return "".join(parts)
+
+
+def _levels(low: float, high: float) -> list[float]:
+    """Gains at which to draw lines: 1 and about five whole numbers."""
+    step = max(1, round((high - low) / 5))
+    return sorted({float(v) for v in range(int(low) - 1, int(high) + 1) if v >= low and v % step == 0} | {1.0})

@@ -1,0 +1,271 @@
+"""A reduced picture under an edit, fast enough to follow a slider.
+
+A photograph is reduced to the size at which edits of brightness look at it, so that the preview holds the very picture
+that these work on. What depends on the pixels of the photograph itself comes from there. Edits of single pixels differ
+a little from what a file will hold, which :meth:`~nlfilter_torch.photo.app.session.Session.at_rest` computes.
+
+Slow results are cached with the settings they depend on: the layers that the sliders weigh, the filter for masks, the
+filter of the step that is being changed, and the picture after each step.
+"""
+
+import math
+from bisect import bisect_right
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from nlfilter_torch.filtering.filters import detail_layers, weigh_layers
+from nlfilter_torch.operator.build import operator_from_features
+from nlfilter_torch.operator.features import (
+    GuideChannels,
+    GuideFeatures,
+    estimate_bandwidth,
+    reduce_channels,
+    unit_window,
+)
+from nlfilter_torch.operator.operator import NonlocalOperator
+from nlfilter_torch.photo.declared.declaration import Edit
+from nlfilter_torch.photo.declared.parameters import DETAIL, MASK
+from nlfilter_torch.photo.declared.presets import Recipe
+from nlfilter_torch.photo.declared.shared_parameters import VIEWING_SIZE
+from nlfilter_torch.photo.declared.steps import Step
+from nlfilter_torch.photo.edits.applying import filter_key, prepare, scribbles_of
+from nlfilter_torch.photo.picture.changes import activity, change_of_mean, limit_by_activity, split_sliders
+from nlfilter_torch.photo.picture.in_memory import InMemory
+from nlfilter_torch.photo.picture.pixels import Fitted, Pixels, part_of
+from nlfilter_torch.photo.picture.resizing import resize
+from nlfilter_torch.photo.picture.source import seeded
+from nlfilter_torch.photo.picture.viewing import MEGAPIXEL, viewed_size, within_limits
+from nlfilter_torch.photo.selections.mask import region_mask
+
+Key = tuple[object, ...]  # the settings on which a cached result depends
+PIXELS = round(VIEWING_SIZE.default * MEGAPIXEL)  # of a preview, at most
+
+
+def reduce(image: Tensor, stride: int) -> Tensor:
+    """Means over squares of ``stride`` pixels, (B, C, H // stride, W // stride)."""
+    return F.avg_pool2d(image, stride) if stride > 1 else image
+
+
+def sampled_operator(
+    guide: Tensor,
+    stride: int,
+    detail: Step,
+    *,
+    bandwidth: float | Tensor,
+    distance: float | Tensor | None,
+    channels: GuideChannels,
+    patch_size: int,
+) -> NonlocalOperator:
+    """The operator of every ``stride``-th pixel of a guide, from the patches around them at full resolution."""
+    recipe = GuideFeatures(unit_window(patch_size, None).to(guide), bandwidth, distance, channels)
+    size = (guide.shape[-2] // stride, guide.shape[-1] // stride)
+    return operator_from_features(
+        recipe(guide, stride=stride),
+        size=size,
+        num_landmarks=min(detail["landmarks"], size[0] * size[1]),
+        landmarks=detail["sampling"],
+        generator=seeded(),
+    )
+
+
+def between_knots(declared: Edit, edit: Callable[[Step], Tensor], image: Tensor) -> Callable[[Step], Tensor]:
+    """Return an edit of an image that is computed only at the knots of its slider, if that has any.
+
+    Between two knots the pictures are interpolated linearly.
+    """
+    slow = [(p.name, p.slider.knots) for p in declared if p.slider is not None and p.slider.knots]
+    if not slow:
+        return edit
+    name, knots = slow[0]
+
+    @lru_cache(maxsize=4)
+    def computed(step: Step) -> Tensor:
+        return edit(step) if step.changes() else image
+
+    def with_value(step: Step, value: float) -> Step:
+        values: dict[str, Any] = {name: value}
+        return step.changed(**values)
+
+    def interpolated(step: Step) -> Tensor:
+        value = step[name]
+        if value in knots or value > knots[-1]:
+            return computed(step)
+        above = bisect_right(knots, value)
+        ends = knots[above - 1], knots[above]
+        low, high = (computed(with_value(step, end)) for end in ends)
+        return torch.lerp(low, high, (value - ends[0]) / (ends[1] - ends[0]))
+
+    return interpolated
+
+
+@dataclass(frozen=True, eq=False)
+class Layers:
+    """Layers (1, k+1, 1, h, w) of the luminance, which the detail sliders weigh, and the eigenvalues (R,)."""
+
+    key: Key
+    layers: Tensor
+    eigenvalues: Tensor
+
+
+class Preview:
+    """A reduced photograph under any edit.
+
+    Args:
+        photograph: (1, C, H, W), in [0, 1] except for files of floats.
+        pixels: largest number of pixels of the preview, about.
+
+    Attributes:
+        size: (height, width) of the preview.
+        stride: every how many pixels of the photograph it has one.
+    """
+
+    def __init__(self, photograph: Tensor, pixels: int = PIXELS) -> None:
+        whole = (photograph.shape[-2], photograph.shape[-1])
+        self.size = viewed_size(whole, pixels / MEGAPIXEL)
+        self.stride = math.sqrt(whole[0] * whole[1] / (self.size[0] * self.size[1]))
+        self.photograph = photograph
+        self.pixels = resize(photograph.float(), self.size) if self.size != whole else photograph.float()
+        self._layers: Layers | None = None
+        self._source = InMemory(self.pixels, {})  # with the filter of the masks
+        self._compared_by: Key = ()  # the settings of that filter
+        self._mask: tuple[Key, Tensor] | None = None
+        self._active: tuple[tuple[int, int], Tensor] | None = None
+        self._filter: tuple[Key, Callable[[Step], Tensor]] | None = None
+        self._pictures: dict[int, tuple[Key, Tensor]] = {}
+
+    def layers(self, detail: Step) -> Layers:
+        """The layers for the filter of a step; slow if its settings have changed."""
+        order = len(detail["alpha"]) - 1
+        key = (*filter_key(detail), detail["viewing_size"], order)
+        if self._layers is None or self._layers.key != key:
+            stride, shown = self._compared(detail)
+            luminance = reduce_channels(shown, "luminance")
+            bandwidth = detail.arguments(self.size)["photometric_bandwidth"]
+            operator = sampled_operator(
+                luminance,
+                stride,
+                detail,
+                bandwidth=estimate_bandwidth(luminance) if bandwidth == "auto" else bandwidth,
+                distance=self._distance(detail, luminance),
+                channels="luminance",
+                patch_size=detail["patch_size"],
+            )
+            layers = detail_layers(operator, reduce_channels(self.pixels, "luminance"), order=order)
+            self._layers = Layers(key, layers, operator.spectrum().eigenvalues[0])
+        return self._layers
+
+    def _compared(self, detail: Step) -> tuple[int, Tensor]:
+        """What the filter of a step compares: every so many patches of a picture, of about the viewing size."""
+        viewed = self._viewed(detail)
+        stride = max(1, round(viewed[0] / self.size[0]))
+        if stride == 1:
+            return 1, self.pixels
+        return stride, resize(self.photograph.float(), (self.size[0] * stride, self.size[1] * stride))
+
+    def _viewed(self, step: Step) -> tuple[int, int]:
+        """(H, W) at which a step looks at the photograph."""
+        return viewed_size((self.photograph.shape[-2], self.photograph.shape[-1]), step["viewing_size"])
+
+    def _activity(self, detail: Step) -> Tensor:
+        """The activity of what the filter of a step compares, in the size of the preview."""
+        viewed = self._viewed(detail)
+        if self._active is None or self._active[0] != viewed:
+            stride, shown = self._compared(detail)
+            self._active = (viewed, reduce(activity(shown), stride))
+        return self._active[1]
+
+    def _distance(self, detail: Step, guide: Tensor) -> float | Tensor | None:
+        """The spatial bandwidth of a step in pixels of a guide."""
+        size = (guide.shape[-2], guide.shape[-1])
+        scale = self._viewed(detail)[0] / size[0]
+        return DETAIL["spatial_bandwidth"].distance(detail.arguments(size, scale)["spatial_bandwidth"], size)
+
+    def mask(self, detail: Step) -> Tensor | None:
+        """The mask (1, 1, h, w) of the sliders inside, or None without strokes; slow the first time only."""
+        if not detail.has_region():
+            return None
+        key = (detail.strokes, detail["reach"], detail["tolerance"], detail["landmarks"])
+        if self._mask is None or self._mask[0] != key:
+            fewer = min(detail["landmarks"], MASK.defaults["num_landmarks"])
+            if (detail["tolerance"], fewer) != self._compared_by:
+                self._source, self._compared_by = InMemory(self.pixels, {}), (detail["tolerance"], fewer)
+            (inner,), others = scribbles_of(detail, self.size)
+            names = ("mask_bandwidth", "reach")
+            bandwidth, reach = (detail.arguments(self.size)[name] for name in names)
+            fitted = region_mask.fit(
+                self._source,
+                inner,
+                others.get("negative"),
+                names=("regions", "negative"),
+                photometric_bandwidth=bandwidth,
+                reach=reach,
+                num_landmarks=fewer,
+                generator=seeded(),
+            )
+            self._mask = (key, self._source.all(fitted))
+        return self._mask[1]
+
+    def render(self, recipe: Recipe, upto: str | None = None) -> Tensor:
+        """The preview under an edit, or under its steps up to the one named ``upto``: (1, 1 or 3, h, w) in [0, 1]."""
+        result, drawn = self.pixels, False
+        key: Key = ()
+        places = [i for i, step in enumerate(recipe.steps) if step.edit == upto]
+        for i, step in enumerate(recipe.steps[: places[-1] + 1] if places else recipe.steps):
+            if not step.changes():
+                continue
+            before, key = key, (*key, step)
+            if not before and self._is_of_layers(step):
+                result = self._blend(step)
+                continue
+            cached = self._pictures.get(i)
+            if cached is None or cached[0] != key:
+                # The first picture to be computed again is that of the step being changed: its filter is cached.
+                edit = self._filter_of(step, result, before, keep=not drawn)
+                cached = self._pictures[i] = (key, edit(step))
+                drawn = True
+            result = cached[1]
+        return result.clamp(0, 1)
+
+    def _is_of_layers(self, step: Step) -> bool:
+        """Whether a step weighs layers of luminance, which are cached."""
+        if step.edit != "detail" or step["residual"] is not None or step["channels"] != "luminance":
+            return False
+        return self._viewed(step) >= self.size
+
+    def _blend(self, detail: Step) -> Tensor:
+        mask = self.mask(detail)
+        layers, active = part_of(self.layers(detail).layers), part_of(self._activity(detail))
+
+        def changes(of: Tensor, alpha: tuple[float, ...]) -> Tensor:
+            return torch.cat([weigh_layers(of, part) for part in split_sliders(torch.tensor(alpha) - 1)], dim=1)
+
+        def change(pixels: Pixels) -> Tensor:
+            some = layers(pixels)
+            found = changes(some, detail["alpha"])
+            if mask is not None:
+                found = torch.lerp(found, changes(some, detail.sliders_inside), part_of(mask)(pixels))
+            return limit_by_activity(found, active(pixels), detail["threshold"] / 255)
+
+        rows = [detail["alpha"], detail.sliders_inside]
+        brighter = detail["alpha"][-1] - 1 if mask is None else change_of_mean(torch.tensor(rows) - 1)
+        return self._source.all(within_limits(self._source, Fitted(change), detail["limits"], brighter))
+
+    def _filter_of(self, step: Step, image: Tensor, before: Key, *, keep: bool) -> Callable[[Step], Tensor]:
+        """The edit of a step on the picture before it; slow unless its filter is cached."""
+        key = (*before, step.edit, *filter_key(step))
+        if self._filter is not None and self._filter[0] == key:
+            return self._filter[1]
+        if keep:
+            self._filter = None  # first, since two of them would take twice the memory
+        # A reduced photograph goes a little beyond its range, also where saving reduces it.
+        given = image.clamp(0, 1) if before else image
+        edit = between_knots(step.declared, prepare(step, given, stride=self.stride), given)
+        if keep:
+            self._filter = (key, edit)
+        return edit

@@ -1,0 +1,92 @@
+"""The editor's server: one page, one session per photograph, pictures at an address that only that tab knows.
+
+Why NiceGUI and not Gradio: Gradio 6.31 excludes Pillow 13, its ImageEditor sends whole bitmaps, and in a trial with
+headless Chromium its change event had not arrived three seconds after a stroke. NiceGUI reports the pointer in pixels
+of the picture, keeps the moves of a slider in order, and includes every script and font that it uses.
+"""
+
+import socket
+import sys
+import threading
+import time
+from pathlib import Path
+
+from fastapi import Response
+from nicegui import app, binding, ui
+
+from nlfilter_torch.photo.app.access import Guard
+from nlfilter_torch.photo.app.library import Library
+from nlfilter_torch.photo.app.page import EDITORS, Editor
+
+TITLE = "nlfilter-torch"
+STARTING, PAUSE = 30.0, 0.05  # seconds for the server to accept connections, and between two attempts
+
+
+def serve(image: Path | None, folder: Path, *, host: str, port: int, open_page: bool) -> None:
+    """Run the editor until it is interrupted; it begins with an image, if there is one, and saves in the folder.
+
+    Raises:
+        ValueError: if it cannot listen on that address; port 0 is a free one.
+    """
+    port = _check_address(host, port)
+    binding.MAX_PROPAGATION_TIME = 1.0  # otherwise NiceGUI warns, on standard error, whenever the machine is busy
+    app.add_middleware(Guard, host=host)
+    library = Library(folder, None if image is None else image.parent)
+    app.config.quasar_config["loadingBar"] = {"skipHijack": True}  # the page shows what it is doing itself
+
+    @app.get("/picture/{token}/{kind}")
+    def _picture(token: str, kind: str, at: str = "") -> Response:
+        editor = EDITORS.get(token)
+        content = None if editor is None else editor.picture(kind, at)
+        if not content:
+            return Response(status_code=404)
+        media_type = "image/jpeg" if kind in ("before", "after") else "image/png"
+        return Response(content, media_type=media_type, headers={"Cache-Control": "no-store"})
+
+    @ui.page("/", title=TITLE, language="en-US")
+    def _page(photo: str = "") -> None:
+        Editor(library).build(image, photo)
+
+    app.on_startup(threading.Thread(target=_tell_when_ready, args=(host, port), daemon=True).start)
+    ui.run(
+        host=host,
+        port=port,
+        title=TITLE,
+        dark=True,
+        reload=False,
+        show=open_page,
+        tailwind=True,
+        binding_refresh_interval=None,
+        show_welcome_message=False,
+        favicon="\U0001f39a\ufe0f",
+        uvicorn_logging_level="warning",
+    )
+
+
+def _tell_when_ready(host: str, port: int) -> None:
+    """Print the address once the server accepts connections, which is a little after the start."""
+    reachable = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)  # not on every system as they are
+    for _ in range(round(STARTING / PAUSE)):
+        try:
+            socket.create_connection((reachable, port), timeout=STARTING).close()
+            break
+        except OSError:
+            time.sleep(PAUSE)
+    shown = f"[{host}]" if ":" in host else host
+    print(f"Editor at http://{shown}:{port}/ - Ctrl+C ends it", flush=True)
+
+
+def _check_address(host: str, port: int) -> int:
+    """The port to listen on; raises ValueError if that is not possible."""
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    with socket.socket(family) as probe:
+        if sys.platform != "win32":
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((host, port))
+        except OSError as error:
+            remedy = "use --port 0 for a free port, or another address" if port else "use another, such as 127.0.0.1"
+            raise ValueError(
+                f"cannot listen on --host {host} --port {port} ({error.strerror or error}); {remedy}"
+            ) from error
+        return int(probe.getsockname()[1])

@@ -1,0 +1,363 @@
+"""The editing of one photograph: what is open, the edit, and what can be undone. Independent of the page."""
+
+import threading
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from nlfilter_torch.photo.app.preview import PIXELS, Preview
+from nlfilter_torch.photo.app.sidecar import Sidecar
+from nlfilter_torch.photo.declared.parameters import EDITS
+from nlfilter_torch.photo.declared.presets import Recipe
+from nlfilter_torch.photo.declared.steps import Step
+from nlfilter_torch.photo.declared.strokes import Stroke, thin
+from nlfilter_torch.photo.edits.applying import apply_recipe
+from nlfilter_torch.photo.io import tiff
+from nlfilter_torch.photo.io.photographs import (
+    BITS,
+    DEPTHS,
+    SUFFIXES,
+    Photograph,
+    check_memory,
+    check_output,
+    first_bytes,
+    read_photograph,
+    write_photograph,
+)
+from nlfilter_torch.photo.io.rows import TILED, WHOLE, usual_memory
+from nlfilter_torch.photo.io.writing import open_beside
+from nlfilter_torch.photo.picture.resizing import resize
+from nlfilter_torch.photo.tiled.parts import Parts, Rectangle
+from nlfilter_torch.photo.tiled.recipe import edit_rows
+from nlfilter_torch.photo.tiled.sampling import Report, in_silence
+from nlfilter_torch.photo.tiled.tiles import Passes, Statistics
+
+SPACING = 0.2  # of the points of a stroke, as a share of its radius
+UNDOS = 100
+SMALL = 1 << 18  # pixels, up to which statistics are those of all pixels; a sample is nearly as exact, and fast
+OPEN_BYTES = 40  # per pixel, for a photograph before and after the edit and the files of both; edits work in tiles
+
+
+@dataclass(frozen=True)
+class Opened:
+    """An open photograph.
+
+    Attributes:
+        path: its file, which may be a copy.
+        name: the name of the file for the user.
+        photograph: its pixels.
+        preview: its preview.
+        parts: parts of it at full size.
+        pages: number of pages of the file.
+    """
+
+    path: Path
+    name: str
+    photograph: Photograph
+    preview: Preview
+    parts: Parts
+    pages: int = 1
+
+
+class Session:
+    """The state of the pages that show a photograph.
+
+    Args:
+        folder: where files are saved.
+        pixels: largest number of pixels of the preview.
+
+    Attributes:
+        recipe: the edit.
+        opened: the photograph, or None.
+        address: by which a page finds the session again.
+        saved: the edit of the file that was written last.
+    """
+
+    def __init__(self, folder: Path, pixels: int = PIXELS) -> None:
+        self.folder = folder
+        self.recipe = Recipe()
+        self.opened: Opened | None = None
+        self.address = ""
+        self.saved = Recipe()
+        self._sidecar: Sidecar | None = None
+        self._kept = Recipe()  # what the sidecar holds
+        self._drawing = threading.Lock()  # previews keep what was computed, one picture at a time
+        self._fitting = threading.Lock()  # and so do parts at full size
+        self._at_rest: tuple[tuple[Step, ...], Tensor] | None = None  # the last result, for other tabs
+        self._pixels = pixels
+        self._past: list[Recipe] = []
+        self._future: list[Recipe] = []
+        self._shown = Recipe()  # the last committed edit
+
+    def open(self, path: Path, name: str | None = None) -> None:
+        """Read a photograph and begin a new edit; a failure changes nothing.
+
+        Raises:
+            ValueError, OSError, MemoryError: see :func:`read_photograph`; the message names the file as ``name``, of
+                which ``path`` may be a copy.
+        """
+        try:
+            photograph = read_photograph(path, bytes_per_pixel=OPEN_BYTES)
+        except (ValueError, OSError, MemoryError) as error:
+            raise type(error)(str(error).replace(str(path), name or str(path))) from error
+        if self.opened is not None:
+            self.opened.parts.close()
+        parts = Parts(photograph.pixels[0].permute(1, 2, 0).numpy(), name or path.name)
+        pages = tiff.count_pages(path) if tiff.is_tiff(first_bytes(path)) else 1
+        preview = Preview(photograph.pixels, self._pixels)
+        self.opened = Opened(path.resolve(), name or path.name, photograph, preview, parts, pages)
+        self.recipe = self._shown = self.saved = Recipe()
+        self._at_rest = None
+        self._past, self._future = [], []
+
+    def keep_in(self, sidecar: Sidecar) -> None:
+        """Keep the edit in a file from now on, beginning with the edit that is there."""
+        self._sidecar = sidecar
+        self.recipe = self._shown = self.saved = self._kept = sidecar.read() or Recipe()
+
+    def restore(self) -> None:
+        """Load what is kept if another program has changed it."""
+        if self._sidecar is not None:
+            found = self._sidecar.read() or Recipe()
+            if found != self._kept:
+                self._kept = found
+                self.load(found)
+
+    @property
+    def trouble(self) -> str | None:
+        """Why the edit is not kept, or None."""
+        return None if self._sidecar is None else self._sidecar.trouble
+
+    @property
+    def unsaved(self) -> bool:
+        """Whether the edit has changed since it was opened or written."""
+        return self.opened is not None and self.recipe != self.saved
+
+    @property
+    def can_undo(self) -> bool:
+        """Whether there is a change to undo."""
+        return bool(self._past)
+
+    @property
+    def can_redo(self) -> bool:
+        """Whether there is a change that was undone."""
+        return bool(self._future)
+
+    @property
+    def preview(self) -> Preview:
+        """The preview; raises ValueError if no photograph is open."""
+        if self.opened is None:
+            raise ValueError("open a photograph first")
+        return self.opened.preview
+
+    def set(self, edit: str, **values: Any) -> None:
+        """Change the last step of an edit, or add one; :meth:`commit` completes the change."""
+        self.recipe = self.recipe.with_last(self.recipe.last(edit).changed(**values))
+
+    def commit(self) -> None:
+        """Complete a change, which can then be undone."""
+        if self.recipe != self._shown:
+            self._past = [*self._past[-UNDOS + 1 :], self._shown]
+            self._future = []
+            self._shown = self.recipe
+            self._keep()
+
+    def _keep(self) -> None:
+        drawn = self._shown.drawn
+        if self._sidecar is not None and drawn != self._kept:
+            self._sidecar.write(drawn)
+            if self._sidecar.trouble is None:
+                self._kept = drawn
+
+    def load(self, recipe: Recipe) -> None:
+        """Replace the edit, as one change."""
+        self.recipe = recipe
+        self.commit()
+
+    def undo(self) -> bool:
+        """Undo the last change; False if there is none."""
+        return self._go(self._past, self._future)
+
+    def redo(self) -> bool:
+        """Redo the last change that was undone; False if there is none."""
+        return self._go(self._future, self._past)
+
+    def _go(self, there: list[Recipe], back: list[Recipe]) -> bool:
+        if not there:
+            return False
+        back.append(self._shown)
+        self.recipe = self._shown = there.pop()
+        self._keep()
+        return True
+
+    def add_stroke(self, step: str, points: list[tuple[float, float]], radius: float, paint: str) -> None:
+        """Add a stroke to a step: points (x, y) in pixels of the preview, and a radius as a share of its short side.
+
+        Raises:
+            ValueError: if no photograph is open, or the step takes no stroke of that meaning or colour.
+        """
+        height, width = self.preview.size
+        shares = thin(((x / width, y / height) for x, y in points), SPACING * radius)
+        entries = {"points": [list(point) for point in shares], "radius": round(radius, 4), "paint": paint}
+        words = EDITS[step].words
+        if not words:
+            raise ValueError(f"{step} takes no strokes: it holds for the whole photograph")
+        stroke = Stroke.from_entries(entries, words, step)
+        last = self.recipe.last(step)
+        if (
+            step == "detail" and paint == "in" and not last.has_region()
+        ):  # the region begins with the sliders of the rest
+            self.set("detail", inside=last["alpha"])
+        self.set(step, strokes=(*last.strokes, stroke))
+        self.commit()
+
+    def render(self, upto: str | None = None) -> Tensor:
+        """The preview under the edit, (1, C, h, w) in [0, 1]; see :meth:`Preview.render`."""
+        with self._drawing:
+            return self.preview.render(self.recipe, upto)
+
+    def mask(self) -> Tensor | None:
+        """The mask of the sliders inside; see :meth:`Preview.mask`."""
+        with self._drawing:
+            return self.preview.mask(self.recipe.last("detail"))
+
+    def part(self, place: Rectangle, recipe: Recipe, report: Report = in_silence) -> Tensor:
+        """A part of the photograph under an edit as :meth:`save` makes it, (1, C, h, w) in [0, 1].
+
+        The first of an edit takes nearly as long as saving: its statistics are those of the whole photograph. The
+        report of the progress may raise an error to interrupt.
+
+        Raises:
+            ValueError, OSError, MemoryError: if nothing is open, or the photograph cannot be edited.
+        """
+        with self._fitting:
+            return self._fitted(recipe, report).edited(place)
+
+    def at_rest(self, recipe: Recipe, report: Report = in_silence) -> Tensor:
+        """The photograph under an edit as :meth:`save` makes it, reduced to the size of the preview.
+
+        :meth:`render` is fast, and approximate for edits that depend on single pixels; this takes as long as saving.
+        The report of the progress may raise an error to interrupt.
+
+        Raises:
+            ValueError, OSError, MemoryError: as :meth:`part`.
+        """
+        with self._fitting:
+            if self._at_rest is None or self._at_rest[0] != recipe.acting:
+                pixels = self._edited_at_once(recipe, report)
+                if pixels is None:
+                    found = self._fitted(recipe, report).reduced(self.preview.size, report)
+                else:
+                    found = resize(pixels.clamp(0, 1), self.preview.size).clamp(0, 1)  # a file holds no more
+                self._at_rest = recipe.acting, found
+            return self._at_rest[1]
+
+    def _fitted(self, recipe: Recipe, report: Report) -> Parts:
+        """The parts of the photograph, with an edit fitted to the whole."""
+        opened = self._opened_to("show")
+        opened.parts.fit(recipe.steps, self._passes(opened.photograph, report))
+        return opened.parts
+
+    def _edited_at_once(self, recipe: Recipe, report: Report) -> Tensor | None:
+        """The edited pixels (1, C, H, W), as the command line computes them; None if that takes much memory."""
+        opened = self._opened_to("edit")
+        height, width = opened.photograph.size
+        if width * height * recipe.bytes_per_pixel > WHOLE:
+            return None
+        check_memory(Path(opened.name), width, height, recipe.bytes_per_pixel)
+        return apply_recipe(recipe, opened.photograph.pixels, partial(report, "Editing"))
+
+    def _opened_to(self, purpose: str) -> Opened:
+        """The open photograph; raises ValueError, with what it was needed for, if there is none."""
+        if self.opened is None:
+            raise ValueError(f"open a photograph first; there is nothing to {purpose}")
+        return self.opened
+
+    def _passes(self, photograph: Photograph, report: Report) -> Passes:
+        """Of an edit in parts at full size."""
+        height, width = photograph.size
+        statistics: Statistics = "full" if width * height <= SMALL else "sample"
+        kind = str(photograph.pixels.numpy().dtype)
+        return Passes(kind, statistics, memory=usual_memory(TILED), report=report, folder=self.folder)
+
+    def target(self, name: str) -> Path:
+        """The file of that name in the folder; raises ValueError if ``name`` leads out of it or is no name."""
+        path = Path(name.strip())
+        if not path.name or path.name != name.strip() or path.name.startswith(".") or "\0" in name:
+            raise ValueError(
+                f"the name must be one of a file, such as photo-edited.png, got {name!r}; files go to {self.folder}"
+            )
+        return self.folder / path
+
+    def check_photograph(self, name: str) -> Path:
+        """:meth:`target` of a name under which the photograph can be saved; raises ValueError for others."""
+        target, opened = self.target(name), self._opened_to("save")
+        if target.resolve() == opened.path:
+            raise ValueError(
+                f"the name must not be that of the photograph, got {name!r}: its edit is kept, and would be "
+                "applied again; choose another name"
+            )
+        check_output(target, opened.photograph)
+        return target
+
+    def check_preset(self, name: str) -> Path:
+        """:meth:`target` of a name under which the edit can be saved; raises ValueError for others."""
+        target = self.target(name)
+        if target.suffix.lower() != ".json":
+            raise ValueError(f"the name of a preset must end in .json, got {name!r}")
+        return target
+
+    def suggested_name(self) -> str:
+        """The name of the photograph with ``-edited``, and an extension of a file type that can hold it."""
+        if self.opened is None:
+            return ""
+        path, photograph = Path(self.opened.name), self.opened.photograph
+        suffix = path.suffix.lower()
+        kind = SUFFIXES.get(suffix)
+        fits = kind is not None and photograph.depth in DEPTHS[kind] and (photograph.alpha is None or kind != "JPEG")
+        if not fits:
+            suffix = ".tif" if BITS[photograph.depth] == "floats" else ".png"
+        return f"{path.stem}-edited{suffix}"
+
+    def save(self, name: str, report: Report = in_silence) -> Path:
+        """Edit the photograph at its full size and write it to the folder; the file appears complete or not at all.
+
+        Raises:
+            ValueError, OSError, MemoryError: if nothing is open, or the file cannot be edited or written.
+        """
+        target, opened = self.check_photograph(name), self._opened_to("save")
+        recipe, photograph = self.recipe, opened.photograph
+        pixels = self._edited_at_once(recipe, report)
+        if pixels is None:
+            rows = photograph.pixels[0].permute(1, 2, 0).numpy()
+            channels = 3 if recipe.gives_colour else rows.shape[2]
+            pixels = photograph.pixels.new_empty((1, channels, *photograph.size))
+            for part, values in edit_rows(self._passes(photograph, report), rows, recipe.steps, opened.name):
+                pixels[0, :, part] = torch.from_numpy(values).permute(2, 0, 1)
+        report("Writing", 0, 1)
+        write_photograph(photograph.with_pixels(pixels), target)
+        self.saved = recipe
+        return target
+
+    def save_preset(self, name: str, report: Report = in_silence) -> Path:
+        """Write the edit as a file for :meth:`load_preset` and the command line.
+
+        This is quick, so that ``report`` is not called.
+
+        Raises:
+            ValueError, OSError: if it cannot be written.
+        """
+        target, recipe = self.check_preset(name), self.recipe
+        with open_beside(target) as stream:
+            stream.write(recipe.to_json(drawn=True).encode())
+        self.saved = recipe
+        return target
+
+    def load_preset(self, content: bytes, name: str) -> None:
+        """Load the edit in the content of a file; raises ValueError if there is none, or no photograph is open."""
+        self._opened_to("edit")
+        self.load(Recipe.from_json(content, name))

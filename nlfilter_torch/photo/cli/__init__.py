@@ -1,0 +1,33 @@
+"""The command line ``nlfilter-torch``. Options shared by several commands are in ``options``.
+
+Invalid input of any kind is reported in one sentence on standard error, with exit status 2.
+"""
+
+import sys
+from collections.abc import Callable, Iterable
+
+from nlfilter_torch.photo.cli import interrupts
+
+Commands = Callable[[], Iterable[Callable[..., None]]]
+
+
+def main(arguments: list[str] | None = None, others: Commands = tuple) -> int:
+    """Run the command line on ``arguments`` (``sys.argv`` without its first entry) and return its exit status.
+
+    ``others`` imports and returns commands besides those of this package.
+    """
+    try:
+        with interrupts.handled():
+            from nlfilter_torch.photo.cli.application import run
+
+            return run(arguments, others())
+    except KeyboardInterrupt:
+        return interrupts.tell()
+    except interrupts.Ended as ended:
+        return ended.status
+    except ModuleNotFoundError as error:
+        sys.stderr.write(
+            f"nlfilter-torch: the command line needs {error.name}, which is not installed; "
+            "install it with: pip install 'nlfilter-torch[cli]'\n"
+        )
+        return 2

@@ -1,0 +1,215 @@
+"""The part shared by all commands that edit one photograph: read, check, edit and write, in tiles if necessary."""
+
+import sys
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import AbstractContextManager, ExitStack
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from nlfilter_torch.photo.cli import options
+from nlfilter_torch.photo.cli.progress import stages, steps
+from nlfilter_torch.photo.declared.steps import Step, working_bytes
+from nlfilter_torch.photo.io.photographs import (
+    Photograph,
+    TooLarge,
+    check_depth,
+    check_memory,
+    check_output,
+    read_photograph,
+    write_photograph,
+)
+from nlfilter_torch.photo.io.rows import (
+    TILED,
+    WHOLE,
+    StoredPicture,
+    check_place,
+    is_zarr,
+    open_picture,
+    usual_memory,
+    write_picture,
+)
+from nlfilter_torch.photo.picture.viewing import viewed_size
+from nlfilter_torch.photo.tiled.pictures import mask_plane
+from nlfilter_torch.photo.tiled.sampling import Report
+from nlfilter_torch.photo.tiled.tiles import Passes, Processes, Statistics, Tiling
+
+MOST = 1e6  # gigabytes; upper limit of ``--memory``
+
+
+def allowed_memory(gigabytes: float | None, most: int = sys.maxsize) -> int:
+    """``--memory`` in bytes, or without it the usual memory, and at most so many bytes."""
+    if gigabytes is None:
+        return usual_memory(most)
+    if not 0 < gigabytes <= MOST:
+        raise ValueError(f"--memory must be a positive number of gigabytes, such as 4, got {gigabytes:g}")
+    return int(gigabytes * 1e9)
+
+
+def viewed_within_memory(path: str | Path, size: tuple[int, int], step: Step, factors: int = 1) -> tuple[int, int]:
+    """Size (h, w) at which the filter of a step looks at a photograph of size (H, W).
+
+    Raises:
+        TooLarge: if so many factors of that size do not fit in the free memory. It is a MemoryError.
+    """
+    height, width = viewed_size(size, step["viewing_size"])
+    check_memory(Path(path), width, height, working_bytes(step["landmarks"], step["patch_size"], factors=factors))
+    return height, width
+
+
+def read_if_it_fits(source: str, target: str, bytes_per_pixel: int, gigabytes: float | None) -> Photograph | None:
+    """Read the photograph, or return None if it must be read by rows, given ``--memory``."""
+    if is_zarr(Path(source)) or is_zarr(Path(target)):
+        return None
+    try:
+        return read_photograph(source, bytes_per_pixel=bytes_per_pixel, memory=allowed_memory(gigabytes, WHOLE))
+    except TooLarge:
+        return None
+
+
+def read_masks(paths: Sequence[Path], of: str | Path, size: tuple[int, int] | None = None) -> Tensor:
+    """Masks (1, K, H, W), see :func:`mask_plane`, of files of the same size, or of the size (H, W)."""
+    found = [mask_plane(read.pixels, read.alpha) for read in map(read_photograph, paths)]
+    height, width = found[0].shape[-2:] if size is None else size
+    for path, one in zip(paths, found, strict=True):
+        if tuple(one.shape[-2:]) != (height, width):
+            like = paths[0] if size is None else of
+            raise ValueError(
+                f"{path} must have the size of {like}, {width}x{height}, got {one.shape[-1]}x{one.shape[-2]}; "
+                f"resize it to that of {of}"
+            )
+    return torch.cat(found, dim=1)
+
+
+def check_apart(option: str, path: str | Path | None, **files: str | Path | Iterable[str | Path] | None) -> None:
+    """Raise ValueError if the file that an option or argument writes is one of the others, given by what they are."""
+    if path is None:
+        return
+    for what, some in files.items():
+        for file in [some] if isinstance(some, str | Path) else some or []:
+            if Path(path).resolve() == Path(file).resolve():
+                raise ValueError(f"{option} must be another file than the {what}, got {path}; choose another name")
+
+
+@dataclass
+class Job:
+    """A photograph that is edited by rows.
+
+    Attributes:
+        picture: the input.
+        kind: dtype of the output.
+        memory: bytes that may still be used.
+        limit: bytes that tiles may use, at most.
+        report: called with the progress.
+        files: closes opened files.
+        processes: compute tiles in place of the threads of this process, if given.
+    """
+
+    picture: StoredPicture
+    kind: str
+    memory: int
+    limit: int
+    report: Report
+    files: ExitStack
+    processes: Processes | None = None
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(H, W)."""
+        return self.picture.shape[0], self.picture.shape[1]
+
+    def passes(self, full: bool, folder: Path) -> Passes:
+        """Tiling options, with statistics from all pixels or from a sample, and a folder for temporary files."""
+        statistics: Statistics = "full" if full else "sample"
+        memory = max(min(self.memory, self.limit), 1)
+        return Passes(self.kind, statistics, memory=memory, report=self.report, folder=folder, processes=self.processes)
+
+    def open(self, path: Path) -> StoredPicture:
+        """Open another picture to be read by rows; it is closed at the end of the job."""
+        found = self.files.enter_context(open_picture(path, self.memory))
+        check_depth(path, found.rows.dtype)
+        self.memory -= found.cached
+        return found
+
+
+def check_workers(workers: int | None, cluster: str | None) -> None:
+    """Raise ValueError if processes of this machine and of a cluster are asked for."""
+    if workers is not None and cluster is not None:
+        raise ValueError(
+            f"--workers must not be combined with --cluster, got {workers} and {cluster}; omit one of them"
+        )
+
+
+def check_processes(source: str, target: str, workers: int | None, cluster: str | None) -> None:
+    """Raise ValueError if worker processes are asked for and the files are not zarr arrays."""
+    check_workers(workers, cluster)
+    option = "--workers" if cluster is None else "--cluster"
+    if (workers is not None or cluster is not None) and not (is_zarr(Path(source)) and is_zarr(Path(target))):
+        raise ValueError(
+            f"{option} takes zarr arrays, which several processes can write, as IN and OUT, got {source} and {target}; "
+            "leave it out, or convert them"
+        )
+
+
+def processes_for(workers: int | None, cluster: str | None, stack: ExitStack) -> Processes | None:
+    """The worker processes that are asked for, until ``stack`` is closed, or None."""
+    if workers is None and cluster is None:
+        return None
+    from nlfilter_torch.photo.cli.processes import zarr_processes
+
+    return stack.enter_context(zarr_processes(workers, cluster))
+
+
+def edit_file(
+    source: str,
+    target: str,
+    depth: options.FileDepth | None,
+    edit: Callable[[Photograph], Tensor],
+    *,
+    bytes_per_pixel: int,
+    memory: float | None,
+    by_rows: Callable[[Job], AbstractContextManager[Tiling]],
+    coloured: bool = False,
+    workers: int | None = None,
+    cluster: str | None = None,
+) -> None:
+    """Edit the photograph in a file, and write it to another file or the same one, with its metadata.
+
+    Args:
+        source: the file to read.
+        target: the file to write.
+        depth: of the output; None is that of the input.
+        edit: computes new pixels (1, C, H, W) from the photograph.
+        bytes_per_pixel: memory that the edit needs per pixel of an image.
+        memory: gigabytes that may be used; None is a fifth of the machine's, but at most 2, or 1 in tiles.
+        by_rows: the same edit for photographs that do not fit in memory.
+        coloured: whether the edit by rows adds colours to a grey photograph.
+        workers: number of processes that filter zarr arrays, instead of threads.
+        cluster: address of the cluster whose processes do this.
+    """
+    check_processes(source, target, workers, cluster)
+    allowed, kind = allowed_memory(memory), None if depth is None else options.DEPTHS[depth]
+    with steps(3) as begin:
+        begin("Reading")
+        photograph = read_if_it_fits(source, target, bytes_per_pixel, memory)
+        if photograph is not None:
+            edited = photograph if kind is None else replace(photograph, depth=kind)
+            check_output(target, edited)
+            begin("Editing")
+            edited = edited.with_pixels(edit(photograph))
+            begin("Writing")
+            write_photograph(edited, target)
+            return
+    with ExitStack() as stack:
+        picture = stack.enter_context(open_picture(Path(source), allowed))
+        found = check_depth(source, picture.rows.dtype)
+        stored = kind or found
+        written = picture.in_colour() if coloured else picture
+        check_place(Path(target), stored, written, allowed)
+        processes = processes_for(workers, cluster, stack)
+        report = stack.enter_context(stages())
+        job = Job(picture, stored, allowed - picture.cached, allowed_memory(memory, TILED), report, stack, processes)
+        with by_rows(job) as tiling:
+            write_picture(Path(target), tiling, stored, written)

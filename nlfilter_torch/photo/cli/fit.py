@@ -1,0 +1,305 @@
+"""``nlfilter-torch fit``: find the look that turns photographs into edited ones, and save it for others."""
+
+from collections.abc import Iterator, Sequence
+from itertools import chain, pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from nlfilter_torch.photo.cli import options
+from nlfilter_torch.photo.cli.edits import step_of, with_options
+from nlfilter_torch.photo.declared.parameters import EDITS
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from nlfilter_torch.photo.declared.steps import Step
+    from nlfilter_torch.photo.look_fitting.fit_look import FittedLook
+
+Before = Annotated[str, typer.Argument(metavar="BEFORE", help="The photograph before the edit, or a folder of them.")]
+After = Annotated[
+    str, typer.Argument(metavar="AFTER", help="The same after the edit; in a folder, under the same names.")
+]
+Result = Annotated[Path, typer.Argument(metavar="PRESET", help="The JSON file in which the look is saved.")]
+Order = Annotated[
+    int,
+    typer.Option("--layers", min=2, max=10, metavar="N", help="Number of sliders, from the finest to the coarsest."),
+]
+Preview = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FILE",
+        help="A picture of the first pair at the viewing size: before, after, the look, and what is left, amplified, "
+        "around grey.",
+    ),
+]
+Map = Annotated[
+    Path | None,
+    typer.Option("--map", metavar="FILE", help="A grey picture of what the look leaves of the first pair's edit."),
+]
+PAIR_BYTES = 140  # per pixel of a pair at its full size, while it is read and compared
+ENOUGH = 0.8  # share that is to be explained
+AMPLIFIED = 4  # what is left, in the preview
+SQUARE = 16  # pixels, of places that an edit is looked for in
+FEW, MOST = 0.1, 0.5  # of these places, and of what is left, for an edit to be called local
+CALLED = {
+    "alpha": "sliders",
+    "bands": "gains of blurs",
+    "texture": "texture",
+    "tone": "a tone curve",
+    "curves": "a tone curve for each channel",
+    "matrix": "colours",
+    "saturation": "saturation",
+    "stretch": "automatic levels",
+    "local": "local contrast",
+}
+
+
+@with_options("bandwidth", "spatial_bandwidth", "patch_size", "landmarks", "sampling")
+def fit(
+    before: Before,
+    after: After,
+    preset: Result = Path("preset.json"),
+    layers: Order = 4,
+    mask: options.MasksOfPairs = None,
+    preview: Preview = None,
+    left: Map = None,
+    **given: Any,
+) -> None:
+    """Find the look that turns one photograph into another, or a folder of them, whatever program made the edit.
+
+    A look has sliders, tone curves, colours and sharpness, as far as they explain the edit of photographs left out of
+    the fit, too. Prints how much that is, and saves the look in a file for other photographs:
+
+    `nlfilter-torch fit before.jpg after.jpg look.json --preview seen.png`
+
+    `nlfilter-torch apply other.jpg out.jpg --preset look.json`
+
+    Each --mask is a region that has a look of its own, in numbered files:
+
+    `nlfilter-torch fit before.jpg after.jpg look.json --mask sky.png --mask ground.png`
+    """
+    step = step_of(EDITS["look"], given)
+
+    from nlfilter_torch.photo.cli.editing import check_apart, read_masks
+    from nlfilter_torch.photo.cli.progress import steps
+    from nlfilter_torch.photo.io.photographs import check_type
+    from nlfilter_torch.photo.io.writing import check_file, open_beside
+    from nlfilter_torch.photo.look_fitting.fit_look import fit_look
+
+    paths = _paths(before, after)
+    regions = _regions(mask or [], paths, Path(before).is_dir())
+    results = [preset.with_stem(f"{preset.stem}-{i + 1}") for i in range(len(mask))] if mask else [preset]
+    inputs = {"photographs": [*chain(*paths)], "mask": [*chain(*regions)]}
+    for path in results:
+        check_file(path)
+        if path.suffix.lower() != ".json":
+            raise ValueError(f"PRESET must end in .json, got {path}; rename it")
+        check_apart("PRESET", path, **inputs)
+    for option, picture in (("--preview", preview), ("--map", left)):
+        if picture is not None:
+            check_type(picture, "uint8", alpha=False)
+            check_apart(option, picture, **inputs)
+    check_apart("--map", left, preview=preview)
+    alone = len(paths) == 1
+    judged = (alone and not mask) or preview is not None or left is not None
+    first: list[tuple[Tensor, ...]] = []  # images that are judged, and masks
+    with steps(len(paths) + 1) as begin:
+
+        def pairs() -> "Iterator[tuple[Tensor, ...]]":
+            for pair, masks in zip(paths, regions, strict=True):
+                begin(f"Comparing {pair[1].name}")
+                images = (*_read(*pair, step), *([read_masks(masks, pair[0])] if masks else []))
+                if judged and not first:
+                    first.append(images)
+                yield images
+
+        found = fit_look(pairs(), order=layers - 1, step=step)
+        begin("Judging")
+        looks = found if isinstance(found, tuple) else (found,)
+        seen = [_judged(looks, *images) for images in first]  # of the first pair, if judged
+        for before_and_after in seen:
+            _draw(*before_and_after, preview, left)
+        for look, path in zip(looks, results, strict=True):
+            with open_beside(path) as stream:
+                stream.write(look.to_json().encode())
+    whole = seen[0] if alone and not mask else None
+    for look, path in zip(looks, results, strict=True):
+        _report(look, look.fitted if whole is None else _explained(*whole), path, alone=alone)
+    if whole is not None:
+        _tell_where(*whole, stride=first[0][0].shape[-1] / whole[0].shape[-1])
+
+
+def _paths(before: str, after: str) -> list[tuple[Path, Path]]:
+    """The files of the pairs."""
+    first, second = Path(before), Path(after)
+    if not first.is_dir() and not second.is_dir():
+        return [(first, second)]
+    if not (first.is_dir() and second.is_dir()):
+        raise ValueError(
+            f"BEFORE and AFTER must be two photographs or two folders, got {before} and {after}; pass both"
+        )
+    edited = _pictures(second)
+    found = [(path, pair) for path in _pictures(first) if (pair := _counterpart(path, edited)) is not None]
+    if not found:
+        raise ValueError(f"{after} must hold photographs of the names of those in {before}, got none; rename them")
+    for (path, pair), (other, same) in pairwise(sorted(found, key=lambda each: each[1])):
+        if pair == same:
+            raise ValueError(
+                f"{before} must hold one photograph for {pair}, got {path.name} and {other.name}; remove one of them"
+            )
+    _note_unpaired(first, {path.stem for _, path in found})
+    _note_unpaired(second, {path.stem for path, _ in found})
+    return found
+
+
+def _note_unpaired(folder: Path, paired: set[str]) -> None:
+    """Print a note if photographs of a folder have no counterpart of their name in the other."""
+    rest = [path.name for path in _pictures(folder) if path.stem not in paired]
+    if rest:
+        others = f" and {len(rest) - 1} more" if len(rest) > 1 else ""
+        options.note(f"{rest[0]}{others} in {folder} left out, without a photograph of that name in the other folder")
+
+
+def _regions(masks: list[Path], paths: list[tuple[Path, Path]], folders: bool) -> list[list[Path]]:
+    """The files of the masks of every pair: these, or those in these folders under the names of the photographs."""
+    found: list[list[Path]] = [[] for _ in paths]
+    for mask in masks:
+        if mask.is_dir() != folders:
+            wanted = (
+                "folders of masks, as BEFORE and AFTER are folders" if folders else "pictures, as BEFORE and AFTER are"
+            )
+            remedy = "put the masks in a folder under the names of the photographs" if folders else "name a file in it"
+            raise ValueError(f"--mask must name {wanted}, got {mask}; {remedy}")
+        named = _pictures(mask) if folders else []
+        for files, (photograph, _) in zip(found, paths, strict=True):
+            own = _counterpart(photograph, named) if folders else mask
+            if own is None:
+                raise ValueError(
+                    f"{mask} must hold a mask for every photograph, got none for {photograph.name}; add one, black all "
+                    "over if the region is not in the photograph"
+                )
+            files.append(own)
+    return found
+
+
+def _pictures(folder: Path) -> list[Path]:
+    from nlfilter_torch.photo.cli.folders import is_picture
+
+    return [path for path in sorted(folder.iterdir()) if is_picture(path)]
+
+
+def _counterpart(path: Path, others: Sequence[Path]) -> Path | None:
+    """The one of these files that has the name of a photograph, or if none has, the name but for its suffix.
+
+    Raises:
+        ValueError: if several differ from it in the suffix only.
+    """
+    found = [other for other in others if other.stem == path.stem]
+    if len(found) > 1 and path.name not in {other.name for other in found}:
+        names = " and ".join(other.name for other in found)
+        raise ValueError(
+            f"{found[0].parent} must hold one photograph of the name of {path.name}, got {names}; remove all but one"
+        )
+    return next((other for other in found if other.name == path.name), found[0] if found else None)
+
+
+def _read(before: Path, after: Path, step: "Step") -> "tuple[Tensor, Tensor]":
+    """A pair on the same pixels, in colour if one of them is."""
+    from nlfilter_torch.photo.cli.editing import viewed_within_memory
+    from nlfilter_torch.photo.io.photographs import read_photograph
+    from nlfilter_torch.photo.look_fitting.alignment import align
+    from nlfilter_torch.photo.look_fitting.fit_look import check_belong
+
+    images = [read_photograph(path, bytes_per_pixel=PAIR_BYTES).pixels for path in (before, after)]
+    viewed_within_memory(before, (images[0].shape[2], images[0].shape[3]), step)
+    channels = max(image.shape[1] for image in images)
+    first, second = (image.expand(-1, channels, -1, -1) for image in images)
+    image, edited, done = align(first, second, str(before), str(after))
+    if done:
+        options.note(done)
+    if bool((image == edited).all()):
+        raise ValueError(f"{after} must differ from {before}, but they are the same; give an edited photograph")
+    check_belong(image[0].expand(3, -1, -1), edited[0].expand(3, -1, -1), str(before), str(after))
+    return image, edited
+
+
+def _judged(
+    looks: "Sequence[FittedLook]", image: "Tensor", edited: "Tensor", masks: "Tensor | None" = None
+) -> "tuple[Tensor, Tensor, Tensor]":
+    """A pair at the viewing size, and what the looks make of the photograph, each in its region."""
+    from nlfilter_torch.photo.picture.changes import blend_edited
+    from nlfilter_torch.photo.picture.resizing import resize
+    from nlfilter_torch.photo.picture.viewing import viewed_size
+
+    whole = (image.shape[2], image.shape[3])
+    size = viewed_size(whole, looks[0].step["viewing_size"])
+    if size != whole:
+        image, edited = (resize(planes, size).clamp(0, 1) for planes in (image, edited))
+        masks = None if masks is None else resize(masks, size).clamp(0, 1)
+    found = [look.apply(image).clamp(0, 1) for look in looks]
+    return image, edited, found[0] if masks is None else blend_edited(image, found, masks)
+
+
+def _explained(before: "Tensor", after: "Tensor", found: "Tensor") -> float:
+    """Share of the change's energy, 1 at best, without a frame around the picture."""
+    from nlfilter_torch.photo.look_fitting.alignment import inside_frame
+
+    shown = inside_frame(before[0], after[0])
+    before, after, found = (image[..., shown] for image in (before, after, found))
+    rest, change = ((after.double() - image.double()).square().sum() for image in (found, before))
+    return 1.0 - float(rest / change)
+
+
+def _report(look: "FittedLook", share: float, path: Path, *, alone: bool) -> None:
+    """Print what a look is and what it is worth."""
+    typer.echo(f"{'explained of the change by':40}{'fitted':>8}{'left out':>10}")
+    for parts, (fitted, left_out) in look.explained.items():
+        if len(parts) == 1 or parts == look.parts:
+            name = " + ".join(CALLED[part] for part in parts)
+            typer.echo(f"{name:40}{100 * fitted:7.1f} %{100 * left_out:8.1f} %")
+    typer.echo("alpha: " + ", ".join(f"{slider:.3f}" for slider in look.step["alpha"]))
+    others = "parts of the picture left out of the fit" if alone else "other photographs"
+    typer.echo(f"explained: {100 * share:.1f} % of the change, {100 * look.left_out:.1f} % in {others}")
+    if alone:
+        typer.echo("in other photographs: not known from one pair; folders of three pairs or more tell")
+    if min(share, look.left_out) < ENOUGH:
+        options.note(f"the look explains less than {100 * ENOUGH:.0f} % of the edit; --preview shows what is missing")
+    typer.echo(f"preset: {path}")
+
+
+def _tell_where(before: "Tensor", after: "Tensor", found: "Tensor", stride: float) -> None:
+    """Say where what is left is, if it is in a few places; ``stride`` is the size of their pixels in the photograph."""
+    from torch.nn.functional import avg_pool2d
+
+    from nlfilter_torch.photo.look_fitting.alignment import inside_frame
+
+    rest = (after - found).square().mean(1, keepdim=True) * inside_frame(before[0], after[0])
+    rest = avg_pool2d(rest, SQUARE, ceil_mode=True)[0, 0]
+    if _explained(before, after, found) > ENOUGH or rest.numel() < 1 / FEW:
+        return
+    some = max(1, int(FEW * rest.numel()))
+    largest = rest.flatten().topk(some)
+    if float(largest.values.sum() / rest.sum()) < MOST:
+        return
+    place = int(largest.indices[0])
+    row, column = (round(SQUARE * stride * number) for number in divmod(place, rest.shape[1]))
+    options.note(
+        f"most of what is left is in a tenth of the picture, around row {row}, column {column}: an edit of a part; "
+        "--map shows where, and --mask fits parts by themselves"
+    )
+
+
+def _draw(before: "Tensor", after: "Tensor", found: "Tensor", preview: Path | None, left: Path | None) -> None:
+    """Write the preview and the map of what is left."""
+    import torch
+
+    from nlfilter_torch.photo.io.photographs import Photograph, write_photograph
+
+    if preview is not None:
+        rest = (0.5 + AMPLIFIED * (after - found)).clamp(0, 1)
+        write_photograph(Photograph(torch.cat([before, after, found, rest], dim=3)), preview)
+    if left is not None:
+        rest = (after - found).abs().amax(1, keepdim=True)
+        write_photograph(Photograph(rest / rest.amax().clamp(min=1e-6)), left)

@@ -1,0 +1,204 @@
+"""``nlfilter-torch frames``: one edit for all frames of a film, without flicker."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from nlfilter_torch.photo.cli import options
+from nlfilter_torch.photo.cli.edits import (
+    DETAIL_OPTIONS,
+    other_recipe,
+    preset_option,
+    step_of,
+    typed_options,
+    with_options,
+)
+from nlfilter_torch.photo.declared.parameters import EDITS
+from nlfilter_torch.photo.declared.presets import PRESETS, Recipe
+
+if TYPE_CHECKING:
+    from nlfilter_torch.photo.tiled.film import FilmEdit
+
+#: Edits without scribbles.
+EDITS_WITHOUT_STROKES = tuple(edit for edit in EDITS.values() if not edit.requires_strokes)
+BYTES_PER_PIXEL = 100  # bytes per pixel of a frame, besides those of the edit, which is tiled
+
+Frames = Annotated[
+    Path,
+    typer.Argument(
+        metavar="FRAMES",
+        help="A film (.mp4, .m4v or .mov), or a folder of photographs, read in the order of their names.",
+    ),
+]
+Edited = Annotated[
+    Path,
+    typer.Argument(
+        metavar="OUT",
+        help="The edited film (.mp4, .m4v or .mov), or the folder for the edited photographs; created if it does not "
+        "exist.",
+    ),
+]
+References = Annotated[
+    int,
+    typer.Option(
+        min=1,
+        metavar="N",
+        help="Number of frames, spread over the film, to which the filter is fitted. Use more if the scene changes.",
+    ),
+]
+EditName = Annotated[
+    str,
+    typer.Option(
+        "--edit",
+        metavar="|".join(edit.name for edit in EDITS_WITHOUT_STROKES),
+        help="The edit to apply, with the name of its command.",
+    ),
+]
+Preset = Annotated[
+    str | None,
+    preset_option(
+        f"One of {', '.join(PRESETS)}, or a file of any edits without scribbles, as written by `nlfilter-torch fit` or "
+        "the editor. Options on the command line override a detail preset; other presets accept none.",
+        plain=False,
+    ),
+]
+
+
+@with_options(*DETAIL_OPTIONS, more=EDITS_WITHOUT_STROKES)
+def frames(
+    context: typer.Context,
+    source: Frames,
+    target: Edited,
+    edit: EditName = "detail",
+    references: References = 3,
+    seed: options.Seed = 0,
+    preset: Preset = None,
+    memory: options.Memory = None,
+    **given: Any,
+) -> None:
+    """Edit all frames of a film alike, without flicker.
+
+    The filter is fitted once, to frames spread over the film, and applied to every frame. Since objects move, distance
+    counts only if --spatial-bandwidth is given. Films keep their sound, frame rate, time stamps, rotation and colour
+    properties (needs the extra `films`). Photographs in a folder keep their names, types, depths, transparency, colour
+    profiles and camera metadata; files in OUT are replaced if this command wrote them.
+
+    By sliders: `nlfilter-torch frames film.mp4 edited.mp4 --alpha 2,2,2,1`
+
+    By the name of a look, or a file: `nlfilter-torch frames shots edited --preset crisp`
+
+    Another edit: `nlfilter-torch frames film.mp4 edited.mp4 --edit denoise --noise-level 8`
+    """
+    recipe = chosen_recipe(context, edit, preset, given)
+
+    from nlfilter_torch.photo.cli.editing import allowed_memory
+    from nlfilter_torch.photo.cli.showing import note_idle
+    from nlfilter_torch.photo.io.films import is_film
+    from nlfilter_torch.photo.io.rows import TILED
+    from nlfilter_torch.photo.tiled.film import FilmEdit, film_steps
+    from nlfilter_torch.photo.tiled.tiles import Passes
+
+    film_steps(recipe.steps)
+    note_idle(recipe, preset or f"--edit {edit}")
+    passes = Passes("float32", memory=allowed_memory(memory, TILED))
+
+    def fit(samples: list[Any]) -> FilmEdit:
+        return FilmEdit(recipe.steps, samples, passes, seed=seed)
+
+    work = edit_film if is_film(source) and not source.is_dir() else edit_folder
+    count = work(source, target, references, fit)
+    typer.echo(f"{count} frames in {target}")
+
+
+def chosen_recipe(context: typer.Context, name: str, preset: str | None, given: dict[str, Any]) -> Recipe:
+    """Create the edit from options.
+
+    Raises:
+        ValueError: if an option does not belong to the edit.
+    """
+    if preset is not None and (recipe := other_recipe(context, preset, (*given, "edit"))) is not None:
+        return recipe
+    if name not in {edit.name for edit in EDITS_WITHOUT_STROKES}:
+        names = ", ".join(edit.name for edit in EDITS_WITHOUT_STROKES)
+        raise ValueError(f"--edit must be one of {names}, got {name!r}; choose one of these")
+    if preset is not None and name != "detail":
+        raise ValueError(f"--edit must not be given together with --preset, got {name} and {preset}; drop one of them")
+    own, declared = typed_options(context, given), {parameter.name for parameter in EDITS[name]}
+    other = next((option for option in own if option not in declared), None)
+    if other is not None:
+        edits = " or ".join(edit.name for edit in EDITS_WITHOUT_STROKES if other in {p.name for p in edit})
+        raise ValueError(
+            f"--{other.replace('_', '-')} must be used with --edit {edits}, got --edit {name}; drop it or change --edit"
+        )
+    mine = given if name == "detail" else {option: given[option] for option in own}
+    return Recipe((step_of(EDITS[name], mine),))
+
+
+def edit_film(source: Path, target: Path, references: int, fit: "Callable[[list[Any]], FilmEdit]") -> int:
+    """Edit a film, and return the number of its frames."""
+    from nlfilter_torch.photo.cli.progress import steps
+    from nlfilter_torch.photo.io.films import check_film_output, open_film, write_film
+
+    check_film_output(target)
+    with open_film(source) as film, steps(film.count + 1) as begin:
+        begin("Fitting to sample frames")
+        edit = fit(film.sample(references))
+        return write_film(film, target, edit, lambda number: begin(f"Frame {number + 1} of {film.count}"))
+
+
+def edit_folder(source: Path, target: Path, references: int, fit: "Callable[[list[Any]], FilmEdit]") -> int:
+    """Edit the photographs in a folder, and return their number."""
+    import torch
+
+    from nlfilter_torch.photo.cli.folders import check_replaced, pictures, record_written
+    from nlfilter_torch.photo.cli.progress import steps
+    from nlfilter_torch.photo.io.films import is_film
+    from nlfilter_torch.photo.io.photographs import check_output, read_photograph, write_photograph
+    from nlfilter_torch.photo.io.writing import check_folder
+
+    if source.is_file():
+        raise ValueError(f"{source} must be a film (.mp4, .m4v or .mov) or a folder; convert it")
+    paths = pictures(source, "frames")
+    if target.exists() and target.resolve() == source.resolve():
+        raise ValueError(f"{target} must not be the folder of the frames; choose another folder")
+    if is_film(target) and not target.is_dir():
+        raise ValueError(f"OUT must be a folder, as FRAMES is one, got {target}; choose the name of a folder")
+    check_folder(target)
+    is_new, written = not target.exists(), check_replaced(paths, target)
+    first: tuple[int, ...] = ()
+
+    def read(path: Path) -> tuple[Any, Any]:
+        nonlocal first
+        photograph = read_photograph(path, bytes_per_pixel=BYTES_PER_PIXEL)
+        rows = photograph.pixels[0].permute(1, 2, 0).float().contiguous().numpy()
+        first = first or rows.shape
+        if rows.shape != first:
+            wanted, got = (
+                f"{height}x{width} and {colours} channel(s)" for height, width, colours in (first, rows.shape)
+            )
+            raise ValueError(
+                f"{path} must have the size and channels of the first frame, {wanted}, got {got}; convert it"
+            )
+        return photograph, rows
+
+    with steps(len(paths) + 1) as begin:
+        begin("Fitting to sample frames")
+        spread = torch.linspace(0, len(paths) - 1, min(references, len(paths))).round().long().tolist()
+        edit = fit([read(paths[i])[1] for i in spread])
+        for number, path in enumerate(paths):
+            begin(path.name)
+            photograph, rows = read(path)
+            target.mkdir(exist_ok=True)
+            try:
+                check_output(target / path.name, photograph)
+            except ValueError:
+                if number == 0 and is_new:
+                    target.rmdir()
+                raise
+            if number == 0:
+                record_written(target, written | {path.name for path in paths})
+            edited = torch.from_numpy(edit(rows)).permute(2, 0, 1)[None]
+            write_photograph(photograph.with_pixels(edited), target / path.name)
+    return len(paths)

@@ -1,0 +1,212 @@
+"""Options shared by several commands, in units familiar to photographers.
+
+Modules of commands import torch only inside the functions that run, so that help, lists and errors in options appear
+at once.
+"""
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+
+from nlfilter_torch.photo.declared.declaration import FILTER_PANEL, GAINS, MAX_SLIDERS, UNITS, Parameter
+
+if TYPE_CHECKING:
+    from nlfilter_torch.photo.io.photographs import Depth
+
+FILES_PANEL = "Files and memory"  # section in the help
+LEVELS = 255.0  # grey levels between black and white, whatever the depth of the file
+
+
+FileDepth = Literal["8", "16", "float"]  # what a channel of the output file holds
+DEPTHS: dict[FileDepth, "Depth"] = {"8": "uint8", "16": "uint16", "float": "float32"}
+
+
+NOTE = "nlfilter-torch: note: "  # begins every note on standard error
+
+
+def note(sentence: str) -> None:
+    """Print a note on standard error."""
+    typer.echo(f"{NOTE}{sentence}", err=True)
+
+
+def parse_sliders(text: str, option: str) -> tuple[float, ...]:
+    """Parse sliders separated by commas.
+
+    >>> parse_sliders("3, 3,4,1.05", "--alpha")
+    (3.0, 3.0, 4.0, 1.05)
+    """
+    try:
+        numbers = [float(part) for part in text.split(",")]
+    except ValueError:
+        raise ValueError(f"{option} must be numbers separated by commas, such as 3,3,4,1.05, got {text!r}") from None
+    if not all(map(math.isfinite, numbers)):
+        raise ValueError(f"{option} must be finite numbers, such as 3,3,4,1.05, got {text!r}")
+    if len(numbers) < 2:
+        raise ValueError(f"{option} must have at least two numbers, such as 3,3,4,1.05, got {text!r}")
+    if len(numbers) > MAX_SLIDERS:
+        raise ValueError(f"{option} must have at most {MAX_SLIDERS} numbers, got {len(numbers)}; drop some")
+    if max(map(abs, numbers)) > GAINS[1]:
+        raise ValueError(
+            f"{option} must be numbers from {GAINS[0]:.0f} to {GAINS[1]:.0f}, such as 3,3,4,1.05, got {text!r}"
+        )
+    return tuple(numbers)
+
+
+def parse_number(text: str, parameter: Parameter) -> float | str:
+    """Parse the value of an option that takes a positive number, or one of the parameter's words.
+
+    >>> from nlfilter_torch.photo.declared.parameters import EDITS
+    >>> [parse_number(text, EDITS["detail"]["bandwidth"]) for text in ("51", "auto")]
+    [51.0, 'auto']
+    """
+    if text in parameter.words:
+        return text
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    name, unit = f"--{parameter.name.replace('_', '-')}", UNITS[parameter.unit][0]
+    words = "".join(f", or {word}" for word in parameter.words)
+    if not 0 < value < math.inf:
+        raise ValueError(f"{name} must be a positive number of {unit}, such as 20{words}, got {text!r}")
+    if not parameter.low <= value <= parameter.high:
+        raise ValueError(
+            f"{name} must be from {parameter.low:g} to {parameter.high:.0f} {unit}{words}, got {text!r}; "
+            "20 suits most photographs"
+        )
+    return value
+
+
+def check_odd(value: int, parameter: Parameter) -> None:
+    """Raise ValueError unless the value of an option is odd and positive; its upper limit is checked by typer."""
+    if value < 1 or value % 2 == 0:
+        nearest = min(abs(value) // 2 * 2 + 1, int(parameter.high))
+        raise ValueError(f"--{parameter.name.replace('_', '-')} must be odd and at least 1, got {value}; try {nearest}")
+
+
+Source = Annotated[str, typer.Argument(metavar="IN", help="The photograph: a PNG, JPEG, TIFF, WebP or AVIF file.")]
+Seed = Annotated[
+    int,
+    typer.Option(
+        min=0,
+        max=2**63 - 1,
+        metavar="N",
+        help="Random seed: the same seed gives the same picture again, another seed a variation of it.",
+        rich_help_panel=FILTER_PANEL,
+    ),
+]
+Target = Annotated[
+    str,
+    typer.Argument(
+        metavar="OUT",
+        help="The edited photograph; its extension (.png, .jpg, .tif, .webp, .avif) selects the file type.",
+    ),
+]
+OutputDepth = Annotated[
+    FileDepth | None,
+    typer.Option(
+        help="Bits per channel of the output, or floats (TIFF only). Default: as in the input.",
+        rich_help_panel=FILES_PANEL,
+    ),
+]
+Memory = Annotated[
+    float | None,
+    typer.Option(
+        metavar="GB",
+        help="Memory limit in gigabytes, in addition to 0.3 for the program itself. A photograph that needs more is "
+        "processed in tiles, without seams. Default: a fifth of the machine's memory, but at most 2, or 1 in tiles.",
+        rich_help_panel=FILES_PANEL,
+    ),
+]
+Full = Annotated[
+    bool,
+    typer.Option(
+        "--full",
+        help="In tiles: compute statistics from every pixel instead of a sample. Takes two or three times as long.",
+        rich_help_panel=FILES_PANEL,
+    ),
+]
+
+
+Workers = Annotated[
+    int | None,
+    typer.Option(
+        min=1,
+        metavar="N",
+        help="With zarr arrays as IN and OUT: filter and write their parts by this many processes instead of threads.",
+    ),
+]
+ADDRESS = "address of a Dask cluster, such as tcp://host:8786, or Ray cluster, such as ray://host:10001, whose workers"
+ON_CLUSTER = "They have one thread each and see the folders under the same names. Needs the extra cluster or ray."
+Cluster = Annotated[
+    str | None,
+    typer.Option(
+        metavar="ADDRESS",
+        help=f"With zarr arrays as IN and OUT: the {ADDRESS} filter and write their parts. {ON_CLUSTER}",
+    ),
+]
+
+
+def _file(name: str, help: str) -> Any:
+    """An option for a file."""
+    return Annotated[Path | None, typer.Option(name, metavar="FILE", help=help)]
+
+
+def _rectangles(name: str, metavar: str, help: str) -> Any:
+    """An option for rectangles, which may be given several times."""
+    return Annotated[list[str] | None, typer.Option(name, metavar=metavar, help=help)]
+
+
+StrokesFile = _file(
+    "--strokes",
+    "Scribbles on the photograph: a PNG, TIFF or WebP picture of its size, transparent where nothing is drawn.",
+)
+ColourRegions = _rectangles(
+    "--region",
+    "X,Y,W,H:COLOUR",
+    "A rectangle of colour, instead of scribbles or on top of them: column and row of its upper left corner, width and "
+    "height, in pixels or in % of the photograph, and a colour such as red or #c04020; X,Y alone is a small square "
+    "around that point. May be repeated; later rectangles cover earlier ones.",
+)
+Keeps = _rectangles("--keep", "X,Y,W,H", "A rectangle; everything that resembles it stays unchanged. May be repeated.")
+Regions = _rectangles(
+    "--region",
+    "X,Y,W,H",
+    "A rectangle: column and row of its upper left corner, width and height, in pixels or in % of the photograph; X,Y "
+    "alone is a small square around that point. May be repeated.",
+)
+Backgrounds = _rectangles(
+    "--background",
+    "X,Y,W,H",
+    "A rectangle of the background, where too much is selected. May be repeated.",
+)
+SliderRegions = _rectangles(
+    "--region",
+    "X,Y,W,H[:SLIDERS]",
+    "Edit only what resembles a rectangle: column and row of its upper left corner, its width and height, and its own "
+    "sliders if they differ from --alpha, such as 60,300,20,20:3,3,4,1. May be repeated.",
+)
+MaskFile = _file(
+    "--mask",
+    "A picture of the same size as the photograph, white where selected and black elsewhere. Pixels darker than middle "
+    "grey are not selected.",
+)
+_LOOK_MASK = "A grey picture of the size of the photograph, white in the region of one look. May be repeated."
+Masks = Annotated[list[Path] | None, typer.Option("--mask", metavar="FILE", help=_LOOK_MASK)]
+MasksOfPairs = Annotated[
+    list[Path] | None,
+    typer.Option(
+        "--mask",
+        metavar="FILE",
+        help=f"{_LOOK_MASK} For folders of photographs, a folder of such pictures under the same names.",
+    ),
+]
+NoiseMap = _file(
+    "--map", "Also write a picture of the standard deviation of the noise at every pixel; white is 64 grey levels."
+)
+Show = _file(
+    "--show",
+    "Picture to write before the edit: the photograph, reduced, with the scribbles and the selected area marked on it.",
+)

@@ -1,0 +1,133 @@
+"""Tiles computed by worker processes, which write them to a zarr array: the last part of an edit of a large picture.
+
+The edit is fitted in one process. The result, a :class:`~nlfilter_torch.photo.tiled.tiles.Tiling`, is written to a file
+in the folder of the new array. A worker reads it, opens the picture and the array, computes some rows, and writes the
+chunks that they make up. Rows that a dead worker had begun are computed again by another one. Workers need to see the
+folders under the same names; pixels do not pass through the process that fits.
+"""
+
+import pickle
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import gettempdir
+from typing import Any
+
+from nlfilter_torch.photo.cli.workers import DEATHS, Workers, is_death, worker_pool
+from nlfilter_torch.photo.io.rows import ZarrRows, write_band, zarr_package
+from nlfilter_torch.photo.io.writing import claimed, part_beside
+from nlfilter_torch.photo.tiled.pictures import RowSource
+from nlfilter_torch.photo.tiled.tiles import Tiling
+
+TASK_PIXELS = 1 << 20  # that a worker computes before it is given others, if there are enough of them
+TASKS = 4  # per worker at least, so that they end at about the same time
+STRIP = 32  # rows of a chunk of an array between two steps
+JOB = "tiling.pickle"  # in the folder of an array that is being written
+
+
+@dataclass(frozen=True)
+class ZarrProcesses:
+    """Worker processes of joblib.
+
+    Attributes:
+        workers: processes that joblib's calls run in.
+        cluster: address of their cluster; None is this machine.
+    """
+
+    workers: Workers
+    cluster: str | None = None
+
+    @property
+    def on_this_machine(self) -> int:
+        """Number of processes that share the memory of this machine."""
+        return self.workers.number if self.cluster is None else 0
+
+    def fill(self, tiling: Tiling, path: Path) -> None:
+        """Compute rows and write them to the zarr array in a folder.
+
+        Raises:
+            ChildProcessError: if workers keep dying.
+        """
+        import cloudpickle
+
+        tiling.part(0, 1)  # computes what is computed once, such as sums over the picture
+        path = path.absolute()
+        with (path / JOB).open("wb") as stream:
+            cloudpickle.dump(tiling, stream)
+        height, chunk = tiling.picture.size[0], zarr_package().open_array(path, mode="r").chunks[0]
+        shares = min(TASK_PIXELS // (chunk * tiling.picture.size[1]), height // (chunk * TASKS * self.workers.number))
+        rows = chunk * max(1, shares)
+        done, report = 0, tiling.passes.report
+        report(tiling.stage, 0, height)
+        for part, comparisons in self._outcomes(
+            path, [range(k, min(k + rows, height)) for k in range(0, height, rows)]
+        ):
+            done += len(part)
+            report(tiling.stage, done, height)
+            tiling.note(comparisons)
+        (path / JOB).unlink()
+
+    @contextmanager
+    def stored(self, tiling: Tiling, folder: Path | None) -> Iterator[RowSource]:
+        """Compute rows and store them in a temporary array in a folder that the workers see."""
+        values, _ = tiling.part(0, 1)
+        height, width = tiling.picture.size
+        with part_beside((folder or Path(gettempdir())) / "steps.zarr") as beside:
+            zarr_package().create_array(
+                store=beside,
+                shape=(height, width, values.shape[2]),
+                chunks=(min(STRIP, height), width, values.shape[2]),
+                dtype=values.dtype,
+                compressors=None,
+            )
+            with claimed(beside):
+                self.fill(tiling, beside)
+                yield ZarrRows(beside)
+
+    def _outcomes(self, path: Path, parts: list[range]) -> Iterator[tuple[range, list[Any]]]:
+        """Each range of rows as it is finished, with results for :meth:`Tiling.note`."""
+        from joblib import delayed
+
+        waiting, deaths = dict.fromkeys(parts), 0
+        while waiting:
+            calls = [delayed(compute)(path, part) for part in waiting]
+            try:
+                with closing(self.workers.run(calls)) as ended:
+                    for part, comparisons in ended:
+                        del waiting[part]
+                        deaths = 0
+                        yield part, comparisons
+            except Exception as error:
+                if not is_death(error):
+                    raise
+                deaths += 1
+                if deaths == DEATHS or type(error).__name__ == "KilledWorker":  # Dask has tried several workers
+                    raise ChildProcessError(
+                        f"the processes that worked on the rows from {next(iter(waiting)).start} on died, one after "
+                        "the other; leave them more memory, by fewer --workers or a smaller --memory"
+                    ) from error
+
+
+def compute(path: Path, rows: range) -> tuple[range, list[Any]]:
+    """Compute some rows and write them to the array in a folder, chunk by chunk; runs in a worker."""
+    if not (path / JOB).exists():
+        raise ValueError(
+            f"{path.parent} must be seen by all workers under this name, but one of them finds no file {JOB} there; "
+            "share the folder"
+        )
+    with (path / JOB).open("rb") as stream:
+        tiling: Tiling = pickle.load(stream)
+    array, found = zarr_package().open_array(path, mode="r+"), []
+    for start in range(rows.start, rows.stop, array.chunks[0]):
+        values, comparisons = tiling.part(start, min(start + array.chunks[0], rows.stop))
+        write_band(array, start, values)
+        found += comparisons
+    return rows, found
+
+
+@contextmanager
+def zarr_processes(workers: int | None, cluster: str | None) -> Iterator[ZarrProcesses]:
+    """Processes on this machine, or those of a cluster."""
+    with worker_pool(cluster, workers or 1, 1) as pool:
+        yield ZarrProcesses(pool, cluster)

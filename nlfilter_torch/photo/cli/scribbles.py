@@ -1,0 +1,279 @@
+"""Scribbles, masks and rectangles on a photograph, from the options of a command, as rows."""
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar, Self
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from PIL import ImageColor
+from torch import Tensor
+
+from nlfilter_torch.photo.cli.options import parse_sliders
+from nlfilter_torch.photo.declared.steps import Step
+from nlfilter_torch.photo.io.photographs import check_depth
+from nlfilter_torch.photo.io.rows import StoredPicture
+from nlfilter_torch.photo.tiled.pictures import LazyRows, Picture, mask_of, transparency
+
+Size = tuple[int, int]  # (height, width) of the photograph
+Open = Callable[[Path], StoredPicture]  # opens a picture of scribbles or a mask
+Floats = NDArray[np.float32]
+SELECTED = 0.5  # brightness from which a mask selects a pixel: the borders of soft masks fade to 0 far outside
+DOT_SIZE = 0.03  # side of the square around a point, as a share of the short side
+
+
+@dataclass(frozen=True)
+class Rectangle:
+    """A rectangle in a photograph, and the text after its colon."""
+
+    rows: slice
+    columns: slice
+    note: str | None
+
+    @staticmethod
+    def parse(text: str, option: str, size: tuple[int, int]) -> "Rectangle":
+        """Parse ``X,Y,W,H``, or ``X,Y`` for a small square around a point, both optionally with ``:NOTE``.
+
+        Numbers are in pixels, or with a percent sign relative to the width (X, W) or height (Y, H) in ``size``.
+
+        >>> Rectangle.parse("2,3,4,5:red", "--region", (20, 30))
+        Rectangle(rows=slice(3, 8, None), columns=slice(2, 6, None), note='red')
+        >>> str(Rectangle.parse("50%,25%,4,10%", "--region", (20, 30))), str(Rectangle.parse("50%,0%", "", (90, 120)))
+        ('15,5,4,2', '59,0,3,3')
+        """
+        numbers, colon, note = text.partition(":")
+        try:
+            lengths = [size[1 - i % 2] for i in range(4)]
+            parts = numbers.split(",")
+            found = [_pixels(part, length) for part, length in zip(parts, lengths[: len(parts)], strict=True)]
+            point = found if len(found) == 2 else [0]
+            if len(found) == 2:
+                side = max(1, round(DOT_SIZE * min(size)))
+                found = [min(max(int(at) - side // 2, 0), n - side) for at, n in zip(found, lengths, strict=False)]
+                found += [side, side]
+            x, y, width, height = (math.floor(number) for number in found)
+        except ValueError:
+            raise ValueError(
+                f"{option} must be four whole numbers X,Y,W,H, such as 40,60,20,20, got {text!r}; percentages "
+                "such as 25% and a point X,Y are accepted too"
+            ) from None
+        if not all(0 <= at <= length for at, length in zip(point, lengths, strict=False)):
+            raise ValueError(
+                f"{option} must be a point in the photograph, which is {size[1]} pixels wide and {size[0]} high, got "
+                f"{text!r}; move it"
+            )
+        if width < 1 or height < 1:
+            raise ValueError(f"{option} must be at least 1 pixel wide and high, got {width}x{height} in {text!r}")
+        if x < 0 or y < 0 or x + width > size[1] or y + height > size[0]:
+            raise ValueError(
+                f"{option} must lie within the photograph, which is {size[1]} pixels wide and {size[0]} high, got "
+                f"columns {x} to {x + width - 1} and rows {y} to {y + height - 1} in {text!r}; move or shrink it"
+            )
+        return Rectangle(slice(y, y + height), slice(x, x + width), note if colon else None)
+
+    def __str__(self) -> str:
+        """``X,Y,W,H`` in pixels."""
+        rows, columns = self.rows, self.columns
+        return f"{columns.start},{rows.start},{columns.stop - columns.start},{rows.stop - rows.start}"
+
+
+def _pixels(text: str, length: int) -> float:
+    """Parse a number of pixels or a percentage of a length."""
+    text = text.strip()
+    if not text.endswith("%"):
+        return int(text)
+    value = float(text[:-1]) * length / 100  # in this order, whole numbers of pixels are exact
+    if not math.isfinite(value):
+        raise ValueError(text)
+    return value
+
+
+@dataclass(frozen=True)
+class Overlay(ABC):
+    """Scribbles or masks over a photograph, as rows (h, W, S): a picture of its size, and rectangles on top.
+
+    Attributes:
+        shape: (H, W, S).
+        picture: the picture, or None.
+        rectangles: with the channels that each sets, and their values.
+    """
+
+    shape: tuple[int, int, int]
+    picture: Picture | None
+    rectangles: list[tuple[Rectangle, slice, list[float]]]
+    dtype = np.dtype(np.float32)
+    marked: ClassVar[int]  # channel that is above 0 where something is marked
+    empty: ClassVar[str]  # end of the error for a picture in which nothing is marked
+
+    @abstractmethod
+    def _of_picture(self, rows: slice, picture: Picture) -> Floats:
+        """Rows of the picture without the rectangles."""
+
+    def __getitem__(self, rows: slice) -> Floats:
+        """The rows from ``rows.start`` to ``rows.stop``."""
+        found = np.zeros((rows.stop - rows.start, *self.shape[1:]), self.dtype)
+        if self.picture is not None:
+            found = self._of_picture(rows, self.picture)
+        for rectangle, channels, values in self.rectangles:
+            top, bottom = (max(row - rows.start, 0) for row in (rectangle.rows.start, rectangle.rows.stop))
+            found[top:bottom, rectangle.columns, channels] = values
+        return found
+
+    def checked(self) -> Self:
+        """Return this overlay; raise ValueError if nothing is marked in its picture."""
+        if self.picture is not None and not self._any(lambda weights: weights != 0):
+            raise ValueError(f"{self.picture.name} is {self.empty}")
+        return self
+
+    def _any(self, holds: Callable[[Floats], NDArray[np.bool_]]) -> bool:
+        """Whether a condition holds for the mark of a pixel of the picture."""
+        picture = self.picture
+        assert picture is not None  # for mypy
+        return LazyRows(self.shape[:2], lambda rows: holds(self._of_picture(rows, picture)[..., self.marked])).any()
+
+    def at_once(self) -> Tensor:
+        """All rows, as planes (1, S, H, W)."""
+        return torch.from_numpy(self[slice(0, self.shape[0])]).permute(2, 0, 1)[None].contiguous()
+
+
+class Regions(Overlay):
+    """Masks of regions; the picture is the first of them."""
+
+    marked, empty = 0, "darker than middle grey everywhere; paint the selected area white"
+
+    def _of_picture(self, rows: slice, picture: Picture) -> Floats:
+        weights = np.zeros((rows.stop - rows.start, *self.shape[1:]), self.dtype)
+        tile = picture.tile(rows.start, rows.stop, 0)
+        painted = mask_of(tile)[0, 0].float().numpy()
+        weights[..., 0] = np.where(painted < SELECTED, 0, painted)
+        return weights
+
+
+class Strokes(Overlay):
+    """Coloured scribbles: RGB and their mask, in four channels."""
+
+    marked, empty = 3, "transparent everywhere; draw at least one scribble"
+    opaque: ClassVar[str] = (
+        "has no transparency, so every pixel would count as a scribble; "
+        "draw on a transparent layer and save only that layer"
+    )
+
+    def checked(self) -> Self:
+        """Return these scribbles; raise ValueError if their picture has none, or they cover all of it."""
+        if super().checked().picture is not None and not self._any(lambda opacity: opacity == 0):
+            raise ValueError(f"{self.picture.name} {self.opaque}")  # type: ignore[union-attr]
+        return self
+
+    def _of_picture(self, rows: slice, picture: Picture) -> Floats:
+        tile = picture.tile(rows.start, rows.stop, 0)
+        colours = tile.pixels[0].expand(3, -1, -1).permute(1, 2, 0)  # a grey picture has one channel
+        return np.concatenate([colours.to(torch.float32), transparency(tile, "float32")], axis=2)
+
+
+def of_edit(step: Step, size: Size, given: Mapping[str, Any], read: Open) -> tuple[tuple[Any, ...], dict[str, Any]]:
+    """Read scribbles and masks from the options of an edit; as in :func:`scribbles_of`, but sources of rows."""
+    mask, regions = given.get("mask"), given.get("region")
+    if step.edit in ("recolor", "colorize"):
+        keep = selection(size, None, given.get("keep"), "--keep", read)
+        strokes = _strokes(size, given.get("strokes"), regions, read)
+        return (strokes, None), {} if keep is None else {"keep": keep}
+    if step.edit == "defocus":
+        focus = selection(size, mask, regions, "--region", read)
+        if focus is None:
+            raise ValueError(
+                "give --region X,Y,W,H or --mask FILE to mark what stays sharp, such as --region 190,60,60,60"
+            )
+        background = selection(size, None, given.get("background"), "--background", read)
+        return (focus,), {} if background is None else {"background": background}
+    if step.edit != "detail" or (mask is None and not regions):
+        return (), {}
+    masks, sliders = _slider_regions(size, mask, regions, torch.tensor(step["alpha"]), read)
+    return (masks,), {"alpha": sliders}
+
+
+def at_once(scribbles: tuple[Any, ...], named: dict[str, Any]) -> tuple[tuple[Tensor, ...], dict[str, Any]]:
+    """Convert the result of :func:`of_edit` to tensors."""
+    planes = [rows.at_once() for rows in scribbles if rows is not None]
+    if scribbles and isinstance(scribbles[0], Strokes):
+        planes = list(planes[0].split([3, 1], dim=1))
+    return tuple(planes), {name: v.at_once() if isinstance(v, Overlay) else v for name, v in named.items()}
+
+
+def _strokes(size: Size, path: Path | None, regions: list[str] | None, read: Open) -> Strokes:
+    """Read coloured scribbles from ``--strokes`` and ``--region``."""
+    if path is None and not regions:
+        raise ValueError("give --strokes FILE or --region X,Y,W,H:COLOUR, such as --region 40,60,20,20:red")
+    rectangles = []
+    for text in regions or []:
+        rectangle = Rectangle.parse(text, "--region", size)
+        if rectangle.note is None:
+            raise ValueError(f"--region must end in a colour, such as {text}:red, got {text!r}")
+        try:
+            *colour, opacity = (*ImageColor.getrgb(rectangle.note), 255)[:4]
+            if max(*colour, opacity) > 255:
+                raise ValueError(rectangle.note)
+        except ValueError:
+            raise ValueError(
+                "--region must end in a colour, such as red, #c04020 or rgb(192,64,32), "
+                f"got {rectangle.note!r} in {text!r}"
+            ) from None
+        if opacity < 255:
+            raise ValueError(
+                f"--region must end in an opaque colour, got {rectangle.note!r} in {text!r}; leave out its last part"
+            )
+        rectangles.append((rectangle, slice(None), [*(torch.tensor(colour) / 255).tolist(), 1.0]))
+    return Strokes((*size, 4), _picture(size, path, read, transparent=True), rectangles).checked()
+
+
+def selection(size: Size, path: Path | None, texts: list[str] | None, option: str, read: Open) -> Regions | None:
+    """Read a single region from a mask file and the rectangles of an option, or return None if neither is given."""
+    rectangles = []
+    for text in texts or []:
+        rectangle = Rectangle.parse(text, option, size)
+        if rectangle.note is not None:
+            raise ValueError(f"{option} must be X,Y,W,H only, got {text!r}; drop the colon and what follows it")
+        rectangles.append((rectangle, slice(None), [1.0]))
+    if path is None and not rectangles:
+        return None
+    return Regions((*size, 1), _picture(size, path, read), rectangles).checked()
+
+
+def _slider_regions(
+    size: Size, path: Path | None, texts: list[str] | None, alpha: Tensor, read: Open
+) -> tuple[Regions, Tensor]:
+    """Read K regions and their sliders (K, k+1) from ``--mask`` and ``--region``, of which at least one is given.
+
+    The mask, and rectangles without their own sliders, have the sliders ``alpha`` (k+1,).
+    """
+    rectangles, sliders = [], [] if path is None else [alpha]
+    for text in texts or []:
+        rectangle = Rectangle.parse(text, "--region", size)
+        own = alpha if rectangle.note is None else torch.tensor(parse_sliders(rectangle.note, "--region"))
+        if len(own) != len(alpha):
+            raise ValueError(
+                f"--region must have as many sliders as --alpha, {len(alpha)}, got {len(own)} in {text!r}; "
+                "add or drop some"
+            )
+        rectangles.append((rectangle, slice(len(sliders), len(sliders) + 1), [1.0]))
+        sliders.append(own)
+    return Regions((*size, len(sliders)), _picture(size, path, read), rectangles).checked(), torch.stack(sliders)
+
+
+def _picture(size: Size, path: Path | None, read: Open, *, transparent: bool = False) -> Picture | None:
+    """Open a picture over a photograph; raise ValueError unless it has its size and, if needed, transparency."""
+    if path is None:
+        return None
+    stored = read(path)
+    check_depth(path, stored.rows.dtype)
+    found = stored.shape[:2]
+    if found != size:
+        raise ValueError(
+            f"{path} must be as large as the photograph, {size[1]}x{size[0]}, but is {found[1]}x{found[0]}; resize it"
+        )
+    if transparent and not stored.alpha:
+        raise ValueError(f"{path} {Strokes.opaque}")
+    return Picture(stored.rows, str(path))

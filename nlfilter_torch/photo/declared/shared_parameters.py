@@ -1,0 +1,262 @@
+"""Parameters shared by several edits, functions that declare common kinds of parameters, and the look."""
+
+from typing import Any
+
+from nlfilter_torch.photo.declared.declaration import (
+    BANDWIDTHS,
+    DISTANCES,
+    FILTER_PANEL,
+    GAINS,
+    MAX_LANDMARKS,
+    MAX_PATCH,
+    Edit,
+    Parameter,
+    Slider,
+    Unit,
+)
+from nlfilter_torch.photo.declared.shading import LANDMARKS, LEVELS, NEAR
+
+ALIKE = "How much two places may differ and still count as similar"
+#: Arguments of the filter of an edit.
+FILTER = ("photometric_bandwidth", "spatial_bandwidth", "patch_size", "num_landmarks", "landmarks")
+
+
+def number(name: str, default: Any, help: str, ends: tuple[float, float], unit: Unit = "", **more: Any) -> Parameter:
+    """Declare a number within a range."""
+    return Parameter(name, "number", default, help, *ends, unit, **more)
+
+
+def gain(name: str, default: float | None, help: str, **more: Any) -> Parameter:
+    """Declare a factor."""
+    return number(name, default, help, GAINS, "gain", domain="finite", per_image=True, **more)
+
+
+def sliders(name: str, default: tuple[float, ...] | None, help: str, unit: Unit = "gain", **more: Any) -> Parameter:
+    """Declare a list of numbers."""
+    return Parameter(name, "sliders", default, help, *GAINS, unit, **more)
+
+
+def choice(name: str, choices: tuple[str, ...], help: str) -> Parameter:
+    """Declare a choice among words, the first by default."""
+    return Parameter(name, "choice", choices[0], help, domain="choice", choices=choices)
+
+
+def filter_parameters(
+    *,
+    bandwidth: Any = None,
+    share: float = 0.0,
+    patch_size: int = 5,
+    landmarks: int = 100,
+    auto: bool = False,
+    far: bool = False,
+) -> tuple[Parameter, ...]:
+    """Declare the filter parameters of an edit, with its defaults; ``far`` allows ``"none"`` as spatial bandwidth."""
+    levels = f"{ALIKE}, in grey levels from 0 to 255. Small values (5) affect fine texture only, large ones (40) treat "
+    photometric = number(
+        "bandwidth",
+        bandwidth,
+        levels + ("much as detail. `auto` estimates it from the picture." if auto else "wide areas as one."),
+        BANDWIDTHS,
+        "levels",
+        words=("auto",) if auto else (),
+        optional=bandwidth is None,
+        argument="photometric_bandwidth",
+        panel=FILTER_PANEL,
+    )
+    reach = "no limit" if share == 0 else f"{share:.2g} of the short side"
+    if far:
+        reach += ". `none`: distance is ignored, and large areas of light and dark count as detail too"
+    return (
+        photometric,
+        number(
+            "spatial_bandwidth",
+            None,
+            f"How far apart two places may be and still count as similar. Default: {reach}.",
+            DISTANCES,
+            "px",
+            words=("none",) if far else (),
+            optional=True,
+            share=share,
+            panel=FILTER_PANEL,
+        ),
+        Parameter(
+            "patch_size",
+            "odd",
+            patch_size,
+            "Width of the compared patch around each pixel, an odd number. 1 compares single pixels.",
+            1,
+            MAX_PATCH,
+            "px",
+            panel=FILTER_PANEL,
+        ),
+        Parameter(
+            "landmarks",
+            "count",
+            landmarks,
+            "Number of typical patches that represent the whole picture. More are more accurate, but slower, and need "
+            "more memory.",
+            1,
+            MAX_LANDMARKS,
+            argument="num_landmarks",
+            metavar="N",
+            panel=FILTER_PANEL,
+        ),
+        Parameter(
+            "sampling",
+            "choice",
+            "kmeans",
+            "How the typical patches are chosen: by grouping similar ones, on a regular grid, or at random.",
+            choices=("kmeans", "uniform", "random"),
+            argument="landmarks",
+            panel=FILTER_PANEL,
+        ),
+    )
+
+
+#: Filter parameters of the edits of brightness that separate shading from detail.
+WITHOUT_SHADING = filter_parameters(bandwidth=LEVELS, share=NEAR, landmarks=LANDMARKS, auto=True, far=True)
+#: For all edits of brightness.
+LIMITS = choice(
+    "limits",
+    ("soft", "none"),
+    "Limits of brightening and darkening: `soft` keeps detail in highlights and shadows, `none` lets them clip.",
+)
+#: For all edits of brightness.
+VIEWING_SIZE = number(
+    "viewing_size",
+    1.5,
+    "Size at which the picture is viewed, in megapixels, so that the sliders have the same effect at any resolution. "
+    "In larger photographs, patches and lengths are measured in pixels at that size. 0: the size of the file.",
+    (0, 1e6),
+    domain="not negative",
+    zero_meaning="pass 0 for the size of the image",
+    metavar="MEGAPIXELS",
+    panel=FILTER_PANEL,
+)
+#: For all edits that select objects.
+TOLERANCE = number(
+    "tolerance",
+    8.0,
+    "How much two colours may differ and still count as similar, in units of CIE Lab.",
+    (1, 100),
+    "lab",
+    argument="photometric_bandwidth",
+    panel=FILTER_PANEL,
+)
+#: For all edits that select regions.
+REACH = number(
+    "reach",
+    0.6,
+    "How far a region spreads to less similar areas. 0 stays close, 0.95 goes far.",
+    (0, 0.999),
+    domain="below 1",
+    metavar="0...1",
+    panel=FILTER_PANEL,
+    per_image=True,
+)
+REACH_SLIDER = Slider("Reach of the region", 0, 0.95, 0.05)
+
+
+def reach_of_time(time: float) -> float:
+    """Convert a diffusion time, as in files of former versions, to a reach; the defaults, 1 and 0.6, correspond."""
+    return time / (time + 2 / 3) if time > 0 else time
+
+
+KNOTS = 17  # of a tone curve
+SATURATIONS = 5  # that have a factor of their own
+STRAIGHT = tuple(i / (KNOTS - 1) for i in range(KNOTS))
+
+
+def _curve(channel: str) -> Parameter:
+    help = f"Tone curve of {channel}: what it becomes at equal steps from black to white, with commas between."
+    return sliders(channel, STRAIGHT, help, unit="", idle=STRAIGHT, metavar="V,V,...,V")
+
+
+LOOK = Edit(
+    "look",
+    """Put a photograph under a look: tone curves, colours, contrast and details, as another edit had them.
+
+    `nlfilter-torch fit` finds looks from photographs before and after an edit, and `nlfilter-torch apply` takes them.
+
+    Sepia: `nlfilter-torch look in.jpg out.jpg --matrix .39,.77,.19,.35,.69,.17,.27,.53,.13`
+    """,
+    (
+        sliders(
+            "alpha",
+            (1.0, 1.0, 1.0, 1.0),
+            "One slider for each layer of detail, as those of `nlfilter-torch detail`. 1 leaves a layer as it is.",
+            idle=1.0,
+            metavar="A,B,...,Z",
+        ),
+        sliders(
+            "bands",
+            (1.0,) * 7,
+            "Strength of what is finer than 1, 2, 5, 9, 18 and 37 pixels, edges too, and of the rest, around the mean "
+            "brightness. 1 leaves it as it is.",
+            idle=(1.0,) * 7,
+            metavar="A,B,...,G",
+            length=7,
+        ),
+        sliders(
+            "texture",
+            (1.0,) * 6,
+            "Strength of what is finer than 1, 2, 5, 9, 18 and 37 pixels where brightness varies little: surfaces, not "
+            "edges. 1 leaves it as it is.",
+            idle=(1.0,) * 6,
+            metavar="A,B,...,F",
+            length=6,
+        ),
+        _curve("red"),
+        _curve("green"),
+        _curve("blue"),
+        sliders(
+            "matrix",
+            (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0),
+            "Three rows of three numbers: how much red, green and blue of the photograph goes into each.",
+            unit="",
+            idle=(1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0),
+            metavar="RR,RG,...,BB",
+            length=9,
+        ),
+        sliders(
+            "saturation",
+            (1.0,) * SATURATIONS,
+            "How many times as far red, green and blue are to be from the largest of them, as saturation in HSV: a "
+            "factor for each of five equal steps from grey to pure colours. 1 leaves them as they are.",
+            idle=(1.0,) * SATURATIONS,
+            metavar="A,B,...,E",
+        ),
+        sliders(
+            "stretch",
+            (0.0,) * 3,
+            "Automatic levels: how much of the change that stretches brightness from the darkest to the lightest pixel "
+            "to black and white is added: of luminance, of the largest channel with colours in proportion, and of each "
+            "channel for itself. 0 is none.",
+            unit="",
+            idle=(0.0,) * 3,
+            metavar="A,B,C",
+            length=3,
+        ),
+        sliders(
+            "local",
+            (0.0,) * 8,
+            "Local contrast: how much of the change that equalises the histogram around each pixel is added, under "
+            "limits of contrast of 1.5, 2, 3 and 5: four numbers for luminance, four for colours in proportion. 0 is "
+            "none.",
+            unit="",
+            idle=(0.0,) * 8,
+            metavar="A,B,...,H",
+            length=8,
+        ),
+        gain(
+            "amount",
+            1.0,
+            "How much of the look: 0 none, 1 all of it, 2 twice as much.",
+            slider=Slider("Amount", 0, 2, 0.05),
+        ),
+        VIEWING_SIZE,
+        *WITHOUT_SHADING,
+    ),
+    function="apply_look",
+    hint="A look that was found by `nlfilter-torch fit`; load its file, and choose how much of it.",
+)

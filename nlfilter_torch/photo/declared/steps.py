@@ -1,0 +1,217 @@
+"""A step of a recipe: the name of an edit, its parameters and strokes, all of them relative to the picture.
+
+A step is an immutable value that does not depend on the photograph, so that one made on a preview also applies to the
+original. Does not import torch.
+"""
+
+import json
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from nlfilter_torch.photo.declared.declaration import Edit, Parameter, is_within, shown
+from nlfilter_torch.photo.declared.parameters import EDITS
+from nlfilter_torch.photo.declared.shared_parameters import FILTER
+
+if TYPE_CHECKING:
+    from nlfilter_torch.photo.declared.strokes import Stroke
+
+VERSION = 1  # of files of steps
+NONE = (1.0, 1.0, 1.0, 1.0)  # sliders that change nothing
+# Defaults in files of the format without a list of steps, which left out values that change nothing.
+FORMER_DEFAULTS: dict[str, dict[str, Any]] = {"detail": {"alpha": NONE}, "abstract": {"power": 0.0}}
+
+
+@dataclass(frozen=True, init=False)
+class Step:
+    """One step of an edit.
+
+    Attributes:
+        edit: name of the edit, one of :data:`~nlfilter_torch.photo.declared.parameters.EDITS`.
+        strokes: strokes painted for it.
+        values: names and values of the parameters that differ from their defaults, in the order of declaration.
+
+    Example:
+        >>> Step("abstract", edges=1.0)["power"], Step("abstract", power=0.1).values
+        (0.1, ())
+    """
+
+    edit: str
+    strokes: tuple["Stroke", ...]
+    values: tuple[tuple[str, Any], ...]
+
+    def __init__(self, edit: str, strokes: tuple["Stroke", ...] = (), **values: Any) -> None:
+        """Create a step; omitted parameters have their defaults."""
+        declared = EDITS[edit]
+        unknown = values.keys() - {parameter.name for parameter in declared}
+        if unknown:
+            raise TypeError(
+                f"{edit} has no parameter {min(unknown)}; its parameters are {', '.join(p.name for p in declared)}"
+            )
+        given = [(p.name, values[p.name]) for p in declared if p.name in values and values[p.name] != p.default]
+        for name, value in (("edit", edit), ("strokes", strokes), ("values", tuple(given))):
+            object.__setattr__(self, name, value)
+
+    @staticmethod
+    def idle(edit: str) -> "Step":
+        """Return the step that changes nothing, from which the editor starts."""
+        values: dict[str, Any] = {
+            p.name: NONE if p.kind == "sliders" and p.idle == 1 else p.idle for p in EDITS[edit] if p.idle is not ...
+        }
+        return Step(edit, **values)
+
+    def __getitem__(self, name: str) -> Any:
+        """Return the value of a parameter."""
+        return dict(self.values).get(name, EDITS[self.edit][name].default)
+
+    def changed(self, *, strokes: tuple["Stroke", ...] | None = None, **values: Any) -> "Step":
+        """Return a copy with other strokes or parameters."""
+        return Step(self.edit, self.strokes if strokes is None else strokes, **{**dict(self.values), **values})
+
+    @property
+    def declared(self) -> Edit:
+        """Declaration of the edit."""
+        return EDITS[self.edit]
+
+    def painted(self, word: str) -> tuple["Stroke", ...]:
+        """Return the strokes whose paint is the given word; for ``colour``, those with any colour."""
+        return tuple(s for s in self.strokes if s.paint == word or (word == "colour" and s.paint.startswith("#")))
+
+    @property
+    def sliders_inside(self) -> tuple[float, ...]:
+        """Sliders inside the region; by default 1 for each layer."""
+        inside: tuple[float, ...] | None = self["inside"]
+        return inside or (1.0,) * len(self["alpha"])
+
+    def has_region(self) -> bool:
+        """Whether this is a detail step with a region that has sliders of its own."""
+        return self.edit == "detail" and bool(self.painted("in"))
+
+    def changes(self) -> bool:
+        """Whether the step has any effect."""
+        if self.declared.requires_strokes:
+            return bool(self.painted(self.declared.words[0]))
+        acting = [p for p in self.declared if p.idle is not ...]
+        return any(not p.is_idle(self[p.name]) for p in acting) or (
+            self.has_region() and any(slider != 1 for slider in self.sliders_inside)
+        )
+
+    def bytes_per_pixel(self, *, masked: bool = False) -> int:
+        """Memory in bytes needed per pixel of an image; ``masked`` if a region is given by other means than strokes."""
+        names = {parameter.name for parameter in self.declared}
+        if "method" in names and self["method"] == "network":
+            return working_bytes(0, 0)  # its tiles are small
+        landmarks = self["landmarks"] if "landmarks" in names else 0
+        # Patches of 3x3 in colour are as large as those of 5x5 in grey.
+        patch_size = max(self["patch_size"], 5) if "patch_size" in names else 0
+        return working_bytes(landmarks, patch_size, factors=2 if masked or self.has_region() else 1)
+
+    def arguments(self, size: tuple[int, int], stride: float = 1) -> dict[str, Any]:
+        """Return the arguments of the edit's function for an image of that size; see :meth:`Parameter.argument_of`."""
+        return {p.keyword: p.argument_of(self[p.name], size, stride) for p in self.declared if p.is_option}
+
+    def filter_options(self, size: tuple[int, int]) -> dict[str, Any]:
+        """Return the options of :func:`nonlocal_operator` for an image of size (H, W), the viewing size."""
+        found = {name: value for name, value in self.arguments(size).items() if name in FILTER}
+        distance = self.declared["spatial_bandwidth"].distance(found["spatial_bandwidth"], size)
+        return found | {"spatial_bandwidth": distance}
+
+    def to_json(self, indent: str = "", *, complete: bool = False) -> str:
+        """Format the step as a JSON object, with one line for each entry and each stroke.
+
+        Args:
+            indent: indentation of all lines.
+            complete: whether to write defaults, too, so that they can be edited by hand.
+        """
+        entries = [("edit", json.dumps(self.edit))]
+        for parameter in self.declared:
+            value = self[parameter.name]
+            acts = parameter.idle is not ... and not parameter.is_idle(value)
+            if value != parameter.default or acts or (complete and parameter.is_option):
+                entries.append((parameter.name, json.dumps(value)))
+        if self.strokes:
+            strokes = ",\n".join(f"{indent}    {json.dumps(stroke.entries())}" for stroke in self.strokes)
+            entries.append(("strokes", f"[\n{strokes}\n{indent}  ]"))
+        lines = ",\n".join(f'{indent}  "{name}": {value}' for name, value in entries)
+        return f"{indent}{{\n{lines}\n{indent}}}"
+
+    @staticmethod
+    def from_entries(
+        edit: str, entries: Any, place: str, *, whole_file: bool = False, former_format: bool = False
+    ) -> "Step":
+        """Create a step from parsed JSON.
+
+        Args:
+            edit: name of the edit.
+            entries: JSON object of the step.
+            place: description of where it was found, for errors.
+            whole_file: whether the file holds nothing else, so that ``place`` is the file.
+            former_format: whether the file has the former format, without a list of steps.
+
+        Raises:
+            ValueError: if an entry is unknown or invalid.
+        """
+        if not isinstance(entries, dict):
+            raise ValueError(f"{place} must be a JSON object, got {shown(entries)}; correct it")
+        declared, values = EDITS[edit], dict(FORMER_DEFAULTS.get(edit, {})) if former_format else {}
+        strokes: tuple[Stroke, ...] = ()
+        for entry, value in entries.items():
+            if entry == "strokes" and declared.brushes:
+                strokes = _read_strokes(value, declared, place)
+                continue
+            found = _find(declared, entry)
+            if found is None:
+                names = [*(p.name for p in declared), *(["strokes"] if declared.brushes else [])]
+                raise ValueError(f"{place} must have no entries other than {', '.join(names)}, got {entry}; remove it")
+            parameter, factor = found
+            converted = value
+            if is_within(value, -1e300, 1e300) and factor != 1:
+                converted = factor(value) if callable(factor) else value * factor
+            if not parameter.is_valid(converted):
+                where = f"{'in' if whole_file else 'of'} {place}"
+                raise ValueError(f"{entry} {where} must be {parameter.wanted}, got {shown(value)}; correct it")
+            values[parameter.name] = tuple(map(float, converted)) if isinstance(converted, list) else converted
+        step = Step(edit, strokes, **values)
+        if edit == "detail" and len(step.sliders_inside) != len(step["alpha"]):
+            raise ValueError(f"inside of {place} must have as many numbers as alpha; add or drop some")
+        return step
+
+
+def acting_steps(steps: Iterable[Step]) -> tuple[Step, ...]:
+    """The steps that have an effect."""
+    return tuple(step for step in steps if step.changes())
+
+
+def json_of(steps: Iterable[Step], *, complete: bool = False) -> str:
+    """Format steps as JSON, see :meth:`~nlfilter_torch.photo.declared.presets.Recipe.to_json`."""
+    text = ",\n".join(step.to_json("    ", complete=complete) for step in steps)
+    listed = f"[\n{text}\n  ]" if text else "[]"
+    return f'{{\n  "version": {VERSION},\n  "steps": {listed}\n}}\n'
+
+
+def working_bytes(landmarks: int, patch_size: int, *, factors: int = 1) -> int:
+    """Bytes of memory that an edit needs per pixel, slightly more than measured on two megapixels.
+
+    Args:
+        landmarks: M, the number of floats of the factor per pixel.
+        patch_size: p; two copies of the patches exist while they are weighted.
+        factors: number of arrays of the factor's size at once: 1 for filtering, 5 for diagnostics.
+    """
+    return 4 * (factors * landmarks + 2 * patch_size**2 + 40)
+
+
+def _find(declared: Edit, entry: str) -> tuple[Parameter, float | Callable[[float], float]] | None:
+    """Find the parameter with the name of an entry, and the factor or function that converts its value."""
+    for parameter in declared:
+        factors: dict[str, float | Callable[[float], float]] = {parameter.name: 1.0, **dict(parameter.former_names)}
+        if entry in factors:
+            return parameter, factors[entry]
+    return None
+
+
+def _read_strokes(value: Any, declared: Edit, place: str) -> tuple["Stroke", ...]:
+    from nlfilter_torch.photo.declared.strokes import Stroke
+
+    if not isinstance(value, list):
+        raise ValueError(f"strokes of {place} must be a list, got {shown(value)}; correct them")
+    return tuple(Stroke.from_entries(stroke, declared.words, place) for stroke in value)

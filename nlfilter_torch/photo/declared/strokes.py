@@ -1,0 +1,82 @@
+"""Brush strokes as lines with a width.
+
+Coordinates are relative to the picture, so that strokes cover the same part of a preview and of the photograph. Does
+not import torch.
+"""
+
+import re
+import reprlib
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+from nlfilter_torch.photo.declared.declaration import is_within, shown
+
+COLOUR = re.compile(r"#[0-9a-f]{6}", re.IGNORECASE)
+
+
+@dataclass(frozen=True)
+class Stroke:
+    """A line drawn with a round brush.
+
+    Attributes:
+        points: at least one (x, y), as shares of the picture's width and height.
+        radius: radius of the brush, as a share of the picture's short side.
+        paint: meaning of the stroke: a colour ``#rrggbb``, or a word that the edit declares.
+    """
+
+    points: tuple[tuple[float, float], ...]
+    radius: float
+    paint: str
+
+    def entries(self) -> dict[str, Any]:
+        """Return the stroke as a JSON object."""
+        return {"paint": self.paint, "radius": self.radius, "points": [list(point) for point in self.points]}
+
+    @staticmethod
+    def from_entries(value: Any, words: tuple[str, ...], place: str) -> "Stroke":
+        """Create a stroke from a JSON value; ``words`` are the allowed paints, of which ``colour`` allows any colour.
+
+        Raises:
+            ValueError: if ``value`` is no stroke; ``place`` says in the message where it was found.
+        """
+        if not isinstance(value, dict) or set(value) != {"points", "radius", "paint"}:
+            raise ValueError(
+                f"strokes of {place} must have the entries points, radius and paint, got {shown(value)}; correct it"
+            )
+        points, radius, paint = value["points"], value["radius"], value["paint"]
+        if not (isinstance(points, list) and points and all(map(_is_point, points))):
+            raise ValueError(
+                f"points of a stroke in {place} must be pairs of numbers, shares of width and height from -2 to 2, got "
+                f"{shown(points)}; correct them"
+            )
+        if not (is_within(radius, 0, 1) and radius > 0):
+            raise ValueError(f"radius of a stroke in {place} must be in (0, 1], got {shown(radius)}; correct it")
+        is_colour = "colour" in words and isinstance(paint, str) and COLOUR.fullmatch(paint)
+        if not is_colour and (paint not in words or paint == "colour"):
+            wanted = ", ".join("a colour such as #c04020" if word == "colour" else word for word in words)
+            raise ValueError(
+                f"paint of a stroke in {place} must be one of {wanted}, got {reprlib.repr(paint)}; correct it"
+            )
+        return Stroke(tuple((float(x), float(y)) for x, y in points), float(radius), paint)
+
+
+def _is_point(value: Any) -> bool:
+    return isinstance(value, list) and len(value) == 2 and all(is_within(v, -2, 2) for v in value)
+
+
+def thin(points: Iterable[tuple[float, float]], spacing: float) -> tuple[tuple[float, float], ...]:
+    """Drop points that are closer than ``spacing`` to the previous point kept; the last is always kept.
+
+    >>> thin([(0.0, 0.0), (0.01, 0.0), (0.1, 0.0), (0.11, 0.0)], 0.05)
+    ((0.0, 0.0), (0.1, 0.0), (0.11, 0.0))
+    """
+    kept: list[tuple[float, float]] = []
+    last = None
+    for point in points:
+        last = (round(point[0], 4), round(point[1], 4))
+        if not kept or max(abs(last[0] - kept[-1][0]), abs(last[1] - kept[-1][1])) >= spacing:
+            kept.append(last)
+    if last is not None and kept[-1] != last:
+        kept.append(last)
+    return tuple(kept)

@@ -1,0 +1,397 @@
+"""Colouring of a grey photograph from a few strokes of colour. Paper: Sec. V-B, Fig. 16.
+
+Three estimates of the chroma are averaged: the regression on the strokes relates pixels of similar brightness and
+texture, however far apart; two :class:`LocalValues` relate pixels that are connected without an edge between them, with
+two notions of an edge. Their errors are in different places, so that the mean is better than each.
+
+An estimate counts less the farther it is from the other two and the more saturated it is. The regression also counts
+less where no stroke is on similar pixels nearby, and where strokes on similar pixels differ in colour. The estimate by
+relative differences has the fewest large errors, so that the distance of the mean from it is limited. It and the
+regression are compared by predicting the colour of each stroke from other strokes: the smaller the errors of the
+regression are in comparison, and the more strokes there are, the more it counts, and the larger the distance may be.
+
+Shadows and highlights of an object have less chroma than its midtones. The regression therefore extends chroma relative
+to :func:`usual_chroma`, and propagation between neighbours relative to its square root; that by relative differences
+only where this reduces the chroma.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Literal, cast
+
+import torch
+from torch import Tensor
+
+from nlfilter_torch.core.checks import check_count, check_patch_size, check_positive, check_tensor
+from nlfilter_torch.core.precision import per_image
+from nlfilter_torch.filtering.masks import segment
+from nlfilter_torch.filtering.scribbles import fit_strokes
+from nlfilter_torch.operator.features import reduce_channels
+from nlfilter_torch.operator.spectrum import Spectrum
+from nlfilter_torch.photo.declared.parameters import COLORIZE
+from nlfilter_torch.photo.picture.colour import (
+    group_colours,
+    merge_luminance,
+    region_means,
+    split_luminance,
+    with_green,
+)
+from nlfilter_torch.photo.picture.in_memory import edit_of
+from nlfilter_torch.photo.picture.pixels import part_of
+from nlfilter_torch.photo.picture.scribbled_pixels import scribbled_blocks
+from nlfilter_torch.photo.picture.source import Fitted, Guide, Operator, Planes, Source, luminance
+from nlfilter_torch.photo.picture.viewing import Coarse, viewed_size
+from nlfilter_torch.photo.selections.local_values import ABSOLUTE, RELATIVE, Links, LocalValues
+from nlfilter_torch.photo.selections.mask import blocks_of
+from nlfilter_torch.photo.selections.stroke_groups import StrokeGroups
+from nlfilter_torch.photo.selections.texture import TEXTURE_MARGIN, with_texture
+
+Method = Literal["regression", "kmeans"]
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One of several regressions, each on the residual of the strokes' chroma after the previous ones.
+
+    Attributes:
+        spatial: factor of the spatial bandwidth.
+        photometric: factor of the photometric bandwidth.
+        reach: that of :func:`propagate_strokes`.
+        smoothness: that of :func:`propagate_strokes`.
+    """
+
+    spatial: float
+    photometric: float
+    reach: float
+    smoothness: float
+
+
+# These, the defaults of COLORIZE and the constants of LocalValues were chosen on the pictures that benchmarks.colorize
+# names for that and on others, with 6 to 60 random strokes.
+FAR, NEAR = Stage(1.0, 1.0, 0.95, 0.7), Stage(2 / 9, 3.0, 0.9, 0.7)
+BLOCKS = 8  # least number of blocks along the short side whose mean brightness is compared
+SAME_BRIGHTNESS = 1e-3  # mean difference of blocks that hardly counts
+ANISOTROPY, MOST_ANISOTROPY = 2.5, 3.0  # exponent of the ratio of differences, and limit of the resulting ratio
+# With this scale, a difference in brightness between two even areas is also the difference of their guides, whose
+# channels of texture are then 0.
+GUIDE_SCALE = math.sqrt(5 / 2)
+TEXTURE_WEIGHT = 3.0
+LEAST_CHROMA = 0.01  # square of the usual chroma of black and white
+NO_CHROMA = 1e-8  # square of a saturation that cannot be seen; keeps quotients and derivatives finite
+LEAST_SUPPORT = 0.05  # of a pixel by the strokes nearby
+RELATIVE_WEIGHT = 0.5  # factor of the estimate by relative differences
+# In units of the saturation of the strokes, or of its square, so that strokes of half the saturation give half of it.
+SAME_CHROMA = 0.02  # difference of estimates that hardly counts
+FAINT = 1.0  # chroma below which estimates differ little in weight
+LARGE_VARIANCE = 0.45  # of chroma among strokes on similar pixels
+# Limit of the distance of the result from the estimate by relative differences, if this and the regression predict many
+# strokes equally well.
+MOST_CHANGE = 1.6
+SAME_ERROR = 0.13  # squared error of a predicted stroke that hardly counts
+ERROR_EXPONENT, MOST_WEIGHT = 2.0, 3.0  # exponent of the ratio of errors, and limit of the resulting factor
+FEW_STROKES = 5  # number of compared strokes at which the factor is about half of that for many
+
+
+def colorize_guide(image: Tensor) -> Tensor:
+    """Guide of the regression, (B, 5, H, W): brightness, that of the surroundings, and strength of the texture."""
+    brightness = reduce_channels(image, "luminance")
+    return GUIDE_SCALE * with_texture(brightness, brightness, TEXTURE_WEIGHT)
+
+
+@edit_of("grey", channels=1)
+def colorize(
+    source: Source,
+    /,
+    strokes: Tensor,
+    stroke_mask: Tensor,
+    *,
+    method: Method = COLORIZE.defaults["method"],
+    strength: float | Tensor = COLORIZE.defaults["strength"],
+    time: float | Tensor = 1.0,
+    photometric_bandwidth: float | Tensor = COLORIZE.defaults["photometric_bandwidth"],
+    spatial_bandwidth: float | Tensor | None = None,
+    patch_size: int = COLORIZE.defaults["patch_size"],
+    num_landmarks: int = COLORIZE.defaults["num_landmarks"],
+    viewing_size: float = COLORIZE.defaults["viewing_size"],
+    generator: torch.Generator | None = None,
+) -> Fitted:
+    """Colour a grey image from strokes; its luminance is kept.
+
+    Paper: Sec. V-B. ``"regression"`` extends the chroma of the strokes by :func:`propagate_strokes`, first over long
+    distances, then the residual near the strokes. Two estimates by propagation between neighbouring pixels up to edges
+    are blended in. The regression counts more the better it predicts the colour of each stroke from other strokes.
+    Shadows and highlights get less chroma than midtones of the same object. ``"kmeans"`` is the paper's method:
+    :func:`segment_mask` divides the image into one segment per colour.
+
+    Args:
+        grey: (B, 1, H, W) in [0, 1].
+        strokes: (B, 3, H, W), RGB, of which only the chroma is used.
+        stroke_mask: (B, 1, H, W) in [0, 1], above 0 where painted. Grey strokes keep similar pixels grey.
+        method: ``"regression"`` or ``"kmeans"``.
+        strength: for the regression, in [0, 1]: at 1 every pixel is coloured, at 0 pixels similar to no stroke stay
+            grey.
+        time: for k-means, diffusion time t > 0 of the segments.
+        photometric_bandwidth: in units of the image; how much grey levels of one colour may differ. Brightness of the
+            surroundings and texture, if they differ, count as further differences.
+        spatial_bandwidth: in pixels: the geometric mean of the vertical and the horizontal bandwidth. The one along
+            which brightness changes more is smaller, by a factor of at most 3. None is 0.7 of the short side.
+        patch_size: width of the compared patches.
+        num_landmarks: M of the operator.
+        viewing_size: in megapixels; the colours of a larger image are found in its reduction to this size, patches and
+            bandwidths are in pixels of that, and borders between colours follow the image's; 0 is the size of the
+            image.
+        generator: source of randomness for the landmarks; None draws the same for every call.
+
+    Returns:
+        RGB (B, 3, H, W), in [0, 1] where ``grey`` is; chroma is scaled down where the luminance requires it.
+        Differentiable in image, strokes, mask and bandwidths with ``"regression"``, in the strokes only with
+        ``"kmeans"``.
+
+    Raises:
+        TypeError, ValueError: if a tensor has another size, the mask leaves [0, 1], or nothing is painted.
+
+    Example:
+        >>> grey = torch.rand(1, 1, 24, 24, generator=torch.Generator().manual_seed(0)) * 0.2 + 0.1
+        >>> grey[..., 12:] += 0.6
+        >>> strokes, painted = torch.zeros(1, 3, 24, 24), torch.zeros(1, 1, 24, 24)
+        >>> strokes[:, 2, :4, :4], strokes[:, 0, :4, -4:] = 0.8, 0.8  # dark is blue, bright is red
+        >>> painted[..., :4, :4] = painted[..., :4, -4:] = 1
+        >>> colour = colorize(grey, strokes, painted, num_landmarks=50)
+        >>> bool((colour[:, 2] > colour[:, 0])[..., :10].all()), bool((colour[:, 0] > colour[:, 2])[..., 14:].all())
+        (True, True)
+    """
+    if source.whole:  # otherwise they are checked when they are read
+        check_tensor(strokes, "strokes")
+    COLORIZE.check(method=method)
+    if method == "kmeans" and not source.whole:
+        raise ValueError(
+            "method must be regression for a picture processed in tiles, got kmeans, which needs all pixels in memory; "
+            "choose regression, or allow more memory"
+        )
+    COLORIZE.check(source.batch, strength=strength)
+    check_positive(time, "time", source.batch)
+    check_positive(photometric_bandwidth, "photometric_bandwidth", source.batch)
+    if spatial_bandwidth is not None:
+        check_positive(spatial_bandwidth, "spatial_bandwidth", source.batch)
+    check_patch_size(patch_size)
+    check_count(num_landmarks, "num_landmarks")
+    COLORIZE.check(viewing_size=viewing_size)
+    scribbles, viewed = source.scribbles(stroke_mask, strokes, "stroke_mask"), source
+    small = viewed_size(source.size, viewing_size)
+    if small != source.size:
+        viewed = source.resized(small)
+        steps = (source.size[0] / small[0], source.size[1] / small[1])
+        scribbles = blocks_of(scribbles, viewed, source.size, steps)
+    pixels = small[0] * small[1]
+    options = {"patch_size": patch_size, "num_landmarks": min(num_landmarks, pixels), "generator": generator}
+    ratio = viewed.measured(bandwidth_ratio)
+    mean = per_image(COLORIZE["spatial_bandwidth"].distance(spatial_bandwidth, small), ratio, 1)
+    bandwidths = mean / ratio.sqrt(), mean * ratio.sqrt()
+
+    def operator_of(stage: Stage) -> Operator:
+        scaled = {
+            "photometric_bandwidth": stage.photometric * photometric_bandwidth,
+            "spatial_bandwidth": tuple(stage.spatial * bandwidth for bandwidth in bandwidths),
+        }
+        return viewed.operator(Guide(options | scaled, colorize_guide, TEXTURE_MARGIN, 5, spectral=True))
+
+    assert scribbles.colours is not None  # for mypy
+    wanted = split_luminance(scribbles.colours.unsqueeze(2))[1].squeeze(2)  # (B, 3, n)
+    if method == "kmeans":
+        regions, colours, valid = group_colours(wanted.unsqueeze(2), scribbles.weights.unsqueeze(2))
+        planes = scribbles.weighted(regions.squeeze(2)).planes(viewed)
+        pieces = segment(cast(Spectrum, operator_of(FAR).pairs), planes, time, valid)
+        chroma = torch.einsum("bkhw,bkc->bchw", pieces, colours)
+        return _coloured(source, viewed, part_of(chroma[:, ::2]))
+    wanted = wanted[:, ::2]  # green follows from red and blue
+    mean_square = region_means(squared_sum(wanted).unsqueeze(2), scribbles.weights.unsqueeze(2))  # (B, 1, 1)
+    saturation = (mean_square + NO_CHROMA).sqrt()
+    wanted = wanted / saturation
+
+    usual_there = usual_chroma(scribbles.image.unsqueeze(2)).squeeze(2)
+    # Cubed, so that pixels partly covered by the border of a scribble count little; how many there are depends on the
+    # size of the picture.
+    cubed, scaled = scribbles.weights**3, wanted / usual_there.sqrt()
+
+    groups = StrokeGroups.of(scribbles, small)
+
+    def propagated(links: Links, values: Tensor, predicted: Tensor | None = None) -> LocalValues:
+        guide, places = viewed.reduced(luminance, links.step(small)), scribbles.places
+        solved = partial(LocalValues.of, links, guide, small, places, cubed, values, groups, predicted)
+        return viewed.kept(links, [guide, places, cubed, values], solved)
+
+    def interpolated(found: LocalValues, some: Any, own: Tensor) -> Tensor:
+        place = (found.links, some.first, some.image.shape)
+        return viewed.kept(place, [found.values], lambda: found(own, some.first))
+
+    absolute = propagated(ABSOLUTE, scaled)
+    relative = propagated(RELATIVE, torch.cat([scaled, wanted], dim=1), wanted)
+    weights = [scribbles.weights, *groups.weights_without_each(scribbles.weights)]
+    (far, near), residuals = extended(operator_of, scribbles.places, weights, wanted / usual_there, pixels, strength)
+    everywhere = per_image(strength, wanted, 4)
+    regression_weight = factor_of_count(0)
+    if relative.left_out is not None:
+        residual = groups.of_own(residuals[1:]) * usual_there
+        regression_weight = compared(groups, scribbles.weights, residual, wanted, relative.left_out)
+
+    def chroma_of(some: Any) -> Tensor:
+        own = luminance(some)
+        usual = usual_chroma(own)
+        connected, influence = interpolated(absolute, some, own).tensor_split([2], dim=1)
+        around, unscaled = interpolated(relative, some, own)[:, :4].split(2, dim=1)
+        around = limit_saturation(unscaled, around * usual.sqrt())
+        mean, square = far(some).tensor_split([2], dim=1)
+        residual, support = near(some).tensor_split([2], dim=1)
+        variance = (square - squared_sum(mean)) * usual.square()
+        alike = (mean + residual) * usual
+        around = torch.lerp(alike, around, influence + everywhere * (1 - influence))
+        connected = torch.lerp((alike + around) / 2, connected * usual.sqrt(), influence)
+        trust = (support.clamp(min=0.0) + LEAST_SUPPORT) ** 1.5 / (1 + variance.clamp(min=0.0) / LARGE_VARIANCE)
+        factors = regression_weight * trust, influence**2, RELATIVE_WEIGHT
+        change = weighted_mean((alike, connected, around), factors) - around
+        limited = change * (1 + squared_sum(change) / (regression_weight * MOST_CHANGE**2)).rsqrt()
+        return saturation.unsqueeze(3) * (around + limited)
+
+    return _coloured(source, viewed, chroma_of)
+
+
+def usual_chroma(image: Tensor) -> Tensor:
+    """Usual chroma of pixels (B, 1 or 3, H, W) of one colour, (B, 1, H, W): largest halfway from black to white."""
+    own = reduce_channels(image, "luminance")
+    return ((own * (1 - own)).clamp(min=0.0) + LEAST_CHROMA).sqrt()
+
+
+def bandwidth_ratio(source: Source) -> Tensor:
+    """Ratio (B,) of the horizontal to the vertical bandwidth, from changes of brightness at a large scale.
+
+    Where sky, buildings and ground lie above each other, brightness changes more from top to bottom, and so do colours.
+    """
+    step = max(1, min(source.size) // BLOCKS)
+    height, width = (length // step for length in source.size)
+    blocks = source.reduced(luminance, step)[..., :height, :width]  # without those that the border cuts off
+    changes = [blocks.diff(dim=dim).abs().flatten(1) for dim in (2, 3)]
+    down, across = (change.sum(1) / max(1, change.shape[1]) + SAME_BRIGHTNESS for change in changes)
+    return (down / across).pow(ANISOTROPY).clamp(1 / MOST_ANISOTROPY, MOST_ANISOTROPY)
+
+
+def extended(
+    operator_of: Callable[[Stage], Operator],
+    places: Tensor,
+    weights: list[Tensor],
+    wanted: Tensor,
+    pixels: int,
+    strength: float | Tensor,
+) -> tuple[list[Planes], list[Tensor]]:
+    """Extend values by the regressions :data:`FAR` and :data:`NEAR`, for several sets of weights.
+
+    Args:
+        operator_of: the operator of a stage.
+        places: row-major indices of the scribbled pixels, (n,).
+        weights: of the scribbled pixels, for each set (B, 1, n).
+        wanted: values of the scribbled pixels, (B, 2, n).
+        pixels: number of pixels of the picture.
+        strength: of the first regression, see :func:`propagate_strokes`.
+
+    Returns:
+        Results of both stages for the first set: (B, 3, h, W), the values, and as a third channel for FAR their squared
+        sum, from which the variance among strokes on similar pixels follows; for NEAR, the degree to which strokes
+        nearby determine a pixel. For every set, the residuals at the scribbled pixels, (B, 2, n).
+    """
+    residuals = [wanted] * len(weights)
+    planes = []
+    for stage, other in ((FAR, squared_sum(wanted)), (NEAR, torch.ones_like(wanted[:, :1]))):
+        operator = operator_of(stage)
+        columns = operator.at(places)
+        fits = [
+            fit_strokes(
+                partial(scribbled_blocks, [(columns, own, torch.cat([residual, other], dim=1))]),
+                operator.pairs,
+                pixels,
+                strength=strength if stage is FAR else 0.0,
+                reach=stage.reach,
+                smoothness=stage.smoothness,
+            )
+            for own, residual in zip(weights, residuals, strict=True)
+        ]
+        found = [[fitted(block)[:, :2] for fitted in fits] for block in columns()]  # columns are computed once for all
+        residuals = [
+            before - torch.cat(blocks, dim=2)
+            for before, blocks in zip(residuals, zip(*found, strict=True), strict=True)
+        ]
+        planes.append(operator.each(lambda found, fitted=fits[0]: fitted(found.factor)))  # type: ignore[misc]
+        del operator  # frees its factor before the next one is computed
+    return planes, residuals
+
+
+def compared(groups: StrokeGroups, weights: Tensor, residual: Tensor, wanted: Tensor, left_out: Tensor) -> Tensor:
+    """Factor (B, 1, 1, 1) of the regression, from its errors and those of another estimate for strokes left out.
+
+    It is smaller if few strokes are compared.
+
+    Args:
+        groups: of the strokes.
+        weights: of the scribbled pixels, (B, 1, n).
+        residual: of the regression on the other groups, (B, 2, n), in the unit of ``wanted``.
+        wanted: chroma of the strokes, (B, 2, n).
+        left_out: of the other estimate, see :class:`LocalValues`.
+    """
+    painted, flow = groups.sums(weights), groups.sums(left_out * (weights > 0))  # (B, 1, S), (B, 3, S)
+    valid = (painted > 0) & (flow[:, -1:] > 0)
+    painted = torch.where(valid, painted, 1.0)
+    error = squared_sum(groups.sums(residual * weights) / painted)
+    predicted = flow[:, :-1] / torch.where(valid, flow[:, -1:], 1.0)
+    other = squared_sum(predicted - groups.sums(wanted * weights) / painted)
+    ratios = ((other + SAME_ERROR) / (error + SAME_ERROR)).log() * valid
+    count = valid.sum(2)
+    factor = (ERROR_EXPONENT * ratios.sum(2) / count.clamp(min=1)).exp().clamp(max=MOST_WEIGHT)
+    return (factor * factor_of_count(count)).to(weights).view(-1, 1, 1, 1)
+
+
+def factor_of_count(count: float | Tensor) -> float | Tensor:
+    """Factor that reduces the weight of the regression if few strokes are compared; approaches 1 for many."""
+    return (1 + count) / (1 + count + FEW_STROKES)
+
+
+def limit_saturation(chroma: Tensor, other: Tensor) -> Tensor:
+    """Reduce the saturation of chroma (B, 2, H, W) to that of another chroma, where that is less saturated."""
+    return chroma * ((squared_sum(other) + NO_CHROMA) / (squared_sum(chroma) + NO_CHROMA)).clamp(max=1.0).sqrt()
+
+
+def squared_sum(chroma: Tensor) -> Tensor:
+    """Squared saturation (B, 1, ...) of chroma (B, 2, ...)."""
+    return chroma.square().sum(1, keepdim=True)
+
+
+def weighted_mean(estimates: tuple[Tensor, Tensor, Tensor], factors: tuple[float | Tensor, ...]) -> Tensor:
+    """Average three estimates (B, 2, H, W).
+
+    The weight of each is its factor, (B, 1, H, W) or a number, divided by its saturation and by its distance from the
+    other two.
+    """
+    alike, connected, around = estimates
+    pairs = ((alike, connected), (connected, around), (around, alike))
+    first, second, third = (squared_sum(one - other) for one, other in pairs)
+    distances = (first + third, first + second, second + third)
+    total, weights = around.new_zeros(()), around.new_zeros(())
+    for estimate, factor, distance in zip(estimates, factors, distances, strict=True):
+        share = factor * ((squared_sum(estimate) + FAINT**2) * (distance + SAME_CHROMA**2)).rsqrt()
+        total, weights = torch.addcmul(total, share, estimate), weights + share
+    return total / weights
+
+
+def _coloured(source: Source, viewed: Source, chroma: Planes) -> Fitted:
+    """A picture in the chroma (B, 2, h, w), red and blue, of its reduction; edges follow those of its luminance.
+
+    A source may be in colour: only its luminance counts.
+    """
+    if source is viewed:
+        return Fitted(lambda some: merge_luminance(luminance(some), with_green(chroma(some))))
+
+    def twice(some: Any) -> Tensor:
+        return luminance(some).expand(-1, 2, -1, -1)
+
+    before = viewed.all(Fitted(twice))
+    changes = Coarse.of(before, viewed.all(Fitted(chroma)), None, "none").changes(source, twice)
+    return Fitted(lambda some: merge_luminance(luminance(some), with_green(changes(some)[0])))

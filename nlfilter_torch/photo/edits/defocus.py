@@ -1,0 +1,148 @@
+"""Synthetic defocus: a sharp subject before a blurred background, as with a wide aperture. Paper: Sec. V-C."""
+
+import math
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from nlfilter_torch.core.checks import check_reach
+from nlfilter_torch.core.inner import Inner
+from nlfilter_torch.photo.declared.parameters import DEFOCUS
+from nlfilter_torch.photo.picture.in_memory import edit_of
+from nlfilter_torch.photo.picture.source import Fitted, Source
+from nlfilter_torch.photo.selections.mask import background_of, fit_regions
+
+Aperture = Literal["disc", "gaussian"]
+
+# A mask below BLURRED counts as background, above SHARP as subject. A blurred part of the subject is more disturbing
+# than a sharp part of the background, so uncertain pixels stay sharp and the reach is larger than for other regions.
+BLURRED, SHARP, REACH = 0.15, 0.4, 0.72
+SUBJECT_WEIGHT = 1e-5  # weight of the subject in the blur of the background
+ROWS, FAST = 192, 64  # rows of a Fourier transform, about; its sizes are multiples of this, which makes it fast
+
+
+@edit_of("image")
+def defocus(
+    source: Source,
+    /,
+    focus_region: Tensor,
+    *,
+    background: Tensor | None = None,
+    radius: float | None = None,
+    aperture: Aperture = DEFOCUS.defaults["aperture"],
+    reach: float | Tensor = REACH,
+    photometric_bandwidth: float | Tensor = DEFOCUS.defaults["photometric_bandwidth"],
+    spatial_bandwidth: float | Tensor | None = None,
+    patch_size: int = DEFOCUS.defaults["patch_size"],
+    **options: Any,
+) -> Fitted:
+    """Blur the background of a subject that stays in focus.
+
+    Paper: Sec. V-C, Fig. 17, with :func:`region_mask` in place of its mask. Only the background is blurred, so the
+    subject does not bleed into it.
+
+    Args:
+        image: (B, C, H, W) in [0, 1], C = 1 or 3.
+        focus_region: (B, 1, H, W) in [0, 1], above 0 on part or all of the subject.
+        background: (B, 1, H, W) in [0, 1], background scribbles, above 0 on pixels that are blurred together with
+            similar ones. ``focus_region`` takes precedence over it.
+        radius: radius of the strongest blur, in pixels, at most half the short side; None is 2.5 % of the short side.
+        aperture: ``"disc"`` turns bright dots into discs, as a lens does; ``"gaussian"`` is the paper's, with the same
+            variance.
+        reach: that of :func:`region_mask`; larger than there by default, so that more of the subject stays sharp.
+        photometric_bandwidth: that of :func:`region_mask`, in hundredths of Lab.
+        spatial_bandwidth: that of :func:`region_mask`, in pixels; None is 0.3 of the short side.
+        patch_size: width of the compared patches.
+        **options: further options of :func:`region_mask`, such as ``num_landmarks`` or ``generator``.
+
+    Returns:
+        (B, C, H, W), within the range of ``image`` and equal to it to rounding where it is in focus. Differentiable in
+        image, region and background.
+
+    Raises:
+        TypeError, ValueError: if a tensor has another size, leaves its range, the region is empty, or ``background`` is
+            painted only under it in some image.
+
+    Example:
+        >>> image = torch.rand(1, 3, 40, 40, generator=torch.Generator().manual_seed(0)) * 0.2
+        >>> image[..., 20:] += 0.6
+        >>> region = torch.zeros(1, 1, 40, 40)
+        >>> region[..., 10:20, 24:34] = 1
+        >>> blurred = defocus(image, region, radius=3.0, num_landmarks=50)
+        >>> torch.equal(blurred[..., 10:20, 24:34], image[..., 10:20, 24:34])
+        True
+        >>> bool(blurred[..., :18].std() < image[..., :18].std() / 2)
+        True
+    """
+    if source.channels not in (1, 3):
+        raise ValueError(f"image must have 1 or 3 channels, got {source.channels}; select 1 or 3")
+    DEFOCUS.check(aperture=aperture, radius=radius)
+    blur_radius = float(DEFOCUS["radius"].pixels(radius, source.size))
+    check_reach(blur_radius, "radius", source.size)
+    scribbles = source.scribbles(focus_region, None, "focus_region")
+    found = fit_regions(
+        source,
+        [scribbles],
+        background_of(source, background, scribbles, "background"),
+        reach=reach,
+        photometric_bandwidth=photometric_bandwidth,
+        spatial_bandwidth=DEFOCUS["spatial_bandwidth"].distance(spatial_bandwidth, source.size),
+        patch_size=patch_size,
+        **options,
+    )
+
+    def finish(image: Tensor, masks: Tensor, _: Inner) -> Tensor:
+        return blur_behind(image, focus_of(masks), blur_radius, aperture)
+
+    return Fitted(found.masks, finish, _kernel_radius(blur_radius, aperture))
+
+
+def focus_of(mask: Tensor) -> Tensor:
+    """Return the fraction of each pixel that is in focus, from the mask (B, 1, H, W) of the subject."""
+    return ((mask - BLURRED) / (SHARP - BLURRED)).clamp(0.0, 1.0)
+
+
+def blur_behind(image: Tensor, focus: Tensor, radius: float, aperture: Aperture) -> Tensor:
+    """Blur the background of an image by itself, and blend it by the fraction of each pixel that is in focus."""
+    behind = (1 - focus).square() + SUBJECT_WEIGHT  # SUBJECT_WEIGHT matters only where there is no background nearby
+    sums = convolve(torch.cat([image * behind, behind], dim=1), blur_kernel(radius, aperture).to(image))
+    blurred = torch.lerp(sums[:, :-1] / sums[:, -1:], image, focus)
+    return torch.where(focus == 1, image, blurred)
+
+
+def _kernel_radius(radius: float, aperture: Aperture) -> int:
+    """Radius of the kernel in pixels; for a Gaussian, three standard deviations."""
+    return math.ceil(radius + 0.5) if aperture == "disc" else math.ceil(1.5 * radius)
+
+
+def blur_kernel(radius: float, aperture: Aperture) -> Tensor:
+    """Compute a square kernel of unit sum: a disc with a soft rim, or a Gaussian of the same variance."""
+    half_width = _kernel_radius(radius, aperture)
+    axis = torch.arange(-half_width, half_width + 1, dtype=torch.float64)
+    squared = axis.square().unsqueeze(0) + axis.square().unsqueeze(1)
+    if aperture == "disc":
+        kernel = (radius + 0.5 - squared.sqrt()).clamp(0.0, 1.0)
+    else:
+        kernel = torch.exp(-squared / (2 * (radius / 2) ** 2))
+    return kernel / kernel.sum()
+
+
+def convolve(planes: Tensor, kernel: Tensor) -> Tensor:
+    """Convolve planes (B, C, H, W) with a symmetric kernel (k, k), with zeros outside the image.
+
+    By Fourier transforms of some rows at a time, which stay in the cache.
+    """
+    height, width = planes.shape[-2:]
+    half = kernel.shape[0] // 2
+    rows = min(height, max(ROWS, 8 * half))
+    size = tuple(math.ceil((length + 2 * half) / FAST) * FAST for length in (rows, width))
+    step = size[0] - 2 * half
+    spectrum, parts = torch.fft.rfft2(kernel, s=size), []
+    for first in range(0, height, step):
+        top = max(0, first - half)
+        some = planes[..., top : first + step + half, :]
+        found = torch.fft.irfft2(torch.fft.rfft2(some, s=size) * spectrum, s=size)
+        start = first - top + half
+        parts.append(found[..., start : start + min(step, height - first), half : half + width])
+    return torch.cat(parts, dim=-2)

@@ -1,0 +1,352 @@
+"""Films read and written frame by frame: mp4 and mov, with sound, time stamps, rotation and colour properties.
+
+Needs the ``cli`` and the ``films`` extra (PyAV). Frames are decoded to RGB floats, and encoded with the codec, chroma
+subsampling and bit depth of the film; sound and subtitles are copied as they are.
+"""
+
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nlfilter_torch.photo.io.photographs import first_bytes
+from nlfilter_torch.photo.io.writing import check_file, claimed, link_target, part_beside
+
+if TYPE_CHECKING:
+    from av.container import InputContainer, OutputContainer
+    from av.video.frame import VideoFrame
+    from av.video.stream import VideoStream
+
+Floats = NDArray[np.float32]
+
+FILMS = {".mp4": "mp4", ".m4v": "mp4", ".mov": "mov"}  # muxer of each suffix
+#: Encoder of each codec, with options for a quality at which the loss is barely visible; other codecs become H.264.
+ENCODERS: dict[str, tuple[str, dict[str, str]]] = {
+    "h264": ("libx264", {"crf": "16", "preset": "medium"}),
+    "hevc": ("libx265", {"crf": "18", "preset": "medium", "x265-params": "log-level=error"}),
+    "prores": ("prores_ks", {}),
+}
+BT601, BT709 = 5, 1  # colour matrices, numbered as in swscale
+MATRICES = {1: 1, 4: 4, 5: 5, 6: 5, 7: 7, 9: 9}  # from numbers of H.273 to those of swscale
+LIMITED, FULL = 1, 2  # colour ranges
+HD_ROWS = 720  # rows from which on players assume BT.709 for untagged films
+CONTAINER_METADATA = ("major_brand", "minor_version", "compatible_brands", "encoder")  # metadata of the file itself
+COPIED_STREAMS = ("audio", "subtitle")
+PLANES = [2, 0, 1]  # order of red, green and blue in the planes green, blue, red
+
+
+def is_film(path: Path) -> bool:
+    """Whether a path has the suffix of a film."""
+    return path.suffix.lower() in FILMS
+
+
+def check_film_output(path: Path) -> str:
+    """Return the muxer for a path; raises ValueError if no film can be written there."""
+    check_file(path)
+    kind = FILMS.get(path.suffix.lower())
+    if kind is None:
+        raise ValueError(f"{path} must end in .mp4, .m4v or .mov, got {path.suffix!r}; choose one of these")
+    return kind
+
+
+def _av() -> Any:
+    try:
+        import av
+    except ImportError as error:
+        raise ValueError("films need the package av, which is not installed; install nlfilter-torch[films]") from error
+    return av
+
+
+@dataclass(eq=False)
+class Film:
+    """An open film.
+
+    Attributes:
+        path: its file.
+        container: the container of PyAV.
+        stream: the video stream.
+    """
+
+    path: Path
+    container: "InputContainer"
+    stream: "VideoStream"
+
+    @property
+    def count(self) -> int:
+        """Approximate number of frames: some of them may be hidden."""
+        return self.stream.frames or len(self.stream.index_entries)
+
+    @property
+    def matrix(self) -> int:
+        """The colour matrix between RGB and the stored planes, numbered as in swscale."""
+        untagged = BT709 if self.stream.codec_context.height >= HD_ROWS else BT601
+        return MATRICES.get(self.stream.codec_context.colorspace, untagged)
+
+    @property
+    def range(self) -> int:
+        """The colour range."""
+        pix_fmt = self.stream.codec_context.pix_fmt or ""
+        return FULL if self.stream.codec_context.color_range == FULL or pix_fmt.startswith("yuvj") else LIMITED
+
+    def frames(self) -> Iterator["VideoFrame"]:
+        """Decode all frames from the current position on; raises ValueError if a frame cannot be decoded."""
+        number = 0
+        for packet in self.container.demux(self.stream):
+            for frame in self.decoded(packet, number):
+                number += 1
+                yield frame
+
+    def decoded(self, packet: Any, number: int) -> list["VideoFrame"]:
+        """Decode the frames that a packet completes; ``number`` frames came before, for errors."""
+        av = _av()
+        try:
+            frames: list[VideoFrame] = packet.decode()
+        except av.error.FFmpegError as error:
+            raise ValueError(
+                f"{self.path} is damaged after frame {number}: {error.strerror}; copy it again from its source"
+            ) from error
+        for frame in frames:
+            if frame.interlaced_frame:
+                raise ValueError(f"{self.path} is interlaced, which is not supported; deinterlace it first")
+            if (frame.width, frame.height) != (self.stream.codec_context.width, self.stream.codec_context.height):
+                raise ValueError(
+                    f"{self.path} changes its frame size after frame {number}; split it into films of one size"
+                )
+        return frames
+
+    def pixels(self, frame: "VideoFrame") -> Floats:
+        """Convert a frame to RGB (H, W, 3) in [0, 1]."""
+        from av.video.reformatter import Interpolation
+
+        planes = frame.reformat(
+            format="gbrpf32le",
+            src_colorspace=self.matrix,
+            dst_colorspace=self.matrix,
+            src_color_range=self.range,
+            dst_color_range=FULL,
+            interpolation=Interpolation.BICUBIC | Interpolation.ACCURATE_RND | Interpolation.FULL_CHR_H_INP,
+        )
+        found: Floats = np.ascontiguousarray(planes.to_ndarray())
+        return found
+
+    def sample(self, count: int) -> list[Floats]:
+        """Decode the middle frames of ``count`` equal parts of the film, or all frames of a shorter film."""
+        start, length = self.span()
+        found: list[Floats] = []
+        last: int | None = None
+        for part in range(count):
+            wanted = start + int(length * (part + 0.5) / count)
+            self.container.seek(wanted, stream=self.stream)
+            frame = None
+            for frame in self.frames():
+                if frame.pts is not None and frame.pts + (frame.duration or 0) > wanted:
+                    break
+            if frame is not None and frame.pts != last:
+                found.append(self.pixels(frame))
+                last = frame.pts
+        if not found:
+            raise ValueError(f"{self.path} holds no frame that can be decoded; copy it again from its source")
+        return found
+
+    def span(self) -> tuple[int, int]:
+        """Return the first time stamp, and the duration in the same units."""
+        entries = self.stream.index_entries
+        start = self.stream.start_time or 0
+        return start, self.stream.duration or (entries[-1].timestamp - start + 1 if len(entries) else 1)
+
+
+@contextmanager
+def open_film(path: Path) -> Iterator[Film]:
+    """Open a film to read it.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if it is no film, has no video stream, is truncated, or has transparency or a palette.
+    """
+    first_bytes(path)
+    av = _av()
+    try:
+        container = av.open(str(path))
+    except av.error.FFmpegError as error:
+        raise ValueError(f"{path} cannot be read as a film, or is cut short; copy it again or convert it") from error
+    with container:
+        if not container.streams:
+            raise ValueError(f"{path} cannot be read as a film, or is cut short; copy it again or convert it")
+        streams = [
+            stream for stream in container.streams.video if not stream.disposition & stream.disposition.attached_pic
+        ]
+        if not streams or streams[0].codec_context is None or not streams[0].codec_context.pix_fmt:
+            raise ValueError(f"{path} holds no video stream that can be decoded; choose a file with video")
+        stored = path.stat().st_size
+        ends = [entry.pos + entry.size for stream in container.streams for entry in stream.index_entries]
+        if max(ends, default=0) > stored:
+            raise ValueError(
+                f"{path} is cut short: it has {stored} of at least {max(ends)} bytes; copy it again from its source"
+            )
+        stream = streams[0]
+        stream.thread_type = "AUTO"
+        if stream.codec_context.format.has_palette or _has_alpha(stream.codec_context.pix_fmt):
+            raise ValueError(f"{path} has transparency or a palette, which are not supported; convert it to yuv420p")
+        yield Film(path, container, stream)
+
+
+def _has_alpha(pix_fmt: str) -> bool:
+    return pix_fmt.startswith(("yuva", "rgba", "bgra", "argb", "abgr", "gbrap", "ya"))
+
+
+def write_film(film: Film, path: Path, edit: Callable[[Floats], Floats], begin: Callable[[int], None]) -> int:
+    """Write a film with every frame edited; the file appears complete or not at all.
+
+    Args:
+        film: the film, read from its start.
+        path: path of an mp4 or mov file.
+        edit: function from a frame (H, W, 3) in [0, 1] to one of the same size; values may leave [0, 1].
+        begin: called with the number of each frame before it is edited.
+
+    Returns:
+        The number of frames.
+
+    Raises:
+        ValueError: if the film cannot be decoded, or ``path`` cannot hold its codecs.
+        OSError: if the file cannot be written.
+    """
+    kind = check_film_output(path)
+    av = _av()
+    path = link_target(path)
+    with part_beside(path) as beside:
+        beside.touch(exist_ok=False)
+        with claimed(beside):
+            options = {"movflags": "+faststart" + ("+use_metadata_tags" if kind == "mov" else "")}
+            try:
+                with av.open(str(beside), "w", format=kind, options=options) as output:
+                    count = _transcode(film, output, edit, begin, path)
+            except av.error.FFmpegError as error:
+                if isinstance(error, OSError) and error.filename:
+                    raise
+                raise OSError(
+                    f"{path} cannot be written: {error.strerror}; free some space there, or choose another file type"
+                ) from error
+            beside.replace(path)
+    return count
+
+
+def _transcode(
+    film: Film, output: "OutputContainer", edit: Callable[[Floats], Floats], begin: Callable[[int], None], path: Path
+) -> int:
+    """Write the edited frames and the other streams of a film to an open container; return the number of frames."""
+    target = _encoder(film, output)
+    copied: dict[int, Any] = {}
+    for stream in film.container.streams:
+        if stream.type not in COPIED_STREAMS or stream.codec_context is None:
+            continue
+        try:
+            copied[stream.index] = output.add_stream_from_template(stream)
+        except ValueError as error:
+            raise ValueError(
+                f"{path} cannot store the {stream.codec_context.name} {stream.type} of {film.path}; "
+                "use the file type of that film, or convert it"
+            ) from error
+        copied[stream.index].metadata.update(stream.metadata)
+    output.metadata.update(
+        {key: text for key, text in film.container.metadata.items() if key not in CONTAINER_METADATA}
+    )
+    film.container.seek(0)  # the header is written with the first packet, which may be a sound packet
+    target.set_display_matrix(next(map(display_matrix, film.frames()), None))
+    film.container.seek(0)
+    count = 0
+    durations: dict[int | None, int] = {}  # durations of the frames in the encoder, which may lose them
+
+    def put(packets: Iterable[Any]) -> None:
+        for packet in packets:
+            packet.duration = durations.pop(packet.pts, 0) or packet.duration
+            output.mux(packet)
+
+    for packet in film.container.demux(film.stream, *(s for s in film.container.streams if s.index in copied)):
+        if packet.stream.index in copied:
+            if packet.dts is not None:
+                packet.stream = copied[packet.stream.index]
+                output.mux(packet)
+            continue
+        for frame in film.decoded(packet, count):
+            begin(count)
+            count += 1
+            durations[frame.pts] = frame.duration
+            put(target.encode(_stored(film, frame, edit(film.pixels(frame)), target)))
+    if count == 0:
+        raise ValueError(f"{film.path} holds no frame that can be decoded; copy it again from its source")
+    put(target.encode(None))
+    return count
+
+
+def _encoder(film: Film, output: "OutputContainer") -> "VideoStream":
+    """Add a stream for the edited frames, with the properties of the film."""
+    av = _av()
+    source = film.stream.codec_context
+    name, options = ENCODERS.get(source.codec.canonical_name, ENCODERS["h264"])
+    rate = film.stream.average_rate or 25
+    target = cast("VideoStream", output.add_stream(name, rate=rate, options=options))
+    offered = {form.name for form in av.codec.Codec(name, "w").video_formats or ()}
+    wanted = (source.pix_fmt or "").replace("yuvj", "yuv")
+    target.pix_fmt = wanted if wanted in offered else "yuv420p"
+    target.width, target.height = source.width, source.height
+    across, down = subsampling(target.pix_fmt)
+    if target.width % across or target.height % down:
+        raise ValueError(
+            f"{film.path} must have an even width and height to be stored as {target.pix_fmt}, got "
+            f"{target.width}x{target.height}; crop or scale it"
+        )
+    context = target.codec_context
+    context.time_base = film.stream.time_base or 1 / Fraction(rate)
+    for entry in ("color_primaries", "color_trc", "colorspace"):
+        setattr(context, entry, getattr(source, entry))
+    context.color_range = film.range
+    if source.sample_aspect_ratio:
+        context.sample_aspect_ratio = source.sample_aspect_ratio
+    if name == "libx265":
+        context.codec_tag = "hvc1"  # required by some players
+    target.metadata.update(film.stream.metadata)
+    return target
+
+
+def subsampling(pix_fmt: str) -> tuple[int, int]:
+    """Return the width and height in pixels of the block that shares a chroma sample.
+
+    >>> subsampling("yuv420p10le"), subsampling("yuv422p"), subsampling("gbrp")
+    ((2, 2), (2, 1), (1, 1))
+    """
+    if "420" in pix_fmt or pix_fmt.startswith("nv12"):
+        return 2, 2
+    return (2, 1) if "422" in pix_fmt else (1, 1)
+
+
+def display_matrix(frame: "VideoFrame") -> list[int] | None:
+    """Return the display matrix (rotation) of a frame as nine integers; None if it is upright."""
+    kept: Any = frame.side_data  # the type stubs declare only one kind
+    data = next((part for part in kept if part.type.name == "DISPLAYMATRIX"), None)
+    return None if data is None else [int(number) for number in np.frombuffer(bytes(data), np.int32)]
+
+
+def _stored(film: Film, frame: "VideoFrame", pixels: Floats, target: "VideoStream") -> "VideoFrame":
+    """Convert edited pixels to a frame to encode, with the time stamps of the original frame."""
+    from av.video.frame import VideoFrame
+    from av.video.reformatter import Interpolation
+
+    rows = np.ascontiguousarray(pixels.clip(0, 1).astype(np.float32))
+    edited = VideoFrame.from_ndarray(rows, format="gbrpf32le").reformat(
+        format=target.pix_fmt,
+        src_colorspace=film.matrix,
+        dst_colorspace=film.matrix,
+        src_color_range=FULL,
+        dst_color_range=film.range,
+        interpolation=Interpolation.BICUBIC | Interpolation.ACCURATE_RND | Interpolation.FULL_CHR_H_INT,
+    )
+    context = film.stream.codec_context
+    edited.colorspace, edited.color_range = context.colorspace, film.range
+    edited.color_primaries, edited.color_trc = context.color_primaries, context.color_trc
+    edited.pts, edited.duration, edited.time_base = frame.pts, frame.duration, film.stream.time_base
+    return edited

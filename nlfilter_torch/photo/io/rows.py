@@ -1,0 +1,267 @@
+"""Picture files read and written a few rows at a time: TIFF, BigTIFF and zarr. Other formats are decoded whole.
+
+Needs the ``cli`` extra, and the ``zarr`` extra for zarr. A file appears complete or not at all.
+"""
+
+import math
+import shutil
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import psutil
+from numpy.typing import NDArray
+
+from nlfilter_torch.photo.io import exif as exif_tags
+from nlfilter_torch.photo.io import tiff
+from nlfilter_torch.photo.io.extras import NO_EXTRAS, Extras, read_extras
+from nlfilter_torch.photo.io.photographs import check_type, encode, first_bytes, read_channels
+from nlfilter_torch.photo.io.tiff import TiffRows
+from nlfilter_torch.photo.io.writing import check_file, claimed, link_target, name_beside, open_beside, part_beside
+from nlfilter_torch.photo.tiled.pictures import Rows, RowSource
+from nlfilter_torch.photo.tiled.tiles import Tiling
+
+ZARR = ".zarr"
+CHUNK = 256  # side of the chunks of a new zarr array
+FIFTH = psutil.virtual_memory().total // 5  # bytes that a command uses, at most, if no limit is given
+WHOLE = min(FIFTH, 2_000_000_000)  # bytes of an edit, likewise; a photograph that needs more is edited in tiles
+TILED = 1_000_000_000  # bytes of these tiles, likewise; more saves no time
+CODEC_MEMORY_FACTOR = 8  # memory to decode or encode other formats, as a multiple of the picture's size in bytes
+
+
+@dataclass(frozen=True)
+class StoredPicture:
+    """A picture in a file, read on demand.
+
+    Attributes:
+        rows: upright rows, (H, W, S) or (H, W).
+        alpha: whether the last channel is transparency.
+        cached: bytes kept in memory while the picture is read.
+        icc: the colour profile, or None.
+        exif: the EXIF block, or None.
+        attributes: attributes of a zarr array.
+        extras: XMP and print resolution.
+    """
+
+    rows: RowSource
+    alpha: bool
+    cached: int
+    icc: bytes | None = None
+    exif: bytes | None = None
+    attributes: dict[str, Any] | None = None
+    extras: Extras = NO_EXTRAS
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """(H, W, S)."""
+        height, width, *samples = self.rows.shape
+        return height, width, samples[0] if samples else 1
+
+    def in_colour(self) -> "StoredPicture":
+        """Return shape and metadata of the colour version, without pixels; the profile of a grey picture is dropped."""
+        height, width, samples = self.shape
+        if samples > 2:
+            return self
+        shape = (height, width, 3 + self.alpha)
+        return replace(self, rows=np.broadcast_to(np.zeros((), self.rows.dtype), shape), icc=None)
+
+
+def is_zarr(path: Path) -> bool:
+    """Whether ``path`` is the folder of a zarr array or ends in ``.zarr``."""
+    return path.suffix.lower() == ZARR or _holds_zarr(path)
+
+
+def _holds_zarr(path: Path) -> bool:
+    return any((path / name).is_file() for name in ("zarr.json", ".zarray"))
+
+
+@contextmanager
+def open_picture(path: Path, memory: int) -> Iterator[StoredPicture]:
+    """Open a picture, whose rows can be read within the block.
+
+    Raises:
+        FileNotFoundError, ValueError: if the file does not exist or cannot be read.
+        MemoryError: if reading it needs more than ``memory`` bytes.
+    """
+    with ExitStack() as stack:
+        if is_zarr(path):
+            stored = _open_zarr(path)
+        elif tiff.is_tiff(first_bytes(path)):
+            stored = _open_tiff(path, stack)
+        else:
+            channels, icc, exif = read_channels(path, bytes_per_pixel=CODEC_MEMORY_FACTOR, memory=memory)
+            stored = StoredPicture(
+                channels, channels.shape[2] in (2, 4), channels.nbytes, icc, exif, extras=read_extras(path)
+            )
+        if stored.cached > memory:
+            raise MemoryError(
+                f"{path} can only be read in pieces of {stored.cached / 1e6:.0f} MB, but only {memory / 1e6:.0f} MB "
+                "may be used; save it in smaller tiles, or allow more memory"
+            )
+        yield stored
+
+
+def check_place(path: Path, depth: str, picture: StoredPicture, memory: int) -> None:
+    """Raise unless the picture can be written to ``path`` at that depth, using at most ``memory`` bytes."""
+    if path.suffix.lower() == ZARR:
+        zarr_package()
+        if not path.is_dir():
+            check_file(path)
+            if path.exists():
+                raise ValueError(f"{path} is a file, not a zarr array that can be replaced; choose another name")
+        elif not _holds_zarr(path):
+            raise ValueError(f"{path} is a folder, not a zarr array that can be replaced; choose another name")
+        return
+    kind = check_type(path, depth, picture.alpha, picture.shape[:2], picture.exif)
+    needed = 0 if kind == "TIFF" else math.prod(picture.shape) * np.dtype(depth).itemsize * CODEC_MEMORY_FACTOR
+    if needed > memory:
+        raise MemoryError(
+            f"{path} needs {needed / 1e6:.0f} MB of memory to be encoded, but only {memory / 1e6:.0f} MB may be used; "
+            "write a TIFF file, or allow more"
+        )
+
+
+def write_picture(path: Path, rows: Rows | Tiling, depth: str, like: StoredPicture) -> None:
+    """Write rows as they are computed, with the shape, profile and metadata of another picture."""
+    shape, dtype = like.shape, np.dtype(depth)
+    if path.suffix.lower() == ZARR:
+        _write_zarr(path, rows, dtype, like)
+        return
+    kind = check_type(path, depth, like.alpha)
+    with open_beside(path) as stream:
+        if kind == "TIFF":
+            values = (part for _, part in rows)
+            tiff.write_rows(
+                stream, values, shape, dtype, like.alpha, like.icc, like.exif, like.extras.xmp, **like.extras.tags()
+            )
+        else:
+            whole = np.empty(shape, dtype)
+            for part, values_of_part in rows:
+                whole[part] = values_of_part
+            encode(stream, kind, whole, like.alpha, like.icc, like.exif, like.extras)
+
+
+def free_memory() -> int:
+    """Default memory budget in bytes: four fifths of the free memory."""
+    return int(psutil.virtual_memory().available * 4 // 5)
+
+
+def usual_memory(most: int = sys.maxsize) -> int:
+    """Memory budget in bytes of a command if none is given: a fifth of the machine's memory, at most what is free."""
+    return min(FIFTH, most, free_memory())
+
+
+def _open_tiff(path: Path, stack: ExitStack) -> StoredPicture:
+    with tiff.decoding(path):
+        rows = stack.enter_context(TiffRows(path))
+    tiff.warn_of_pages(path)
+    source: RowSource = _turn(rows, stack) if rows.turned else rows
+    return StoredPicture(source, rows.alpha, rows.cached, rows.icc, rows.exif, extras=read_extras(path))
+
+
+def _turn(rows: TiffRows, stack: ExitStack) -> RowSource:
+    """Rotate a picture that is stored sideways, in a temporary file."""
+    height, width, samples = rows.shape
+    copy = stack.enter_context(tempfile.TemporaryFile())  # noqa: SIM115 - the stack closes it
+    upright = np.memmap(copy, dtype=rows.dtype, mode="w+", shape=(width, height, samples))
+    step = max(rows.segment[0], 64)
+    for start in range(0, height, step):
+        stop = min(start + step, height)
+        block = exif_tags.upright(rows[slice(start, stop)], rows.orientation)
+        # Orientations 6 and 7 begin with the last row.
+        place = slice(height - stop, height - start) if rows.orientation in (6, 7) else slice(start, stop)
+        upright[:, place] = block
+    return upright
+
+
+def zarr_package() -> Any:
+    """The package zarr; raises ValueError if it is not installed."""
+    try:
+        import zarr
+    except ImportError as error:
+        raise ValueError(
+            "zarr arrays need the package zarr, which is not installed; install nlfilter-torch[zarr]"
+        ) from error
+    return zarr
+
+
+class ZarrRows:
+    """A zarr array that detects a change of its shape; another process opens it again."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.array = self._open()
+        self.shape: tuple[int, ...] = tuple(self.array.shape)
+        self.dtype = self.array.dtype
+
+    def __reduce__(self) -> tuple[type["ZarrRows"], tuple[Path]]:
+        return ZarrRows, (self.path.absolute(),)
+
+    def _open(self) -> Any:
+        try:
+            return zarr_package().open_array(self.path, mode="r")
+        except (FileNotFoundError, KeyError, TypeError) as error:
+            raise ValueError(f"{self.path} is not a zarr array ({error}); choose the folder of one") from error
+
+    def __getitem__(self, rows: slice) -> NDArray[Any]:
+        now = tuple(self._open().shape)
+        if now != self.shape:
+            raise ValueError(
+                f"{self.path} changed its shape while it was read, from {self.shape} to {now}; make sure that nothing "
+                "writes to it, and start again"
+            )
+        return np.asarray(self.array[rows])
+
+
+def _open_zarr(path: Path) -> StoredPicture:
+    rows = ZarrRows(path)
+    if len(rows.shape) not in (2, 3):
+        raise ValueError(
+            f"{path} must have the shape (H, W) or (H, W, S), got {rows.shape}; choose the array of a picture"
+        )
+    alpha = len(rows.shape) == 3 and rows.shape[2] in (2, 4)
+    chunk = (*rows.array.chunks[:1], *rows.shape[1:])
+    cached = 2 * math.prod(chunk) * rows.dtype.itemsize
+    return StoredPicture(rows, alpha, cached, attributes=dict(rows.array.attrs))
+
+
+def write_band(array: Any, start: int, rows: NDArray[Any]) -> None:
+    """Write rows (h, W, S) to a zarr array from row ``start`` on, where a chunk begins."""
+    values, width = rows.reshape(len(rows), *array.shape[1:]), array.chunks[1]
+    # One chunk per call: zarr writes several in parallel and continues with the others after one fails.
+    for left in range(0, array.shape[1], width):
+        array[start : start + len(values), left : left + width] = values[:, left : left + width]
+
+
+def _write_zarr(path: Path, rows: Rows | Tiling, dtype: np.dtype[Any], like: StoredPicture) -> None:
+    """Write an array under another name, which replaces an existing array only when it is complete."""
+    shape = tuple(like.rows.shape)
+    path = link_target(path)
+    former = name_beside(path)
+    chunks = (min(CHUNK, shape[0]), min(CHUNK, shape[1]), *shape[2:])
+    with part_beside(path) as beside:
+        array = zarr_package().create_array(
+            store=beside, shape=shape, chunks=chunks, dtype=dtype, attributes=like.attributes or {}
+        )
+        with claimed(beside):
+            if isinstance(rows, Tiling) and rows.passes.processes is not None:
+                rows.passes.processes.fill(rows, beside)
+            else:
+                start = 0
+                for band in tiff.bands((part for _, part in rows), CHUNK):
+                    write_band(array, start, band)
+                    start += len(band)
+            if path.exists():
+                path.replace(former)
+            try:
+                beside.replace(path)
+            except OSError:
+                former.replace(path)
+                raise
+            finally:
+                shutil.rmtree(former, ignore_errors=True)

@@ -1,0 +1,1 @@
+"""Finding the look of pairs of photographs, before and after an edit."""

@@ -1,0 +1,164 @@
+"""Pixels of a photograph before and after an edit, with all that looks change of them."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from nlfilter_torch.core.precision import working_dtype
+from nlfilter_torch.filtering.filters import detail_layers
+from nlfilter_torch.filtering.fit import HALF_LEVEL, OFF_LEVEL
+from nlfilter_torch.operator.build import nonlocal_operator, sampled_operator
+from nlfilter_torch.operator.features import reduce_channels
+from nlfilter_torch.photo.declared.steps import Step
+from nlfilter_torch.photo.look_fitting.alignment import inside_frame
+from nlfilter_torch.photo.look_fitting.look_fit import MOST, Layout, Sums, columns_of, sample, sums_of
+from nlfilter_torch.photo.looks.histogram import LocalCurves
+from nlfilter_torch.photo.looks.look_filter import bands_of, local_curves, range_of, textures_of
+from nlfilter_torch.photo.picture.resizing import resize
+from nlfilter_torch.photo.picture.source import seeded
+from nlfilter_torch.photo.picture.viewing import viewed_size
+
+INSIDE = 0.9  # of a mask, from where on a pixel counts for its region
+
+
+@dataclass(frozen=True)
+class SomePixels:
+    """Some pixels of a photograph.
+
+    Attributes:
+        places: their numbers (P,), along the rows.
+        before: (3, P).
+        after: (3, P).
+        weighed: what parts of a look weigh there, as for :func:`columns_of`.
+        weights: (3, P).
+    """
+
+    places: Tensor
+    before: Tensor
+    after: Tensor
+    weighed: dict[str, Tensor]
+    weights: Tensor
+
+    def sums(self, layout: Layout, parts: list[Tensor]) -> list[Sums]:
+        """Sums over parts (P',) of them."""
+        found = []
+        for some in parts:
+            before = self.before[..., some]
+            columns = columns_of(before, {name: each[..., some] for name, each in self.weighed.items()}, layout)
+            found.append(sums_of(columns, self.after[..., some] - before, self.weights[..., some]))
+        return found
+
+
+class EditedPhotograph:
+    """A photograph before and after an edit, at the viewing size.
+
+    Args:
+        before: (3, H, W) in [0, 1].
+        after: likewise.
+        masks: of regions, (K, H, W) in [0, 1]; None is a region of everything.
+        step: ``look`` with the parameters of the filter.
+        order: k of the layers.
+        generator: source of randomness for the landmarks; None draws the same for every photograph.
+    """
+
+    def __init__(
+        self,
+        before: Tensor,
+        after: Tensor,
+        masks: Tensor | None,
+        step: Step,
+        order: int,
+        generator: torch.Generator | None,
+    ) -> None:
+        dtype = working_dtype(before)
+        before, after = before.to(dtype), after.to(dtype)
+        free = ((after > 0) & (after < 1)).to(dtype) * inside_frame(before, after).to(dtype)
+        size = (before.shape[-2], before.shape[-1])
+        self.size = viewed_size(size, step["viewing_size"])
+        self.stretch = range_of(before[None])  # not of its reduction, which has fewer extremes
+        levels = after * 255
+        #: Half the step between the values of the edited photograph, or 0.
+        self.rounding = HALF_LEVEL if bool(((levels - levels.round()).abs() < OFF_LEVEL).all()) else 0.0
+        if self.size != size:
+            before, after, free = (resize(planes[None], self.size)[0] for planes in (before, after, free))
+            masks = None if masks is None else resize(masks[None].to(before), self.size)[0]
+            free, self.rounding = (free > 0.99).to(dtype), 0.0
+        self.image, self.order = before[None], order
+        self.before, self.after = before.flatten(1), after.flatten(1)
+        self.free, self.masks = free.flatten(1), masks
+        self.options = step.filter_options(self.size)
+        self.generator = generator or seeded()
+
+    @cached_property
+    def luminance(self) -> Tensor:
+        """Before the edit, (1, 1, H, W)."""
+        return reduce_channels(self.image, "luminance")
+
+    @cached_property
+    def bands(self) -> list[Tensor]:
+        """What blurs take away and leave before the edit, (3, N) each."""
+        bands = [band[0].flatten(1) for band in bands_of(self.image)]
+        return [*bands[:-1], bands[-1] - self.luminance.mean()]
+
+    @cached_property
+    def texture(self) -> list[Tensor]:
+        """Of the photograph before the edit, (N,) each."""
+        return [texture.flatten() for texture in textures_of(self.image)]
+
+    @cached_property
+    def local(self) -> LocalCurves:
+        """Local tone curves before the edit."""
+        return local_curves(self.image, self.stretch)
+
+    @cached_property
+    def layers(self) -> Tensor:
+        """Of luminance before the edit, (k+1, N)."""
+        operator = nonlocal_operator(self.luminance, **self.options, generator=self.generator)
+        return detail_layers(operator, self.luminance, order=self.order)[0, :, 0].flatten(1)
+
+    def regions(self) -> list[SomePixels]:
+        """Pixels of each region that are not clipped; none of a region that the photograph does not show."""
+        return [self._pixels(weights, self.layers) for weights in self._weights()]
+
+    def regions_of_sample(self) -> list[SomePixels] | None:
+        """The same, with layers by a filter whose sums are taken over a sample of the pixels.
+
+        That takes a fifth of the time, and layers are off by a twentieth. None for small photographs, for those that
+        are mostly clipped, and with masks: the sample has few pixels of a small region.
+        """
+        count = self.free.shape[1]
+        if count <= MOST or self.masks is not None or float(self.free.amax(0).mean()) < 0.5:
+            return None
+        places = sample(torch.ones_like(self.free[0]))
+        generator = self.generator.clone_state()  # the landmarks are those of :attr:`layers`
+        operator = sampled_operator(self.luminance, places, **self.options, generator=generator)
+        some = self.luminance.flatten(2)[:, :, None, places]
+        layers = detail_layers(operator, some, order=self.order)[0, :, 0].flatten(1)
+        inside = self.free[:, places].amax(0) > 0
+        return [self._at(places[inside], layers[:, inside], self.free)]
+
+    def _weights(self) -> list[Tensor]:
+        """Of the pixels, (3, N) for each region."""
+        if self.masks is None:
+            return [self.free]
+        inside = ((self.masks.to(self.free).flatten(1) - INSIDE) / (1 - INSIDE)).clamp(0, 1)
+        return [self.free * mask for mask in inside]
+
+    def _pixels(self, weights: Tensor, layers: Tensor) -> SomePixels:
+        places = sample(weights.amax(0))
+        return self._at(places, layers[:, places], weights)
+
+    def _at(self, places: Tensor, layers: Tensor, weights: Tensor) -> SomePixels:
+        share = float((weights.amax(0) > 0).sum()) / max(len(places), 1)
+        rows, columns = places // self.size[1], places % self.size[1]
+        before, after = self.before[:, places], self.after[:, places]
+        weighed = {
+            "bands": torch.stack([band[:, places] for band in self.bands], dim=1),
+            "texture": torch.stack([texture[places] for texture in self.texture]),
+            "stretch": self.stretch.changes(before[None, :, None])[0, :, :, 0].transpose(0, 1),
+            "local": self.local.at(before[None], rows, columns)[0].transpose(0, 1),
+            "alpha": layers,
+        }
+        return SomePixels(places, before, after, weighed, weights[:, places] * share)

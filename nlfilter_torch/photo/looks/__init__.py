@@ -1,0 +1,1 @@
+"""What a look does to pixels, and the module whose parameters are a look."""

@@ -1,0 +1,185 @@
+"""Changes by the histogram of a picture: automatic levels of the whole, and tone curves of its parts.
+
+Automatic levels stretch brightness to the whole range, from the darkest to the lightest pixel. There are three kinds:
+of luminance, which changes all channels alike; of the largest channel (value in HSV), which scales colours; and of each
+channel for itself. As in other programs, single outliers set the range.
+
+Tone curves equalise the histogram around a pixel as far as limits of contrast allow. After Zuiderveld, "Contrast
+Limited Adaptive Histogram Equalization" (1994): clipped histograms of 8 x 8 tiles give curves, and a pixel takes its
+value from the curves of the four nearest tiles. Here histograms are of hat functions, so that curves are continuous in
+the picture. What curves of luminance change is added to every channel; curves of the largest channel, which is
+stretched to the whole range first, scale colours.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import product
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from nlfilter_torch.operator.features import reduce_channels
+
+DARKEST = 1 / 255  # colours are divided by their largest channel, or by this if it is smaller
+KINDS = 3  # of automatic levels
+FLAT = 1 / 255  # range of a picture that is not stretched
+LIMITS = (1.5, 2.0, 3.0, 5.0)  # clip limits relative to an even histogram; also the steepest slopes of curves
+STRENGTHS = 2 * len(LIMITS)  # of tone curves of luminance, and of the largest channel
+SHADES = 33
+TILES = 8  # along both sides
+FINE = 16  # blocks along the short side of a tile that histograms are first taken of
+
+
+def brightness(image: Tensor) -> Tensor:
+    """Luminance and largest channel (B, 2, H, W) of an image (B, C, H, W)."""
+    return torch.cat([reduce_channels(image, "luminance").mean(1, keepdim=True), image.amax(1, keepdim=True)], dim=1)
+
+
+def tones(image: Tensor) -> Tensor:
+    """What is stretched: both kinds of :func:`brightness` and the channels, (B, 2 + C, H, W)."""
+    return torch.cat([brightness(image), image], dim=1)
+
+
+@dataclass(frozen=True, eq=False)
+class Stretch:
+    """The range of a picture's :func:`tones`.
+
+    Attributes:
+        darkest: (B, 2 + C, 1, 1).
+        width: distance to the lightest; 1 where it is so small that nothing is stretched, and ``darkest`` is 0 there.
+    """
+
+    darkest: Tensor
+    width: Tensor
+
+    @staticmethod
+    def of(ends: tuple[Tensor, Tensor]) -> "Stretch":
+        """The range between the least and the largest :func:`tones` of a picture, (B, 2 + C, 1, 1) each."""
+        width = ends[1] - ends[0]
+        flat = width < FLAT
+        return Stretch(ends[0].masked_fill(flat, 0.0), width.masked_fill(flat, 1.0))
+
+    def largest(self, values: Tensor) -> Tensor:
+        """Stretch the largest channels (B, 1, H, W) of pixels."""
+        return (values - self.darkest[:, 1:2]) / self.width[:, 1:2]
+
+    def changes(self, image: Tensor) -> Tensor:
+        """What each kind changes of an image (B, C, H, W): (B, KINDS, C, H, W)."""
+        found = tones(image)
+        moved = (found - self.darkest) / self.width - found
+        scaled = moved[:, 1:2] * image / found[:, 1:2].clamp(min=DARKEST)
+        return torch.stack([moved[:, :1].expand_as(image), scaled, moved[:, 2:]], dim=1)
+
+    def change(self, image: Tensor, strengths: Tensor) -> Tensor:
+        """The sum (B, C, H, W) of all kinds, weighted by strengths (KINDS,) or (B, KINDS)."""
+        return (strengths.to(image).reshape(-1, KINDS, 1, 1, 1) * self.changes(image)).sum(1)
+
+
+def ramps(image: Tensor, stretch: Stretch) -> Tensor:
+    """How far luminance and the stretched largest channel are from each shade to the next, (B, 2 (K - 1), H, W)."""
+    light = _stretched(brightness(image), stretch) * (SHADES - 1)
+    return torch.stack([light.clamp(k, k + 1) - k for k in range(SHADES - 1)], dim=2).flatten(1, 2)
+
+
+def mean_ramps(image: Tensor, stretch: Stretch, step: int) -> Tensor:
+    """Means of :func:`ramps` over blocks of ``step`` x ``step`` pixels, with one shade in memory at a time."""
+    light = _stretched(brightness(image), stretch) * (SHADES - 1)
+    means = [
+        F.avg_pool2d(light.clamp(k, k + 1), step, ceil_mode=True, count_include_pad=False) - k
+        for k in range(SHADES - 1)
+    ]
+    return torch.stack(means, dim=2).flatten(1, 2)
+
+
+def _stretched(light: Tensor, stretch: Stretch) -> Tensor:
+    """Both kinds of :func:`brightness`, (B, 2, H, W), of which the largest channel is stretched."""
+    return torch.cat([light[:, :1], stretch.largest(light[:, 1:])], dim=1)
+
+
+@dataclass(frozen=True, eq=False)
+class LocalCurves:
+    """Changes of brightness by tone curves around the middles of tiles.
+
+    Attributes:
+        changes: of K shades of luminance and of the largest channel, by S curves, (B, 2, S, K, TILES, TILES).
+        size: (H, W) of the picture.
+        stretch: range of its brightness.
+    """
+
+    changes: Tensor
+    size: tuple[int, int]
+    stretch: Stretch
+
+    @staticmethod
+    def of(size: tuple[int, int], stretch: Stretch, reduced: Callable[[int], Tensor]) -> "LocalCurves":
+        """The curves of a picture of size (H, W), one for each of :data:`LIMITS`.
+
+        ``reduced`` returns means of its :func:`ramps` over blocks of so many pixels, (B, 2 (K - 1), h, w).
+        """
+        step = max(1, min(size) // (TILES * FINE))
+        means = reduced(step).unflatten(1, (2, SHADES - 1))
+        rows, columns = (_shares(length, step).to(means) for length in size)
+        # A hat function rises with one ramp and falls with the next.
+        passed = F.pad(rows @ means @ columns.mT, (0, 0, 0, 0, 1, 0), value=1.0)
+        histogram = passed - F.pad(passed[:, :, 1:], (0, 0, 0, 0, 0, 1))
+        straight = torch.linspace(0, 1, SHADES).to(means).view(-1, 1, 1)
+        changes = []
+        for limit in LIMITS:
+            most = histogram.clamp(max=limit / SHADES)
+            shared = most + (1 - most.sum(2, keepdim=True)) / SHADES
+            changes.append(shared.cumsum(2) - shared / 2 - straight)
+        return LocalCurves(torch.stack(changes, dim=2), size, stretch)
+
+    def weighed(self, strength: Tensor) -> "LocalCurves":
+        """The sum of all curves as one, weighted by strengths (2 S,) or (B, 2 S)."""
+        weights = strength.to(self.changes).reshape(-1, 2, len(LIMITS), 1, 1, 1)
+        return LocalCurves((weights * self.changes).sum(2, keepdim=True), self.size, self.stretch)
+
+    def rectangle(self, image: Tensor, corner: tuple[int, int]) -> Tensor:
+        """Changes (B, 2 S, C, h, w) of an image (B, C, h, w), whose first pixel is in that row and column."""
+        height, width = image.shape[-2:]
+        rows, columns = (
+            torch.arange(start, start + length, device=image.device)
+            for start, length in zip(corner, (height, width), strict=True)
+        )
+        found = self.at(image.flatten(2), rows.repeat_interleave(width), columns.repeat(height))
+        return found.unflatten(3, (height, width))
+
+    def at(self, image: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
+        """Changes (B, 2 S, C, P) of some pixels (B, C, P), in rows and columns (P,)."""
+        light = brightness(image.unsqueeze(2))
+        places = _stretched(light, self.stretch).squeeze(2)
+        added, scaled = self._changes_of(places, rows, columns).unbind(1)
+        colours = (image / light[:, 1:, 0].clamp(min=DARKEST)).unsqueeze(1)
+        added = added.unsqueeze(2).expand(-1, -1, image.shape[1], -1)
+        return torch.cat([added, scaled.unsqueeze(2) * colours], dim=1)
+
+    def _changes_of(self, light: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
+        """Changes (B, 2, S, P) of both kinds of brightness (B, 2, P)."""
+        shape = (SHADES, TILES, TILES)
+        places = [light.clamp(0, 1) * (SHADES - 1)]
+        for numbers, length in zip((rows, columns), self.size, strict=True):
+            places.append(((numbers + 0.5) * (TILES / length) - 0.5).to(light))
+        places = [place.clamp(0, length - 1) for place, length in zip(places, shape, strict=True)]
+        below = [place.detach().floor().clamp(max=length - 2) for place, length in zip(places, shape, strict=True)]
+        changes = self.changes.flatten(3).expand(len(light), -1, -1, -1)
+        found = torch.zeros_like(light).unsqueeze(2)
+        for corner in product((0, 1), repeat=3):
+            index, share = torch.zeros_like(light, dtype=torch.long), torch.ones_like(light)
+            for place, low, one, length in zip(places, below, corner, shape, strict=True):
+                index = index * length + low.long() + one
+                part = place - low
+                share = share * (part if one else 1 - part)
+            taken = changes.gather(3, index.unsqueeze(2).expand(-1, -1, changes.shape[2], -1))
+            found = found + share.unsqueeze(2) * taken
+        return found
+
+
+def _shares(length: int, step: int) -> Tensor:
+    """Weights (TILES, n) of blocks of ``step`` pixels in the means over tiles, along a side of a picture."""
+    starts = torch.arange(0, length, step, dtype=torch.float64)
+    ends = (starts + step).clamp(max=length)
+    edges = torch.arange(TILES + 1, dtype=torch.float64).view(-1, 1) * (length / TILES)
+    shared = torch.minimum(ends, edges[1:]) - torch.maximum(starts, edges[:-1])
+    return shared.clamp(min=0) * (TILES / length)

@@ -1,0 +1,84 @@
+"""Rasterisation of brush strokes to masks and colours."""
+
+from collections.abc import Iterable
+from itertools import pairwise
+
+import torch
+from torch import Tensor
+
+from nlfilter_torch.photo.declared.strokes import Stroke
+
+MIN_RADIUS = 0.75  # minimum radius in pixels, at which a dot always covers a pixel
+
+
+def cover(stroke: Stroke, size: tuple[int, int], rows: slice | None = None) -> Tensor:
+    """Rasterise a stroke: the pixels that it covers, (H, W) bool, or (h, W) for ``rows`` of a picture of that size.
+
+    >>> cover(Stroke(((0.5, 0.5),), 0.1, "in"), (5, 5)).int()
+    tensor([[0, 0, 0, 0, 0],
+            [0, 0, 0, 0, 0],
+            [0, 0, 1, 0, 0],
+            [0, 0, 0, 0, 0],
+            [0, 0, 0, 0, 0]], dtype=torch.int32)
+    """
+    height, width = size
+    radius = max(stroke.radius * min(size), MIN_RADIUS)
+    first = 0 if rows is None else rows.start
+    covered = torch.zeros(_shape(size, rows), dtype=torch.bool)
+    # The origin is the centre of the first pixel.
+    points = [(x * width - 0.5, y * height - 0.5) for x, y in stroke.points]
+    for (x0, y0), (x1, y1) in pairwise(points if len(points) > 1 else points * 2):
+        top, bottom = _span(y0, y1, radius, first, first + len(covered))
+        left, right = _span(x0, x1, radius, 0, width)
+        if top >= bottom or left >= right:
+            continue
+        y = torch.arange(top, bottom, dtype=torch.float32).unsqueeze(1) - y0
+        x = torch.arange(left, right, dtype=torch.float32) - x0
+        dx, dy = x1 - x0, y1 - y0
+        along = ((x * dx + y * dy) / max(dx * dx + dy * dy, 1e-12)).clamp(0, 1)  # nearest point of the line
+        near = (x - along * dx).square() + (y - along * dy).square() <= radius * radius
+        covered[top - first : bottom - first, left:right] |= near
+    return covered
+
+
+def _span(a: float, b: float, radius: float, first: int, last: int) -> tuple[int, int]:
+    """Range of the pixels in [first, last) that a line from a to b may cover."""
+    return max(first, int(min(a, b) - radius)), min(last, int(max(a, b) + radius) + 2)
+
+
+def mask_of(
+    strokes: Iterable[Stroke], size: tuple[int, int], rows: slice | None = None, *, above: Iterable[Stroke] = ()
+) -> Tensor:
+    """Rasterise strokes to a mask (1, 1, H, W), float32, of zeros and ones; ``rows`` as in :func:`cover`.
+
+    It is 0 where the strokes ``above`` cover them.
+    """
+    visible, hidden = torch.zeros(2, *_shape(size, rows), dtype=torch.bool)
+    for covered, some in ((visible, strokes), (hidden, above)):
+        for stroke in some:
+            covered |= cover(stroke, size, rows)
+    return (visible & ~hidden)[None, None].float()
+
+
+def paint(strokes: Iterable[Stroke], size: tuple[int, int], rows: slice | None = None) -> tuple[Tensor, Tensor]:
+    """Rasterise strokes to colours (1, 3, H, W) and a mask (1, 1, H, W); later strokes cover earlier ones."""
+    shape = _shape(size, rows)
+    colours, painted = torch.zeros(3, *shape), torch.zeros(shape, dtype=torch.bool)
+    for stroke in strokes:
+        covered = cover(stroke, size, rows)
+        colours[:, covered] = colour_of(stroke.paint).unsqueeze(1)
+        painted |= covered
+    return colours[None], painted[None, None].float()
+
+
+def _shape(size: tuple[int, int], rows: slice | None) -> tuple[int, int]:
+    return size if rows is None else (rows.stop - rows.start, size[1])
+
+
+def colour_of(paint: str) -> Tensor:
+    """Parse ``#rrggbb`` to RGB (3,) in [0, 1].
+
+    >>> colour_of("#ff0033")
+    tensor([1.0000, 0.0000, 0.2000])
+    """
+    return torch.tensor([int(paint[i : i + 2], 16) for i in (1, 3, 5)]) / 255

@@ -1,0 +1,1 @@
+"""Masks and colours of objects, from scribbles."""

@@ -1,0 +1,405 @@
+"""Soft object masks from foreground and background scribbles. Goes beyond the paper's Sec. IV.
+
+A regression with the filter's covariance (:mod:`nlfilter_torch.filtering.scribbles`) on colour, surrounding colour and
+texture separates foreground from background, together with the colours of single pixels
+(:mod:`nlfilter_torch.photo.selections.scribbled_colours`). Points that an even area, such as a sky, links to a scribble
+count as scribbled, too. Two local solves (:mod:`nlfilter_torch.photo.selections.matting`) then align the borders of the
+mask with those of the picture. Both run on a copy reduced to about :data:`SOLVED` pixels, so the cost hardly grows with
+the size of the picture. The result is a linear function of the colour for each place, which gives the mask of any pixel
+from its own colour; results in tiles are therefore exact.
+"""
+
+import math
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from nlfilter_torch.core.checks import check_count, check_positive
+from nlfilter_torch.filtering.scribbles import fit_strokes
+from nlfilter_torch.operator.features import blur
+from nlfilter_torch.photo.declared.parameters import MASK
+from nlfilter_torch.photo.declared.shared_parameters import VIEWING_SIZE
+from nlfilter_torch.photo.picture.colour import LIGHTNESS, hundredths_of_lab
+from nlfilter_torch.photo.picture.in_memory import edit_of
+from nlfilter_torch.photo.picture.pixels import corner
+from nlfilter_torch.photo.picture.resizing import block_means, enlarged
+from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles, scribbled_blocks
+from nlfilter_torch.photo.picture.source import Blocks, Fitted, Guide, Operator, Planes, Source
+from nlfilter_torch.photo.picture.viewing import viewed_size
+from nlfilter_torch.photo.selections.matting import LinearMasks, linear_mask, linear_models, solve_linear, solve_mask
+from nlfilter_torch.photo.selections.scribbled_colours import (
+    colour_likelihood,
+    evenness,
+    frame_places,
+    inner_places,
+    likeness,
+    linked_evenly,
+)
+from nlfilter_torch.photo.selections.texture import TEXTURE_MARGIN, with_texture
+
+SOLVED = 1 << 17  # pixels
+VIEWED = VIEWING_SIZE.default  # megapixels; larger pictures are first reduced to this size
+CHROMA_WEIGHT = 0.7  # weight of hue and saturation; that of lightness is LIGHTNESS
+TEXTURE_WEIGHT = 1.5
+NUM_CHANNELS = 9  # channels of the guide
+FLOATS_PER_PIXEL = 80  # estimated working memory per pixel of the reduced picture, in addition to its operator
+SMOOTHNESS = 0.25  # of the regression
+CONTRAST = 4.0  # steepness of the curve from likelihood to rough mask
+ROUGH_CONFIDENCE, SCRIBBLE_CONFIDENCE = 0.02, 1000.0  # confidence in the rough mask, and in scribbles
+COLOUR_SHARE = 0.65  # weight of the colours of single pixels in the rough mask; the rest is the regression
+# Colours count less where the regression finds no part of the region nearby: standard deviation of "nearby" as a share
+# of the short side, number of rows or columns of the grid it is averaged on, and average from which on colours count.
+AROUND_SIGMA, AROUND_GRID, ENOUGH_AROUND = 0.1, 40, 0.5
+FRAME_PIXELS = 112 * 160  # in larger pictures points of the frame count more, as scribbles have more pixels there
+ODDS, STEEPNESS = 1.5, 1.4  # of the curve from the solution along borders, too low halfway, to masks
+EPSILON = 1e-6
+
+
+def region_guide(image: Tensor) -> Tensor:
+    """Guide of the operator, (B, 9, H, W): colour, surrounding colour, and strength of the texture."""
+    lab = hundredths_of_lab(image)
+    colours = lab * lab.new_tensor([LIGHTNESS, CHROMA_WEIGHT, CHROMA_WEIGHT]).view(1, 3, 1, 1)
+    return with_texture(colours, lab[:, :1], TEXTURE_WEIGHT)
+
+
+@edit_of("image")
+def region_mask(
+    source: Source,
+    /,
+    scribbles: Tensor,
+    background: Tensor | None = None,
+    *,
+    reach: float | Tensor = MASK.defaults["reach"],
+    photometric_bandwidth: float | Tensor = MASK.defaults["photometric_bandwidth"],
+    spatial_bandwidth: float | Tensor | None = None,
+    num_landmarks: int = MASK.defaults["num_landmarks"],
+    **options: Any,
+) -> Fitted:
+    """Soft object masks from foreground and background scribbles.
+
+    A regression on colour and texture separates the two: pixels similar to the scribbles belong to the region, pixels
+    similar to background scribbles do not. An even area with a scribble, such as a sky, belongs to the region as a
+    whole. Points along the borders of the picture also count as background unless they resemble the region or are part
+    of such an area, so one scribble is enough. The borders of the mask are then aligned with those of the picture.
+    :func:`diffusion_mask` is the paper's mask, which selects everything similar to one region.
+
+    Args:
+        image: (B, C, H, W) in [0, 1], C = 1 or 3.
+        scribbles: (B, K, H, W) in [0, 1], above 0 on part or all of each of K regions; a rough mask is fine. Exactly 0
+            elsewhere: pixels with faint scribbles count as parts of the region too. Scribbles of other regions are
+            background, except where they overlap.
+        background: (B, 1 or K, H, W) in [0, 1], above 0 on part of the background of all regions or of each;
+            ``scribbles`` take precedence. None means no background scribbles.
+        reach: in [0, 1), probability that a random walk over similar pixels continues after each step; larger values
+            include less similar pixels.
+        photometric_bandwidth: in hundredths of Lab: 0.08 is 8 units.
+        spatial_bandwidth: in pixels; None is 0.45 of the short side, ``math.inf`` no limit: similar pixels anywhere.
+        num_landmarks: M of the operator.
+        **options: further ones of :func:`nonlocal_operator`, such as ``generator``.
+
+    Returns:
+        (B, K, H, W) in [0, 1], about 1 on scribbles and about 0 on those of the background. Differentiable in image,
+        scribbles, background and parameters.
+
+    Raises:
+        TypeError, ValueError: if a tensor has another size, leaves [0, 1], or has no painted pixel that no other
+            scribble overrides.
+
+    Example:
+        >>> image = torch.rand(1, 3, 32, 32, generator=torch.Generator().manual_seed(0)) * 0.2
+        >>> image[:, 0, 8:24, 8:24] += 0.6  # a red square
+        >>> scribble = torch.zeros(1, 1, 32, 32)
+        >>> scribble[..., 14:18, 12:20] = 1
+        >>> mask = region_mask(image, scribble, num_landmarks=50)
+        >>> bool(mask[..., 10:22, 10:22].min() > 0.8), bool(mask[..., :6, :].max() < 0.1)
+        (True, True)
+    """
+    found = select_regions(
+        source,
+        scribbles,
+        background,
+        reach=reach,
+        photometric_bandwidth=photometric_bandwidth,
+        spatial_bandwidth=spatial_bandwidth,
+        num_landmarks=num_landmarks,
+        **options,
+    )
+    return Fitted(found.masks)
+
+
+@dataclass(frozen=True, eq=False)
+class Regions:
+    """Masks of K regions, as other edits use them.
+
+    Attributes:
+        reduced: the reduced picture in which the masks were computed, (B, C, h, w) in [0, 1].
+        steps: height and width of a pixel of ``reduced``, in pixels of the picture.
+        functions: linear functions from colours in [0, 1] to masks, (B, K, C+1, h, w), see :meth:`LinearMasks.fit`.
+        scribbles: for each region, weights on the region and on its background.
+    """
+
+    reduced: Tensor
+    steps: tuple[float, float]
+    functions: Tensor
+    scribbles: list[Scribbles]
+
+    @property
+    def background_weights(self) -> Tensor:
+        """Largest weight of a background scribble of each region, (B, K)."""
+        return torch.stack([marked.weights[:, 1].amax(1) for marked in self.scribbles], dim=1)
+
+    def rows(self, planes: Tensor, pixels: Any) -> Tensor:
+        """Planes of the reduced picture, enlarged to the given pixels, (B, C, h, w)."""
+        height, width = pixels.image.shape[-2:]
+        return enlarged(planes, self.steps, corner(pixels), (height, width))
+
+    def masks(self, pixels: Any) -> Tensor:
+        """Masks (B, K, h, w) of the given pixels."""
+        image, found = pixels.image.clamp(0.0, 1.0) - 0.5, []
+        for functions, marked in zip(self.functions.unbind(1), self.scribbles, strict=True):
+            mask = calibrated(linear_mask(image, self.rows(functions, pixels)))
+            front, back = marked.planes(pixels).split(1, dim=1)
+            found.append(mask * (1 - front - back) + front)
+        return torch.cat(found, dim=1)
+
+    def reduced_masks(self) -> Tensor:
+        """Masks (B, K, h, w) of the reduced picture."""
+        image = self.reduced - 0.5
+        return torch.cat([calibrated(linear_mask(image, f)) for f in self.functions.unbind(1)], dim=1)
+
+
+def select_regions(
+    source: Source,
+    scribbles: Any,
+    background: Any = None,
+    *,
+    names: tuple[str, str] = ("scribbles", "background"),
+    **options: Any,
+) -> Regions:
+    """Compute the masks of regions from scribbles in the form that the source takes; ``names`` name them in errors.
+
+    Further arguments are those of :func:`region_mask`.
+    """
+    if source.channels not in (1, 3):
+        raise ValueError(f"image must have 1 or 3 channels, got {source.channels}; select 1 or 3")
+    inside = source.regions(scribbles, names[0])
+    others = [] if background is None else source.regions(background, names[1])
+    if len(others) not in (0, 1, len(inside)):
+        raise ValueError(
+            f"{names[1]} must have 1 channel or one for each of the {len(inside)} regions, got {len(others)}; "
+            "add or drop some"
+        )
+    found = fit_regions(source, inside, others, **options)
+    if others and bool((found.background_weights.detach() <= 0).any()):
+        raise ValueError(
+            f"{names[1]} must hold a painted pixel outside the scribbles of each region in every image, got none; "
+            "paint outside them, or omit it"
+        )
+    return found
+
+
+def background_of(source: Source, given: Any, inside: Scribbles, name: str) -> list[Scribbles]:
+    """Read scribbles on the background of objects, if any are given, in the form that the source takes.
+
+    Raises:
+        ValueError: if in any image all of them lie under those on the objects; the message calls them ``name``.
+    """
+    if given is None:
+        return []
+    background = source.scribbles(given, None, name, needed=False)
+    painted = (background.weights > 0).flatten(1).any(1)
+    free = (inside.joined(background).weights[:, -1] > 0).any(1)
+    if bool((painted & ~free).any()):
+        raise ValueError(
+            f"{name} must hold a painted pixel outside the scribbles on the object, got only pixels under them; "
+            "paint outside them, or omit it"
+        )
+    return [background]
+
+
+def fit_regions(
+    source: Source,
+    inside: list[Scribbles],
+    background: list[Scribbles],
+    *,
+    reach: float | Tensor = MASK.defaults["reach"],
+    spatial_bandwidth: float | Tensor | None = None,
+    **options: Any,
+) -> Regions:
+    """Compute the masks of regions from scribbles on each, and on the background: none, one for all, or one for each.
+
+    Further arguments are those of :func:`region_mask`.
+    """
+    MASK.check(source.batch, reach=reach)
+    if "guide_channels" in options:
+        raise TypeError("guide_channels must not be given: masks compare colours and texture; leave it out")
+    count, several = len(inside), len(background) > 1
+    both = [_against(inside, k, background[k : k + 1] if several else background) for k in range(count)]
+
+    defaults = {name: MASK.defaults[name] for name in ("photometric_bandwidth", "num_landmarks")}
+    options = defaults | {"patch_size": 1} | options | {"guide_channels": "all"}
+    check_positive(options["photometric_bandwidth"], "photometric_bandwidth", source.batch)
+    check_count(options["num_landmarks"], "num_landmarks")
+    # The size of a preview, so that masks are the same in a preview and in the photograph.
+    size = viewed_size(source.size, VIEWED)
+    viewed = source if size == source.size else source.resized(size)
+    blocks = math.ceil(math.sqrt(size[0] * size[1] / SOLVED))
+    small = viewed.blocks(blocks, FLOATS_PER_PIXEL + options["num_landmarks"])
+    # In a long narrow picture, the rounding of the smaller size makes the steps differ.
+    steps = (blocks * source.size[0] / size[0], blocks * source.size[1] / size[1])
+    marks = [blocks_of(marked, small, source.size, steps) for marked in both]
+    options["num_landmarks"] = min(options["num_landmarks"], small.size[0] * small.size[1])
+    if not (isinstance(spatial_bandwidth, float) and spatial_bandwidth == math.inf):
+        if spatial_bandwidth is not None:
+            check_positive(spatial_bandwidth, "spatial_bandwidth", source.batch)
+            spatial_bandwidth = spatial_bandwidth / math.sqrt(steps[0] * steps[1])
+        options["spatial_bandwidth"] = MASK["spatial_bandwidth"].distance(spatial_bandwidth, small.size)
+    operator = small.operator(Guide(options, region_guide, TEXTURE_MARGIN, NUM_CHANNELS, spectral=True, sampled=True))
+    places = frame_places(small.size)
+    inner = inner_places(small.size)
+    at_frame, at_grid = operator.at(places), operator.at(inner)
+    colours, inner_colours = small.colours(places), small.colours(inner)
+    image = small.image.clamp(0.0, 1.0)  # a far brighter pixel of a float file would upset the linear functions
+    even = small.kept("evenness", [], lambda: evenness(small.image))
+    rough, bandwidth = [], torch.as_tensor(options["photometric_bandwidth"], dtype=small.dtype)
+    for number, marked in enumerate(marks):
+        unlike = 1 - likeness(marked.image, marked.weights[:, :1], colours, bandwidth)
+        linked = linked_evenly(even, marked.planes(small)).flatten(2)
+        frame_links, grid_links = linked[:, :, places], linked[:, :, inner]
+        regression = _regression(small, operator, marked, (at_frame, unlike, frame_links), (at_grid, grid_links), reach)
+        likely = sharpened(regression(small))
+        own = torch.maximum((likely * even).flatten(2)[:, :, places], frame_links)
+        compared = [unlike, own, inner_colours, grid_links, bandwidth]
+        by_colour = small.kept(
+            ("likelihood", number),
+            [marked.image, marked.weights, *compared],
+            partial(colour_likelihood, small.image, marked, colours, *compared),
+        )
+        rough.append(likely + (by_colour - likely) * COLOUR_SHARE * (around(likely) / ENOUGH_AROUND).clamp(max=1.0))
+    front, back = (torch.cat([marked.planes(small)[:, k : k + 1] for marked in marks], dim=1) for k in (0, 1))
+    masks = [torch.cat(rough, dim=1), front, back]
+
+    def borders() -> Tensor:
+        return fit_borders(image, small.kept("models", [], lambda: linear_models(image)), *masks)
+
+    return Regions(image, steps, small.kept("borders", masks, borders), both)
+
+
+def blocks_of(marked: Scribbles, small: Source, size: tuple[int, int], steps: tuple[float, float]) -> Scribbles:
+    """Scribbles on the reduced picture; weight and colour of a block are the means of its pixels.
+
+    Args:
+        marked: scribbles on the picture.
+        small: the reduced picture.
+        size: (H, W) of the picture.
+        steps: height and width of a block, in pixels.
+    """
+    if steps == (1, 1):
+        return marked
+    rows, columns = (
+        ((torch.arange(length, dtype=torch.float64) + 0.5) / step).long().clamp(max=count - 1).to(marked.places)
+        for length, count, step in zip(size, small.size, steps, strict=True)
+    )
+    pixels = torch.outer(rows.bincount(minlength=small.size[0]), columns.bincount(minlength=small.size[1])).flatten()
+    row, column = rows[marked.places // size[1]], columns[marked.places % size[1]]
+    places, block = (row * small.size[1] + column).unique(return_inverse=True)
+    weights = marked.weights.new_zeros(*marked.weights.shape[:2], len(places))
+    weights = weights.index_add(2, block, marked.weights) / pixels[places]
+    colours = marked.colours
+    if colours is not None:
+        total = marked.weights.sum(1, keepdim=True)
+        sums = [
+            part.new_zeros(*part.shape[:2], len(places)).index_add(2, block, part) for part in (colours * total, total)
+        ]
+        colours = sums[0] / sums[1].clamp(min=EPSILON)
+    return Scribbles(places, weights.clamp(max=1.0), small.colours(places), colours)
+
+
+def _against(inside: list[Scribbles], number: int, background: list[Scribbles]) -> Scribbles:
+    """Two planes of scribbles: on one region, and on everything outside it."""
+    rest = [other for k, other in enumerate(inside) if k != number] + background
+    own = inside[number]
+    if not rest:
+        return own.weighted(torch.cat([own.weights, torch.zeros_like(own.weights)], dim=1))
+    around = rest[0]
+    for other in rest[1:]:
+        joined = around.joined(other)
+        around = joined.weighted(joined.weights.amax(1, keepdim=True))
+    return own.joined(around)
+
+
+def _regression(
+    source: Source,
+    operator: Operator,
+    marked: Scribbles,
+    frame: tuple[Blocks, Tensor, Tensor],
+    inside: tuple[Blocks, Tensor],
+    reach: float | Tensor,
+) -> Planes:
+    """Likelihood that a pixel belongs to a region: about 1 inside and about 0 outside; not clamped.
+
+    Args:
+        source: the picture.
+        operator: its operator.
+        marked: scribbles on the region and on its background.
+        frame: pixels along the borders of the picture: their columns, dissimilarity to the scribbles on the region, and
+            :func:`linked_evenly` to these, (B, 1, n).
+        inside: pixels on a grid: their columns, and :func:`linked_evenly`, (B, 1, m).
+        reach: that of :func:`region_mask`.
+    """
+    columns, weights = operator.at(marked.places), marked.weights
+    total = weights.sum(1, keepdim=True).clamp(max=1.0)
+    values = weights[:, :1] / weights.sum(1, keepdim=True).clamp(min=EPSILON)
+    pixels = source.size[0] * source.size[1]
+    fit = partial(fit_strokes, pairs=operator.pairs, pixels=pixels, reach=reach, smoothness=SMOOTHNESS)
+    known = [(columns, total, values)]
+    opposed = (weights[:, 1].detach() > 0).any(1).to(weights)  # 1 for images with scribbles on the background
+    first = fit(lambda: scribbled_blocks(known), strength=opposed)
+    at_frame, unlike, linked = frame
+    unlike = unlike * torch.cat([(1 - first(block)).clamp(0.0, 1.0).square() for block in at_frame()], dim=2)
+    known.append((at_frame, unlike * max(1.0, pixels / FRAME_PIXELS), linked))
+    known.append((*inside, torch.ones_like(inside[1])))
+    fitted = fit(lambda: scribbled_blocks(known), strength=1.0)
+    return operator.each(lambda found: fitted(found.factor))
+
+
+def calibrated(mask: Tensor) -> Tensor:
+    """Mask of a solution along borders: a curve on which 0 and 1 stay as they are."""
+    mask = mask.clamp(0.0, 1.0)
+    inside, outside = ODDS * mask**STEEPNESS, (1 - mask) ** STEEPNESS
+    return inside / (inside + outside)
+
+
+def sharpened(likely: Tensor) -> Tensor:
+    """Rough mask of a likelihood: a steep curve on which 0 and 1 stay as they are."""
+    bound = math.tanh(CONTRAST / 2)
+    return (0.5 + torch.tanh(CONTRAST * (likely - 0.5)) / (2 * bound)).clamp(0.0, 1.0)
+
+
+def around(likely: Tensor) -> Tensor:
+    """Average of planes (B, 1, H, W) over a wide Gaussian, approximately."""
+    size = (likely.shape[-2], likely.shape[-1])
+    step = max(1, min(size) // AROUND_GRID)
+    coarse = block_means(likely, step)
+    return enlarged(blur(coarse, AROUND_SIGMA * min(size) / step), (step, step), (0, 0), size)
+
+
+def fit_borders(image: Tensor, models: list[LinearMasks], rough: Tensor, front: Tensor, back: Tensor) -> Tensor:
+    """Linear functions (B, K, C+1, H, W) from colours to masks, see :func:`solve_linear`.
+
+    Args:
+        image: (B, C, H, W).
+        models: :func:`linear_models` of the image.
+        rough: rough masks of the regions, (B, K, H, W).
+        front: weights of the scribbles on the regions, (B, K, H, W).
+        back: weights of the scribbles on their background, (B, K, H, W).
+    """
+    painted = front + back
+    target = (rough * ROUGH_CONFIDENCE + front * SCRIBBLE_CONFIDENCE) / (
+        ROUGH_CONFIDENCE + painted * SCRIBBLE_CONFIDENCE
+    )
+    start = solve_mask(image, target, ROUGH_CONFIDENCE + painted * SCRIBBLE_CONFIDENCE)
+    return solve_linear(models, start, rough, front, back)

@@ -1,0 +1,274 @@
+"""One edit for all frames of a film: fitted to some reference frames, and applied to each frame a few rows at a time.
+
+Everything that an edit computes from the whole picture (landmarks, sums, means, the noise level) it computes from the
+reference frames, in an order that does not depend on the picture. The results are cached the first time and returned
+again for every other frame, so that equal patches are edited equally in all frames.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, TypeVar, cast
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from nlfilter_torch.core.blocks import stratified
+from nlfilter_torch.core.precision import full_precision
+from nlfilter_torch.operator.build import operator_from_features
+from nlfilter_torch.operator.features import GuideFeatures, estimate_bandwidth, reduce_channels, unit_window
+from nlfilter_torch.operator.scaling import PixelScaling
+from nlfilter_torch.operator.spectrum import RitzPairs
+from nlfilter_torch.photo.declared.steps import Step, acting_steps
+from nlfilter_torch.photo.edits.applying import fit_step
+from nlfilter_torch.photo.picture.source import Fitted, Guide, Planes, Source, seeded
+from nlfilter_torch.photo.tiled.operator import TiledOperator, first_plane
+from nlfilter_torch.photo.tiled.pictures import Picture
+from nlfilter_torch.photo.tiled.sampling import CHUNK, ColumnCache, GuidePicture, Pilot
+from nlfilter_torch.photo.tiled.source import Tiled
+from nlfilter_torch.photo.tiled.statistics import Block, Sums
+from nlfilter_torch.photo.tiled.tiles import Passes
+
+# Pixels of all references together; twice or half as many approximate all pixels equally well.
+REFERENCE_PIXELS = 1 << 16
+UNLIMITED_BANDWIDTH = 1e6  # spatial bandwidth in pixels at which distance has no effect
+Cached = TypeVar("Cached")
+FrameArray = NDArray[np.float32]
+
+
+@dataclass(eq=False)
+class References:
+    """Frames that an edit is fitted to, and the results computed from them so far, in order."""
+
+    pictures: list[Picture]
+    results: list[Any] = field(default_factory=list)
+
+    def forget_pixels(self) -> None:
+        """Free the frames and keep only the results, once all of them are known."""
+        self.pictures = []
+        for result in self.results:
+            if isinstance(result, References):
+                result.forget_pixels()
+            elif isinstance(result, LearntFilter):
+                result.blocks = []
+
+
+@dataclass(eq=False)
+class LearntFilter:
+    """The filter of all references: its kernel and balancing, and blocks of the pixels that it was fitted to."""
+
+    pilot: Pilot
+    pixel_scaling: PixelScaling
+    blocks: list[Block]
+
+
+class FrameOperator(TiledOperator):
+    """The filter of the references, applied to the pixels of a frame."""
+
+    frame: "Frame"
+
+    @property
+    def pairs(self) -> RitzPairs:
+        """The spectrum."""
+
+        def found() -> RitzPairs:
+            sums = self._summed_up(first_plane, 1, self.over("Summing up"))
+            return RitzPairs.of_sums(sums.grams[:, :2], sums.dtype)
+
+        return self.frame.cached_result(found)
+
+    def sums(self, planes: Planes, order: int) -> Sums:
+        """The sums over the references for the first ``order`` powers of W."""
+        return self.frame.cached_result(lambda: self._summed_up(planes, order, self.over("Summing up")))
+
+    def mean(self, planes: Planes) -> Tensor:
+        """Means over the references."""
+        return self.frame.cached_result(lambda: TiledOperator.mean(self, planes))
+
+
+class Frame(Tiled):
+    """A frame as the source of an edit that is fitted to reference frames of the same size."""
+
+    def __init__(self, picture: Picture, passes: Passes, references: References) -> None:
+        super().__init__(picture, passes)
+        self.references, self.num_requested = references, 0
+
+    def cached_result(self, compute: Callable[[], Cached]) -> Cached:
+        """Return the next cached result for the references, or compute and cache it."""
+        if self.num_requested == len(self.references.results):
+            with torch.no_grad():
+                self.references.results.append(compute())
+        self.num_requested += 1
+        return cast(Cached, self.references.results[self.num_requested - 1])
+
+    def each_reference(self) -> Iterator["Frame"]:
+        """Yield the references, as frames that share the operators of this one."""
+        for picture in self.references.pictures:
+            other = Frame(picture, self.passes, self.references)
+            other.operators, other.tile_floats = self.operators, self.tile_floats
+            yield other
+
+    @full_precision
+    def operator(self, guide: Guide) -> FrameOperator:
+        """The filter of the references."""
+        learnt = self.cached_result(lambda: learn_filter(self.references.pictures, guide))
+        found = FrameOperator(
+            GuidePicture(self.picture, guide),
+            learnt.pilot,
+            self.passes.report,
+            sample_size=None,
+            full_passes=True,
+            kernel=learnt.pilot.kernel,
+            bounded=False,
+            workers=self.passes.workers(learnt.pilot.moment.shape[1]),
+            cache=ColumnCache(1, 0),
+        )
+        found.frame, found._pixel_scaling, found._sample = self, learnt.pixel_scaling, learnt.blocks
+        self.operators.append(found)
+        self.tile_floats += learnt.pilot.kernel.landmarks.shape[1]
+        return found
+
+    def resized(self, size: tuple[int, int]) -> "Frame":
+        """The frame, with the references, in a smaller size."""
+
+        def reduced() -> References:
+            return References([Tiled.resized(other, size).picture for other in self.each_reference()])
+
+        references = self.cached_result(reduced)
+        return Frame(super().resized(size).picture, replace(self.plain, tile_rows=None), references)
+
+    def cached(self, fitted: Fitted) -> Fitted:
+        """Return the edit unchanged: stored planes would be those of the frame, but means are over the references."""
+        return fitted
+
+    def mean(self, planes: Planes) -> Tensor:
+        """Means over the references."""
+        return self.cached_result(lambda: average([Tiled.mean(other, planes) for other in self.each_reference()]))
+
+    def mean_of(self, fitted: Fitted, function: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
+        """Means over the references."""
+        return self.cached_result(
+            lambda: average([Tiled.mean_of(other, fitted, function) for other in self.each_reference()])
+        )
+
+    def ends(self, planes: Planes) -> tuple[Tensor, Tensor]:
+        """Means of the least and largest values of the references."""
+
+        def found() -> tuple[Tensor, Tensor]:
+            least, largest = zip(*(Tiled.ends(other, planes) for other in self.each_reference()), strict=True)
+            return average(least), average(largest)
+
+        return self.cached_result(found)
+
+    def measured(self, function: Callable[[Source], Tensor]) -> Tensor:
+        """The mean of a measurement over the references."""
+        return self.cached_result(lambda: average([function(other) for other in self.each_reference()]))
+
+
+def average(values: Sequence[Tensor]) -> Tensor:
+    """The mean of tensors of one shape."""
+    return torch.stack(list(values)).mean(0)
+
+
+def learn_filter(pictures: Sequence[Picture], guide: Guide) -> LearntFilter:
+    """Fit one filter to several pictures of one size, from an even sample of the pixels of each.
+
+    Coordinates of a pixel are those in its own picture. The weights of all pictures together sum to the number of
+    pixels of one.
+    """
+    options = dict(guide.options)
+    channels, bandwidth = options.pop("guide_channels", "luminance"), options.pop("photometric_bandwidth", "auto")
+    window = unit_window(options.pop("patch_size", 5), None).to(pictures[0].dtype)
+    spatial, generator = options.pop("spatial_bandwidth", None), options.pop("generator", None)
+    generator = seeded() if generator is None else generator
+    if isinstance(bandwidth, str):
+        guides = (reduce_channels(guide(whole(picture)), channels) for picture in pictures)
+        bandwidth = average([estimate_bandwidth(compared, guide_channels=channels) for compared in guides])
+    recipe = GuideFeatures(window, bandwidth, spatial, channels)
+    each = min(pictures[0].pixels, max(1, REFERENCE_PIXELS // len(pictures)))
+    drawn = torch.Generator().manual_seed(generator.initial_seed() % (1 << 63))
+    features, images = [], []
+    for picture in pictures:
+        image = whole(picture)
+        places = stratified(picture.pixels, each, drawn)
+        features.append(recipe(guide(image))[:, :, places])
+        images.append(image.flatten(2)[:, :, places])
+    points, colours = torch.cat(features, dim=2), torch.cat(images, dim=2)
+    weights = torch.full((1, points.shape[2]), pictures[0].pixels / points.shape[2], dtype=points.dtype)
+    options["num_landmarks"] = min(options.get("num_landmarks", 100), points.shape[2])
+    built = operator_from_features(points, size=(points.shape[2],), weights=weights[0], generator=generator, **options)
+    pixels = (built.factor, built.diagonal, colours, weights)
+    cuts = zip(*(part.split(CHUNK, dim=-1) for part in pixels), strict=True)
+    blocks = [Block(factor, diagonal, image, weight) for factor, diagonal, image, weight in cuts]
+    empty = Block(built.factor[..., :0], built.diagonal[..., :0], colours[..., :0], weights[..., :0])
+    kernel = replace(built.kernel, features=recipe)
+    return LearntFilter(Pilot(kernel, empty, built.balancing.moment, 0), built.balancing, blocks)
+
+
+def whole(picture: Picture) -> Tensor:
+    """All pixels (1, C, H, W)."""
+    return picture.tile(0, picture.size[0], 0).pixels
+
+
+def film_steps(steps: Sequence[Step]) -> tuple[Step, ...]:
+    """Adapt the steps of an edit to a film: position is ignored unless a spatial bandwidth is set.
+
+    An object that moves far from its position in all references would otherwise be edited differently.
+
+    Raises:
+        ValueError: if a step has or needs strokes.
+    """
+    for step in steps:
+        if step.strokes or step.declared.requires_strokes:
+            raise ValueError(f"edits of a film must not have strokes, got {step.edit} with strokes; remove that step")
+    return tuple(
+        step.changed(
+            spatial_bandwidth="none" if "none" in step.declared["spatial_bandwidth"].words else UNLIMITED_BANDWIDTH
+        )
+        if step["spatial_bandwidth"] is None
+        else step
+        for step in acting_steps(steps)
+    )
+
+
+class FilmEdit:
+    """A whole edit, fitted to some frames of a film.
+
+    Args:
+        steps: without strokes.
+        references: frames (H, W, C) of one size.
+        passes: tiling options; ``kind`` is ignored.
+        seed: of the random numbers of every step.
+
+    Raises:
+        ValueError: if a step has strokes, or references differ in size.
+    """
+
+    def __init__(
+        self, steps: Sequence[Step], references: Sequence[FrameArray], passes: Passes, *, seed: int = 0
+    ) -> None:
+        self.steps, self.passes, self.seed = film_steps(steps), replace(passes, kind="float32"), seed
+        self.references: list[References] = []
+        self.size = references[0].shape[:2]
+        pictures = [Picture(reference, "reference") for reference in references]
+        for number, step in enumerate(self.steps):
+            learnt = References(pictures)
+            self.references.append(learnt)
+            last = number + 1 == len(self.steps)
+            edited = [self.edit(step, picture, learnt) for picture in (pictures[:1] if last else pictures)]
+            learnt.forget_pixels()
+            pictures = [Picture(rows.clip(0, 1), "reference") for rows in edited]
+
+    def edit(self, step: Step, picture: Picture, references: References) -> FrameArray:
+        """Apply a step to a frame (H, W, C)."""
+        frame = Frame(picture, self.passes, references)
+        rows = frame.rows(fit_step(step, frame, (), {}, generator=seeded(self.seed)), plain=True)
+        return np.concatenate([values for _, values in rows])
+
+    def __call__(self, frame: FrameArray) -> FrameArray:
+        """Apply the edit to a frame (H, W, C); values may leave [0, 1]."""
+        for step, references in zip(self.steps, self.references, strict=True):
+            source = frame if step is self.steps[0] else frame.clip(0, 1)
+            frame = self.edit(step, Picture(source, "frame"), references)
+        return frame

@@ -1,0 +1,95 @@
+"""A whole edit, as saved by the editor, on a picture larger than memory: one step after another, in tiles of rows."""
+
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from nlfilter_torch.photo.declared.steps import Step, acting_steps
+from nlfilter_torch.photo.edits.applying import fit_step, scribbles_of
+from nlfilter_torch.photo.picture.changes import blend_edited
+from nlfilter_torch.photo.tiled.pictures import Picture, Rows, RowSource, Tile, mask_of
+from nlfilter_torch.photo.tiled.scribbles import colour_rows, mask_rows
+from nlfilter_torch.photo.tiled.source import Tiled
+from nlfilter_torch.photo.tiled.tiles import TILE_PIXELS, Passes, TileEdit, Tiling
+from nlfilter_torch.photo.tiled.workers import single_threaded
+
+
+def edit_rows(passes: Passes, source: RowSource, steps: Sequence[Step], name: str) -> Rows:
+    """Yield the rows (h, W, S) of the picture edited as by :meth:`Recipe.apply`, in order; see :func:`edit_tiling`."""
+    with edit_tiling(passes, source, steps, name) as tiling:
+        yield from tiling
+
+
+@contextmanager
+def edit_tiling(passes: Passes, source: RowSource, steps: Sequence[Step], name: str) -> Iterator[Tiling]:
+    """Yield the rows of the picture edited as by :meth:`Recipe.apply`, not yet computed after the last step.
+
+    ``name`` is that of the source, for error messages.
+
+    Raises:
+        ValueError: if a step needs the whole picture at once, or does not suit the picture.
+        OSError: if a temporary file does not fit.
+    """
+    steps = acting_steps(steps)
+    limits = Picture(source, name).limits if len(steps) > 1 else (0.0, 1.0)
+    with ExitStack() as stack:
+        for step in steps[:-1]:
+            with step_tiling(step, replace(passes, kind="float32"), source, name) as tiling:
+                source = stack.enter_context(passes.stored(clipped(tiling, limits)))
+        if steps:
+            yield stack.enter_context(step_tiling(steps[-1], passes, source, name))
+        else:
+            yield tile_by_tile(passes, Picture(source, name), inner)
+
+
+@contextmanager
+def edit_regions(
+    passes: Passes, source: RowSource, edits: Sequence[Sequence[Step]], masks: Sequence[RowSource], name: str
+) -> Iterator[Tiling]:
+    """The rows of the picture under one edit for each mask, whose rows are of a grey picture of the same size.
+
+    Raises:
+        ValueError, OSError: as :func:`edit_tiling`.
+    """
+    each, edited = replace(passes, kind="float32"), []
+    with ExitStack() as stack:
+        for steps in edits:
+            with edit_tiling(each, source, steps, name) as tiling:
+                edited.append(Picture(stack.enter_context(passes.stored(tiling))))
+        shares = [Picture(mask) for mask in masks]
+
+        def blended(tile: Tile) -> Tensor:
+            image, stop = tile.inner, tile.start + tile.inner.shape[2]
+            found = [one.tile(tile.start, stop, 0).inner.to(image) for one in edited]
+            grey = [mask_of(one.tile(tile.start, stop, 0)).to(image) for one in shares]
+            return blend_edited(image, found, torch.cat(grey, dim=1))
+
+        yield tile_by_tile(passes, Picture(source, name), blended)
+
+
+@contextmanager
+def step_tiling(step: Step, passes: Passes, source: RowSource, name: str) -> Iterator[Tiling]:
+    """Yield the rows of a picture after a step, not yet computed."""
+    tiled = Tiled(Picture(source, name), passes)
+    with single_threaded(passes.workers(1)):
+        fitted = fit_step(step, tiled, *scribbles_of(step, tiled.size, colour_rows, mask_rows))
+    with tiled.tiling(fitted) as tiling:
+        yield tiling
+
+
+def tile_by_tile(passes: Passes, picture: Picture, edit: TileEdit) -> Tiling:
+    """An edit that computes each pixel from that of the picture."""
+    return Tiling(passes, picture, edit, 0, passes.tile_rows or max(1, TILE_PIXELS // picture.size[1]))
+
+
+def inner(tile: Tile) -> Tensor:
+    """The pixels of a tile."""
+    return tile.inner
+
+
+def clipped(tiling: Tiling, limits: tuple[float, float]) -> Tiling:
+    """The same rows, with values in a range."""
+    return replace(tiling, edit=lambda tile: tiling.edit(tile).clamp(*limits))

@@ -1,0 +1,392 @@
+"""A picture that is read a few rows at a time as the source of an edit: sums in passes, output in tiles."""
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from nlfilter_torch.core.checks import check_count
+from nlfilter_torch.core.precision import full_precision
+from nlfilter_torch.operator.eigenvalue_bound import is_bounded
+from nlfilter_torch.photo.picture.ends import ends_of
+from nlfilter_torch.photo.picture.in_memory import InMemory
+from nlfilter_torch.photo.picture.pixels import part_of
+from nlfilter_torch.photo.picture.resizing import block_means, resized, resized_parts
+from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles
+from nlfilter_torch.photo.picture.source import Fitted, Guide, Kept, Planes, Source
+from nlfilter_torch.photo.tiled.operator import TiledOperator, TilePixels
+from nlfilter_torch.photo.tiled.pictures import Picture, Rows, RowSource, Tile
+from nlfilter_torch.photo.tiled.sampling import ColumnCache, GuidePicture, take_pilot, visit
+from nlfilter_torch.photo.tiled.scribbles import (
+    check_scribble_memory,
+    floats_per_scribbled_pixel,
+    read_scribbles,
+    region_rows,
+)
+from nlfilter_torch.photo.tiled.tiles import TILE_PIXELS, Passes, Tiling, cacheable_pixels, rows_that_fit
+from nlfilter_torch.photo.tiled.workers import Result, in_order, single_threaded
+
+CACHED_SHARE = 1 / 16  # largest share of the memory for planes that an edit reuses
+FINISH_FLOATS = 64  # floats per pixel of a tile during ``Fitted.finish``: images, their transforms and products
+
+
+class Tiled:
+    """A picture that is read in tiles, as the source of an edit; errors call its scribbles ``strokes``."""
+
+    batch = 1
+    whole = False
+
+    def __init__(self, picture: Picture, passes: Passes, strokes: str = "strokes") -> None:
+        self.picture, self.passes, self.strokes = picture, passes, strokes
+        self.size, self.channels, self.dtype = picture.size, picture.colours, picture.dtype
+        self.operators: list[TiledOperator] = []
+        self.tile_floats = 8 * picture.colours + 40  # floats per pixel of a tile; each operator adds its features
+        self.scribbled_pixels = 0
+        self.cached_floats = 0  # floats of cached columns
+        self.guide_floats = 0  # floats of stored guides
+
+    @torch.no_grad()
+    @full_precision
+    def operator(self, guide: Guide) -> "TiledOperator":
+        """The filter of the whole picture, balanced on a sample of the pixels or on all of them.
+
+        Raises:
+            MemoryError: if the samples or a row do not fit in memory.
+        """
+        options = dict(guide.options)
+        patch_size, count = options.get("patch_size", 5), options.get("num_landmarks", 100)
+        check_count(patch_size, "patch_size")
+        check_count(count, "num_landmarks")
+        compared = guide.channels or (self.channels if options.get("guide_channels") == "all" else 1)
+        num_features = patch_size**2 * compared + 2
+        for other in self.operators:
+            other.cache = ColumnCache(1, 0)  # frees memory
+        self.cached_floats = 0
+        self.fitting_rows(num_features, count)
+        passes, picture = self.passes, GuidePicture(self.picture, guide)
+        workers = passes.workers(count)
+        if guide.margin and passes.stores_guide(picture.pixels * compared * self.dtype.itemsize):
+            self.guide_floats += picture.pixels * compared
+            self.fitting_rows(num_features, count)
+            picture.store(max(1, TILE_PIXELS // self.size[1]), workers)
+        pilot = take_pilot(picture, passes.report, workers, **options)
+        sampled, count = passes.sample < picture.pixels, pilot.moment.shape[1]
+        cached_pixels = cacheable_pixels(picture, passes, num_features, count, self.stored_floats(num_features))
+        self.cached_floats = cached_pixels * (count + 2)
+        found = TiledOperator(
+            picture,
+            pilot,
+            passes.report,
+            passes.sample if sampled else None,
+            full_passes=not sampled or passes.statistics == "full" or guide.exact,
+            kernel=pilot.kernel,
+            bounded=is_bounded(options.get("landmarks", "kmeans"), picture.pixels, count),
+            workers=workers,
+            cache=ColumnCache(picture.statistics_rows * self.size[1], cached_pixels),
+        )
+        self.operators.append(found)
+        self.tile_floats += num_features
+        return found
+
+    def fitting_rows(self, num_features: int, num_landmarks: int) -> int:
+        """Rows of a tile that fit in memory, with ``num_features`` more features per pixel.
+
+        Raises:
+            MemoryError: if not even one row fits, or the samples do not.
+        """
+        check_scribble_memory(self.picture, self.scribbled_pixels, num_features, self.passes.memory)
+        floats, kept = self.tile_floats + num_features, self.cached_floats + self.stored_floats(num_features)
+        return rows_that_fit(self.picture, self.passes, floats, num_features, num_landmarks, kept)
+
+    def stored_floats(self, num_features: int) -> int:
+        """Floats of stored guides, and of scribbles with ``num_features`` features per pixel."""
+        return self.guide_floats + self.scribbled_pixels * floats_per_scribbled_pixel(num_features)
+
+    def scribbles(
+        self, mask: RowSource | None, colours: RowSource | None, name: str, *, needed: bool = True
+    ) -> Scribbles:
+        """Read scribbles from a mask, rows (H, W) or (H, W, 1), and colours, rows (H, W, 3).
+
+        Without a mask, colours are rows (H, W, 4), whose last channel is the mask.
+
+        Raises:
+            ValueError: if the size or number of channels of an input does not fit, a weight is outside [0, 1], or
+                scribbles are ``needed`` and cover no pixel.
+            MemoryError: if there are too many scribbled pixels.
+        """
+        found = read_scribbles(
+            self.picture,
+            mask,
+            colours,
+            name=name,
+            strokes=self.strokes,
+            memory=self.passes.memory,
+            report=self.passes.report,
+        )
+        if needed and len(found.places) == 0:
+            called = self.strokes if mask is None else name
+            raise ValueError(f"{called} must hold a painted pixel, got none; paint at least one")
+        self.scribbled_pixels += len(found.places)
+        return found
+
+    def regions(self, masks: RowSource, name: str) -> list[Scribbles]:
+        """Read the scribbles of K regions from rows (H, W, K) in [0, 1].
+
+        Raises:
+            ValueError, MemoryError: as :meth:`scribbles`.
+        """
+        if len(masks.shape) == 2:
+            return [self.scribbles(masks, None, name)]
+        return [self.scribbles(region_rows(masks, k), None, name) for k in range(masks.shape[2])]
+
+    def colours(self, places: Tensor) -> Tensor:
+        """Read the colours (1, C, n) of single pixels."""
+        seen = visit(self.picture, 0, places, self.passes.report, "Looking", every=False)
+        return torch.cat([tile.inner.flatten(2)[:, :, chosen] for tile, chosen in seen], dim=2)
+
+    @torch.no_grad()
+    def resized(self, size: tuple[int, int]) -> "Tiled":
+        """The picture in a smaller size, in memory, as another tiled source."""
+        planes = self._resized(lambda tile: tile.pixels, size)[0].permute(1, 2, 0).numpy()
+        passes = replace(self.plain, tile_rows=None)
+        return Tiled(Picture(np.ascontiguousarray(planes), self.picture.name), passes, self.strokes)
+
+    @torch.no_grad()
+    def shrunk(self, planes: Planes, size: tuple[int, int]) -> Tensor:
+        """Planes (1, C, h, w) of all pixels in a smaller size."""
+        return self._resized(lambda tile: planes(self.pixels_of(tile)), size)
+
+    @torch.no_grad()
+    def resized_weights(self, weights: RowSource, size: tuple[int, int], name: str) -> RowSource:
+        """Weights, rows (H, W, K) or (H, W), in a smaller size."""
+        if tuple(weights.shape[:2]) != self.size:
+            raise ValueError(
+                f"{name} must have the height and width of the picture, {self.size}, got {tuple(weights.shape[:2])}; "
+                "resize them"
+            )
+        # Extremes of each plane; interpolation may exceed them, but must not hide an invalid weight.
+        lowest: list[Tensor] = []
+        highest: list[Tensor] = []
+
+        def read(start: int, stop: int) -> Tensor:
+            rows = torch.from_numpy(np.atleast_3d(np.array(weights[start:stop], np.float32)))
+            rows = rows.permute(2, 0, 1)[None]
+            lowest.append(rows.amin((2, 3), keepdim=True))
+            highest.append(rows.amax((2, 3), keepdim=True))
+            return rows
+
+        found = resized(read, self.size, size)  # fills the lists
+        found = found.clamp(torch.cat(lowest).amin(0), torch.cat(highest).amax(0))
+        return found[0].permute(1, 2, 0).contiguous().numpy()
+
+    def _resized(self, planes: Callable[[Tile], Tensor], size: tuple[int, int]) -> Tensor:
+        """Resize planes of tiles, which are computed by several threads."""
+
+        def read(start: int, stop: int) -> Callable[[], Tensor]:
+            self.passes.report("Reducing", start, self.size[0])
+            return partial(planes, self.picture.tile(start, stop, 0))
+
+        parts = resized_parts(read, self.size, size)
+        return torch.cat(list(in_order(lambda part: part(), parts, self.passes.workers(1))), dim=2)
+
+    def all(self, fitted: Fitted) -> Tensor:
+        """The planes (1, C, H, W) that an edit makes of all pixels."""
+        rows = np.concatenate([values for _, values in self.rows(fitted, plain=True)])
+        return torch.from_numpy(rows).permute(2, 0, 1)[None]
+
+    def cached(self, fitted: Fitted) -> Fitted:
+        """Compute the planes of an edit and keep them in memory, if small; else they are recomputed on every use."""
+        if self.picture.pixels * self.channels * self.dtype.itemsize > CACHED_SHARE * self.passes.memory:
+            return fitted
+        return Fitted(part_of(self.all(fitted)))
+
+    @torch.no_grad()
+    def mean_of(self, fitted: Fitted, function: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
+        """Means over all pixels, in a pass over the picture."""
+        total = sum(values.sum((0, 1), dtype=np.float64) for _, values in self.rows(fitted.then(function), plain=True))
+        return torch.as_tensor(total / self.picture.pixels).to(self.dtype).view(1, -1, 1, 1)
+
+    @torch.no_grad()
+    def mean(self, planes: Planes) -> Tensor:
+        """Means (1, C, 1, 1) over all pixels."""
+
+        def summed(tile: Tile) -> Tensor:
+            return planes(self.pixels_of(tile)).double().sum((2, 3), keepdim=True)
+
+        total = sum(self._map_tiles(summed, self.picture.statistics_rows, "Averaging"))
+        return torch.as_tensor(total / self.picture.pixels).to(self.dtype)
+
+    @torch.no_grad()
+    def ends(self, planes: Planes) -> tuple[Tensor, Tensor]:
+        """Least and largest values over all pixels."""
+
+        def part(tile: Tile) -> tuple[Tensor, Tensor]:
+            return ends_of(planes(self.pixels_of(tile)))
+
+        parts = list(self._map_tiles(part, self.picture.statistics_rows, "Finding black and white"))
+        least, largest = (torch.cat(values, dim=2) for values in zip(*parts, strict=True))
+        return least.amin(2, keepdim=True), largest.amax(2, keepdim=True)
+
+    @torch.no_grad()
+    def reduced(self, planes: Planes, step: int) -> Tensor:
+        """Means over blocks of ``step`` pixels in both directions."""
+        rows = max(1, self.picture.statistics_rows // step) * step
+
+        def part(tile: Tile) -> Tensor:
+            return block_means(planes(self.pixels_of(tile)), step)
+
+        return torch.cat(list(self._map_tiles(part, rows, "Reducing")), dim=2)
+
+    def _map_tiles(self, function: Callable[[Tile], Result], rows: int, stage: str) -> Iterator[Result]:
+        """Apply a function to each tile, and yield the results in order.
+
+        The first tile is finished before the others begin, since it may compute the sums of an operator.
+        """
+
+        def tiles() -> Iterator[Tile]:
+            for tile in self.picture.tiles(0, rows):
+                self.passes.report(stage, tile.start, self.size[0])
+                yield tile
+
+        each = tiles()
+        yield function(next(each))
+        yield from in_order(function, each, self.passes.workers(1))
+
+    def blocks(self, step: float, floats: int) -> InMemory:
+        """The picture, reduced by means over blocks of an integer number of pixels along each axis, in memory.
+
+        Raises:
+            MemoryError: if ``floats`` numbers for each of its pixels do not fit.
+        """
+        needed = math.prod(math.ceil(side / step) for side in self.size) * floats * self.dtype.itemsize
+        if needed > self.passes.memory:
+            raise MemoryError(
+                f"{self.picture.name} needs at least {needed / 1e6:.0f} MB of memory, but only "
+                f"{self.passes.memory / 1e6:.0f} MB may be used; allow more, or use a smaller picture"
+            )
+        return InMemory(self.reduced(lambda pixels: pixels.image, round(step)))
+
+    def kept(self, name: Any, given: Sequence[Tensor], compute: Callable[[], Kept]) -> Kept:
+        """The result of a function, of which nothing is kept."""
+        return compute()
+
+    @torch.no_grad()
+    def measured(self, function: Callable[[Source], Tensor]) -> Tensor:
+        """Apply a measurement to the picture."""
+        return function(self)
+
+    def pixels_of(self, tile: Tile) -> TilePixels:
+        """All pixels of a tile of the picture."""
+        width = self.size[1]
+        return TilePixels(tile.inner, lambda operator: operator.features(tile), tile.start * width, width)
+
+    def parts_of(self, tile: Tile) -> Iterator[TilePixels]:
+        """Split a tile into groups of a few rows, which are the same for tiles of any height.
+
+        The height of tiles therefore does not affect results, although the rounding of a matrix product depends on its
+        shape.
+        """
+        width, step = self.size[1], self.passes.chunk_rows(self.size[1], self.num_landmarks)
+        features: dict[int, tuple[Tensor, ...]] = {}
+
+        def features_of(operator: TiledOperator, part: int) -> Tensor:
+            if id(operator) not in features:
+                features[id(operator)] = operator.features(tile).split(step * width, dim=2)
+            return features[id(operator)][part]
+
+        for part, image in enumerate(tile.inner.split(step, dim=2)):
+            first = (tile.start + part * step) * width
+            yield TilePixels(image, lambda operator, part=part: features_of(operator, part), first, width)  # type: ignore[misc]
+
+    @full_precision
+    def edited(self, fitted: Fitted, tile: Tile) -> Tensor:
+        """The planes (1, C, h, W) that an edit computes from a tile, before ``finish``."""
+        return torch.cat([fitted.pixels(part) for part in self.parts_of(tile)], dim=2)
+
+    @property
+    def num_landmarks(self) -> int:
+        """The most landmarks of a filter that an edit has fitted to the picture; 0 without one."""
+        return max((operator.kernel.landmarks.shape[2] for operator in self.operators), default=0)
+
+    @property
+    def margin(self) -> int:
+        """Number of rows around a tile that its columns depend on."""
+        return max((operator.picture_margin for operator in self.operators), default=0)
+
+    @property
+    def plain(self) -> Passes:
+        """Tiling options for output in the dtype of the computation."""
+        return replace(self.passes, kind="float32" if self.dtype == torch.float32 else "float64")
+
+    def rows(self, fitted: Fitted, *, plain: bool = False) -> Rows:
+        """Yield the rows (h, W, S) of the edited picture, in order; arguments as those of :meth:`tiling`."""
+        with self.tiling(fitted, plain=plain) as tiling:
+            yield from tiling
+
+    @contextmanager
+    def tiling(self, fitted: Fitted, *, plain: bool = False) -> Iterator[Tiling]:
+        """Yield the rows of the edited picture, not yet computed; they can be computed within the block.
+
+        With ``plain`` they are in the dtype of the computation, without transparency.
+        """
+        passes = replace(self.plain, processes=None) if plain else self.passes  # for an edit that is being fitted
+        landmarks = self.num_landmarks
+        rows = self.passes.tile_rows or (self.fitting_rows(0, landmarks) if landmarks else TILE_PIXELS // self.size[1])
+        together, workers = self.passes.chunk_rows(self.size[1], landmarks), self.passes.workers(landmarks)
+        rows = max(1, rows // together) * together
+        with single_threaded(workers):
+            for operator in self.operators:
+                operator.prepare()  # before several workers need it
+        tiling = Tiling(
+            passes,
+            self.picture,
+            lambda tile: self.edited(fitted, tile),
+            self.margin,
+            rows,
+            together,
+            workers,
+            transparent=not plain,
+        )
+        if fitted.finish is None:
+            yield tiling
+            return
+        finish, margin = fitted.finish, fitted.margin
+        before = replace(tiling, passes=replace(passes, kind=self.plain.kind), transparent=False, stage="Comparing")
+        with passes.stored(before) as planes:
+            stored = Picture(planes, self.picture.name, channels=planes.shape[2])
+
+            def finished(tile: Tile) -> Tensor:
+                stop = tile.start + tile.inner.shape[2]
+                inner = slice(tile.halo[0], tile.pixels.shape[2] - tile.halo[1]), slice(None)
+                return finish(tile.pixels, stored.tile(tile.start, stop, margin).pixels, inner)[..., *inner]
+
+            rows, workers = self._rows_to_finish(fitted, rows, workers)
+            yield replace(tiling, edit=finished, margin=margin, rows=rows, together=fitted.step, workers=workers)
+
+    def _rows_to_finish(self, fitted: Fitted, rows: int, workers: int) -> tuple[int, int]:
+        """Rows per tile and number of workers for ``finish``.
+
+        A tile has at least as many rows as the margin, or several times as many if ``tile_rows`` is None, as far as
+        memory allows. There is only one worker unless memory allows such a tile for each of them.
+
+        Raises:
+            MemoryError: if no tile fits.
+        """
+        row = self.size[1] * FINISH_FLOATS * self.dtype.itemsize
+        most = self.passes.memory // row - 2 * fitted.margin
+        if self.size[0] > most and most < fitted.step:
+            raise MemoryError(
+                f"{self.picture.name} needs at least {row * (2 * fitted.margin + fitted.step) / 1e6:.0f} MB of memory, "
+                f"but only {self.passes.memory / 1e6:.0f} MB may be used; allow more, or use a smaller picture"
+            )
+        rows = max(rows, (1 if self.passes.tile_rows else 4) * fitted.margin)
+        if (1 + workers) * row * (rows + 2 * fitted.margin) > self.passes.memory:
+            workers = 1
+        rows = rows if self.size[0] <= most else min(rows, most)
+        return max(1, rows // fitted.step) * fitted.step, workers
