@@ -1,6 +1,5 @@
 """Editing a folder by several processes: each photograph once, broken ones reported, interrupted work resumed."""
 
-import contextlib
 import json
 import os
 import signal
@@ -100,29 +99,22 @@ def test_two_hundred_killed_in_the_middle(tmp_path: Path) -> None:
 
 
 @pytest.mark.client("Dask", "edits folders and zarr arrays: `--cluster`")
-@pytest.mark.client("Ray", "edits folders and zarr arrays: `--cluster ray://host:10001`")
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore::DeprecationWarning:ray", "ignore::FutureWarning:ray", "ignore::ResourceWarning")
-@pytest.mark.parametrize("engine", ["distributed", "ray"])
-def test_a_cluster_of_which_a_worker_is_killed(engine: str, tmp_path: Path) -> None:
+def test_a_cluster_of_which_a_worker_is_killed(tmp_path: Path) -> None:
     """The file of a dead worker is given to another one; broken files are named, and those there are left alone."""
-    package = pytest.importorskip(engine, reason=f"{engine} is not installed")
+    distributed = pytest.importorskip("distributed", reason="distributed is not installed")
     paths = plain_files(tmp_path / "in", 6)
     prepare(paths, tmp_path / "out", {})
     (tmp_path / "out" / "5.png").write_text("before")
     tally, told = Tally(), list[str]()
-    with contextlib.ExitStack() as stack:
-        address = "ray:local"
-        if engine == "distributed":
-            cluster = package.LocalCluster(2, threads_per_worker=1, dashboard_address=None)
-            address = stack.enter_context(cluster).scheduler_address
+    with distributed.LocalCluster(2, threads_per_worker=1, dashboard_address=None) as cluster:
         edit_folder(
             paths,
             tmp_path / "out",
             die_once_in_a_cluster,
             workers=1,
             threads=1,
-            cluster=address,
+            cluster=cluster.scheduler_address,
             tell=told.append,
             begin=lambda name: None,
             tally=tally,

@@ -172,16 +172,6 @@ def test_a_worker_of_a_cluster_that_dies_is_replaced(picture: Path) -> None:
     check_negative(picture)
 
 
-@pytest.mark.client("Ray", "edits folders and zarr arrays: `--cluster ray://host:10001`")
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore")  # of Ray
-def test_a_worker_of_ray_that_dies_is_replaced(picture: Path) -> None:
-    pytest.importorskip("ray", reason="Ray is not installed")
-    with zarr_processes(None, "ray:local") as workers:
-        write_negative(picture, workers)
-    check_negative(picture)
-
-
 def test_a_worker_without_the_folder_says_so(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=f"{tmp_path} must be seen by all workers under this name"):
         processes.compute(tmp_path / ".out.zarr.01234567.part", range(4))

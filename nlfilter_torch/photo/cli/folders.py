@@ -1,6 +1,6 @@
 """A folder of photographs edited by worker processes: those of joblib on this machine, or those of a cluster.
 
-Needs the ``cli`` extra, and ``cluster`` or ``ray`` for a cluster. A file is done when the output folder has a file of
+Needs the ``cli`` extra, and ``cluster`` for a cluster. A file is done when the output folder has a file of
 its name, since a name appears only when its file is complete (:func:`~nlfilter_torch.photo.io.writing.open_beside`). An
 interrupted run continues when it is started again.
 """

@@ -138,8 +138,8 @@ Workers = Annotated[
         help="With zarr arrays as IN and OUT: filter and write their parts by this many processes instead of threads.",
     ),
 ]
-ADDRESS = "address of a Dask cluster, such as tcp://host:8786, or Ray cluster, such as ray://host:10001, whose workers"
-ON_CLUSTER = "They have one thread each and see the folders under the same names. Needs the extra cluster or ray."
+ADDRESS = "address of a Dask cluster, such as tcp://host:8786, whose workers"
+ON_CLUSTER = "They have one thread each and see the folders under the same names. Needs the extra cluster."
 Cluster = Annotated[
     str | None,
     typer.Option(

@@ -23,26 +23,15 @@ PAUSE = 0.5  # seconds between two looks at the main process
 
 @dataclass(frozen=True)
 class Workers:
-    """Processes that joblib's calls run in.
-
-    Attributes:
-        number: of processes.
-        streaming: whether results come as they end; otherwise they come in rounds of one call for each process.
-    """
+    """Processes that joblib's calls run in; ``number`` is how many there are."""
 
     number: int
-    streaming: bool = True
 
     def run(self, calls: Sequence[Any]) -> Generator[Any]:
         """Results of calls that are made with ``joblib.delayed``, in any order; calls begin in their order."""
         from joblib import Parallel
 
-        if self.streaming:
-            yield from Parallel(return_as="generator_unordered", pre_dispatch=self.number, batch_size=1)(calls)
-            return
-        with Parallel(batch_size=1) as parallel:
-            for first in range(0, len(calls), self.number):
-                yield from parallel(calls[first : first + self.number])
+        yield from Parallel(return_as="generator_unordered", pre_dispatch=self.number, batch_size=1)(calls)
 
 
 @contextlib.contextmanager
@@ -50,8 +39,7 @@ def worker_pool(cluster: str | None, workers: int, threads: int) -> Iterator[Wor
     """Have joblib work in processes of this machine, or in those of a cluster.
 
     Args:
-        cluster: address of the scheduler of a Dask cluster, or of a Ray cluster (``ray://host:10001``, or ``ray:`` and
-            what ``ray.init`` takes, such as ``ray:auto``), whose workers have one thread each; None is this machine.
+        cluster: address of the scheduler of a Dask cluster, whose workers have one thread each; None is this machine.
         workers: number of processes on this machine.
         threads: of each of these.
 
@@ -60,8 +48,6 @@ def worker_pool(cluster: str | None, workers: int, threads: int) -> Iterator[Wor
     """
     if cluster is None:
         yield from _of_this_machine(workers, threads)
-    elif cluster.startswith("ray:"):
-        yield from _of_ray(cluster)
     else:
         yield from _of_dask(cluster)
 
@@ -101,30 +87,9 @@ def _of_dask(address: str) -> Iterator[Workers]:
         yield Workers(joblib.effective_n_jobs())
 
 
-def _of_ray(address: str) -> Iterator[Workers]:
-    import joblib
-
-    try:
-        import ray
-        from ray.util.joblib import register_ray
-    except ImportError as error:
-        raise ValueError("--cluster ray: needs the extra ray; install nlfilter-torch[ray]") from error
-    try:
-        ray.init(address if address.startswith("ray://") else address.removeprefix("ray:"), log_to_driver=False)
-    except (OSError, RuntimeError, ValueError) as error:
-        raise ValueError(f"--cluster must be the address of a Ray cluster, got {address}; {error}") from error
-    try:
-        register_ray()
-        number = int(ray.cluster_resources()["CPU"])
-        with joblib.parallel_config("ray", n_jobs=number):
-            yield Workers(number, streaming=False)
-    finally:
-        ray.shutdown()
-
-
 def is_death(error: Exception) -> bool:
     """Whether a worker died; Dask tries a task on several of them before it says so."""
-    return isinstance(error, BrokenProcessPool) or type(error).__name__ in ("KilledWorker", "ActorDiedError")
+    return isinstance(error, BrokenProcessPool) or type(error).__name__ == "KilledWorker"
 
 
 def be_worker(parent: int) -> None:
