@@ -33,7 +33,7 @@ from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from benchmarks.denoiser_crops import CONTRASTS, MISSTATED, Crops
-from nlfilter_torch.nn.denoiser.network import ADDED, PASSES, PLANES, SLOPE, WIDTH, Layer, NonlocalDenoiser, shapes_of
+from nlfilter_torch.nn.denoiser.network import PASSES, PLANES, SLOPE, WIDTH, Layer, NonlocalDenoiser, shapes_of
 from nlfilter_torch.nn.denoiser.weights import read_weights
 from nlfilter_torch.photo.io.writing import open_beside
 from nlfilter_torch.photo.plotting import save_figure
@@ -134,7 +134,7 @@ class Training:
     ) -> None:
         self.model = new_denoiser(plain=plain, seed=seed, passes=passes).to(memory_format=torch.channels_last)
         if start is not None:
-            self.model.load_state_dict(read_weights(start, shapes_of(self.model), ADDED))
+            self.model.load_state_dict(read_weights(start, shapes_of(self.model)))
         self.mean = AveragedModel(self.model, multi_avg_fn=get_ema_multi_avg_fn(1 - 1 / MEAN_OVER))
         named = {name: weight for name, weight in self.model.named_parameters() if weight.requires_grad}
         bandwidths = [named.pop("log_bandwidths")] if "log_bandwidths" in named else []

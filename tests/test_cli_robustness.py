@@ -2,7 +2,6 @@
 
 import ast
 import errno
-import json
 import subprocess
 import sys
 from pathlib import Path
@@ -13,6 +12,8 @@ import pytest
 import nlfilter_torch
 import nlfilter_torch.photo
 from nlfilter_torch.photo.declared.declaration import shown
+from nlfilter_torch.photo.declared.presets import Recipe
+from nlfilter_torch.photo.declared.steps import Step
 from tests.commands import refused, small_photo
 
 LONG = "9" * 400
@@ -28,7 +29,7 @@ def photo(tmp_path: Path) -> Path:
     ("command", "sentence"),
     [
         ("detail --bandwidth 1e-40", "--bandwidth must be from 0.01 to 1000000 grey levels, or auto, got '1e-40'"),
-        ("recolor --tolerance 1e-40", "'--tolerance' / '--bandwidth': "),
+        ("recolor --tolerance 1e-40", "'--tolerance': "),
         ("tone --bandwidth 1e-40", "--bandwidth must be from 0.01 to 1000000 grey levels, or auto, got '1e-40'"),
         (
             "detail --spatial-bandwidth 1e-40",
@@ -64,30 +65,47 @@ def test_numbers_without_sense(
     assert [path.name for path in tmp_path.iterdir()] == ["in.png"]
 
 
+def step_file(edit: str, entries: str) -> str:
+    """A file with a single step."""
+    return f'{{"version": 1, "steps": [{{"edit": "{edit}", {entries}}}]}}'
+
+
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [
         ("[" * 100_000, "is not a preset: it is nested too deeply"),
         ('{"alpha": ' * 100_000, "is not a preset: it is nested too deeply"),
-        ('{"alpha": ' + "[" * 900 + "]" * 900 + "}", "must be a list of 2 to 100 numbers"),
-        (f'{{"alpha": [1, {LONG}]}}', "must be a list of 2 to 100 numbers"),
-        (f'{{"alpha": [1, 1], "bandwidth": {LONG}}}', "must be a positive number of grey levels, from 0.01 to"),
-        ('{"alpha": [1, 1], "bandwidth": 1e-40}', "must be a positive number of grey levels, from 0.01 to"),
-        ('{"alpha": [1, 1], "spatial_bandwidth": 1e-40}', "must be a positive number of pixels, from 0.01 to"),
-        ('{"alpha": [1, 1], "patch_size": 1000001}', "must be an odd number from 1 to 99, got 1000001"),
-        (f'{{"alpha": [1, 1], "landmarks": {LONG}}}', "must be a whole number from 1 to 10000"),
+        (step_file("detail", '"alpha": ' + "[" * 900 + "]" * 900), "must be a list of 2 to 100 numbers"),
+        (step_file("detail", f'"alpha": [1, {LONG}]'), "must be a list of 2 to 100 numbers"),
         (
-            f'{{"defocus": {{"radius": {LONG}}}}}',
+            step_file("detail", f'"alpha": [1, 1], "bandwidth": {LONG}'),
+            "must be a positive number of grey levels, from 0.01 to",
+        ),
+        (
+            step_file("detail", '"alpha": [1, 1], "bandwidth": 1e-40'),
+            "must be a positive number of grey levels, from 0.01 to",
+        ),
+        (
+            step_file("detail", '"alpha": [1, 1], "spatial_bandwidth": 1e-40'),
+            "must be a positive number of pixels, from 0.01 to",
+        ),
+        (
+            step_file("detail", '"alpha": [1, 1], "patch_size": 1000001'),
+            "must be an odd number from 1 to 99, got 1000001",
+        ),
+        (step_file("detail", f'"alpha": [1, 1], "landmarks": {LONG}'), "must be a whole number from 1 to 10000"),
+        (
+            step_file("defocus", f'"radius": {LONG}'),
             "must be a positive number of hundredths of the short side, from 0.1 to 20",
         ),
-        (f'{{"abstract": {{"tones": {LONG}}}}}', "must be a whole number from 2 to 65536, or null"),
-        ('{"abstract": {"tones": 4.0}}', "must be a whole number from 2 to 65536, or null"),
+        (step_file("abstract", f'"tones": {LONG}'), "must be a whole number from 2 to 65536, or null"),
+        (step_file("abstract", '"tones": 4.0'), "must be a whole number from 2 to 65536, or null"),
         (
-            f'{{"recolor": {{"strokes": [{{"points": [[{LONG}, 0]], "radius": 0.1, "paint": "keep"}}]}}}}',
+            step_file("recolor", f'"strokes": [{{"points": [[{LONG}, 0]], "radius": 0.1, "paint": "keep"}}]'),
             "must be pairs of numbers",
         ),
         (
-            f'{{"recolor": {{"strokes": [{{"points": [[0, 0]], "radius": {LONG}, "paint": "keep"}}]}}}}',
+            step_file("recolor", f'"strokes": [{{"points": [[0, 0]], "radius": {LONG}, "paint": "keep"}}]'),
             "must be in (0, 1]",
         ),
     ],
@@ -109,7 +127,7 @@ def test_memory_of_large_patches_is_asked_for(
     photo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     preset = tmp_path / "look.json"
-    preset.write_text(json.dumps({"alpha": [2, 1], "patch_size": 99}))
+    preset.write_text(Recipe((Step("detail", alpha=(2.0, 1.0), patch_size=99),)).to_json())
     asked: list[int] = []
 
     def read(*_: object, bytes_per_pixel: int, **__: object) -> None:

@@ -87,11 +87,16 @@ def test_options_count_for_more_than_the_preset(before: Path) -> None:
     assert torch.equal(read_photograph(out).pixels, read_photograph(before).pixels)
 
 
+def detail_file(entries: str) -> str:
+    """A preset with a single step of ``detail``, with the given entries."""
+    return f'{{"version": 1, "steps": [{{"edit": "detail", {entries}}}]}}'
+
+
 def test_preset_keeps_every_entry() -> None:
     values = {"alpha": (3.0, 0.25, 1.0), "bandwidth": 12.5, "spatial_bandwidth": 40.0, "patch_size": 7, "landmarks": 60}
     preset = Recipe((Step("detail", **values, sampling="uniform"),))
     assert Recipe.from_json(preset.to_json(complete=True), "it") == preset
-    assert Recipe.from_json('{"alpha": [2, 1]}', "it") == Recipe((Step("detail", alpha=(2.0, 1.0)),))
+    assert Recipe.from_json(detail_file('"alpha": [2, 1]'), "it") == Recipe((Step("detail", alpha=(2.0, 1.0)),))
 
 
 @pytest.mark.parametrize(
@@ -101,15 +106,40 @@ def test_preset_keeps_every_entry() -> None:
         ("[1, 2]", "look.json is not a preset: it must hold a list of steps"),
         ('{"bandwidth": 3}', "look.json is not a preset: it must hold a list of steps"),
         ('{"version": 1, "steps": [{"edit": "tone"}]}', "--preset must hold a look or a single detail step without"),
-        ('{"alpha": [1]}', "alpha in look.json must be a list of 2 to 100 numbers from -1000000 to 1000000, got [1]"),
-        ('{"alpha": []}', "alpha in look.json must be a list of 2 to 100 numbers from -1000000 to 1000000, got []"),
-        ('{"alpha": [1, NaN]}', "alpha in look.json must be a list of 2 to 100 numbers"),
-        ('{"alpha": [1, 1], "bandwidth": 0}', "bandwidth in look.json must be a positive number of grey levels"),
-        ('{"alpha": [1, 1], "spatial_bandwidth": "far"}', "spatial_bandwidth in look.json must be a positive number"),
-        ('{"alpha": [1, 1], "patch_size": 4}', "patch_size in look.json must be an odd number from 1 to 99, got 4"),
-        ('{"alpha": [1, 1], "landmarks": true}', "landmarks in look.json must be a whole number from 1 to 10000"),
-        ('{"alpha": [1, 1], "sampling": "best"}', 'sampling in look.json must be "kmeans", "uniform" or "random"'),
-        ('{"alpha": [1, 1], "colour": 1}', "look.json must have no entries other than alpha, inside, residual"),
+        ('{"alpha": [2, 1]}', "look.json is not a preset: it must hold a list of steps"),
+        (
+            detail_file('"alpha": [1]'),
+            "alpha of detail, step 1 in look.json must be a list of 2 to 100 numbers from -1000000 to 1000000, got [1]",
+        ),
+        (
+            detail_file('"alpha": []'),
+            "alpha of detail, step 1 in look.json must be a list of 2 to 100 numbers from -1000000 to 1000000, got []",
+        ),
+        (detail_file('"alpha": [1, NaN]'), "alpha of detail, step 1 in look.json must be a list of 2 to 100 numbers"),
+        (
+            detail_file('"alpha": [1, 1], "bandwidth": 0'),
+            "bandwidth of detail, step 1 in look.json must be a positive number of grey levels",
+        ),
+        (
+            detail_file('"alpha": [1, 1], "spatial_bandwidth": "far"'),
+            "spatial_bandwidth of detail, step 1 in look.json must be a positive number",
+        ),
+        (
+            detail_file('"alpha": [1, 1], "patch_size": 4'),
+            "patch_size of detail, step 1 in look.json must be an odd number from 1 to 99, got 4",
+        ),
+        (
+            detail_file('"alpha": [1, 1], "landmarks": true'),
+            "landmarks of detail, step 1 in look.json must be a whole number from 1 to 10000",
+        ),
+        (
+            detail_file('"alpha": [1, 1], "sampling": "best"'),
+            'sampling of detail, step 1 in look.json must be "kmeans", "uniform" or "random"',
+        ),
+        (
+            detail_file('"alpha": [1, 1], "colour": 1'),
+            "detail, step 1 in look.json must have no entries other than alpha, inside, residual",
+        ),
     ],
 )
 def test_a_preset_that_is_none_is_told(

@@ -210,28 +210,6 @@ def test_colours_may_be_written_in_capitals() -> None:
     assert Recipe.from_json(recipe.to_json(), "edit.json") == recipe
 
 
-def test_files_from_before_there_was_a_list_of_steps() -> None:
-    """Old files have a fixed order of steps, old names and units, and omit steps that change nothing."""
-    strokes = [BLUE.entries()]
-    text = json.dumps(
-        {
-            "abstract": {"edges": 0.5, "width": 3.0},
-            "recolor": {"strokes": strokes, "tolerance": 20.0, "reach": 0.8},
-            "detail": {"inside": INSIDE, "spread": 0.7, "strokes": [IN.entries()]},
-        }
-    )
-    assert Recipe.from_json(text, "edit.json") == Recipe(
-        (
-            Step("detail", (IN,), alpha=(1.0,) * 4, inside=INSIDE, reach=0.7 / (0.7 + 2 / 3)),
-            Step("recolor", (BLUE,), reach=0.8, tolerance=20.0),
-            Step("abstract", power=0.0, edges=0.5, edge_width=3.0 * 0.1),
-        )
-    )
-    preset = '{"alpha": [2, 1], "bandwidth": 20, "landmarks": 30, "sampling": "uniform", "spatial_bandwidth": null}'
-    step = Step("detail", alpha=(2.0, 1.0), bandwidth=20, landmarks=30, sampling="uniform")
-    assert Recipe.from_json(preset, "look.json") == Recipe((step,))
-
-
 def test_presets_are_edits(tmp_path: Path) -> None:
     crisp = PRESETS["crisp"]
     assert find_recipe("crisp") == crisp
@@ -240,21 +218,33 @@ def test_presets_are_edits(tmp_path: Path) -> None:
     assert find_recipe(str(path)) == crisp
 
 
+def step_file(edit: str, entries: str) -> str:
+    """A file with a single step."""
+    return f'{{"version": 1, "steps": [{{"edit": "{edit}", {entries}}}]}}'
+
+
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [
         ("{", "it is not JSON"),
         ("[1]", "it must hold a list of steps"),
         ('{"detial": {}}', "it must hold a list of steps"),
-        ('{"detail": 1}', "detail in edit.json must be a JSON object"),
-        ('{"detail": {"power": 1}}', "must have no entries other than alpha"),
+        ('{"detail": {}}', "edit.json is not a preset: it must hold a list of steps"),
+        ('{"alpha": [2, 1]}', "edit.json is not a preset: it must hold a list of steps"),
+        (step_file("detail", '"power": 1'), "must have no entries other than alpha"),
         (
-            '{"abstract": {"strokes": []}}',
+            step_file("abstract", '"strokes": []'),
             "must have no entries other than power, edges, edge_width, tones, .*, got strokes",
         ),
-        ('{"abstract": {"tones": 2.5}}', "tones of abstract in edit.json must be a whole number"),
-        ('{"recolor": {"reach": 1}}', "reach of recolor in edit.json must be a number from 0 to 0.999, got 1"),
-        ('{"detail": {"inside": [1, 1]}}', "inside of detail in edit.json must have as many numbers as alpha"),
+        (step_file("abstract", '"tones": 2.5'), "tones of abstract, step 1 in edit.json must be a whole number"),
+        (
+            step_file("recolor", '"reach": 1'),
+            "reach of recolor, step 1 in edit.json must be a number from 0 to 0.999, got 1",
+        ),
+        (
+            step_file("detail", '"inside": [1, 1]'),
+            "inside of detail, step 1 in edit.json must have as many numbers as alpha",
+        ),
         ('{"steps": []}', "version in edit.json must be 1, got null"),
         (
             '{"version": 2, "steps": []}',
@@ -268,26 +258,26 @@ def test_presets_are_edits(tmp_path: Path) -> None:
             '{"version": 1, "steps": [{"edit": "tone"}, {"edit": "tone", "clarity": "1"}]}',
             'clarity of tone, step 2 in edit.json must be a number from -1000000 to 1000000, got "1"',
         ),
-        ('{"defocus": {"strokes": {}}}', "strokes of defocus in edit.json must be a list"),
-        ('{"defocus": {"strokes": [{"points": []}]}}', "must have the entries points, radius and paint"),
+        (step_file("defocus", '"strokes": {}'), "strokes of defocus, step 1 in edit.json must be a list"),
+        (step_file("defocus", '"strokes": [{"points": []}]'), "must have the entries points, radius and paint"),
         (
-            '{"defocus": {"strokes": [{"points": [], "radius": 0.1, "paint": "in"}]}}',
-            "points of a stroke in defocus in edit.json must be pairs of numbers",
+            step_file("defocus", '"strokes": [{"points": [], "radius": 0.1, "paint": "in"}]'),
+            "points of a stroke in defocus, step 1 in edit.json must be pairs of numbers",
         ),
         (
-            '{"defocus": {"strokes": [{"points": [[0, 3]], "radius": 0.1, "paint": "in"}]}}',
+            step_file("defocus", '"strokes": [{"points": [[0, 3]], "radius": 0.1, "paint": "in"}]'),
             r"must be pairs of numbers, shares of width and height from -2 to 2, got \[\[0, 3\]\]",
         ),
         (
-            '{"defocus": {"strokes": [{"points": [[0, NaN]], "radius": 0.1, "paint": "in"}]}}',
-            "points of a stroke in defocus in edit.json must be pairs of numbers",
+            step_file("defocus", '"strokes": [{"points": [[0, NaN]], "radius": 0.1, "paint": "in"}]'),
+            "points of a stroke in defocus, step 1 in edit.json must be pairs of numbers",
         ),
         (
-            '{"defocus": {"strokes": [{"points": [[0, 0]], "radius": 2, "paint": "in"}]}}',
-            r"radius of a stroke in defocus in edit.json must be in \(0, 1\], got 2",
+            step_file("defocus", '"strokes": [{"points": [[0, 0]], "radius": 2, "paint": "in"}]'),
+            r"radius of a stroke in defocus, step 1 in edit.json must be in \(0, 1\], got 2",
         ),
         (
-            '{"recolor": {"strokes": [{"points": [[0, 0]], "radius": 0.1, "paint": "blue"}]}}',
+            step_file("recolor", '"strokes": [{"points": [[0, 0]], "radius": 0.1, "paint": "blue"}]'),
             "must be one of a colour such as #c04020, keep, got 'blue'",
         ),
     ],

@@ -47,13 +47,9 @@ class Learnable(nn.Module):
         unexpected_keys: list[str],
         error_msgs: list[str],
     ) -> None:
-        """Accept names and shapes of earlier versions; report learned options that are fixed in this layer."""
+        """Report learned options that are fixed in this layer."""
         own = dict(self.named_parameters())
         for option, parameter in self.learnable.items():
-            earlier = f"{prefix}{option}.logarithm"
-            if earlier in state_dict:
-                state_dict[prefix + parameter] = state_dict.pop(earlier)
-            as_vectors(state_dict, [prefix + parameter])
             if parameter not in own and prefix + parameter in state_dict:
                 learned = state_dict.pop(prefix + parameter)
                 start = f" and pass {option}={learned.exp().item():.4g}" if learned.ndim == 1 else ""
@@ -87,13 +83,6 @@ def positive_option(name: str, meaning: str) -> Any:
         setattr(layer, f"_{name}", value)
 
     return property(value, assign, doc=meaning)
-
-
-def as_vectors(state_dict: dict[str, Tensor], names: Collection[str]) -> None:
-    """Reshape scalars in a state_dict to (1,), as the parameters, since FSDP cannot shard parameters of shape ()."""
-    for name in names:
-        if name in state_dict and state_dict[name].ndim == 0:
-            state_dict[name] = state_dict[name].reshape(1)
 
 
 class UnitWindow(nn.Module):

@@ -17,7 +17,7 @@ from nlfilter_torch.core.checks import (
 )
 from nlfilter_torch.filtering.filters import filter_regions, polynomial_filter, weigh_layers
 from nlfilter_torch.nn.affinity import NonlocalAffinity
-from nlfilter_torch.nn.parameters import as_vectors, check_learn
+from nlfilter_torch.nn.parameters import check_learn
 from nlfilter_torch.operator.operator import NonlocalOperator
 
 LEARNABLE = ("alpha", "residual")
@@ -91,11 +91,6 @@ class PolynomialSliders(nn.Module):
                 f"layers must have shape (B, k+1, C, H, W), got {tuple(layers.shape)}; take them from detail_layers"
             )
         return weigh_layers(layers, self.alpha if alpha is None else alpha)
-
-    def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *others: Any) -> None:
-        """Accept the residual of earlier versions, whose shape was ()."""
-        as_vectors(state_dict, [f"{prefix}residual"])
-        super()._load_from_state_dict(state_dict, prefix, *others)
 
     def extra_repr(self) -> str:
         """The current sliders."""

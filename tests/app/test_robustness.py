@@ -67,9 +67,9 @@ def test_files_that_cannot_be_used(opened: Tab, folder: Path) -> None:
         page.get_by_text("huge.png is too large").or_(page.get_by_text("huge.png has 20000x50000 pixels"))
     ).to_be_visible()
 
-    (folder / "edit.json").write_text('{"detail": {"sharpness": 11}}')
+    (folder / "edit.json").write_text('{"version": 1, "steps": [{"edit": "detail", "sharpness": 11}]}')
     opened.load_edit(folder / "edit.json")
-    expect(page.get_by_text("detail in edit.json must have no entries other than")).to_be_visible()
+    expect(page.get_by_text("detail, step 1 in edit.json must have no entries other than")).to_be_visible()
 
     page.get_by_role("button", name="Save photo").click()
     for name, sentence in (("../out.png", "the name must be one of a file"), ("out.gif", "out.gif must end in .png")):

@@ -24,7 +24,6 @@ from nlfilter_torch.nn.denoiser.weights import read_weights
 from nlfilter_torch.operator.build import operator_from_features
 
 TRAINED = Path(__file__).with_name("denoiser.safetensors")
-ADDED = ("again.weight", "again.bias")  # 0 where absent: files of earlier versions, whose denoiser had one pass
 
 WIDTH, FEATURES, ORDER = 48, 20, 3  # channels of the network and of the guide; order k of the sliders
 BEFORE, AFTER = (1, 2, 3, 4), (3,)  # dilations before and after the filter; the receptive field of a pass is 33x33
@@ -107,7 +106,7 @@ class NonlocalDenoiser(nn.Module):
         """
         with torch.device("meta"):
             denoiser = cls()
-        weights = read_weights(Path(path), shapes_of(denoiser), ADDED)
+        weights = read_weights(Path(path), shapes_of(denoiser))
         denoiser.load_state_dict({name: value.to(device, dtype) for name, value in weights.items()}, assign=True)
         return denoiser.eval()
 

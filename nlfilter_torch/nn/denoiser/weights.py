@@ -1,7 +1,7 @@
 """Reading weights from a safetensors file, with checks of names and shapes."""
 
 import json
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +12,8 @@ from torch import Tensor
 LENGTH = 8  # size in bytes of the first field, the length of the header
 
 
-def read_weights(
-    path: Path, shapes: Mapping[str, tuple[int, ...]], optional: Collection[str] = ()
-) -> dict[str, Tensor]:
-    """Read float32 tensors of the given names and shapes; those that are optional are 0 if the file lacks them.
+def read_weights(path: Path, shapes: Mapping[str, tuple[int, ...]]) -> dict[str, Tensor]:
+    """Read float32 tensors of the given names and shapes.
 
     Raises:
         FileNotFoundError: if there is no such file.
@@ -35,8 +33,6 @@ def read_weights(
         found = {name: _tensor(entry, memoryview(content)[end:]) for name, entry in header.items()}
     except (ValueError, KeyError, TypeError, AttributeError, RuntimeError) as error:
         raise ValueError(f"weights must be a complete safetensors file, but {path} is damaged: {error}") from None
-    for name in optional:
-        found.setdefault(name, torch.zeros(shapes[name]))
     for name, shape in shapes.items():
         got = tuple(found[name].shape) if name in found else None
         if got != shape:

@@ -123,9 +123,8 @@ def option(parameter: Parameter, panel: str | None = None) -> Any:
         limits = {"min": kind(parameter.low), "max": kind(parameter.high)}
     elif parameter.kind == "odd":
         limits = {"max": int(parameter.high)}
-    names = [parameter.name, *(name for name, factor in parameter.former_names if factor == 1)]
     decorated = typer.Option(
-        *(f"--{name.replace('_', '-')}" for name in names),
+        f"--{parameter.name.replace('_', '-')}",
         metavar=None if parameter.choices else parameter.metavar or UNITS[parameter.unit][1],
         help=parameter.help,
         rich_help_panel=panel or parameter.panel,

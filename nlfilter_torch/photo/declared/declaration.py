@@ -5,7 +5,7 @@ Does not import torch, so that the command line prints help and lists without de
 
 import json
 import reprlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Literal
@@ -84,8 +84,6 @@ class Parameter:
         argument: name of the function's argument, if it differs.
         share: for distances, the share of the short side that None stands for; 0 is no limit.
         min_pixels: minimum in pixels of a length given in hundredths of the short side.
-        former_names: in files, each with a factor or a function that converts its values; names of the same
-            unit are also accepted as options.
         metavar: placeholder of a value in the help, if it is not that of the unit.
         slider: the editor's slider.
         is_option: whether the command has an option for it.
@@ -110,7 +108,6 @@ class Parameter:
     argument: str = ""
     share: float = 0.0
     min_pixels: float = 0.0
-    former_names: tuple[tuple[str, float | Callable[[float], float]], ...] = ()
     metavar: str | None = None
     slider: Slider | None = None
     is_option: bool = True

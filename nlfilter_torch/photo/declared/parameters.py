@@ -18,7 +18,6 @@ from nlfilter_torch.photo.declared.shared_parameters import (
     filter_parameters,
     gain,
     number,
-    reach_of_time,
     sliders,
 )
 
@@ -74,7 +73,7 @@ DETAIL = Edit(
             ("luminance", "all"),
             "`luminance`: edit brightness and keep the colours. `all`: edit red, green and blue, colours too.",
         ),
-        replace(REACH, former_names=(("time", reach_of_time), ("spread", reach_of_time)), slider=REACH_SLIDER),
+        replace(REACH, slider=REACH_SLIDER),
         replace(TOLERANCE, argument="mask_bandwidth"),
         number(
             "threshold",
@@ -226,7 +225,7 @@ RECOLOR = Edit(
             panel=FILTER_PANEL,
             per_image=True,
         ),
-        replace(TOLERANCE, former_names=(("bandwidth", 1.0),), slider=Slider("Tolerance", 3, 40, 1, live=False)),
+        replace(TOLERANCE, slider=Slider("Tolerance", 3, 40, 1, live=False)),
         *filter_parameters(share=1.2, patch_size=1)[1:],
     ),
     hint="Choose a colour and paint some of it on an object; similar areas take it too.",
@@ -297,7 +296,7 @@ DEFOCUS = Edit(
             ("disc", "gaussian"),
             "`disc`: points of light become discs, as in a lens. `gaussian`: they become soft spots.",
         ),
-        replace(TOLERANCE, former_names=(("bandwidth", 100 / 255),)),
+        TOLERANCE,
         *filter_parameters(share=0.3, patch_size=1)[1:],
     ),
     hint="Paint on some of the object to keep sharp; the rest of it is found, and the background is blurred.",
@@ -364,7 +363,6 @@ ABSTRACT = Edit(
             "%",
             domain="positive",
             min_pixels=0.3,  # thinnest line that pixels can show
-            former_names=(("width", 0.1),),
             slider=Slider("Width of lines", 0.05, 0.6, 0.01),
         ),
         Parameter(

@@ -23,7 +23,6 @@ from nlfilter_torch.photo.declared.parameters import EDITS
 from nlfilter_torch.photo.declared.steps import VERSION, Step, acting_steps, json_of
 
 ORDER = tuple(EDITS)  # order in which the editor adds steps
-FORMER_ORDER = ("detail", "colorize", "recolor", "defocus", "abstract")  # order in files without a list of steps
 REMEDY = "save one in the editor"
 
 
@@ -98,23 +97,16 @@ class Recipe:
 
     @staticmethod
     def from_json(text: str | bytes, name: str, remedy: str = REMEDY) -> "Recipe":
-        """Parse the output of :meth:`to_json`, or a file in the former format without a list of steps.
+        """Parse the output of :meth:`to_json`.
 
         Raises:
             ValueError: if ``text`` is no JSON object, or an entry is unknown or invalid. ``name`` is the file's name in
                 the message, which ends in ``remedy`` if the file is no recipe at all.
         """
         entries = parse_json(text, name, remedy)
-        if isinstance(entries, dict) and "alpha" in entries:
-            return Recipe((Step.from_entries("detail", entries, name, whole_file=True, former_format=True),))
-        if isinstance(entries, dict) and "steps" in entries:
-            return Recipe(tuple(_read_steps(entries, name)))
-        if not isinstance(entries, dict) or not set(entries) <= set(FORMER_ORDER):
+        if not isinstance(entries, dict) or "steps" not in entries:
             raise ValueError(f"{name} is not a preset: it must hold a list of steps; {remedy}")
-        former = [edit for edit in FORMER_ORDER if edit in entries]
-        return Recipe(
-            tuple(Step.from_entries(edit, entries[edit], f"{edit} in {name}", former_format=True) for edit in former)
-        )
+        return Recipe(tuple(_read_steps(entries, name)))
 
 
 def _read_steps(entries: dict[str, Any], name: str) -> list[Step]:

@@ -157,11 +157,6 @@ REACH = number(
 REACH_SLIDER = Slider("Reach of the region", 0, 0.95, 0.05)
 
 
-def reach_of_time(time: float) -> float:
-    """Convert a diffusion time, as in files of former versions, to a reach; the defaults, 1 and 0.6, correspond."""
-    return time / (time + 2 / 3) if time > 0 else time
-
-
 KNOTS = 17  # of a tone curve
 SATURATIONS = 5  # that have a factor of their own
 STRAIGHT = tuple(i / (KNOTS - 1) for i in range(KNOTS))

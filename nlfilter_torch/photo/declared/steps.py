@@ -5,11 +5,11 @@ original. Does not import torch.
 """
 
 import json
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from nlfilter_torch.photo.declared.declaration import Edit, Parameter, is_within, shown
+from nlfilter_torch.photo.declared.declaration import Edit, shown
 from nlfilter_torch.photo.declared.parameters import EDITS
 from nlfilter_torch.photo.declared.shared_parameters import FILTER
 
@@ -18,8 +18,6 @@ if TYPE_CHECKING:
 
 VERSION = 1  # of files of steps
 NONE = (1.0, 1.0, 1.0, 1.0)  # sliders that change nothing
-# Defaults in files of the format without a list of steps, which left out values that change nothing.
-FORMER_DEFAULTS: dict[str, dict[str, Any]] = {"detail": {"alpha": NONE}, "abstract": {"power": 0.0}}
 
 
 @dataclass(frozen=True, init=False)
@@ -136,41 +134,31 @@ class Step:
         return f"{indent}{{\n{lines}\n{indent}}}"
 
     @staticmethod
-    def from_entries(
-        edit: str, entries: Any, place: str, *, whole_file: bool = False, former_format: bool = False
-    ) -> "Step":
+    def from_entries(edit: str, entries: dict[str, Any], place: str) -> "Step":
         """Create a step from parsed JSON.
 
         Args:
             edit: name of the edit.
-            entries: JSON object of the step.
-            place: description of where it was found, for errors.
-            whole_file: whether the file holds nothing else, so that ``place`` is the file.
-            former_format: whether the file has the former format, without a list of steps.
+            entries: JSON object of the step, without the name of the edit.
+            place: where the step stands, for errors, such as ``tone, step 2 in edit.json``.
 
         Raises:
             ValueError: if an entry is unknown or invalid.
         """
-        if not isinstance(entries, dict):
-            raise ValueError(f"{place} must be a JSON object, got {shown(entries)}; correct it")
-        declared, values = EDITS[edit], dict(FORMER_DEFAULTS.get(edit, {})) if former_format else {}
+        declared, values = EDITS[edit], dict[str, Any]()
+        parameters = {parameter.name: parameter for parameter in declared}
         strokes: tuple[Stroke, ...] = ()
         for entry, value in entries.items():
             if entry == "strokes" and declared.brushes:
                 strokes = _read_strokes(value, declared, place)
                 continue
-            found = _find(declared, entry)
-            if found is None:
-                names = [*(p.name for p in declared), *(["strokes"] if declared.brushes else [])]
+            if entry not in parameters:
+                names = [*parameters, *(["strokes"] if declared.brushes else [])]
                 raise ValueError(f"{place} must have no entries other than {', '.join(names)}, got {entry}; remove it")
-            parameter, factor = found
-            converted = value
-            if is_within(value, -1e300, 1e300) and factor != 1:
-                converted = factor(value) if callable(factor) else value * factor
-            if not parameter.is_valid(converted):
-                where = f"{'in' if whole_file else 'of'} {place}"
-                raise ValueError(f"{entry} {where} must be {parameter.wanted}, got {shown(value)}; correct it")
-            values[parameter.name] = tuple(map(float, converted)) if isinstance(converted, list) else converted
+            if not parameters[entry].is_valid(value):
+                wanted = parameters[entry].wanted
+                raise ValueError(f"{entry} of {place} must be {wanted}, got {shown(value)}; correct it")
+            values[entry] = tuple(map(float, value)) if isinstance(value, list) else value
         step = Step(edit, strokes, **values)
         if edit == "detail" and len(step.sliders_inside) != len(step["alpha"]):
             raise ValueError(f"inside of {place} must have as many numbers as alpha; add or drop some")
@@ -198,15 +186,6 @@ def working_bytes(landmarks: int, patch_size: int, *, factors: int = 1) -> int:
         factors: number of arrays of the factor's size at once: 1 for filtering, 5 for diagnostics.
     """
     return 4 * (factors * landmarks + 2 * patch_size**2 + 40)
-
-
-def _find(declared: Edit, entry: str) -> tuple[Parameter, float | Callable[[float], float]] | None:
-    """Find the parameter with the name of an entry, and the factor or function that converts its value."""
-    for parameter in declared:
-        factors: dict[str, float | Callable[[float], float]] = {parameter.name: 1.0, **dict(parameter.former_names)}
-        if entry in factors:
-            return parameter, factors[entry]
-    return None
 
 
 def _read_strokes(value: Any, declared: Edit, place: str) -> tuple["Stroke", ...]:
