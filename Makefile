@@ -13,7 +13,7 @@ INSTALL_DEBIAN := $(AS_ROOT) apt-get update && $(AS_ROOT) apt-get install -y --n
 export PYTHONDONTWRITEBYTECODE :=
 
 .DELETE_ON_ERROR:
-.PHONY: demo test lint types compiler chromium bench bench-quick train pictures figures notebooks wheels docs clean
+.PHONY: demo test lint lint-page types compiler chromium bench bench-quick train pictures figures notebooks wheels docs clean
 
 # The stamp files record the last install, which is repeated when a prerequisite changes.
 # torch is installed first, by its exact pin, so that no other package pulls in another build of it.
@@ -52,6 +52,18 @@ test: $(VENV)/.installed-test chromium
 lint: $(VENV)/.installed-test
 	$(BIN)/ruff format --check
 	$(BIN)/ruff check
+	@$(MAKE) --no-print-directory lint-page
+
+# The script and the style sheet of the editor's page; skipped where their linters cannot be installed.
+lint-page:
+	@if ! command -v npm >/dev/null; then echo "There is no node here; the editor's page is not linted."; \
+	elif ! $(MAKE) --no-print-directory node_modules/.installed; then \
+	echo "The linters of package.json could not be installed; the editor's page is not linted."; \
+	else npm run --silent lint; fi
+
+node_modules/.installed: package.json
+	@npm install --engine-strict --no-package-lock --no-audit --no-fund --loglevel=error --fetch-retries=0 >/dev/null
+	@touch $@
 
 types: $(VENV)/.installed-test
 	$(BIN)/mypy
@@ -139,4 +151,4 @@ notebooks: $(VENV)/.installed-test
 	$(BIN)/python -m benchmarks.notebooks notebooks
 
 clean:
-	rm -rf $(VENV) out dist build .mypy_cache .pytest_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) node_modules out dist build .mypy_cache .pytest_cache .ruff_cache .hypothesis

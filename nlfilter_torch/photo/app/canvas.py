@@ -59,8 +59,7 @@ class Canvas:
             self._photo.on(
                 "mouse",
                 lambda event: self._pointer(*event.args),
-                js_handler="(e) => { if (e.buttons || e.mouse_event_type != 'pointermove') "
-                "emit([e.mouse_event_type, e.image_x, e.image_y]) }",
+                js_handler="(event) => page.point(event, emit)",
             )
         self._photo.set_visibility(False)
         self._clipped.set_visibility(False)
@@ -190,7 +189,7 @@ class Canvas:
 
 
 def _build_zoom() -> None:
-    """Buttons for what :mod:`nlfilter_torch.photo.app.script` does."""
+    """Buttons for what ``static/closeup.js`` does."""
 
     def button(label: str, icon: str, tip: str, action: str) -> ui.button:
         found = ui.button(icon=icon).props(f'flat dense color=white aria-label="{label}"').tooltip(tip)

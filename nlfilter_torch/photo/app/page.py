@@ -21,9 +21,7 @@ from nlfilter_torch.photo.app.canvas import Canvas
 from nlfilter_torch.photo.app.closeup import Closeup
 from nlfilter_torch.photo.app.library import Library
 from nlfilter_torch.photo.app.panel import Brush, Panel
-from nlfilter_torch.photo.app.script import SCRIPT
 from nlfilter_torch.photo.app.session import Session
-from nlfilter_torch.photo.app.style import CSS
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.tiled.sampling import Report
 
@@ -35,14 +33,11 @@ SHOWN = 0.5  # seconds between two texts of the progress
 LASTING = 10.0  # seconds that an error is shown
 INSIDE, OUTSIDE = "#4ade80", "#60a5fa"  # colours of the sliders' response in the region, and elsewhere
 EDITORS: dict[str, "Editor"] = {}  # open pages by the token in the addresses of their pictures
-# The browser asks before it leaves a page whose edit has changed since a file was written. Nothing is lost if the
-# editor has ended: the edit is kept in a file.
-LEAVING = """<script>
-window.unsaved = false;
-window.addEventListener("beforeunload", (e) => { if (window.unsaved) { e.preventDefault(); e.returnValue = ""; } });
-</script>"""
-FOLD = "() => document.documentElement.classList.toggle('folded')"  # the controls, on small screens
-DISCONNECTED = "window.socket.on('disconnect', () => { window.unsaved = false; });"
+STATIC = Path(__file__).with_name("static")  # the script and the style sheet of the page
+STATIC_ADDRESS = "/static"
+SCRIPTS = "".join(
+    f'<script type="module" src="{STATIC_ADDRESS}/{name}"></script>\n' for name in ("page.js", "closeup.js")
+)
 
 
 class Editor:
@@ -62,8 +57,8 @@ class Editor:
         EDITORS[self._token] = self
         self._client = ui.context.client
         self._client.on_delete(self._leave)
-        ui.add_css(CSS)
-        ui.add_head_html(LEAVING + SCRIPT)
+        ui.add_css(STATIC / "page.css")
+        ui.add_head_html(SCRIPTS)
         self._closeup = Closeup(self._run, self._start, self._tell)
         self._at_rest = AtRest(self._run, self._start, self._is_preview, self._take)
         self._build_header()
@@ -73,7 +68,7 @@ class Editor:
                 self._canvas = Canvas(self.session, brush, self._token, self._changed, self._show_error)
             with ui.column().classes("panel"):
                 handle = ui.button(icon="drag_handle").props('flat dense aria-label="Show or hide the controls"')
-                handle.classes("handle").on("click", js_handler=FOLD)
+                handle.classes("handle").on("click", js_handler="() => page.fold()")
                 self._panel = Panel(self.session, brush, self._change, self._canvas.switch)
         ui.keyboard(on_key=self._key)
         ui.on("closeup", lambda event: self._look(event.args))
@@ -127,7 +122,7 @@ class Editor:
         upload.on(
             "rejected",
             lambda event: self._refuse(event.args[0], event.args[1], largest),
-            js_handler="(entries) => emit([entries[0].failedPropValidation, entries[0].file.name])",
+            js_handler="(entries) => page.refuse(entries, emit)",
         )
         return upload.props(f'accept="{accept}"').classes("hidden")
 
@@ -174,7 +169,7 @@ class Editor:
         self._undo_button.set_enabled(session.can_undo)
         self._redo_button.set_enabled(session.can_redo)
         self._reset_button.set_enabled(session.recipe != Recipe())
-        self._client.run_javascript(f"window.unsaved = {'true' if session.unsaved else 'false'}")
+        self._client.run_javascript(f"page.isUnsaved = {'true' if session.unsaved else 'false'}")
         if session.trouble != self._told:
             self._told = session.trouble
             if session.trouble is not None:
@@ -248,7 +243,7 @@ class Editor:
     # Files
 
     def _begin(self, image: Path | None, address: str) -> None:
-        self._client.run_javascript(DISCONNECTED)
+        self._client.run_javascript("page.watchConnection()")
         self._show_state()
         if self.session.opened is not None:  # a browser that reconnects keeps its edit
             return

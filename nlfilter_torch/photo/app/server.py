@@ -16,7 +16,7 @@ from nicegui import app, binding, ui
 
 from nlfilter_torch.photo.app.access import Guard
 from nlfilter_torch.photo.app.library import Library
-from nlfilter_torch.photo.app.page import EDITORS, Editor
+from nlfilter_torch.photo.app.page import EDITORS, STATIC, STATIC_ADDRESS, Editor
 
 TITLE = "nlfilter-torch"
 STARTING, PAUSE = 30.0, 0.05  # seconds for the server to accept connections, and between two attempts
@@ -33,6 +33,7 @@ def serve(image: Path | None, folder: Path, *, host: str, port: int, open_page: 
     app.add_middleware(Guard, host=host)
     library = Library(folder, None if image is None else image.parent)
     app.config.quasar_config["loadingBar"] = {"skipHijack": True}  # the page shows what it is doing itself
+    app.add_static_files(STATIC_ADDRESS, STATIC, max_cache_age=0)  # another version must not find old files
 
     @app.get("/picture/{token}/{kind}")
     def _picture(token: str, kind: str, at: str = "") -> Response:

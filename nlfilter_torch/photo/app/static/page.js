@@ -1,0 +1,44 @@
+/** What the page does beside zoom and pan: the question before it is left, and what its controls send to the server. */
+
+/** The page, as the server and the controls use it. */
+class Page {
+  /** Whether the edit has changed since a file was written; the server sets it. */
+  isUnsaved = false;
+
+  /** Leave without a question once the editor has ended: the edit is kept in a file. */
+  watchConnection() {
+    window.socket.on("disconnect", () => {
+      this.isUnsaved = false;
+    });
+  }
+
+  /** Show or hide the controls, on small screens. */
+  fold() {
+    document.documentElement.classList.toggle("folded");
+  }
+
+  /** Send a pointer on the photograph; moves without a pressed button are not sent. */
+  point(event, emit) {
+    if (event.buttons || event.mouse_event_type !== "pointermove") {
+      emit([event.mouse_event_type, event.image_x, event.image_y]);
+    }
+  }
+
+  /** Send why the browser refuses a file, and the name of the file. */
+  refuse(entries, emit) {
+    emit([entries[0].failedPropValidation, entries[0].file.name]);
+  }
+
+  /** Let the browser ask before it leaves a page whose edit has changed. */
+  askBeforeLeaving() {
+    window.addEventListener("beforeunload", (event) => {
+      if (this.isUnsaved) {
+        event.preventDefault();
+        event.returnValue = "";
+      }
+    });
+  }
+}
+
+window.page = new Page();
+window.page.askBeforeLeaving();
