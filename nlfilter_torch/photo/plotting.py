@@ -8,7 +8,6 @@ import math
 import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -144,13 +143,13 @@ def _plot() -> tuple[Figure, Axes]:
     return figure, axis
 
 
-def _picture(image: Tensor) -> NDArray[Any]:
+def _picture(image: Tensor) -> NDArray[np.generic]:
     """Convert (1, C, H, W) or (C, H, W) to (H, W, 3) in [0, 1]."""
     channels = image.detach().reshape(-1, *image.shape[-2:]).clamp(0, 1)
     return channels.expand(3, -1, -1).permute(1, 2, 0).numpy(force=True)
 
 
-def _limit(values: NDArray[Any]) -> float:
+def _limit(values: NDArray[np.generic]) -> float:
     """Compute the limit of a symmetric colour scale; positive even for a plane of zeros."""
     return max(float(np.quantile(np.abs(values), FAR)), 1e-6)
 
@@ -175,7 +174,7 @@ def _panels(
 def _draw(
     axis: Axes,
     title: str,
-    picture: NDArray[Any],
+    picture: NDArray[np.generic],
     *,
     limit: float | None = None,
     colours: str = "gray",

@@ -4,20 +4,16 @@ Needs the ``cli`` extra, and the extras ``raw`` and ``heic``.
 """
 
 import io
-from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import ExifTags, Image
 
 from nlfilter_torch.photo.io import colours, tiff
 from nlfilter_torch.photo.io import exif as exif_tags
-
-Found = tuple[NDArray[np.generic], int, bytes | None, bytes | None]  # channels, orientation, profile and EXIF
-CheckSize = Callable[[tuple[int, int]], None]  # of (width, height)
+from nlfilter_torch.photo.io.decoded import CheckSize, Decoded
 
 #: Suffixes of RAW files, most of which begin like TIFF files.
 RAWS = (
@@ -37,7 +33,7 @@ def is_heic(head: bytes) -> bool:
     return head[4:8] == b"ftyp" and head[8:12] in BRANDS and b"avif" not in head
 
 
-def read_raw(path: Path, check_size: CheckSize) -> Found:
+def read_raw(path: Path, check_size: CheckSize) -> Decoded:
     """Read upright 16-bit channels in sRGB, with the camera's white balance and no brightening."""
     try:
         import rawpy
@@ -58,15 +54,20 @@ def read_raw(path: Path, check_size: CheckSize) -> Found:
         raise tiff.UnhandledImage(
             f"{path} cannot be read as a RAW file, or is damaged; copy it again, or convert it to DNG or TIFF"
         ) from error
-    return channels, 1, None, exif
+    return Decoded(channels, 1, None, exif)
 
 
 def _exif_of(preview: bytes) -> bytes | None:
     """Read the EXIF block of a JPEG preview, and reset its orientation, as the RAW pixels are upright."""
-    return exif_tags.split(lambda: Image.open(io.BytesIO(preview)).getexif())[1]
+    return exif_tags.split(partial(_preview_fields, preview))[1]
 
 
-def read_heic(path: Path, check_size: CheckSize) -> Found:
+def _preview_fields(preview: bytes) -> Image.Exif:
+    """Parse the EXIF block of a JPEG file."""
+    return Image.open(io.BytesIO(preview)).getexif()
+
+
+def read_heic(path: Path, check_size: CheckSize) -> Decoded:
     """Read upright channels of 8 bits, or of 16 if the file has more."""
     try:
         import pillow_heif
@@ -78,18 +79,20 @@ def read_heic(path: Path, check_size: CheckSize) -> Found:
     with tiff.decoding(path):
         picture = pillow_heif.open_heif(path, convert_hdr_to_8bit=False)
         check_size(picture.size)
-        info: dict[str, Any] = picture.info
+        info = picture.info
         numbers = info.get("nclx_profile")
         if numbers and not info.get("icc_profile"):
             colours.check_numbers(path, numbers["color_primaries"], numbers["transfer_characteristics"])
         channels = np.asarray(picture)
         if channels.dtype == np.uint16:  # the lower bits are empty
             channels = np.rint(channels * (65535 / (65536 - (1 << (16 - info["bit_depth"]))))).astype(np.uint16)
+        exif = exif_tags.split(partial(_upright_fields, info.get("exif") or b""))[1]
+        return Decoded(channels.reshape(*channels.shape[:2], -1), 1, info.get("icc_profile"), exif)
 
-        def stored() -> Image.Exif:
-            fields = Image.Exif()
-            fields.load(info.get("exif") or b"")
-            fields.pop(ExifTags.Base.Orientation, None)  # the pixels are upright already
-            return fields
 
-        return channels.reshape(*channels.shape[:2], -1), 1, info.get("icc_profile"), exif_tags.split(stored)[1]
+def _upright_fields(block: bytes) -> Image.Exif:
+    """Parse an EXIF block, without its orientation since the pixels are upright already."""
+    fields = Image.Exif()
+    fields.load(block)
+    fields.pop(ExifTags.Base.Orientation, None)
+    return fields

@@ -32,25 +32,25 @@ def check_numbers(path: Path, primaries: int, transfer: int) -> None:
             f"{path} is an HDR picture ({TRANSFERS[transfer]}), which is not supported; convert it to sRGB, or to a "
             "TIFF file with a colour profile"
         )
-    found = [] if primaries in USUAL_PRIMARIES else [PRIMARIES.get(primaries, f"primaries number {primaries}")]
+    unusual = [] if primaries in USUAL_PRIMARIES else [PRIMARIES.get(primaries, f"primaries number {primaries}")]
     if transfer not in USUAL_TRANSFERS:
-        found.append(TRANSFERS.get(transfer, f"transfer function number {transfer}"))
-    _warn(path, found)
+        unusual.append(TRANSFERS.get(transfer, f"transfer function number {transfer}"))
+    _warn(path, unusual)
 
 
 def check_png(path: Path, gamma: float | None, chromaticities: Sequence[float] | None) -> None:
-    """Warn if colours described by the chunks gAMA and cHRM of a PNG file, of which each may be None, are not sRGB."""
-    found = []
+    """Warn if the chunks gAMA and cHRM of a PNG file describe other colours than sRGB; None if a chunk is missing."""
+    unusual = []
     if chromaticities is not None and max(abs(a - b) for a, b in zip(chromaticities, SRGB, strict=True)) > NEAR:
-        found.append("other primaries than sRGB")
+        unusual.append("other primaries than sRGB")
     if gamma is not None and gamma > 0 and abs(gamma / GAMMA - 1) > NEAR_GAMMA:
-        found.append(f"a gamma of {1 / gamma:.2g}")
-    _warn(path, found)
+        unusual.append(f"a gamma of {1 / gamma:.2g}")
+    _warn(path, unusual)
 
 
-def _warn(path: Path, found: Sequence[str]) -> None:
-    if found:
+def _warn(path: Path, unusual: Sequence[str]) -> None:
+    if unusual:
         warn(
-            f"{path} has {' and '.join(found)} without a colour profile, which the output will not say, so that its "
+            f"{path} has {' and '.join(unusual)} without a colour profile, which the output will not say, so that its "
             "colours will look different; convert the photograph to sRGB, or embed a profile, before the edit"
         )

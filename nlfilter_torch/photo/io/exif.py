@@ -2,10 +2,14 @@
 
 import warnings
 from collections.abc import Callable, MutableMapping
-from typing import Any
+from typing import TypeVar
 
+import numpy as np
 from numpy.typing import NDArray
 from PIL import ExifTags, Image, TiffImagePlugin
+
+Scalar = TypeVar("Scalar", bound=np.generic)
+Fields = dict[int, object]  # values of a table by their tags
 
 PREFIX = b"Exif\0\0"
 FOLDERS: tuple[int, ...] = (ExifTags.IFD.Exif, ExifTags.IFD.GPSInfo)  # fields that point to a nested table
@@ -25,12 +29,12 @@ class Latin1(str):
         return super().encode("latin-1", "replace")
 
 
-def writable(value: Any) -> Any:
+def writable(value: object) -> object:
     """The value of a field as it is to be given to Pillow."""
     return Latin1(value) if isinstance(value, str) else value
 
 
-def upright(channels: NDArray[Any], orientation: int) -> NDArray[Any]:
+def upright(channels: NDArray[Scalar], orientation: int) -> NDArray[Scalar]:
     """Rotate or flip an array (H, W, S) stored with an EXIF orientation to the upright position.
 
     >>> import numpy as np
@@ -59,7 +63,7 @@ def split(read: Callable[[], Image.Exif]) -> tuple[int, bytes | None]:
         if set(fields) <= {ExifTags.Base.Orientation}:
             return orientation, None
         exif[ExifTags.Base.Orientation] = 1
-        folders: dict[int, dict[int, Any]] = {
+        folders: dict[int, Fields] = {
             code: folder for code in FOLDERS if code in fields and (folder := _folder(exif, code))
         }
         width, height = ExifTags.Base.ExifImageWidth, ExifTags.Base.ExifImageHeight
@@ -73,7 +77,7 @@ def split(read: Callable[[], Image.Exif]) -> tuple[int, bytes | None]:
             return orientation, _sound(fields, folders).tobytes()
 
 
-def _keep_bytes(*tables: MutableMapping[int, Any]) -> None:
+def _keep_bytes(*tables: MutableMapping[int, object]) -> None:
     """Make Pillow write the texts of tables as they were read."""
     for table in tables:
         for code, value in list(table.items()):
@@ -89,7 +93,7 @@ def without_orientation(block: bytes) -> bytes:
     return exif.tobytes() if exif else b""
 
 
-def orientation_of(value: Any) -> int:
+def orientation_of(value: object) -> int:
     """Return the EXIF orientation, 1 to 8; 1 (upright) if ``value`` is invalid.
 
     >>> orientation_of(6), orientation_of("upside down")
@@ -98,23 +102,23 @@ def orientation_of(value: Any) -> int:
     return int(value) if isinstance(value, int) and 1 <= value <= 8 else 1
 
 
-def _folder(exif: Image.Exif, code: int) -> dict[int, Any]:
+def _folder(exif: Image.Exif, code: int) -> Fields:
     try:
         return exif.get_ifd(code)
     except Exception:
         return {}
 
 
-def tables(exif: Image.Exif) -> dict[int, dict[int, Any]]:
+def tables(exif: Image.Exif) -> dict[int, Fields]:
     """The nested tables of a block, each with the tables inside it in place of pointers to them."""
-    found = {code: dict(folder) for code in FOLDERS if (folder := _folder(exif, code))}
-    for folder in found.values():
+    folders = {code: dict(folder) for code in FOLDERS if (folder := _folder(exif, code))}
+    for folder in folders.values():
         if folder.pop(INTEROP, None) is not None and (inner := _folder(exif, INTEROP)):
             folder[INTEROP] = inner
-    return found
+    return folders
 
 
-def _sound(fields: dict[int, Any], folders: dict[int, dict[int, Any]]) -> Image.Exif:
+def _sound(fields: Fields, folders: dict[int, Fields]) -> Image.Exif:
     """Build an EXIF block from the fields that can be written."""
     block = Image.Exif()
     for code, value in fields.items():
@@ -128,7 +132,7 @@ def _sound(fields: dict[int, Any], folders: dict[int, dict[int, Any]]) -> Image.
     return block
 
 
-def is_writable(code: int, value: Any) -> bool:
+def is_writable(code: int, value: object) -> bool:
     """Whether Pillow can write a field with that value."""
     table = TiffImagePlugin.ImageFileDirectory_v2()
     try:

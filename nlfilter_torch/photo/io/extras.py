@@ -6,9 +6,9 @@ import re
 import struct
 import warnings
 import zlib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import imagecodecs
 import numpy as np
@@ -39,9 +39,9 @@ class Extras:
     xmp: bytes | None = None
     dpi: tuple[float, float] | None = None
 
-    def options(self, kind: str) -> dict[str, Any]:
+    def options(self, kind: str) -> dict[str, object]:
         """Options for Pillow to write the metadata to a JPEG, WebP, AVIF or PNG file."""
-        options: dict[str, Any] = {}
+        options: dict[str, object] = {}
         if self.dpi is not None and kind not in ("WebP", "AVIF"):
             options["dpi"] = self.dpi
         if self.xmp is None:
@@ -60,14 +60,14 @@ class Extras:
 
     def chunks(self) -> list[tuple[bytes, bytes]]:
         """The metadata as chunks of a PNG file."""
-        found = []
+        chunks = []
         if self.dpi is not None:
-            found.append((b"pHYs", struct.pack(">IIB", *(round(value / 0.0254) for value in self.dpi), 1)))
+            chunks.append((b"pHYs", struct.pack(">IIB", *(round(value / 0.0254) for value in self.dpi), 1)))
         if self.xmp is not None:
-            found.append((b"iTXt", PNG_KEY.encode() + bytes(5) + self.xmp))
-        return found
+            chunks.append((b"iTXt", PNG_KEY.encode() + bytes(5) + self.xmp))
+        return chunks
 
-    def tags(self) -> dict[str, Any]:
+    def tags(self) -> tiff.Resolution:
         """Options for tifffile to write the resolution; XMP is written with the extra tags."""
         return {} if self.dpi is None else {"resolution": self.dpi, "resolutionunit": INCH}
 
@@ -102,7 +102,7 @@ def _read(path: Path) -> Extras:
             return Extras(_upright(xmp.encode() if isinstance(xmp, str) else xmp), _sound(image.info.get("dpi")))
 
 
-def _xmp(image: Image.Image) -> Any:
+def _xmp(image: Image.Image) -> bytes | str | None:
     return image.info.get("xmp", image.info.get(PNG_KEY))
 
 
@@ -120,23 +120,23 @@ def _has_late_text(path: Path) -> bool:
     return False
 
 
-def _ratio(value: Any) -> float:
+def _ratio(value: object) -> float:
     """Convert a TIFF fraction to a float; NaN if it is invalid."""
     if isinstance(value, tuple) and len(value) == 2 and value[1]:
         return float(value[0]) / float(value[1])
     return math.nan
 
 
-def _sound(pair: Any) -> tuple[float, float] | None:
+def _sound(pair: Sequence[float] | None) -> tuple[float, float] | None:
     """Return the resolution if it is two valid numbers, else None."""
     try:
-        x, y = (float(value) for value in pair)
-    except (TypeError, ValueError):
+        x, y = (float(value) for value in pair or ())
+    except (TypeError, ValueError):  # of damaged files
         return None
     return (x, y) if all(1 <= value <= 60_000 for value in (x, y)) else None  # 1 without a unit is not a resolution
 
 
-def _upright(xmp: Any) -> bytes | None:
+def _upright(xmp: object) -> bytes | None:
     """Set the orientation in an XMP packet to upright."""
     return ORIENTATION.sub(rb"\g<1>1", xmp) if isinstance(xmp, bytes) and xmp.strip() else None
 

@@ -6,10 +6,11 @@ subsampling and bit depth of the film; sound and subtitles are copied as they ar
 
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from types import ModuleType
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,9 @@ from nlfilter_torch.photo.io.writing import check_file, claimed, link_target, pa
 
 if TYPE_CHECKING:
     from av.container import InputContainer, OutputContainer
+    from av.packet import Packet
+    from av.sidedata.sidedata import SideData
+    from av.stream import Stream
     from av.video.frame import VideoFrame
     from av.video.stream import VideoStream
 
@@ -54,7 +58,7 @@ def check_film_output(path: Path) -> str:
     return kind
 
 
-def _av() -> Any:
+def _av() -> ModuleType:
     try:
         import av
     except ImportError as error:
@@ -101,7 +105,7 @@ class Film:
                 number += 1
                 yield frame
 
-    def decoded(self, packet: Any, number: int) -> list["VideoFrame"]:
+    def decoded(self, packet: "Packet[VideoStream]", number: int) -> list["VideoFrame"]:
         """Decode the frames that a packet completes; ``number`` frames came before, for errors."""
         av = _av()
         try:
@@ -131,13 +135,12 @@ class Film:
             dst_color_range=FULL,
             interpolation=Interpolation.BICUBIC | Interpolation.ACCURATE_RND | Interpolation.FULL_CHR_H_INP,
         )
-        found: Floats = np.ascontiguousarray(planes.to_ndarray())
-        return found
+        return np.ascontiguousarray(planes.to_ndarray(), np.float32)
 
     def sample(self, count: int) -> list[Floats]:
         """Decode the middle frames of ``count`` equal parts of the film, or all frames of a shorter film."""
         start, length = self.span()
-        found: list[Floats] = []
+        frames: list[Floats] = []
         last: int | None = None
         for part in range(count):
             wanted = start + int(length * (part + 0.5) / count)
@@ -147,11 +150,11 @@ class Film:
                 if frame.pts is not None and frame.pts + (frame.duration or 0) > wanted:
                     break
             if frame is not None and frame.pts != last:
-                found.append(self.pixels(frame))
+                frames.append(self.pixels(frame))
                 last = frame.pts
-        if not found:
+        if not frames:
             raise ValueError(f"{self.path} holds no frame that can be decoded; copy it again from its source")
-        return found
+        return frames
 
     def span(self) -> tuple[int, int]:
         """Return the first time stamp, and the duration in the same units."""
@@ -224,7 +227,7 @@ def write_film(film: Film, path: Path, edit: Callable[[Floats], Floats], begin: 
             options = {"movflags": "+faststart" + ("+use_metadata_tags" if kind == "mov" else "")}
             try:
                 with av.open(str(beside), "w", format=kind, options=options) as output:
-                    count = _transcode(film, output, edit, begin, path)
+                    count = _Transcoder(film, output, path, _encoder(film, output)).run(edit, begin)
             except av.error.FFmpegError as error:
                 if isinstance(error, OSError) and error.filename:
                     raise
@@ -235,52 +238,77 @@ def write_film(film: Film, path: Path, edit: Callable[[Floats], Floats], begin: 
     return count
 
 
-def _transcode(
-    film: Film, output: "OutputContainer", edit: Callable[[Floats], Floats], begin: Callable[[int], None], path: Path
-) -> int:
-    """Write the edited frames and the other streams of a film to an open container; return the number of frames."""
-    target = _encoder(film, output)
-    copied: dict[int, Any] = {}
-    for stream in film.container.streams:
-        if stream.type not in COPIED_STREAMS or stream.codec_context is None:
-            continue
-        try:
-            copied[stream.index] = output.add_stream_from_template(stream)
-        except ValueError as error:
-            raise ValueError(
-                f"{path} cannot store the {stream.codec_context.name} {stream.type} of {film.path}; "
-                "use the file type of that film, or convert it"
-            ) from error
-        copied[stream.index].metadata.update(stream.metadata)
-    output.metadata.update(
-        {key: text for key, text in film.container.metadata.items() if key not in CONTAINER_METADATA}
-    )
-    film.container.seek(0)  # the header is written with the first packet, which may be a sound packet
-    target.set_display_matrix(next(map(display_matrix, film.frames()), None))
-    film.container.seek(0)
-    count = 0
-    durations: dict[int | None, int] = {}  # durations of the frames in the encoder, which may lose them
+@dataclass(frozen=True)
+class _Transcoder:
+    """Writes the edited frames and the other streams of a film to an open container.
 
-    def put(packets: Iterable[Any]) -> None:
+    Attributes:
+        film: the film, read from its start.
+        output: the container.
+        path: where the container is going to be, for errors.
+        target: stream of the edited frames.
+        copied: streams of the container, by the index of the stream of the film that each is a copy of.
+        durations: of the frames in the encoder, which may lose them, by time stamp.
+    """
+
+    film: Film
+    output: "OutputContainer"
+    path: Path
+    target: "VideoStream"
+    copied: dict[int, "Stream"] = field(default_factory=dict)
+    durations: dict[int | None, int] = field(default_factory=dict)
+
+    def run(self, edit: Callable[[Floats], Floats], begin: Callable[[int], None]) -> int:
+        """Write everything, see :func:`write_film`; return the number of frames."""
+        source = self.film.container
+        self._add_copies()
+        entries = {key: text for key, text in source.metadata.items() if key not in CONTAINER_METADATA}
+        self.output.metadata.update(entries)
+        source.seek(0)  # the header is written with the first packet, which may be a sound packet
+        self.target.set_display_matrix(next(map(display_matrix, self.film.frames()), None))
+        source.seek(0)
+        count = 0
+        for packet in source.demux(self.film.stream, *(s for s in source.streams if s.index in self.copied)):
+            if packet.stream.index in self.copied:
+                self._copy(packet)
+                continue
+            for frame in self.film.decoded(cast("Packet[VideoStream]", packet), count):
+                begin(count)
+                count += 1
+                self.durations[frame.pts] = frame.duration
+                edited = _stored(self.film, frame, edit(self.film.pixels(frame)), self.target)
+                self._write(self.target.encode(edited))
+        if count == 0:
+            raise ValueError(f"{self.film.path} holds no frame that can be decoded; copy it again from its source")
+        self._write(self.target.encode(None))
+        return count
+
+    def _add_copies(self) -> None:
+        """Add a stream for each of sound and subtitles."""
+        for stream in self.film.container.streams:
+            if stream.type not in COPIED_STREAMS or stream.codec_context is None:
+                continue
+            try:
+                copy = self.output.add_stream_from_template(stream)
+            except ValueError as error:
+                raise ValueError(
+                    f"{self.path} cannot store the {stream.codec_context.name} {stream.type} of {self.film.path}; "
+                    "use the file type of that film, or convert it"
+                ) from error
+            copy.metadata.update(stream.metadata)
+            self.copied[stream.index] = copy
+
+    def _copy(self, packet: "Packet[Stream]") -> None:
+        """Write a packet of sound or subtitles as it is."""
+        if packet.dts is not None:
+            packet.stream = self.copied[packet.stream.index]
+            self.output.mux(packet)
+
+    def _write(self, packets: "Iterable[Packet[VideoStream]]") -> None:
+        """Write encoded frames."""
         for packet in packets:
-            packet.duration = durations.pop(packet.pts, 0) or packet.duration
-            output.mux(packet)
-
-    for packet in film.container.demux(film.stream, *(s for s in film.container.streams if s.index in copied)):
-        if packet.stream.index in copied:
-            if packet.dts is not None:
-                packet.stream = copied[packet.stream.index]
-                output.mux(packet)
-            continue
-        for frame in film.decoded(packet, count):
-            begin(count)
-            count += 1
-            durations[frame.pts] = frame.duration
-            put(target.encode(_stored(film, frame, edit(film.pixels(frame)), target)))
-    if count == 0:
-        raise ValueError(f"{film.path} holds no frame that can be decoded; copy it again from its source")
-    put(target.encode(None))
-    return count
+            packet.duration = self.durations.pop(packet.pts, 0) or packet.duration
+            self.output.mux(packet)
 
 
 def _encoder(film: Film, output: "OutputContainer") -> "VideoStream":
@@ -326,8 +354,8 @@ def subsampling(pix_fmt: str) -> tuple[int, int]:
 
 def display_matrix(frame: "VideoFrame") -> list[int] | None:
     """Return the display matrix (rotation) of a frame as nine integers; None if it is upright."""
-    kept: Any = frame.side_data  # the type stubs declare only one kind
-    data = next((part for part in kept if part.type.name == "DISPLAYMATRIX"), None)
+    parts = cast("Iterable[SideData]", frame.side_data)  # the type stubs declare something else
+    data = next((part for part in parts if part.type.name == "DISPLAYMATRIX"), None)
     return None if data is None else [int(number) for number in np.frombuffer(bytes(data), np.int32)]
 
 

@@ -4,25 +4,25 @@ Needs the ``cli`` extra (Pillow, tifffile, imagecodecs, psutil).
 """
 
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Any, BinaryIO, Literal
+from typing import BinaryIO, Literal
 
 import numpy as np
 import psutil
 import torch
-from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
 from nlfilter_torch.photo.io import cameras, tiff
 from nlfilter_torch.photo.io import exif as exif_tags
 from nlfilter_torch.photo.io.by_pillow import read_by_pillow
+from nlfilter_torch.photo.io.decoded import Channels
 from nlfilter_torch.photo.io.extras import NO_EXTRAS, Extras, encode_deep_png, read_extras
 from nlfilter_torch.photo.io.writing import check_file, open_beside
 from nlfilter_torch.photo.tiled.pictures import Picture, stored_as
 
 Depth = Literal["uint8", "uint16", "float16", "float32", "float64"]
-Pixels = NDArray[np.generic]
 
 BITS = {"uint8": "8 bits", "uint16": "16 bits", "float16": "floats", "float32": "floats", "float64": "floats"}
 # Depths supported by each file type. JPEG has no alpha, PNG no floats.
@@ -119,7 +119,7 @@ def _planes(picture: Picture) -> Tensor:
     return planes
 
 
-def check_depth(path: str | Path, dtype: np.dtype[Any]) -> str:
+def check_depth(path: str | Path, dtype: np.dtype[np.generic]) -> str:
     """Return the depth of a file whose channels have that dtype; raises ValueError if it is not supported."""
     if dtype.name not in BITS:
         raise ValueError(
@@ -150,22 +150,29 @@ def first_bytes(path: Path) -> bytes:
     return head
 
 
-def read_channels(path: Path, *, bytes_per_pixel: int, memory: int | None) -> tuple[Pixels, bytes | None, bytes | None]:
+def read_channels(
+    path: Path, *, bytes_per_pixel: int, memory: int | None
+) -> tuple[Channels, bytes | None, bytes | None]:
     """Read upright channels (H, W, S) in the stored dtype, profile and EXIF; see :func:`read_photograph`."""
     head = first_bytes(path)
-    if cameras.is_raw(path) or cameras.is_heic(head):
-        read = cameras.read_raw if cameras.is_raw(path) else cameras.read_heic
-        channels, orientation, icc, exif = read(path, lambda size: check_memory(path, *size, bytes_per_pixel, memory))
+    check_size = partial(_check_size, path, bytes_per_pixel, memory)
+    if cameras.is_raw(path):
+        decoded = cameras.read_raw(path, check_size)
+    elif cameras.is_heic(head):
+        decoded = cameras.read_heic(path, check_size)
     elif tiff.is_tiff(head):
-        channels, orientation, icc, exif = tiff.read(
-            path, lambda size, double: check_memory(path, *size, bytes_per_pixel * (1 + double), memory)
-        )
+        decoded = tiff.read(path, check_size)
     else:
         deep_png = head.startswith(b"\x89PNG") and head[24:25] == b"\x10"  # the bit depth in the header
-        channels, orientation, icc, exif = read_by_pillow(
-            path, deep_png, lambda size: check_memory(path, *size, bytes_per_pixel, memory)
-        )
-    return exif_tags.upright(channels, orientation), icc, exif
+        decoded = read_by_pillow(path, deep_png, check_size)
+    return exif_tags.upright(decoded.channels, decoded.orientation), decoded.icc, decoded.exif
+
+
+def _check_size(
+    path: Path, bytes_per_pixel: int, memory: int | None, size: tuple[int, int], *, double: bool = False
+) -> None:
+    """Check the memory that a picture of (width, height) needs; twice as much for 64-bit pixels."""
+    check_memory(path, *size, bytes_per_pixel * (1 + double), memory)
 
 
 def write_photograph(photograph: Photograph, path: str | Path) -> None:
@@ -182,7 +189,7 @@ def write_photograph(photograph: Photograph, path: str | Path) -> None:
     kind = check_output(path, photograph)
     planes = [photograph.pixels] if photograph.alpha is None else [photograph.pixels, photograph.alpha]
     rows = max(1, CONVERTED // photograph.size[1])
-    parts = zip(*(each.split(rows, dim=2) for each in planes), strict=True)
+    parts = zip(*(plane.split(rows, dim=2) for plane in planes), strict=True)
     channels = np.concatenate([stored_as(torch.cat(part, dim=1), photograph.depth) for part in parts])  # (H, W, S)
     with open_beside(path) as stream:
         encode(stream, kind, channels, photograph.alpha is not None, photograph.icc, photograph.exif, photograph.extras)
@@ -191,7 +198,7 @@ def write_photograph(photograph: Photograph, path: str | Path) -> None:
 def encode(
     stream: BinaryIO,
     kind: str,
-    channels: Pixels,
+    channels: Channels,
     alpha: bool,
     icc: bytes | None,
     exif: bytes | None,

@@ -7,18 +7,19 @@ import math
 import shutil
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from types import ModuleType
+from typing import Protocol
 
 import numpy as np
 import psutil
-from numpy.typing import NDArray
 
 from nlfilter_torch.photo.io import exif as exif_tags
 from nlfilter_torch.photo.io import tiff
+from nlfilter_torch.photo.io.decoded import Channels
 from nlfilter_torch.photo.io.extras import NO_EXTRAS, Extras, read_extras
 from nlfilter_torch.photo.io.photographs import check_type, encode, first_bytes, read_channels
 from nlfilter_torch.photo.io.tiff import TiffRows
@@ -53,7 +54,7 @@ class StoredPicture:
     cached: int
     icc: bytes | None = None
     exif: bytes | None = None
-    attributes: dict[str, Any] | None = None
+    attributes: Mapping[str, object] | None = None
     extras: Extras = NO_EXTRAS
 
     @property
@@ -179,7 +180,7 @@ def _turn(rows: TiffRows, stack: ExitStack) -> RowSource:
     return upright
 
 
-def zarr_package() -> Any:
+def zarr_package() -> ModuleType:
     """The package zarr; raises ValueError if it is not installed."""
     try:
         import zarr
@@ -188,6 +189,32 @@ def zarr_package() -> Any:
             "zarr arrays need the package zarr, which is not installed; install nlfilter-torch[zarr]"
         ) from error
     return zarr
+
+
+class ZarrArray(Protocol):
+    """What is used of an array of the package zarr."""
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """(H, W) or (H, W, S)."""
+
+    @property
+    def chunks(self) -> tuple[int, ...]:
+        """The shape of a chunk."""
+
+    @property
+    def dtype(self) -> np.dtype[np.generic]:
+        """The stored dtype."""
+
+    @property
+    def attrs(self) -> Mapping[str, object]:
+        """Attributes, as in JSON."""
+
+    def __getitem__(self, rows: slice, /) -> Channels:
+        """Read rows."""
+
+    def __setitem__(self, place: tuple[slice, slice], values: Channels, /) -> None:
+        """Write rows and columns."""
 
 
 class ZarrRows:
@@ -202,13 +229,13 @@ class ZarrRows:
     def __reduce__(self) -> tuple[type["ZarrRows"], tuple[Path]]:
         return ZarrRows, (self.path.absolute(),)
 
-    def _open(self) -> Any:
+    def _open(self) -> ZarrArray:
         try:
             return zarr_package().open_array(self.path, mode="r")
         except (FileNotFoundError, KeyError, TypeError) as error:
             raise ValueError(f"{self.path} is not a zarr array ({error}); choose the folder of one") from error
 
-    def __getitem__(self, rows: slice) -> NDArray[Any]:
+    def __getitem__(self, rows: slice) -> Channels:
         now = tuple(self._open().shape)
         if now != self.shape:
             raise ValueError(
@@ -230,7 +257,7 @@ def _open_zarr(path: Path) -> StoredPicture:
     return StoredPicture(rows, alpha, cached, attributes=dict(rows.array.attrs))
 
 
-def write_band(array: Any, start: int, rows: NDArray[Any]) -> None:
+def write_band(array: ZarrArray, start: int, rows: Channels) -> None:
     """Write rows (h, W, S) to a zarr array from row ``start`` on, where a chunk begins."""
     values, width = rows.reshape(len(rows), *array.shape[1:]), array.chunks[1]
     # One chunk per call: zarr writes several in parallel and continues with the others after one fails.
@@ -238,11 +265,11 @@ def write_band(array: Any, start: int, rows: NDArray[Any]) -> None:
         array[start : start + len(values), left : left + width] = values[:, left : left + width]
 
 
-def _write_zarr(path: Path, rows: Rows | Tiling, dtype: np.dtype[Any], like: StoredPicture) -> None:
+def _write_zarr(path: Path, rows: Rows | Tiling, dtype: np.dtype[np.generic], like: StoredPicture) -> None:
     """Write an array under another name, which replaces an existing array only when it is complete."""
     shape = tuple(like.rows.shape)
     path = link_target(path)
-    former = name_beside(path)
+    replaced = name_beside(path)
     chunks = (min(CHUNK, shape[0]), min(CHUNK, shape[1]), *shape[2:])
     with part_beside(path) as beside:
         array = zarr_package().create_array(
@@ -257,11 +284,11 @@ def _write_zarr(path: Path, rows: Rows | Tiling, dtype: np.dtype[Any], like: Sto
                     write_band(array, start, band)
                     start += len(band)
             if path.exists():
-                path.replace(former)
+                path.replace(replaced)
             try:
                 beside.replace(path)
             except OSError:
-                former.replace(path)
+                replaced.replace(path)
                 raise
             finally:
-                shutil.rmtree(former, ignore_errors=True)
+                shutil.rmtree(replaced, ignore_errors=True)

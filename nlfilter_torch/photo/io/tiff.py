@@ -3,18 +3,19 @@
 import logging
 import os
 import struct
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import BinaryIO, TypedDict, Unpack
 
 import numpy as np
 import tifffile
-from numpy.typing import NDArray
 from PIL import ExifTags, Image, TiffImagePlugin
 
 from nlfilter_torch.core.checks import warn
 from nlfilter_torch.photo.io import exif as exif_tags
+from nlfilter_torch.photo.io.decoded import Channels, CheckSize, Decoded
 
 # Tags that describe the photograph. The others describe how the file stores it and are not copied.
 _DESCRIPTIVE = (270, 271, 272, 305, 306, 315, 33432, *exif_tags.FOLDERS)
@@ -27,6 +28,22 @@ MAX_CLASSIC_BYTES = 4_000_000_000  # bytes of pixels above which a BigTIFF is wr
 _ASSOCIATED = tifffile.EXTRASAMPLE.ASSOCALPHA
 MOST_PAGES = 100  # that are counted
 CACHED_BANDS = 2  # cached bands of strips or tiles: rows shared by two tiles of a picture span at most two
+
+
+class Resolution(TypedDict, total=False):
+    """Options of :func:`tifffile.imwrite` for the print resolution."""
+
+    resolution: tuple[float, float]
+    resolutionunit: int
+
+
+class _Options(Resolution, total=False):
+    """Further options of :func:`tifffile.imwrite`."""
+
+    tile: tuple[int, int]
+    bigtiff: bool
+    maxworkers: int
+    buffersize: int
 
 
 class UnhandledImage(ValueError):
@@ -50,15 +67,10 @@ def is_tiff(head: bytes) -> bool:
     return head[:4] in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 
 
-def read(
-    path: Path, check_size: Callable[[tuple[int, int], bool], None]
-) -> tuple[NDArray[Any], int, bytes | None, bytes | None]:
-    """Read channels (H, W, S) as stored, orientation, profile and EXIF (not from a BigTIFF) of the first page.
-
-    ``check_size((width, height), double)`` is called before the pixels are decoded; ``double`` means 64-bit pixels.
-    """
+def read(path: Path, check_size: CheckSize) -> Decoded:
+    """Read the first page; the EXIF block is not read from a BigTIFF."""
     with decoding(path), TiffRows(path) as rows:
-        check_size((rows.shape[1], rows.shape[0]), rows.dtype == np.float64)
+        check_size((rows.shape[1], rows.shape[0]), double=rows.dtype == np.float64)
         ends = (at + count for at, count in zip(rows.page.dataoffsets, rows.page.databytecounts, strict=True) if count)
         if max(ends, default=0) > path.stat().st_size:  # decoders of JPEG fill what is missing
             raise EOFError("it ends too early")
@@ -66,7 +78,7 @@ def read(
         if rows.page.axes == "SYX":
             channels = np.moveaxis(channels, 0, -1)
         warn_of_pages(path)
-        return plain(rows.page, channels.reshape(rows.shape)), rows.orientation, rows.icc, rows.exif
+        return Decoded(plain(rows.page, channels.reshape(rows.shape)), rows.orientation, rows.icc, rows.exif)
 
 
 def count_pages(path: Path) -> int:
@@ -75,8 +87,8 @@ def count_pages(path: Path) -> int:
     with path.open("rb") as stream, tifffile.TiffFile(stream, name=str(path)) as file:
         try:
             for number in range(1, MOST_PAGES):
-                page: Any = file.pages[number]
-                count += not (page.is_reduced or page.is_mask)
+                page = file.pages[number]
+                count += not (isinstance(page, tifffile.TiffPage) and (page.is_reduced or page.is_mask))
         except Exception:  # no such page, or damage behind the first one, which alone is needed
             return count
     return count
@@ -89,7 +101,7 @@ def warn_of_pages(path: Path) -> None:
         warn(f"{path} has {least}{count} pages, of which only the first is read; save the others as files of their own")
 
 
-def check_page(path: Path, page: Any) -> None:
+def check_page(path: Path, page: tifffile.TiffPage) -> None:
     """Raise UnhandledImage unless a page is a picture in grey or RGB, with or without alpha."""
     kinds = tifffile.PHOTOMETRIC
     by_jpeg = page.compression in (tifffile.COMPRESSION.JPEG, tifffile.COMPRESSION.OJPEG)
@@ -110,11 +122,16 @@ def check_page(path: Path, page: Any) -> None:
         )
 
 
-def plain(page: Any, channels: NDArray[Any]) -> NDArray[Any]:
+def _native(page: tifffile.TiffPage) -> np.dtype[np.generic]:
+    """The dtype of the pixels of a checked page, in native byte order."""
+    return np.dtype(page.dtype).newbyteorder("=")
+
+
+def plain(page: tifffile.TiffPage, channels: Channels) -> Channels:
     """Convert channels (H, W, S) of a page, or some of its rows, to black as 0 and no premultiplied alpha."""
-    channels = channels.astype(page.dtype.newbyteorder("="), copy=True)
+    channels = channels.astype(_native(page), copy=True)
     if page.photometric == tifffile.PHOTOMETRIC.MINISWHITE:
-        white = np.iinfo(channels.dtype).max if channels.dtype.kind == "u" else 1
+        white = np.iinfo(channels.dtype.name).max if channels.dtype.kind == "u" else 1
         channels[..., :1] = white - channels[..., :1]
     return _unmultiplied(channels) if _ASSOCIATED in page.extrasamples else channels
 
@@ -132,41 +149,41 @@ def metadata(file: tifffile.TiffFile, path: Path) -> tuple[int, bytes | None, by
 
 def write_rows(
     stream: BinaryIO,
-    rows: Iterable[NDArray[Any]],
+    rows: Iterable[Channels],
     shape: tuple[int, int, int],
-    dtype: np.dtype[Any],
+    dtype: np.dtype[np.generic],
     alpha: bool,
     icc: bytes | None,
     exif: bytes | None,
     xmp: bytes | None = None,
-    **resolution: Any,
+    **resolution: Unpack[Resolution],
 ) -> None:
     """Write rows (h, W, S) of a picture of ``shape`` as they arrive, in tiles; large files become BigTIFF."""
     height, width, samples = shape
     plain_shape = (height, width) if samples == 1 else shape
-
-    def tiles() -> Iterator[NDArray[Any]]:
-        for band in bands(rows, TILE_SIZE):
-            for left in range(0, width, TILE_SIZE):
-                tile = band[:, left : left + TILE_SIZE]
-                padding = ((0, TILE_SIZE - tile.shape[0]), (0, TILE_SIZE - tile.shape[1]), (0, 0))
-                whole = np.pad(tile, padding)
-                yield whole[..., 0] if samples == 1 else whole
-
     big = height * width * samples * dtype.itemsize > MAX_CLASSIC_BYTES
     # Compressing ahead in threads would queue hundreds of megabytes.
-    options: dict[str, Any] = {"maxworkers": 1, "buffersize": TILE_SIZE * TILE_SIZE * samples * dtype.itemsize}
-    options |= {"tile": (TILE_SIZE, TILE_SIZE), "bigtiff": big, **resolution}
-    write(stream, tiles(), plain_shape, dtype, alpha, icc, None if big else exif, xmp, **options)
+    size = TILE_SIZE * TILE_SIZE * samples * dtype.itemsize
+    options = _Options(maxworkers=1, buffersize=size, tile=(TILE_SIZE, TILE_SIZE), bigtiff=big, **resolution)
+    write(stream, _tiles(rows, width), plain_shape, dtype, alpha, icc, None if big else exif, xmp, **options)
 
 
-def bands(rows: Iterable[NDArray[Any]], height: int) -> Iterator[NDArray[Any]]:
+def _tiles(rows: Iterable[Channels], width: int) -> Iterator[Channels]:
+    """Cut rows (h, W, S) into square tiles, padded with zeros, without the last axis if S = 1."""
+    for band in bands(rows, TILE_SIZE):
+        for left in range(0, width, TILE_SIZE):
+            tile = band[:, left : left + TILE_SIZE]
+            padded = np.pad(tile, ((0, TILE_SIZE - tile.shape[0]), (0, TILE_SIZE - tile.shape[1]), (0, 0)))
+            yield padded[..., 0] if padded.shape[2] == 1 else padded
+
+
+def bands(rows: Iterable[Channels], height: int) -> Iterator[Channels]:
     """Regroup rows (h, W, S) into pieces of the same ``height``, the last one possibly shorter.
 
     >>> [len(band) for band in bands([np.zeros((3, 1, 1)), np.zeros((4, 1, 1))], 2)]
     [2, 2, 2, 1]
     """
-    waiting: list[NDArray[Any]] = []
+    waiting: list[Channels] = []
     for piece in rows:
         waiting.append(piece)
         while sum(map(len, waiting)) >= height:
@@ -179,14 +196,14 @@ def bands(rows: Iterable[NDArray[Any]], height: int) -> Iterator[NDArray[Any]]:
 
 def write(
     stream: BinaryIO,
-    data: Any,
+    data: Channels | Iterator[Channels],
     shape: tuple[int, ...],
-    dtype: np.dtype[Any],
+    dtype: np.dtype[np.generic],
     alpha: bool,
     icc: bytes | None,
     exif: bytes | None,
     xmp: bytes | None = None,
-    **options: Any,
+    **options: Unpack[_Options],
 ) -> None:
     """Write a picture of ``shape`` (H, W) or (H, W, S), or an iterator over its tiles, compressed without loss.
 
@@ -195,13 +212,6 @@ def write(
     tags = Image.Exif()
     if exif is not None:
         tags.load(exif)
-    text: list[tuple[int, str, int, bytes, bool]] = [
-        (code, "s", 0, str(tags[code]).encode("latin-1", "replace"), True)  # latin-1, as decoded by Pillow
-        for code in _DESCRIPTIVE
-        if code in tags and code not in exif_tags.FOLDERS
-    ]
-    if xmp is not None:
-        text.append((XMP, "B", len(xmp), xmp, True))
     folders = exif_tags.tables(tags)
     # tifffile does not write nested tables, so a placeholder tag with the next lower number reserves space for each.
     places = [(code - 1, "I", 1, 0, True) for code in folders]
@@ -217,7 +227,7 @@ def write(
         compression="zlib",
         predictor=bool(np.issubdtype(dtype, np.integer)),
         iccprofile=icc,
-        extratags=[(_ORIENTATION, "H", 1, 1, True), *text, *places],
+        extratags=[(_ORIENTATION, "H", 1, 1, True), *_texts(tags, xmp), *places],
         metadata=None,
         software=False,
         **options,
@@ -230,7 +240,16 @@ def write(
         _write_folder(stream, order, positions[code], code, folder)
 
 
-def _write_folder(stream: BinaryIO, order: str, position: int, code: int, folder: dict[int, Any]) -> None:
+def _texts(tags: Image.Exif, xmp: bytes | None) -> Iterator[tuple[int, str, int, bytes, bool]]:
+    """The descriptive tags and XMP, as tifffile takes them."""
+    for code in _DESCRIPTIVE:
+        if code in tags and code not in exif_tags.FOLDERS:
+            yield code, "s", 0, str(tags[code]).encode("latin-1", "replace"), True  # latin-1, as decoded by Pillow
+    if xmp is not None:
+        yield XMP, "B", len(xmp), xmp, True
+
+
+def _write_folder(stream: BinaryIO, order: str, position: int, code: int, folder: Mapping[int, object]) -> None:
     """Append a table of tags and make the tag at ``position`` point at it."""
     table = TiffImagePlugin.ImageFileDirectory_v2(ifh=(b"II*\0" if order == "<" else b"MM\0*") + bytes(4))
     for key, value in folder.items():
@@ -246,23 +265,24 @@ def _write_folder(stream: BinaryIO, order: str, position: int, code: int, folder
 
 def _read_exif(path: Path) -> bytes | None:
     with path.open("rb") as stream:
-
-        def read() -> Image.Exif:
-            exif = Image.Exif()
-            exif.load_from_fp(stream)
-            for code in list(exif):
-                if code not in _DESCRIPTIVE and code != _ORIENTATION:
-                    del exif[code]
-            return exif
-
-        return exif_tags.split(read)[1]
+        return exif_tags.split(partial(_descriptive_fields, stream))[1]
 
 
-def _unmultiplied(channels: NDArray[Any]) -> NDArray[Any]:
+def _descriptive_fields(stream: BinaryIO) -> Image.Exif:
+    """Parse the tags of a TIFF file that describe the photograph, and its orientation."""
+    exif = Image.Exif()
+    exif.load_from_fp(stream)
+    for code in list(exif):
+        if code not in _DESCRIPTIVE and code != _ORIENTATION:
+            del exif[code]
+    return exif
+
+
+def _unmultiplied(channels: Channels) -> Channels:
     """Divide premultiplied colours by their alpha; black where alpha is 0."""
     colour, alpha = channels[..., :-1].astype(np.float64), channels[..., -1:].astype(np.float64)
     integer = np.issubdtype(channels.dtype, np.integer)
-    limit = np.iinfo(channels.dtype).max if integer else 1.0
+    limit = np.iinfo(channels.dtype.name).max if integer else 1.0
     plain = np.divide(colour * limit, alpha, out=np.zeros_like(colour), where=alpha > 0)
     plain = np.rint(plain.clip(0, limit)) if integer else plain
     return np.concatenate([plain.astype(channels.dtype), channels[..., -1:]], axis=-1)
@@ -285,7 +305,7 @@ class TiffRows:
         self.stream: BinaryIO = path.open("rb")
         try:
             self.file = tifffile.TiffFile(self.stream, name=str(path))
-            page: Any = self.file.pages.first
+            page = self.file.pages.first
             check_page(path, page)
             self.orientation, self.icc, self.exif = metadata(self.file, path)
         except BaseException:
@@ -294,12 +314,12 @@ class TiffRows:
         self.page = page
         self.stamp = self._look()
         self.shape = (page.imagelength, page.imagewidth, page.samplesperpixel)
-        self.dtype = page.dtype.newbyteorder("=")
+        self.dtype = _native(page)
         self.alpha = bool(page.extrasamples)
         # (height, width) of a strip or tile; the declared height of a strip may exceed the picture's.
         self.segment = (page.tilelength, page.tilewidth) if page.is_tiled else (page.rowsperstrip, page.imagewidth)
         self.segment = (min(self.segment[0], self.shape[0]), self.segment[1])
-        self.bands: dict[int, NDArray[Any]] = {}
+        self.bands: dict[int, Channels] = {}
 
     def __reduce__(self) -> tuple[type["TiffRows"], tuple[Path]]:
         return TiffRows, (self.path.absolute(),)  # another process opens the file again
@@ -321,7 +341,7 @@ class TiffRows:
         rows = 0 if self._raw else (CACHED_BANDS + 1) * self.segment[0]
         return rows * self.shape[1] * self.shape[2] * self.dtype.itemsize
 
-    def __getitem__(self, rows: slice) -> NDArray[Any]:
+    def __getitem__(self, rows: slice) -> Channels:
         """Read the rows from ``rows.start`` to ``rows.stop``.
 
         Raises:
@@ -343,14 +363,14 @@ class TiffRows:
         contiguous: bool = self.page.is_contiguous and self.page.planarconfig == tifffile.PLANARCONFIG.CONTIG
         return contiguous and self.page.compression == tifffile.COMPRESSION.NONE and not self.page.is_tiled
 
-    def _read_raw(self, first: int, last: int) -> NDArray[Any]:
+    def _read_raw(self, first: int, last: int) -> Channels:
         length = self.shape[1] * self.shape[2] * self.dtype.itemsize
         self.stream.seek(self.page.dataoffsets[0] + first * length)
         data = self.stream.read((last - first) * length)
-        stored = self.page.dtype.newbyteorder(self.file.byteorder)
+        stored = np.dtype(self.page.dtype).newbyteorder(self.file.byteorder)
         return np.frombuffer(data, stored).reshape(last - first, *self.shape[1:])
 
-    def _decode(self, first: int, last: int) -> NDArray[Any]:
+    def _decode(self, first: int, last: int) -> Channels:
         height = self.segment[0]
         wanted = range(first // height, -(-last // height))
         for band in wanted:
@@ -361,7 +381,7 @@ class TiffRows:
             del self.bands[band]
         return whole[first - wanted.start * height : last - wanted.start * height]
 
-    def _band(self, band: int) -> NDArray[Any]:
+    def _band(self, band: int) -> Channels:
         """Decode one row of tiles, or one strip, (h, W, S)."""
         height, width, samples = self.shape
         top = band * self.segment[0]
