@@ -18,51 +18,23 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.core.checks import check_count, check_positive
-from nlfilter_torch.filtering.scribbles import fit_strokes
-from nlfilter_torch.operator.features import blur
 from nlfilter_torch.photo.declared.parameters import MASK
 from nlfilter_torch.photo.declared.shared_parameters import VIEWING_SIZE
-from nlfilter_torch.photo.picture.colour import LIGHTNESS, hundredths_of_lab
 from nlfilter_torch.photo.picture.in_memory import edit_of
 from nlfilter_torch.photo.picture.pixels import corner
-from nlfilter_torch.photo.picture.resizing import block_means, enlarged
-from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles, scribbled_blocks
-from nlfilter_torch.photo.picture.source import Blocks, Fitted, Guide, Operator, Planes, Source
+from nlfilter_torch.photo.picture.resizing import enlarged
+from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles
+from nlfilter_torch.photo.picture.source import Fitted, Pixels, Reduced, Source
 from nlfilter_torch.photo.picture.viewing import viewed_size
 from nlfilter_torch.photo.selections.matting import LinearMasks, linear_mask, linear_models, solve_linear, solve_mask
-from nlfilter_torch.photo.selections.scribbled_colours import (
-    colour_likelihood,
-    evenness,
-    frame_places,
-    inner_places,
-    likeness,
-    linked_evenly,
-)
-from nlfilter_torch.photo.selections.texture import TEXTURE_MARGIN, with_texture
+from nlfilter_torch.photo.selections.rough_mask import RoughMasks
 
 SOLVED = 1 << 17  # pixels
 VIEWED = VIEWING_SIZE.default  # megapixels; larger pictures are first reduced to this size
-CHROMA_WEIGHT = 0.7  # weight of hue and saturation; that of lightness is LIGHTNESS
-TEXTURE_WEIGHT = 1.5
-NUM_CHANNELS = 9  # channels of the guide
 FLOATS_PER_PIXEL = 80  # estimated working memory per pixel of the reduced picture, in addition to its operator
-SMOOTHNESS = 0.25  # of the regression
-CONTRAST = 4.0  # steepness of the curve from likelihood to rough mask
 ROUGH_CONFIDENCE, SCRIBBLE_CONFIDENCE = 0.02, 1000.0  # confidence in the rough mask, and in scribbles
-COLOUR_SHARE = 0.65  # weight of the colours of single pixels in the rough mask; the rest is the regression
-# Colours count less where the regression finds no part of the region nearby: standard deviation of "nearby" as a share
-# of the short side, number of rows or columns of the grid it is averaged on, and average from which on colours count.
-AROUND_SIGMA, AROUND_GRID, ENOUGH_AROUND = 0.1, 40, 0.5
-FRAME_PIXELS = 112 * 160  # in larger pictures points of the frame count more, as scribbles have more pixels there
 ODDS, STEEPNESS = 1.5, 1.4  # of the curve from the solution along borders, too low halfway, to masks
 EPSILON = 1e-6
-
-
-def region_guide(image: Tensor) -> Tensor:
-    """Guide of the operator, (B, 9, H, W): colour, surrounding colour, and strength of the texture."""
-    lab = hundredths_of_lab(image)
-    colours = lab * lab.new_tensor([LIGHTNESS, CHROMA_WEIGHT, CHROMA_WEIGHT]).view(1, 3, 1, 1)
-    return with_texture(colours, lab[:, :1], TEXTURE_WEIGHT)
 
 
 @edit_of("image")
@@ -117,7 +89,7 @@ def region_mask(
         >>> bool(mask[..., 10:22, 10:22].min() > 0.8), bool(mask[..., :6, :].max() < 0.1)
         (True, True)
     """
-    found = select_regions(
+    regions = select_regions(
         source,
         scribbles,
         background,
@@ -127,7 +99,7 @@ def region_mask(
         num_landmarks=num_landmarks,
         **options,
     )
-    return Fitted(found.masks)
+    return Fitted(regions.masks)
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,26 +121,26 @@ class Regions:
     @property
     def background_weights(self) -> Tensor:
         """Largest weight of a background scribble of each region, (B, K)."""
-        return torch.stack([marked.weights[:, 1].amax(1) for marked in self.scribbles], dim=1)
+        return torch.stack([scribbles.weights[:, 1].amax(1) for scribbles in self.scribbles], dim=1)
 
-    def rows(self, planes: Tensor, pixels: Any) -> Tensor:
+    def rows(self, planes: Tensor, pixels: Pixels) -> Tensor:
         """Planes of the reduced picture, enlarged to the given pixels, (B, C, h, w)."""
         height, width = pixels.image.shape[-2:]
         return enlarged(planes, self.steps, corner(pixels), (height, width))
 
-    def masks(self, pixels: Any) -> Tensor:
+    def masks(self, pixels: Pixels) -> Tensor:
         """Masks (B, K, h, w) of the given pixels."""
-        image, found = pixels.image.clamp(0.0, 1.0) - 0.5, []
-        for functions, marked in zip(self.functions.unbind(1), self.scribbles, strict=True):
+        image, masks = pixels.image.clamp(0.0, 1.0) - 0.5, []
+        for functions, scribbles in zip(self.functions.unbind(1), self.scribbles, strict=True):
             mask = calibrated(linear_mask(image, self.rows(functions, pixels)))
-            front, back = marked.planes(pixels).split(1, dim=1)
-            found.append(mask * (1 - front - back) + front)
-        return torch.cat(found, dim=1)
+            front, back = scribbles.planes(pixels).split(1, dim=1)
+            masks.append(mask * (1 - front - back) + front)
+        return torch.cat(masks, dim=1)
 
     def reduced_masks(self) -> Tensor:
         """Masks (B, K, h, w) of the reduced picture."""
         image = self.reduced - 0.5
-        return torch.cat([calibrated(linear_mask(image, f)) for f in self.functions.unbind(1)], dim=1)
+        return torch.cat([calibrated(linear_mask(image, functions)) for functions in self.functions.unbind(1)], dim=1)
 
 
 def select_regions(
@@ -192,24 +164,24 @@ def select_regions(
             f"{names[1]} must have 1 channel or one for each of the {len(inside)} regions, got {len(others)}; "
             "add or drop some"
         )
-    found = fit_regions(source, inside, others, **options)
-    if others and bool((found.background_weights.detach() <= 0).any()):
+    regions = fit_regions(source, inside, others, **options)
+    if others and bool((regions.background_weights.detach() <= 0).any()):
         raise ValueError(
             f"{names[1]} must hold a painted pixel outside the scribbles of each region in every image, got none; "
             "paint outside them, or omit it"
         )
-    return found
+    return regions
 
 
-def background_of(source: Source, given: Any, inside: Scribbles, name: str) -> list[Scribbles]:
-    """Read scribbles on the background of objects, if any are given, in the form that the source takes.
+def background_of(source: Source, mask: Any, inside: Scribbles, name: str) -> list[Scribbles]:
+    """Read scribbles on the background of objects, if any are drawn, in the form that the source takes.
 
     Raises:
         ValueError: if in any image all of them lie under those on the objects; the message calls them ``name``.
     """
-    if given is None:
+    if mask is None:
         return []
-    background = source.scribbles(given, None, name, needed=False)
+    background = source.scribbles(mask, None, name, needed=False)
     painted = (background.weights > 0).flatten(1).any(1)
     free = (inside.joined(background).weights[:, -1] > 0).any(1)
     if bool((painted & ~free).any()):
@@ -236,81 +208,70 @@ def fit_regions(
     MASK.check(source.batch, reach=reach)
     if "guide_channels" in options:
         raise TypeError("guide_channels must not be given: masks compare colours and texture; leave it out")
-    count, several = len(inside), len(background) > 1
-    both = [_against(inside, k, background[k : k + 1] if several else background) for k in range(count)]
-
+    several = len(background) > 1
+    scribbles = [_against(inside, k, background[k : k + 1] if several else background) for k in range(len(inside))]
     defaults = {name: MASK.defaults[name] for name in ("photometric_bandwidth", "num_landmarks")}
     options = defaults | {"patch_size": 1} | options | {"guide_channels": "all"}
     check_positive(options["photometric_bandwidth"], "photometric_bandwidth", source.batch)
     check_count(options["num_landmarks"], "num_landmarks")
-    # The size of a preview, so that masks are the same in a preview and in the photograph.
-    size = viewed_size(source.size, VIEWED)
-    viewed = source if size == source.size else source.resized(size)
-    blocks = math.ceil(math.sqrt(size[0] * size[1] / SOLVED))
-    small = viewed.blocks(blocks, FLOATS_PER_PIXEL + options["num_landmarks"])
-    # In a long narrow picture, the rounding of the smaller size makes the steps differ.
-    steps = (blocks * source.size[0] / size[0], blocks * source.size[1] / size[1])
-    marks = [blocks_of(marked, small, source.size, steps) for marked in both]
+    small, steps = _reduced(source, FLOATS_PER_PIXEL + options["num_landmarks"])
     options["num_landmarks"] = min(options["num_landmarks"], small.size[0] * small.size[1])
     if not (isinstance(spatial_bandwidth, float) and spatial_bandwidth == math.inf):
         if spatial_bandwidth is not None:
             check_positive(spatial_bandwidth, "spatial_bandwidth", source.batch)
             spatial_bandwidth = spatial_bandwidth / math.sqrt(steps[0] * steps[1])
         options["spatial_bandwidth"] = MASK["spatial_bandwidth"].distance(spatial_bandwidth, small.size)
-    operator = small.operator(Guide(options, region_guide, TEXTURE_MARGIN, NUM_CHANNELS, spectral=True, sampled=True))
-    places = frame_places(small.size)
-    inner = inner_places(small.size)
-    at_frame, at_grid = operator.at(places), operator.at(inner)
-    colours, inner_colours = small.colours(places), small.colours(inner)
+    rough = RoughMasks.of(small, options, reach)
+    reduced = [blocks_of(drawn, small, source.size, steps) for drawn in scribbles]
     image = small.image.clamp(0.0, 1.0)  # a far brighter pixel of a float file would upset the linear functions
-    even = small.kept("evenness", [], lambda: evenness(small.image))
-    rough, bandwidth = [], torch.as_tensor(options["photometric_bandwidth"], dtype=small.dtype)
-    for number, marked in enumerate(marks):
-        unlike = 1 - likeness(marked.image, marked.weights[:, :1], colours, bandwidth)
-        linked = linked_evenly(even, marked.planes(small)).flatten(2)
-        frame_links, grid_links = linked[:, :, places], linked[:, :, inner]
-        regression = _regression(small, operator, marked, (at_frame, unlike, frame_links), (at_grid, grid_links), reach)
-        likely = sharpened(regression(small))
-        own = torch.maximum((likely * even).flatten(2)[:, :, places], frame_links)
-        compared = [unlike, own, inner_colours, grid_links, bandwidth]
-        by_colour = small.kept(
-            ("likelihood", number),
-            [marked.image, marked.weights, *compared],
-            partial(colour_likelihood, small.image, marked, colours, *compared),
-        )
-        rough.append(likely + (by_colour - likely) * COLOUR_SHARE * (around(likely) / ENOUGH_AROUND).clamp(max=1.0))
-    front, back = (torch.cat([marked.planes(small)[:, k : k + 1] for marked in marks], dim=1) for k in (0, 1))
-    masks = [torch.cat(rough, dim=1), front, back]
-
-    def borders() -> Tensor:
-        return fit_borders(image, small.kept("models", [], lambda: linear_models(image)), *masks)
-
-    return Regions(image, steps, small.kept("borders", masks, borders), both)
+    masks = torch.cat([rough.mask(number, drawn) for number, drawn in enumerate(reduced)], dim=1)
+    front, back = torch.stack([drawn.planes(small) for drawn in reduced], dim=2).unbind(1)
+    functions = small.kept("borders", [masks, front, back], partial(_fit_borders, small, image, masks, front, back))
+    return Regions(image, steps, functions, scribbles)
 
 
-def blocks_of(marked: Scribbles, small: Source, size: tuple[int, int], steps: tuple[float, float]) -> Scribbles:
+def _reduced(source: Source, floats: int) -> tuple[Reduced, tuple[float, float]]:
+    """The reduced picture that masks are computed in, and height and width of one of its pixels.
+
+    It is reduced by way of the size of a preview, so that masks are the same in a preview and in the photograph.
+    ``floats`` are the numbers per pixel that there must be room for.
+    """
+    size = viewed_size(source.size, VIEWED)
+    viewed = source if size == source.size else source.resized(size)
+    side = math.ceil(math.sqrt(size[0] * size[1] / SOLVED))
+    # In a long narrow picture, the rounding of the smaller size makes the steps differ.
+    steps = (side * source.size[0] / size[0], side * source.size[1] / size[1])
+    return viewed.blocks(side, floats), steps
+
+
+def _fit_borders(small: Reduced, image: Tensor, rough: Tensor, front: Tensor, back: Tensor) -> Tensor:
+    """:func:`fit_borders` of an image; the reduced picture that it is of keeps its models."""
+    return fit_borders(image, small.kept("models", [], partial(linear_models, image)), rough, front, back)
+
+
+def blocks_of(scribbles: Scribbles, small: Source, size: tuple[int, int], steps: tuple[float, float]) -> Scribbles:
     """Scribbles on the reduced picture; weight and colour of a block are the means of its pixels.
 
     Args:
-        marked: scribbles on the picture.
+        scribbles: on the picture.
         small: the reduced picture.
         size: (H, W) of the picture.
         steps: height and width of a block, in pixels.
     """
     if steps == (1, 1):
-        return marked
+        return scribbles
     rows, columns = (
-        ((torch.arange(length, dtype=torch.float64) + 0.5) / step).long().clamp(max=count - 1).to(marked.places)
+        ((torch.arange(length, dtype=torch.float64) + 0.5) / step).long().clamp(max=count - 1).to(scribbles.places)
         for length, count, step in zip(size, small.size, steps, strict=True)
     )
     pixels = torch.outer(rows.bincount(minlength=small.size[0]), columns.bincount(minlength=small.size[1])).flatten()
-    row, column = rows[marked.places // size[1]], columns[marked.places % size[1]]
+    row, column = rows[scribbles.places // size[1]], columns[scribbles.places % size[1]]
     places, block = (row * small.size[1] + column).unique(return_inverse=True)
-    weights = marked.weights.new_zeros(*marked.weights.shape[:2], len(places))
-    weights = weights.index_add(2, block, marked.weights) / pixels[places]
-    colours = marked.colours
+    weights = scribbles.weights.new_zeros(*scribbles.weights.shape[:2], len(places))
+    weights = weights.index_add(2, block, scribbles.weights) / pixels[places]
+    colours = scribbles.colours
     if colours is not None:
-        total = marked.weights.sum(1, keepdim=True)
+        total = scribbles.weights.sum(1, keepdim=True)
         sums = [
             part.new_zeros(*part.shape[:2], len(places)).index_add(2, block, part) for part in (colours * total, total)
         ]
@@ -331,60 +292,11 @@ def _against(inside: list[Scribbles], number: int, background: list[Scribbles]) 
     return own.joined(around)
 
 
-def _regression(
-    source: Source,
-    operator: Operator,
-    marked: Scribbles,
-    frame: tuple[Blocks, Tensor, Tensor],
-    inside: tuple[Blocks, Tensor],
-    reach: float | Tensor,
-) -> Planes:
-    """Likelihood that a pixel belongs to a region: about 1 inside and about 0 outside; not clamped.
-
-    Args:
-        source: the picture.
-        operator: its operator.
-        marked: scribbles on the region and on its background.
-        frame: pixels along the borders of the picture: their columns, dissimilarity to the scribbles on the region, and
-            :func:`linked_evenly` to these, (B, 1, n).
-        inside: pixels on a grid: their columns, and :func:`linked_evenly`, (B, 1, m).
-        reach: that of :func:`region_mask`.
-    """
-    columns, weights = operator.at(marked.places), marked.weights
-    total = weights.sum(1, keepdim=True).clamp(max=1.0)
-    values = weights[:, :1] / weights.sum(1, keepdim=True).clamp(min=EPSILON)
-    pixels = source.size[0] * source.size[1]
-    fit = partial(fit_strokes, pairs=operator.pairs, pixels=pixels, reach=reach, smoothness=SMOOTHNESS)
-    known = [(columns, total, values)]
-    opposed = (weights[:, 1].detach() > 0).any(1).to(weights)  # 1 for images with scribbles on the background
-    first = fit(lambda: scribbled_blocks(known), strength=opposed)
-    at_frame, unlike, linked = frame
-    unlike = unlike * torch.cat([(1 - first(block)).clamp(0.0, 1.0).square() for block in at_frame()], dim=2)
-    known.append((at_frame, unlike * max(1.0, pixels / FRAME_PIXELS), linked))
-    known.append((*inside, torch.ones_like(inside[1])))
-    fitted = fit(lambda: scribbled_blocks(known), strength=1.0)
-    return operator.each(lambda found: fitted(found.factor))
-
-
 def calibrated(mask: Tensor) -> Tensor:
     """Mask of a solution along borders: a curve on which 0 and 1 stay as they are."""
     mask = mask.clamp(0.0, 1.0)
     inside, outside = ODDS * mask**STEEPNESS, (1 - mask) ** STEEPNESS
     return inside / (inside + outside)
-
-
-def sharpened(likely: Tensor) -> Tensor:
-    """Rough mask of a likelihood: a steep curve on which 0 and 1 stay as they are."""
-    bound = math.tanh(CONTRAST / 2)
-    return (0.5 + torch.tanh(CONTRAST * (likely - 0.5)) / (2 * bound)).clamp(0.0, 1.0)
-
-
-def around(likely: Tensor) -> Tensor:
-    """Average of planes (B, 1, H, W) over a wide Gaussian, approximately."""
-    size = (likely.shape[-2], likely.shape[-1])
-    step = max(1, min(size) // AROUND_GRID)
-    coarse = block_means(likely, step)
-    return enlarged(blur(coarse, AROUND_SIGMA * min(size) / step), (step, step), (0, 0), size)
 
 
 def fit_borders(image: Tensor, models: list[LinearMasks], rough: Tensor, front: Tensor, back: Tensor) -> Tensor:

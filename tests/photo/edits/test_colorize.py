@@ -1,15 +1,28 @@
-"""Colourising: colours are recovered from strokes, and the luminance is unchanged."""
+"""Colours from strokes: propagation, saturation, and the comparison of both estimates."""
 
 import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
+from torch import Tensor
 
 from nlfilter_torch import colorize
-from nlfilter_torch.photo.edits.colorize import bandwidth_ratio, colorize_guide, limit_saturation, weighted_mean
+from nlfilter_torch.photo.edits.colorize import (
+    Stage,
+    bandwidth_ratio,
+    colorize_guide,
+    compared,
+    extended,
+    limit_saturation,
+    weighted_mean,
+)
 from nlfilter_torch.photo.picture.colour import merge_luminance, split_luminance
 from nlfilter_torch.photo.picture.in_memory import InMemory
+from nlfilter_torch.photo.picture.source import Guide, Operator
+from nlfilter_torch.photo.picture.source import luminance as luminance_of
+from nlfilter_torch.photo.selections.local_values import RELATIVE, LocalValues
 from tests.problems import box, colour, luminance, noise, paint
+from tests.strokes import SIZE, dots, groups_of
 
 
 def test_strokes_of_a_narrow_picture_stay_where_they_are() -> None:
@@ -181,3 +194,56 @@ def test_segments_of_an_image_do_not_depend_on_the_colours_of_others() -> None:
     for i in (slice(0, 1), slice(1, 2)):
         single = colorize(grey[i], strokes[i], mask[i], method="kmeans", num_landmarks=40)
         torch.testing.assert_close(both[i], single, atol=1e-5, rtol=0)
+
+
+def test_neither_estimate_predicts_a_stroke_from_itself() -> None:
+    generator = torch.Generator().manual_seed(3)
+    image = torch.rand(1, 1, *SIZE, generator=generator)
+    mask = box(2, 3, 3, 3, size=SIZE) + box(12, 20, 3, 3, size=SIZE) + box(4, 16, 3, 3, size=SIZE)
+    groups, places = groups_of(mask)
+    weights, source = torch.ones(1, 1, len(places)), InMemory(image)
+
+    def operator_of(stage: Stage) -> Operator:
+        scale = {"photometric_bandwidth": 0.2 * stage.photometric, "spatial_bandwidth": 9 * stage.spatial}
+        return source.operator(Guide({"num_landmarks": 30, "patch_size": 1, **scale}, colorize_guide, spectral=True))
+
+    def predictions(values: Tensor) -> tuple[Tensor, Tensor]:
+        sets = [weights, *groups.weights_without_each(weights)]
+        (far, near), residuals = extended(operator_of, places, sets, values, SIZE[0] * SIZE[1], 1.0)
+        whole = (far(source) + near(source))[:, :2].flatten(2)[:, :, places]
+        torch.testing.assert_close(values - residuals[0], whole, rtol=1e-4, atol=1e-5)
+        guide = source.reduced(luminance_of, 1)
+        local = LocalValues.of(RELATIVE, guide, SIZE, places, weights, values, groups, values).left_out
+        assert local is not None
+        return values - groups.of_own(residuals[1:]), (local[:, :2] / local[:, 2:]).to(values)
+
+    values = torch.rand(1, 2, len(places), generator=generator)
+    changed = torch.where(groups.strokes[0] == 1, values + 0.5, values)
+    for before, after in zip(predictions(values), predictions(changed), strict=True):
+        torch.testing.assert_close(before[:, :, groups.strokes[0] == 1], after[:, :, groups.strokes[0] == 1])
+        assert (before - after)[:, :, groups.strokes[0] != 1].abs().max() > 1e-3
+
+
+def test_the_regression_counts_more_if_it_predicts_strokes_better_and_if_there_are_more_of_them() -> None:
+    mask = torch.cat([dots((2, 3), (9, 20), (15, 8))] * 2 + [dots((2, 3))])
+    groups, places = groups_of(mask)
+    weights, wanted = mask.flatten(2)[:, :, places], torch.zeros(3, 2, 3)
+    flow = torch.full((3, 3, 3), 0.5, dtype=torch.float64)
+    flow[:, :2] *= 0.13**0.5  # all predictions are off by this
+    flow[2] = 0  # a single stroke: nothing is compared
+    residual = torch.full((3, 2, 3), 0.13**0.5)
+    residual[1] = 0.0
+    factors = compared(groups, weights, residual, wanted, flow).flatten()
+    few, none = 4 / (4 + 5), 1 / (1 + 5)  # for three strokes and for no comparison
+    torch.testing.assert_close(factors, torch.tensor([few, 3 * few, none]))
+    assert compared(groups, weights, residual * 9, wanted, flow)[0] < 0.01
+
+
+def test_colours_do_not_depend_on_other_images_of_a_batch() -> None:
+    image = torch.rand(2, 3, *SIZE, generator=torch.Generator().manual_seed(4))
+    mask = torch.cat([dots((2, 3), (9, 20), (15, 8), (4, 24), (10, 9)), dots((3, 3), (9, 21))])
+    grey = image.mean(1, keepdim=True)
+    both = colorize(grey, image, mask, num_landmarks=30)
+    for k in range(2):
+        alone = colorize(grey[k : k + 1], image[k : k + 1], mask[k : k + 1], num_landmarks=30)
+        torch.testing.assert_close(both[k : k + 1], alone, atol=1e-4, rtol=0)

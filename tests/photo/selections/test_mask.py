@@ -1,4 +1,4 @@
-"""Region masks: regression and local solve against dense ones, single scribbles, tiles and gradients."""
+"""Region masks: single scribbles, small and large pictures, tiles, gradients and errors."""
 
 import math
 from typing import Any
@@ -7,17 +7,14 @@ import numpy as np
 import pytest
 import torch
 
-from nlfilter_torch import nonlocal_operator, region_mask
-from nlfilter_torch.photo.picture.in_memory import InMemory, InMemoryOperator
-from nlfilter_torch.photo.picture.resizing import enlarged
+from nlfilter_torch import region_mask
+from nlfilter_torch.photo.picture.in_memory import InMemory
 from nlfilter_torch.photo.selections import mask as masks
-from nlfilter_torch.photo.selections import matting
 from nlfilter_torch.photo.tiled import sampling
 from nlfilter_torch.photo.tiled.pictures import Picture
 from nlfilter_torch.photo.tiled.source import Tiled
 from nlfilter_torch.photo.tiled.tiles import Passes
 from tests.problems import box, colour, noise, seeded
-from tests.test_strokes import kriging
 
 SIZE = (40, 48)
 
@@ -39,57 +36,6 @@ def test_one_scribble_is_enough_and_the_background_may_be_painted() -> None:
         assert found.shape == inside.shape
         assert (found - inside).abs().mean() < 0.03
         assert ((found > 0.5) == (inside > 0.5)).float().mean() > 0.99
-
-
-@pytest.mark.parametrize("enlarged", [1.0, 3.0])
-def test_the_regression_is_the_best_estimate_from_scribbles_frame_and_grid(
-    monkeypatch: pytest.MonkeyPatch, enlarged: float
-) -> None:
-    monkeypatch.setattr(masks, "FRAME_PIXELS", 20 * 24 / enlarged)
-    image = colour("coffee", 20, 24).double()
-    front, back = box(9, 10, 3, 4, size=(20, 24)).double(), box(2, 3, 2, 3, size=(20, 24)).double()
-    source = InMemory(image)
-    options = {"photometric_bandwidth": 0.2, "num_landmarks": 60, "patch_size": 1, "guide_channels": "all"}
-    operator = nonlocal_operator(masks.region_guide(image), **options)
-    marked = masks._against(source.regions(front, "a"), 0, source.regions(back, "b"))
-    held = InMemoryOperator(operator, source)
-    places = masks.frame_places((20, 24))
-    grid = torch.tensor([24 * row + column for row in (7, 14) for column in (3, 8, 18)])
-    unlike, linked, within = (noise(1, 1, n, seed=k) for k, n in ((4, len(places)), (5, len(places)), (6, len(grid))))
-    frame, inside = (held.at(places), unlike, linked), (held.at(grid), within)
-    found = masks._regression(source, held, marked, frame, inside, 0.6)(source)
-
-    def estimate(values: torch.Tensor, weights: torch.Tensor) -> np.ndarray:
-        flat = (values.flatten().numpy(), weights.flatten().numpy())
-        return kriging(operator.spectrum(), *flat, 1.0, 0.6, masks.SMOOTHNESS)
-
-    first = estimate(front, front + back)
-    values, weights = front.flatten().clone(), (front + back).flatten()
-    assert not bool(weights[torch.cat([places, grid])].any())  # here the scribbles touch neither
-    assert len(torch.cat([places, grid]).unique()) == len(places) + len(grid)
-    weights[places] = enlarged * torch.from_numpy((1 - first).clip(0, 1) ** 2)[places] * unlike[0, 0]
-    values[places], weights[grid], values[grid] = linked[0, 0], within[0, 0], 1.0
-    expected = estimate(values, weights)
-    np.testing.assert_allclose(found.flatten(), expected, atol=2e-5)
-
-
-@pytest.mark.parametrize("channels", [1, 3])
-def test_the_local_solve_is_that_of_the_linear_system(monkeypatch: pytest.MonkeyPatch, channels: int) -> None:
-    monkeypatch.setattr(matting, "STEPS", (3000,))
-    height, width = 7, 9
-    image, rough = noise(1, channels, height, width), noise(1, 2, height, width, seed=1)
-    trust = 0.05 + noise(1, 2, height, width, seed=2)
-    found = matting.solve_mask(image, rough, trust)
-    pixels = image[0].flatten(1).T.numpy()
-    rows, columns = np.divmod(np.arange(height * width), width)
-    near = np.maximum(abs(rows[:, None] - rows), abs(columns[:, None] - columns)) == 1
-    squares = np.square(pixels[:, None] - pixels).mean(2)
-    weights = near * (np.exp(-matting.STEEPNESS * squares) + matting.MIN_WEIGHT)
-    laplacian = np.diag(weights.sum(1)) - weights
-    for k in range(2):
-        c = trust[0, k].flatten().numpy()
-        expected = np.linalg.solve(laplacian + np.diag(c), c * rough[0, k].flatten().numpy())
-        np.testing.assert_allclose(found[0, k].flatten(), expected, atol=1e-6)
 
 
 def test_regions_are_background_to_each_other_and_batches_are_their_images() -> None:
@@ -182,66 +128,6 @@ def test_tiles_are_as_in_memory(tile_rows: int, monkeypatch: pytest.MonkeyPatch)
     fitted = region_mask.fit(tiled, rows[1], rows[2], num_landmarks=40)
     found = np.concatenate([values for _, values in tiled.rows(fitted)])
     np.testing.assert_allclose(found[..., 0], wanted[0, 0].numpy(), atol=1e-5)
-
-
-def test_the_second_solve_is_closed_form_matting(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(matting, "LINEAR_LEVELS", 1)
-    monkeypatch.setattr(matting, "LINEAR_STEPS", 3000)
-    monkeypatch.setattr(matting, "SLOWEST", 1e-5)
-    height, width, count = 6, 7, 42
-    image, rough = noise(1, 3, height, width), noise(1, 1, height, width, seed=1)
-    front, back = box(1, 1, 2, 2, size=(height, width)).double(), box(4, 4, 1, 2, size=(height, width)).double()
-    functions = matting.solve_linear(matting.linear_models(image), torch.full_like(rough, 0.5), rough, front, back)
-    pixels = image[0].flatten(1).T.numpy()
-    rows, columns = np.divmod(np.arange(count), width)
-    near = np.maximum(abs(rows[:, None] - rows), abs(columns[:, None] - columns)) <= matting.WINDOW_RADIUS
-    share = near / near.sum(1, keepdims=True)  # weights of pixels in windows, and of windows around a pixel
-    smooth = np.zeros((count, count))
-    for middle in range(count):
-        inside = near[middle].nonzero()[0]
-        some = pixels[inside] - pixels[inside].mean(0)
-        slopes = np.linalg.inv(some.T @ some / len(inside) + matting.NOISE * np.eye(3)) @ some.T / len(inside)
-        values = (pixels - pixels[inside].mean(0)) @ slopes + 1 / len(inside)  # values of every pixel from those inside
-        smooth[:, inside] += share[:, [middle]] * values
-    trust = matting.LINEAR_ROUGH_CONFIDENCE * (np.square(2 * rough.numpy().ravel() - 1) + 0.01)
-    certain = matting.LINEAR_SCRIBBLE_CONFIDENCE * (front + back).numpy().ravel()
-    target = trust * rough.numpy().ravel() + matting.LINEAR_SCRIBBLE_CONFIDENCE * front.numpy().ravel()
-    expected = np.linalg.solve(np.diag(1 + trust + certain) - smooth, target)
-    found = matting.linear_mask(image - 0.5, functions[:, 0])
-    stretched = (smooth @ expected.clip(0, 1) - matting.END_MARGIN) / (1 - 2 * matting.END_MARGIN)
-    np.testing.assert_allclose(found.flatten(), stretched, atol=1e-5)
-
-
-@pytest.mark.parametrize("name", ["coffee", "chelsea", "astronaut"])
-def test_the_second_solve_is_the_same_in_float32(name: str) -> None:
-    image = (255 * colour(name, 110, 130)).round() / 255
-    front, back = box(50, 50, 8, 12, size=(110, 130)), box(4, 8, 8, 12, size=(110, 130))
-    rough = region_mask(image, front, back, num_landmarks=40)
-    found = []
-    for dtype in (torch.float32, torch.float64):
-        some, *masks = (planes.to(dtype) for planes in (image, rough, rough, front, back))
-        functions = matting.solve_linear(matting.linear_models(some), *masks)
-        assert functions.dtype == dtype
-        found.append(matting.linear_mask(some - 0.5, functions[:, 0]))
-    torch.testing.assert_close(found[0].double(), found[1], atol=2e-3, rtol=0)
-
-
-@pytest.mark.parametrize("step", [1, 3, 2.5])
-def test_parts_of_enlarged_blocks_are_those_of_the_whole(step: float) -> None:
-    blocks = noise(1, 2, 7, 5)
-    height, width = int(7 * step), int(5 * step)
-    whole = enlarged(blocks, (step, step), (0, 0), (height, width))
-    for row, column, h, w in ((0, 0, 4, width), (3, 2, 3, 1), (5, 1, height - 5, width - 1), (height - 1, 0, 1, 2)):
-        part = enlarged(blocks, (step, step), (row, column), (h, w))
-        torch.testing.assert_close(part, whole[:, :, row : row + h, column : column + w])
-
-
-@pytest.mark.parametrize("step", [1, 2, 3])
-def test_enlarged_blocks_are_interpolated_bilinearly(step: int) -> None:
-    blocks = noise(1, 2, 7, 5)
-    whole = enlarged(blocks, (step, step), (0, 0), (7 * step, 5 * step))
-    expected = torch.nn.functional.interpolate(blocks, scale_factor=step, mode="bilinear", align_corners=False)
-    torch.testing.assert_close(whole, expected)
 
 
 def test_masks_of_a_reduced_picture_follow_the_borders_of_the_large_one(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -88,8 +88,7 @@ def test_links_follow_the_best_path(monkeypatch: pytest.MonkeyPatch, size: tuple
     found = linked_evenly(even, scribbles)
     for k in range(2):
         front, back = (best_path(even[k, 0], scribbles[k, side] > 0) for side in (0, 1))
-        limits = scribbled_colours.UNLINKED, scribbled_colours.LINKED
-        expected = ((front - back - limits[0]) / (limits[1] - limits[0])).clamp(0, 1)
+        expected = ((front - back - 0.25) / 0.25).clamp(0, 1)
         torch.testing.assert_close(found[k, 0], expected)
 
 

@@ -1,4 +1,4 @@
-"""Fitting looks to pairs: sums, constraints, alignment, and what is explained on other photographs."""
+"""Fitting looks to pairs, and what they explain on other photographs."""
 
 import gc
 import json
@@ -19,10 +19,7 @@ from nlfilter_torch.operator.features import reduce_channels
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.edits.applying import apply_step
-from nlfilter_torch.photo.look_fitting.alignment import align
-from nlfilter_torch.photo.look_fitting.look_fit import MOST, nonnegative, sample
-from nlfilter_torch.photo.look_fitting.look_pixels import EditedPhotograph
-from tests.looks import ALPHA, CAT, CUP, FEW, SEPIA, SUIT, explained, in_bytes, one, rgb
+from tests.looks import ALPHA, CAT, CUP, FEW, SEPIA, SUIT, explained, in_bytes, rgb, single_look
 
 
 def equalized(image: Tensor) -> Tensor:
@@ -52,7 +49,7 @@ def test_parts_that_depend_on_the_picture_explain_another_photograph(
     pairs = [(image, edit(image)) for image in (CAT, CUP, SUIT)]
     shares = []
     for some in (parts, parts[:2]):
-        found = one(fit_look(pairs[:2], parts=some, step=FEW))
+        found = single_look(fit_look(pairs[:2], parts=some, step=FEW))
         shares.append(explained(*pairs[2], found.apply(SUIT)))
     assert shares[0] > least > most > shares[1], shares
 
@@ -62,7 +59,7 @@ def test_sliders_are_found_through_eight_bits(count: int) -> None:
     images = (rgb("chelsea", slice(0, 300, 2), slice(0, 450, 2)), rgb("coffee", slice(0, 300, 2), slice(0, 450, 2)))
     step = Step("detail", alpha=ALPHA, limits="none", threshold=0.0, landmarks=150)
     pairs = [(image, in_bytes(apply_step(step, image))) for image in images[:count]]
-    found = one(fit_look(iter(pairs), step=Step("look", landmarks=150)))
+    found = single_look(fit_look(iter(pairs), step=Step("look", landmarks=150)))
     assert found.parts == ("alpha",)
     assert found.step.edit == "detail"
     assert found.step["alpha"] == pytest.approx(ALPHA, abs=1e-3)
@@ -84,7 +81,7 @@ def test_sliders_are_found_through_eight_bits(count: int) -> None:
 def test_edits_of_others_are_explained_on_other_photographs(edit: object) -> None:
     assert callable(edit)
     pairs = [(image, in_bytes(edit(image))) for image in (CAT, CUP, SUIT)]
-    found = one(fit_look(pairs[:2], step=FEW))
+    found = single_look(fit_look(pairs[:2], step=FEW))
     assert all(explained(*pair, found.apply(pair[0])) > 0.95 for pair in pairs)
 
 
@@ -98,52 +95,14 @@ def test_saturation_in_hsv_is_explained_on_other_photographs() -> None:
     pairs = [
         (image, saturated(image)) for image in (rgb(name, every, every) for name in ("astronaut", "coffee", "chelsea"))
     ]
-    found = one(fit_look(pairs[:2], step=FEW))
+    found = single_look(fit_look(pairs[:2], step=FEW))
     assert found.parts == ("saturation",)
     assert all(explained(*pair, found.apply(pair[0])) > 0.99 for pair in pairs)
 
 
-def test_sums_of_samples_are_those_of_all_pixels() -> None:
-    generator = torch.Generator().manual_seed(0)
-    whole = torch.rand(300, 400, generator=generator) + 0.1
-    whole[:, :50] = 0
-    places = sample(whole)
-    assert len(places) == MOST
-    assert len(set(places.tolist())) > 0.9 * MOST
-    assert bool((whole.flatten()[places] > 0).all())
-    assert torch.equal(places, places.sort().values)
-    assert float(whole.flatten()[places].mean()) == pytest.approx(float(whole[:, 50:].mean()), abs=2e-3)
-    assert torch.equal(sample(whole[:50]), whole[:50].flatten().nonzero().squeeze(1))
-
-
-def test_a_sampled_pair_and_a_whole_one_have_the_same_look() -> None:
-    large = torch.nn.functional.interpolate(CAT, (320, 400), mode="bicubic").clamp(0, 1)  # 128,000 pixels
-    step = Step("detail", alpha=ALPHA, limits="none", threshold=0.0, landmarks=40, viewing_size=0.0)
-    sliders = one(fit_look([(large, in_bytes(apply_step(step, large)))], step=FEW.changed(viewing_size=0.0)))
-    assert sliders.step["alpha"] == pytest.approx(ALPHA, abs=1e-3)
-    curve = one(fit_look([(large, in_bytes(large**0.7))], step=FEW))
-    assert explained(large, large**0.7, curve.apply(large)) > 0.99
-
-
-def test_layers_of_a_sample_are_nearly_those_of_all_pixels(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("nlfilter_torch.photo.look_fitting.look_fit.MOST", 2000)
-    monkeypatch.setattr("nlfilter_torch.photo.look_fitting.look_pixels.MOST", 2000)
-    photograph = EditedPhotograph(CAT[0], (CAT[0] ** 0.7), None, FEW, 3, None)
-    found = photograph.regions_of_sample()
-    assert found is not None
-    (some,) = found
-    assert some.weighed["alpha"].shape == (4, 2000)
-    assert float(some.weights[0].sum()) == pytest.approx(float(photograph.free[0].sum()), rel=0.02)
-    exact = photograph.layers[:, some.places]
-    assert torch.allclose(some.weighed["alpha"].sum(0), exact.sum(0), atol=1e-5)
-    assert bool(((some.weighed["alpha"] - exact).square().mean(1) < 0.04 * exact.square().mean(1)).all())
-    masks = torch.ones(1, *CAT.shape[-2:])
-    assert EditedPhotograph(CAT[0], CAT[0] ** 0.7, masks, FEW, 3, None).regions_of_sample() is None
-
-
 def test_one_pair_does_not_bend_curves_where_it_has_no_values() -> None:
     dark = in_bytes(0.1 + 0.25 * CAT)
-    found = one(fit_look([(dark, in_bytes(dark + 0.8 * dark * (0.5 - dark)))], parts=("curves",), step=FEW))
+    found = single_look(fit_look([(dark, in_bytes(dark + 0.8 * dark * (0.5 - dark)))], parts=("curves",), step=FEW))
     curves = found.tensors["curves"]
     assert found.fitted > 0.9
     assert float((curves[:, 12:] - torch.linspace(0, 1, 17)[12:]).abs().max()) < 0.08
@@ -151,22 +110,10 @@ def test_one_pair_does_not_bend_curves_where_it_has_no_values() -> None:
 
 def test_curves_never_fall() -> None:
     after = in_bytes(0.5 + 0.4 * torch.sin(9 * CAT))  # a curve that rises and falls
-    found = one(fit_look([(CAT, after)], parts=("curves",), step=FEW))
+    found = single_look(fit_look([(CAT, after)], parts=("curves",), step=FEW))
     curves = found.tensors["curves"]
     assert float(curves.diff(dim=1).min()) >= -1e-5
     assert float(curves.diff(dim=1).max()) > 0.01
-
-
-def test_nonnegative_least_squares_meets_its_conditions() -> None:
-    generator = torch.Generator().manual_seed(0)
-    for _ in range(20):
-        root = torch.rand(12, 8, generator=generator, dtype=torch.float64) - 0.3
-        matrix, vector = root.mT @ root, torch.rand(8, generator=generator, dtype=torch.float64) - 0.5
-        found = nonnegative(matrix, vector)
-        slope = vector - matrix @ found
-        assert float(found.min()) >= 0
-        assert float(slope.max()) < 1e-8
-        assert float((slope * found).abs().max()) < 1e-8
 
 
 def test_pairs_are_read_once_and_not_kept() -> None:
@@ -182,7 +129,7 @@ def test_pairs_are_read_once_and_not_kept() -> None:
             gc.collect()
             alive.extend(reference() is not None for reference in yielded[:-1])
 
-    found = one(fit_look(pairs(), step=FEW))
+    found = single_look(fit_look(pairs(), step=FEW))
     assert len(yielded) == 6
     assert len(alive) == 15
     assert not any(alive)
@@ -225,7 +172,7 @@ def test_a_frame_around_the_edited_picture_is_left_out(colour: float, width: int
     inside = (..., slice(width, -width), slice(width, -width))
     after = torch.full_like(CAT, colour)
     after[inside] = in_bytes(CAT**0.6)[inside]
-    found = one(fit_look([(CAT, after)], step=FEW))
+    found = single_look(fit_look([(CAT, after)], step=FEW))
     assert found.fitted > 0.98
     assert explained(CAT[inside], after[inside], found.apply(CAT)[inside]) > 0.98
 
@@ -233,14 +180,14 @@ def test_a_frame_around_the_edited_picture_is_left_out(colour: float, width: int
 def test_a_watermark_lowers_what_is_explained_and_little_else() -> None:
     after = in_bytes(CAT**0.6)
     after[..., 60:75, 60:95] = 0.9
-    found = one(fit_look([(CAT, after)], step=FEW))
+    found = single_look(fit_look([(CAT, after)], step=FEW))
     assert 0 < found.fitted < 0.95
     assert explained(CAT[..., :55, :], after[..., :55, :], found.apply(CAT)[..., :55, :]) > 0.8
 
 
 def test_more_parameters_than_pixels_are_told_by_what_is_left_out() -> None:
     noise = torch.rand(1, 3, 5, 5, generator=torch.Generator().manual_seed(0))
-    found = one(fit_look([(CAT[..., :5, :5], noise)], step=Step("look", landmarks=20)))
+    found = single_look(fit_look([(CAT[..., :5, :5], noise)], step=Step("look", landmarks=20)))
     assert found.left_out < 0.5
     assert all(abs(value) < 1e3 for value in found.tensors["alpha"].tolist())
 
@@ -264,47 +211,12 @@ def test_bad_pairs_are_refused_in_a_sentence(pairs: list[object], message: str) 
 
 
 def test_files_keep_looks(tmp_path: Path) -> None:
-    found = one(fit_look([(CAT, in_bytes(CAT**0.6))], step=FEW))
+    found = single_look(fit_look([(CAT, in_bytes(CAT**0.6))], step=FEW))
     text = found.to_json()
     assert json.loads(text)["steps"][0]["edit"] == "look"
     assert Recipe.from_json(text, "it").steps == (found.step,)
     with pytest.raises(ValueError, match="matrix of look, step 1 in it must be a list of 9 numbers"):
         Recipe.from_json('{"version": 1, "steps": [{"edit": "look", "matrix": [1, 2]}]}', "it")
-
-
-@pytest.mark.parametrize(
-    ("cut", "row", "column"), [((slice(7, 67), slice(12, 92)), 7, 12), ((slice(0, 60), slice(20, 100)), 0, 20)]
-)
-def test_crops_are_found(cut: tuple[slice, slice], row: int, column: int) -> None:
-    after = (CAT**0.6)[(..., *cut)]
-    part, edited, done = align(CAT, after, "before", "after")
-    assert torch.equal(part, CAT[(..., *cut)])
-    assert torch.equal(edited, after)
-    assert f"row {row}, column {column}" in done
-
-
-def test_shifts_and_sizes_are_found() -> None:
-    before, after = CAT[..., 5:, :-3], (CAT**0.6)[..., :-5, 3:]
-    first, second, done = align(before, after, "before", "after")
-    assert "5 pixels down and -3" in done
-    assert torch.allclose(first**0.6, second, atol=1e-6)
-    small = torch.nn.functional.interpolate(CAT**0.6, (40, 50), mode="area")
-    _, resized, done = align(CAT, small, "before", "after")
-    assert resized.shape == CAT.shape
-    assert "resized from 50x40 to 100x80" in done
-    framed = torch.nn.functional.pad(CAT**0.6, (6, 6, 6, 12), value=0.95)
-    first, second, done = align(CAT, framed, "before", "after")
-    assert torch.equal(first, CAT)
-    assert torch.equal(second, CAT**0.6)
-    assert done == "after has a frame of one colour, which is left out"
-    small = torch.nn.functional.interpolate(CAT**0.6, (68, 85), mode="area")
-    framed = torch.nn.functional.pad(small, (7, 8, 6, 6), value=1.0)  # of the size of the photograph
-    first, second, done = align(CAT, framed, "before", "after")
-    assert torch.equal(first, CAT)
-    assert (second - CAT**0.6).abs().mean() < 0.02
-    assert "enlarged to 100x80" in done
-    with pytest.raises(ValueError, match="after must have the size of before"):
-        align(CAT, CUP[..., :30, :70], "before", "after")
 
 
 def test_a_pair_of_which_a_single_pixel_is_not_clipped() -> None:

@@ -1,4 +1,4 @@
-"""Values that diffuse from scribbles over neighbouring pixels."""
+"""Values that diffuse from scribbles to neighbouring pixels."""
 
 from dataclasses import replace
 from typing import Any
@@ -20,6 +20,7 @@ from nlfilter_torch.photo.tiled.source import Tiled
 from nlfilter_torch.photo.tiled.tiles import Passes
 from tests.problems import box, colour
 from tests.problems import luminance as grey_of
+from tests.strokes import SIZE, dots, groups_of
 
 
 def halves(height: int = 24, width: int = 40) -> Tensor:
@@ -144,3 +145,20 @@ def test_a_reduced_picture_gives_nearly_the_same_values(links: Links) -> None:
     exact, reduced = (spread(replace(links, pixels=pixels), image, mask, values) for pixels in (1 << 16, 48 * 80 // 9))
     assert (exact[0] - reduced[0]).abs()[..., [*range(38), *range(42, 80)]].max() < 0.1
     assert (exact[1] - reduced[1]).abs().mean() < 0.1
+
+
+@pytest.mark.parametrize("links", [ABSOLUTE, RELATIVE], ids=["absolute", "relative"])
+def test_neighbours_predict_a_dot_as_if_it_were_not_painted(links: Links) -> None:
+    image = torch.rand(1, 1, *SIZE, generator=torch.Generator().manual_seed(1)) * 0.02 + 0.3
+    mask = dots((3, 4), (10, 25), (16, 12), (5, 17))
+    values = torch.rand(1, 2, *SIZE, generator=torch.Generator().manual_seed(2))
+    groups, places = groups_of(mask)
+    weights, known = torch.ones(1, 1, 4), values.flatten(2)[:, :, places]
+    found = LocalValues.of(links, image, SIZE, places, weights, known, groups, known)
+    assert found.left_out is not None
+    ratio = found.left_out[:, :-1] / found.left_out[:, -1:]
+    for k in range(4):
+        rest = torch.arange(4) != k
+        without = LocalValues.of(links, image, SIZE, places[rest], weights[..., rest], known[..., rest])
+        wanted = without(image, 0)[:, :-1].flatten(2)[:, :, places[k]]
+        torch.testing.assert_close(ratio[:, :, k].float(), wanted, rtol=1e-4, atol=1e-5)

@@ -1,0 +1,169 @@
+"""Rough masks of regions: a regression on the scribbles, and the colours of single pixels.
+
+The regression uses the covariance of the filter (:mod:`nlfilter_torch.filtering.scribbles`) and compares colour,
+surrounding colour and texture. Points along the borders of the picture count as background unless they resemble the
+region; points on a grid count as scribbled if an even area, such as a sky, links them to a scribble.
+"""
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cached_property, partial
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from nlfilter_torch.filtering.scribbles import fit_strokes
+from nlfilter_torch.operator.features import blur
+from nlfilter_torch.operator.products import Columns
+from nlfilter_torch.photo.picture.colour import LIGHTNESS, hundredths_of_lab
+from nlfilter_torch.photo.picture.resizing import block_means, enlarged
+from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles, scribbled_blocks
+from nlfilter_torch.photo.picture.source import Blocks, Guide, Operator, Planes, Reduced
+from nlfilter_torch.photo.selections.scribbled_colours import (
+    colour_likelihood,
+    evenness,
+    frame_places,
+    inner_places,
+    likeness,
+    linked_evenly,
+)
+from nlfilter_torch.photo.selections.texture import TEXTURE_MARGIN, with_texture
+
+CHROMA_WEIGHT = 0.7  # weight of hue and saturation; that of lightness is LIGHTNESS
+TEXTURE_WEIGHT = 1.5
+NUM_CHANNELS = 9  # channels of the guide
+SMOOTHNESS = 0.25  # of the regression
+CONTRAST = 4.0  # steepness of the curve from likelihood to rough mask
+COLOUR_SHARE = 0.65  # weight of the colours of single pixels in the rough mask; the rest is the regression
+# Colours count less where the regression finds no part of the region nearby: standard deviation of "nearby" as a share
+# of the short side, number of rows or columns of the grid it is averaged on, and average from which on colours count.
+AROUND_SIGMA, AROUND_GRID, ENOUGH_AROUND = 0.1, 40, 0.5
+FRAME_PIXELS = 112 * 160  # in larger pictures points of the frame count more, as scribbles have more pixels there
+EPSILON = 1e-6
+
+
+def region_guide(image: Tensor) -> Tensor:
+    """Guide of the operator, (B, 9, H, W): colour, surrounding colour, and strength of the texture."""
+    lab = hundredths_of_lab(image)
+    colours = lab * lab.new_tensor([LIGHTNESS, CHROMA_WEIGHT, CHROMA_WEIGHT]).view(1, 3, 1, 1)
+    return with_texture(colours, lab[:, :1], TEXTURE_WEIGHT)
+
+
+@dataclass(frozen=True, eq=False)
+class Points:
+    """Pixels of a picture that are not scribbled on but compared with those that are.
+
+    Attributes:
+        places: their row-major indices (n,), ascending.
+        columns: their columns of the factor, block by block.
+        colours: (B, C, n).
+    """
+
+    places: Tensor
+    columns: Blocks
+    colours: Tensor
+
+    @staticmethod
+    def of(picture: Reduced, operator: Operator, places: Tensor) -> "Points":
+        """Read the pixels of a picture at these places."""
+        return Points(places, operator.at(places), picture.colours(places))
+
+    def values(self, planes: Tensor) -> Tensor:
+        """Values (B, C, n) of planes (B, C, H, W) at the points."""
+        return planes.flatten(2)[:, :, self.places]
+
+
+@dataclass(frozen=True, eq=False)
+class RoughMasks:
+    """Rough masks of the regions of a picture, from the scribbles on each.
+
+    Attributes:
+        picture: the reduced picture.
+        operator: its filter.
+        frame: points along its borders.
+        grid: points inside it.
+        photometric_bandwidth: of the filter.
+        reach: that of :func:`region_mask`.
+    """
+
+    picture: Reduced
+    operator: Operator
+    frame: Points
+    grid: Points
+    photometric_bandwidth: Tensor
+    reach: float | Tensor
+
+    @staticmethod
+    def of(picture: Reduced, options: Mapping[str, Any], reach: float | Tensor) -> "RoughMasks":
+        """Prepare a picture: build its operator, with options of :func:`nonlocal_operator`, and choose the points."""
+        guide = Guide(options, region_guide, TEXTURE_MARGIN, NUM_CHANNELS, spectral=True, sampled=True)
+        operator = picture.operator(guide)
+        frame, grid = (Points.of(picture, operator, choose(picture.size)) for choose in (frame_places, inner_places))
+        bandwidth = torch.as_tensor(options["photometric_bandwidth"], dtype=picture.dtype)
+        return RoughMasks(picture, operator, frame, grid, bandwidth, reach)
+
+    @cached_property
+    def evenness(self) -> Tensor:
+        """:func:`evenness` of the picture."""
+        return self.picture.kept("evenness", [], partial(evenness, self.picture.image))
+
+    def mask(self, number: int, scribbles: Scribbles) -> Tensor:
+        """The rough mask (B, 1, H, W) of a region with that number, from scribbles on it and on its background."""
+        unlike = 1 - likeness(scribbles.image, scribbles.weights[:, :1], self.frame.colours, self.photometric_bandwidth)
+        linked = linked_evenly(self.evenness, scribbles.planes(self.picture))
+        frame_links, grid_links = self.frame.values(linked), self.grid.values(linked)
+        regression = self.regression(scribbles, unlike, frame_links, grid_links)
+        likely = sharpened(regression(self.picture))
+        likely_frame = torch.maximum(self.frame.values(likely * self.evenness), frame_links)
+        compared = [unlike, likely_frame, self.grid.colours, grid_links, self.photometric_bandwidth]
+        by_colour = self.picture.kept(
+            ("likelihood", number),
+            [scribbles.image, scribbles.weights, *compared],
+            partial(colour_likelihood, self.picture.image, scribbles, self.frame.colours, *compared),
+        )
+        return likely + (by_colour - likely) * COLOUR_SHARE * (around(likely) / ENOUGH_AROUND).clamp(max=1.0)
+
+    def regression(self, scribbles: Scribbles, unlike: Tensor, frame_links: Tensor, grid_links: Tensor) -> Planes:
+        """Likelihood that a pixel belongs to a region: about 1 inside and about 0 outside; not clamped.
+
+        Args:
+            scribbles: on the region and on its background.
+            unlike: dissimilarity of the frame to the scribbles on the region, (B, 1, n).
+            frame_links: :func:`linked_evenly` of the frame to these, (B, 1, n).
+            grid_links: the same of the grid, (B, 1, m).
+        """
+        columns, weights = self.operator.at(scribbles.places), scribbles.weights
+        total = weights.sum(1, keepdim=True).clamp(max=1.0)
+        values = weights[:, :1] / weights.sum(1, keepdim=True).clamp(min=EPSILON)
+        pixels = self.picture.size[0] * self.picture.size[1]
+        fit = partial(fit_strokes, pairs=self.operator.pairs, pixels=pixels, reach=self.reach, smoothness=SMOOTHNESS)
+        known = [(columns, total, values)]
+        opposed = (weights[:, 1].detach() > 0).any(1).to(weights)  # 1 for images with scribbles on the background
+        first = fit(partial(scribbled_blocks, tuple(known)), strength=opposed)
+        unlike = unlike * torch.cat(
+            [(1 - first(block)).clamp(0.0, 1.0).square() for block in self.frame.columns()], dim=2
+        )
+        known.append((self.frame.columns, unlike * max(1.0, pixels / FRAME_PIXELS), frame_links))
+        known.append((self.grid.columns, grid_links, torch.ones_like(grid_links)))
+        return self.operator.each(partial(_of_columns, fit(partial(scribbled_blocks, known), strength=1.0)))
+
+
+def _of_columns(regression: Callable[[Tensor], Tensor], columns: Columns) -> Tensor:
+    """A regression at the pixels of these columns."""
+    return regression(columns.factor)
+
+
+def sharpened(likely: Tensor) -> Tensor:
+    """Rough mask of a likelihood: a steep curve on which 0 and 1 stay as they are."""
+    bound = math.tanh(CONTRAST / 2)
+    return (0.5 + torch.tanh(CONTRAST * (likely - 0.5)) / (2 * bound)).clamp(0.0, 1.0)
+
+
+def around(likely: Tensor) -> Tensor:
+    """Average of planes (B, 1, H, W) over a wide Gaussian, approximately."""
+    size = (likely.shape[-2], likely.shape[-1])
+    step = max(1, min(size) // AROUND_GRID)
+    coarse = block_means(likely, step)
+    return enlarged(blur(coarse, AROUND_SIGMA * min(size) / step), (step, step), (0, 0), size)

@@ -1,0 +1,59 @@
+"""Resizing: interpolation by rows, weights, and enlarging of blocks."""
+
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F
+
+from nlfilter_torch.photo.picture.in_memory import InMemory
+from nlfilter_torch.photo.picture.resizing import enlarged, resize, resized
+from nlfilter_torch.photo.tiled.pictures import Picture
+from nlfilter_torch.photo.tiled.source import Tiled
+from nlfilter_torch.photo.tiled.tiles import Passes
+from tests.problems import colour, noise
+
+
+@pytest.mark.parametrize("wanted", [(10, 15), (40, 60), (17, 33), (80, 61)])
+def test_resizing_is_antialiased_bicubic_and_can_go_by_rows(wanted: tuple[int, int]) -> None:
+    image = colour("coffee", 40, 60).double()
+    found = resize(image, wanted)
+    expected = F.interpolate(image, wanted, mode="bicubic", antialias=True)
+    torch.testing.assert_close(found, expected, atol=1e-6 if wanted[0] <= 40 else 1e-4, rtol=0)
+    rows = range(3, min(wanted[0], 9))
+    part = resized(lambda start, stop: image[:, :, start:stop], (40, 60), wanted, rows)
+    torch.testing.assert_close(part, found[:, :, 3:9])
+    columns = range(2, min(wanted[1], 13))
+    part = resized(lambda start, stop: image[:, :, start:stop], (40, 60), wanted, rows, columns)
+    torch.testing.assert_close(part, found[:, :, 3:9, 2:13])
+
+
+def test_weights_are_resized_by_themselves() -> None:
+    mask = torch.zeros(2, 1, 40, 56)
+    mask[..., 5:25, 5:30] = 1
+    mask[0] *= 0.6
+    both = InMemory(torch.zeros(2, 3, 40, 56)).resized_weights(mask, (20, 28), "mask")
+    alone = InMemory(torch.zeros(1, 3, 40, 56)).resized_weights(mask[:1], (20, 28), "mask")
+    assert torch.equal(both[:1], alone)
+    assert both[0].max() == pytest.approx(0.6)
+    rows = mask[:, 0].permute(1, 2, 0).numpy()  # the two as planes of one picture
+    tiled = Tiled(Picture(np.zeros((40, 56, 3), np.float32)), Passes("float32"), "mask")
+    found = torch.from_numpy(np.asarray(tiled.resized_weights(rows, (20, 28), "mask"))).permute(2, 0, 1)
+    torch.testing.assert_close(found, both[:, 0], rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("step", [1, 3, 2.5])
+def test_parts_of_enlarged_blocks_are_those_of_the_whole(step: float) -> None:
+    blocks = noise(1, 2, 7, 5)
+    height, width = int(7 * step), int(5 * step)
+    whole = enlarged(blocks, (step, step), (0, 0), (height, width))
+    for row, column, h, w in ((0, 0, 4, width), (3, 2, 3, 1), (5, 1, height - 5, width - 1), (height - 1, 0, 1, 2)):
+        part = enlarged(blocks, (step, step), (row, column), (h, w))
+        torch.testing.assert_close(part, whole[:, :, row : row + h, column : column + w])
+
+
+@pytest.mark.parametrize("step", [1, 2, 3])
+def test_enlarged_blocks_are_interpolated_bilinearly(step: int) -> None:
+    blocks = noise(1, 2, 7, 5)
+    whole = enlarged(blocks, (step, step), (0, 0), (7 * step, 5 * step))
+    expected = torch.nn.functional.interpolate(blocks, scale_factor=step, mode="bilinear", align_corners=False)
+    torch.testing.assert_close(whole, expected)

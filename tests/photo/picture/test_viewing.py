@@ -1,0 +1,124 @@
+"""Sliders with the same effect at any resolution."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from nlfilter_torch import enhance
+from nlfilter_torch.photo.cli import main
+from nlfilter_torch.photo.io.photographs import Photograph, read_photograph, write_photograph
+from nlfilter_torch.photo.picture.resizing import resize
+from nlfilter_torch.photo.picture.viewing import viewed_size
+from nlfilter_torch.photo.tiled import stream_detail
+from tests.brightness import ALPHA, EDITS
+from tests.problems import colour, luminance
+
+
+@pytest.mark.parametrize("residual", [None, 1.0])
+def test_sliders_at_1_change_no_bit(residual: float | None) -> None:
+    image, region = colour("coffee", 40, 60), torch.zeros(1, 1, 40, 60)
+    region[..., 10:20, 10:20] = 1
+    for options in ({}, {"viewing_size": 0.001}, {"limits": "none"}, {"threshold": 0.0}):
+        found = enhance(image, torch.ones(4), residual=residual, num_landmarks=40, **options)
+        assert torch.equal(found, image)
+        found = enhance(image, torch.ones(4), region, outside=torch.ones(4), num_landmarks=40, **options)
+        assert torch.equal(found, image)
+
+
+def test_the_viewing_size_of_a_picture() -> None:
+    assert viewed_size((1000, 1500), 1.5) == (1000, 1500)
+    assert viewed_size((2000, 3000), 1.5) == (1000, 1500)
+    assert viewed_size((2000, 3000), 0) == (2000, 3000)
+    assert viewed_size((1, 5_000_000), 1.5)[0] == 1
+
+
+@pytest.mark.parametrize("name", EDITS)
+def test_a_larger_picture_looks_alike_at_the_viewing_size(name: str) -> None:
+    large, megapixels = colour("coffee", 180, 270), 60 * 90 / 1e6
+    small = resize(large, (60, 90))
+    wanted = EDITS[name](small, viewing_size=megapixels)
+    assert torch.equal(wanted, EDITS[name](small, viewing_size=0))  # not larger: nothing is resized
+    viewed = resize(EDITS[name](large, viewing_size=megapixels), (60, 90))
+    per_pixel = resize(EDITS[name](large, viewing_size=0), (60, 90))
+
+    def error(found: torch.Tensor) -> float:
+        return float((found - wanted).square().mean().sqrt())
+
+    change = float((wanted - small).square().mean().sqrt())
+    assert error(viewed) < 0.4 * change
+    assert error(viewed) < 0.7 * error(per_pixel)
+
+
+def test_texture_too_fine_to_be_seen_is_changed_as_the_rest() -> None:
+    generator = torch.Generator().manual_seed(0)
+    image = (0.5 + 0.1 * torch.randn(1, 1, 120, 120, generator=generator)).clamp(0, 1)
+    options: dict[str, Any] = {"viewing_size": 0.0036, "num_landmarks": 100, "photometric_bandwidth": 0.3}
+    flat = enhance(image, torch.tensor([0.0, 0.0, 1.0]), **options)
+    assert flat.std() < 0.5 * image.std()
+    rich = enhance(image, torch.tensor([2.0, 2.0, 1.0]), limits="none", **options)
+    assert 1.5 * image.std() < rich.std() < 2.2 * image.std()
+
+
+@pytest.mark.parametrize("name", EDITS)
+def test_gradients_go_through_the_viewing_size(name: str) -> None:
+    image = colour("coffee", 40, 40).requires_grad_()
+    EDITS[name](image, viewing_size=0.0004).square().mean().backward()
+    assert image.grad is not None
+    assert bool(torch.isfinite(image.grad).all())
+    assert image.grad.abs().max() > 0
+
+
+@pytest.mark.parametrize("saturation", [1.0, 3.0])
+def test_tiles_are_those_of_the_edit_in_memory(saturation: float) -> None:
+    image = colour("coffee", 120, 160)
+    if saturation > 1:  # many channels at 0 and 1
+        image = torch.lerp(luminance(image), image, saturation).clamp(0, 1)
+    rows = image[0].permute(1, 2, 0).numpy().astype(np.float32)
+    weights = np.zeros((120, 160, 1), np.float32)
+    weights[20:40, 30:60] = 1
+    for regions in (None, weights):
+        planes = None if regions is None else torch.from_numpy(regions).permute(2, 0, 1)[None]
+        for size in (0.005, 1.5):
+            wanted = enhance(image, ALPHA, planes, num_landmarks=40, viewing_size=size)
+            found = [np.empty_like(rows) for _ in range(2)]
+            for target, height in zip(found, (7, 50), strict=True):
+                stream_detail(
+                    rows,
+                    target,
+                    ALPHA,
+                    regions,
+                    num_landmarks=40,
+                    viewing_size=size,
+                    statistics="full",
+                    tile_rows=height,
+                )
+            assert np.abs(found[0] - wanted[0].permute(1, 2, 0).numpy()).max() < 2e-3
+            assert np.abs(found[0] - found[1]).max() < 1e-6
+
+
+def test_regions_of_another_size_are_told_at_the_viewing_size_too() -> None:
+    image = colour("coffee", 40, 60)
+    for size in (0, 0.001):
+        with pytest.raises(ValueError, match=r"region.* must have the height and width"):
+            enhance(image, ALPHA, torch.ones(1, 1, 40, 50), viewing_size=size, num_landmarks=20)
+        with pytest.raises(ValueError, match=r"regions must be in \[0, 1\]"):
+            enhance(image, ALPHA, -torch.ones(1, 1, 40, 60), viewing_size=size, num_landmarks=20)
+
+
+def test_distance_counts_unless_told_otherwise(tmp_path: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    image = colour("coffee", 48, 72)
+    near, given, far = (enhance(image, ALPHA, num_landmarks=60, spatial_bandwidth=h) for h in (None, 4.0, "none"))
+    assert torch.equal(near, given)  # a twelfth of 48
+    assert (far - near).abs().max() > 0.02
+    with pytest.raises(ValueError, match="spatial_bandwidth must be one of 'none', got 'far'"):
+        enhance(image, ALPHA, spatial_bandwidth="far")
+    write_photograph(Photograph(image), tmp_path / "in.png")
+    arguments = ["detail", str(tmp_path / "in.png"), str(tmp_path / "out.png"), "--landmarks", "60"]
+    assert main([*arguments, "--alpha", "2.2,2.2,2.2,1", "--spatial-bandwidth", "none"]) == 0
+    stored = read_photograph(tmp_path / "in.png").pixels
+    wanted = enhance(stored, ALPHA, num_landmarks=60, spatial_bandwidth="none")
+    assert (read_photograph(tmp_path / "out.png").pixels - wanted.clamp(0, 1)).abs().max() < 0.6 / 255
+    assert main([*arguments, "--spatial-bandwidth", "far"]) == 2
+    assert "--spatial-bandwidth must be a positive number of pixels, such as 20, or none" in capsys.readouterr().err

@@ -1,0 +1,46 @@
+"""Rough masks: the regression against a dense one."""
+
+import numpy as np
+import pytest
+import torch
+
+from nlfilter_torch import nonlocal_operator
+from nlfilter_torch.photo.picture.in_memory import InMemory, InMemoryOperator
+from nlfilter_torch.photo.selections import rough_mask
+from nlfilter_torch.photo.selections.rough_mask import Points, RoughMasks, region_guide
+from nlfilter_torch.photo.selections.scribbled_colours import frame_places
+from tests.problems import box, colour, noise
+from tests.test_strokes import kriging
+
+
+@pytest.mark.parametrize("enlarged", [1.0, 3.0])
+def test_the_regression_is_the_best_estimate_from_scribbles_frame_and_grid(
+    monkeypatch: pytest.MonkeyPatch, enlarged: float
+) -> None:
+    monkeypatch.setattr(rough_mask, "FRAME_PIXELS", 20 * 24 / enlarged)
+    image = colour("coffee", 20, 24).double()
+    front, back = box(9, 10, 3, 4, size=(20, 24)).double(), box(2, 3, 2, 3, size=(20, 24)).double()
+    source = InMemory(image)
+    options = {"photometric_bandwidth": 0.2, "num_landmarks": 60, "patch_size": 1, "guide_channels": "all"}
+    operator = nonlocal_operator(region_guide(image), **options)
+    scribbles = source.regions(front, "a")[0].joined(source.regions(back, "b")[0])
+    held = InMemoryOperator(operator, source)
+    places = frame_places((20, 24))
+    grid = torch.tensor([24 * row + column for row in (7, 14) for column in (3, 8, 18)])
+    unlike, linked, within = (noise(1, 1, n, seed=k) for k, n in ((4, len(places)), (5, len(places)), (6, len(grid))))
+    points = [Points.of(source, held, at) for at in (places, grid)]
+    rough = RoughMasks(source, held, *points, torch.tensor(0.2), reach=0.6)
+    found = rough.regression(scribbles, unlike, linked, within)(source)
+
+    def estimate(values: torch.Tensor, weights: torch.Tensor) -> np.ndarray:
+        flat = (values.flatten().numpy(), weights.flatten().numpy())
+        return kriging(operator.spectrum(), *flat, 1.0, 0.6, 0.25)
+
+    first = estimate(front, front + back)
+    values, weights = front.flatten().clone(), (front + back).flatten()
+    assert not bool(weights[torch.cat([places, grid])].any())  # here the scribbles touch neither
+    assert len(torch.cat([places, grid]).unique()) == len(places) + len(grid)
+    weights[places] = enlarged * torch.from_numpy((1 - first).clip(0, 1) ** 2)[places] * unlike[0, 0]
+    values[places], weights[grid], values[grid] = linked[0, 0], within[0, 0], 1.0
+    expected = estimate(values, weights)
+    np.testing.assert_allclose(found.flatten(), expected, atol=2e-5)
