@@ -131,7 +131,7 @@ def test_channels_of_unsupported_types_in_tiles(tmp_path: Path, capsys: pytest.C
     signed, plain, preset = tmp_path / "signed.tif", tmp_path / "plain.tif", tmp_path / "look.json"
     tifffile.imwrite(signed, np.full(SIZE, 9, np.int16))
     tifffile.imwrite(plain, np.full(SIZE, 9, np.uint16))
-    preset.write_text('{"alpha": [2, 1]}')
+    preset.write_text('{"version": 1, "steps": [{"edit": "detail", "alpha": [2, 1]}]}')
     tiles = ("--memory", "0.001")
     for arguments in (
         ("mask", signed, tmp_path / "out.png", "--region", REGION, *tiles),
