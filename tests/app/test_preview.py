@@ -106,10 +106,8 @@ def test_another_radius_needs_no_other_mask(session: Session, monkeypatch: pytes
     wanted = apply_step(first.changed(radius=4.0), session.preview.pixels).clamp(0, 1)
     session.load(Recipe((first,)))
     session.render()
-    for function in ("fit_borders", "colour_likelihood"):
-        monkeypatch.setattr(
-            f"nlfilter_torch.photo.selections.mask.{function}", lambda *_: pytest.fail("computed again")
-        )
+    for function in ("mask.fit_borders", "rough_mask.colour_likelihood"):
+        monkeypatch.setattr(f"nlfilter_torch.photo.selections.{function}", lambda *_: pytest.fail("computed again"))
     session.set("defocus", radius=4.0)
     assert torch.equal(session.render(), wanted)
 
