@@ -267,8 +267,8 @@ def test_bad_arguments_of_masks(call: Callable[[], object], error: type[Exceptio
 @pytest.mark.parametrize(("landmarks", "alarm"), [(100, 1.0), (20, 0.0)], ids=["too many landmarks", "no balance"])
 def test_warnings_point_at_the_caller(landmarks: int, alarm: float, monkeypatch: pytest.MonkeyPatch) -> None:
     # Row sums of small images are too accurate for a warning, so here any deviation raises one.
-    monkeypatch.setattr("nlfilter_torch.operator.balancing.ALARM", {GUIDE.dtype: alarm})
-    monkeypatch.setattr("nlfilter_torch.operator.balancing.TOLERANCE", {GUIDE.dtype: 1e-17})
+    monkeypatch.setattr("nlfilter_torch.operator.sinkhorn.ALARM", {GUIDE.dtype: alarm})
+    monkeypatch.setattr("nlfilter_torch.operator.sinkhorn.TOLERANCE", {GUIDE.dtype: 1e-17})
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         nonlocal_operator(GUIDE, num_landmarks=landmarks)

@@ -48,7 +48,7 @@ def arguments(dtype: torch.dtype) -> dict[str, tuple[Any, ...]]:
         "without": (factor, norms > norms.median()),
         "convolve": (images16, weight, random(5, seed=7).to(dtype), 2, random(BATCH, 5, 7, 9, seed=8).to(dtype)),
         "solve": (coefficients, random(BATCH, 2, 6, 7, seed=10).to(dtype)),
-        "settle": (factor, (1 - norms).clamp(min=0.0), 1e-5, True, False),
+        "sinkhorn": (factor, (1 - norms).clamp(min=0.0), 1e-5, True, False),
     }
 
 

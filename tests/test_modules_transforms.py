@@ -20,9 +20,9 @@ from nlfilter_torch import (
     polynomial_filter,
     spectral_filter,
 )
-from nlfilter_torch.operator.balancing import Rounds, balance, balance_in_graph, balance_in_rounds
 from nlfilter_torch.operator.landmarks import choose_in_graph, choose_landmarks
 from nlfilter_torch.operator.scaling import Balancing
+from nlfilter_torch.operator.sinkhorn import Rounds, sinkhorn_balance, sinkhorn_in_graph, sinkhorn_in_rounds
 from tests.layers import ALPHA, EVERYTHING, OPTIONS, image
 from tests.problems import noise, picture
 
@@ -128,15 +128,15 @@ def test_balancing_in_a_graph_is_that_without_one(completed: bool) -> None:
     for in_graph in (False, True):
         factor, diagonal = (tensor.clone().requires_grad_() for tensor in lonely())
         if in_graph:
-            kept, rest, result, before = balance_in_graph(factor, diagonal, 1e-5, completed, False)
+            kept, rest, result, before = sinkhorn_in_graph(factor, diagonal, 1e-5, completed, False)
             rounds = Rounds.MOST - sum(torch.equal(total, result.moment) for total in before)
         else:
 
             def balanced(factor: Tensor, diagonal: Tensor) -> tuple[Balancing, float]:
-                return balance(factor, diagonal, completed=completed), 1e-5
+                return sinkhorn_balance(factor, diagonal, completed=completed), 1e-5
 
-            whole = balance_in_rounds(factor, diagonal, balanced, completed=completed)
-            kept, rest, result, rounds = whole.factor, whole.diagonal, whole.found, len(whole.before)
+            whole = sinkhorn_in_rounds(factor, diagonal, balanced, completed=completed)
+            kept, rest, result, rounds = whole.factor, whole.diagonal, whole.result, len(whole.before)
         gradients = torch.autograd.grad((result.scaling * kept[:, 0] + rest).square().sum(), [factor, diagonal])
         found.append((kept, rest, result.scaling, result.moment, result.residual, *gradients, torch.tensor(rounds)))
     assert int(found[0][-1]) == completed  # the lonely pixel is removed in one round
@@ -157,7 +157,7 @@ def test_eigenvalues_above_one_in_a_graph_are_warned_of() -> None:
     operator = nonlocal_operator(guide, spatial_bandwidth=3.0, num_landmarks=50, landmarks="random")
     unlimited = replace(operator.kernel, limiter=None).factor(operator.kernel.recipe(guide))
     with pytest.warns(UserWarning, match="eigenvalues exceed 1, which compiled programs do not correct"):
-        balance_in_graph(*unlimited, 1e-5, True, True)
+        sinkhorn_in_graph(*unlimited, 1e-5, True, True)
 
 
 def test_importing_and_running_does_not_load_the_compiler() -> None:

@@ -14,8 +14,8 @@ from nlfilter_torch import (
     operator_from_features,
     polynomial_filter,
 )
-from nlfilter_torch.operator.balancing import balance
 from nlfilter_torch.operator.scaling import LARGEST, KernelMatrix, PixelScaling, Solution, damped, scaling_from_moment
+from nlfilter_torch.operator.sinkhorn import sinkhorn_balance
 from nlfilter_torch.photo.tiled import stream_detail
 from tests import reference
 from tests.problems import noise, picture, seeded
@@ -119,7 +119,7 @@ def test_damped_steps_take_over_where_sweeps_do_not_converge() -> None:
     """The scaling d of a pixel exceeds the bound of the sweeps."""
     factor = torch.tensor([[[1.0, -0.9, -0.9, 0.4]]], dtype=torch.float64)
     diagonal = 1 - factor.square().sum(1) + 1e-3
-    result = balance(factor, diagonal, completed=True)
+    result = sinkhorn_balance(factor, diagonal, completed=True)
     assert result.scaling.max() > LARGEST
     sums = result.scaling * ((factor.mT @ result.moment).squeeze(2) + diagonal * result.scaling)
     torch.testing.assert_close(sums, torch.ones_like(sums), atol=1e-11, rtol=0)
@@ -128,7 +128,7 @@ def test_damped_steps_take_over_where_sweeps_do_not_converge() -> None:
 def test_a_warning_names_a_remedy_that_is_not_in_force() -> None:
     factor = torch.tensor([[[1.0, 1.0, -1.0, 1e-3]]])
     with pytest.warns(UserWarning, match="row sums that differ from 1 by up to .*num_landmarks$") as caught:
-        balance(factor, torch.zeros(1, 4), completed=True)
+        sinkhorn_balance(factor, torch.zeros(1, 4), completed=True)
     assert "completion" not in str(caught[0].message)
 
 

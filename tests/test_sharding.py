@@ -238,12 +238,14 @@ def refusals(group: Any, rank: int) -> dict[str, str]:
     return found
 
 
-def halos(among: RowCommunicator) -> list[tuple[Tensor, tuple[int, int], Tensor]]:
+def halos(communicator: RowCommunicator) -> list[tuple[Tensor, tuple[int, int], Tensor]]:
     """Rows with halos of several sizes, and the gradient of a function of them."""
     found = []
     for margin in (0, 1, 3, 30):
-        rows = noise(2, 2, HEIGHT, WIDTH)[:, :, among.first_row :][:, :, : among.rows[among.rank]].requires_grad_()
-        extended, halo = among.with_halo(rows, margin)
+        rows = noise(2, 2, HEIGHT, WIDTH)[:, :, communicator.first_row :][
+            :, :, : communicator.rows[communicator.rank]
+        ].requires_grad_()
+        extended, halo = communicator.with_halo(rows, margin)
         extended.pow(3).sum().backward()
         assert rows.grad is not None
         found.append((extended.detach(), halo, rows.grad))
@@ -283,9 +285,9 @@ def work(rank: int, folder: str) -> None:
         place = members.index(rank)
         rows = slice(cuts[place], cuts[place + 1])
         found: dict[str, Any] = {problem: solve(rows, group, dtype) for problem, (solve, dtype, _) in PROBLEMS.items()}
-        among = all_gather_shapes(noise(2, 2, rows.stop - rows.start, WIDTH), group)
-        assert isinstance(among, RowCommunicator)
-        found["halos"] = halos(among)
+        communicator = all_gather_shapes(noise(2, 2, rows.stop - rows.start, WIDTH), group)
+        assert isinstance(communicator, RowCommunicator)
+        found["halos"] = halos(communicator)
         torch.save(found, f"{folder}/{name}{place}.pt")
     world = dist.group.WORLD
     found = {"refusals": refusals(world, rank), "traffic": traffic(world, rank)}
@@ -378,7 +380,7 @@ def test_a_rank_that_is_gone_is_named_in_time(folder: Path) -> None:
 def test_without_a_group() -> None:
     """Without a group the same functions work in one process and exchange nothing."""
     image = noise(1, 1, 6, 7)
-    assert nonlocal_operator(image, num_landmarks=5, group=None).among is ALONE
+    assert nonlocal_operator(image, num_landmarks=5, group=None).communicator is ALONE
     assert ALONE.with_halo(image, 2) == (image, (0, 0))
     assert all_gather_shapes(image, None) is ALONE
     with pytest.raises(TypeError, match=r"group must be a process group of torch.distributed"):

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from nlfilter_torch import estimate_bandwidth, nonlocal_operator
-from nlfilter_torch.operator.balancing import balance
+from nlfilter_torch.operator.sinkhorn import sinkhorn_balance
 from tests import reference
 from tests.images import reduced
 
@@ -32,7 +32,7 @@ def row_sums(factor: torch.Tensor, diagonal: torch.Tensor, d: torch.Tensor) -> t
 @pytest.mark.parametrize("completed", [False, True])
 def test_row_sums_are_one(pixels: int, dtype: torch.dtype, tolerance: float, completed: bool) -> None:
     factor, diagonal = problem(2, 6, pixels, dtype=dtype)
-    result = balance(factor, diagonal, completed=completed)
+    result = sinkhorn_balance(factor, diagonal, completed=completed)
     assert (result.scaling > 0).all()
     assert (row_sums(factor, diagonal, result.scaling) - 1).abs().max() <= tolerance
 
@@ -41,26 +41,26 @@ def test_row_sums_are_one(pixels: int, dtype: torch.dtype, tolerance: float, com
 def test_scaling_is_the_reference_scaling(completed: bool) -> None:
     factor, diagonal = problem(1, 5, 80)
     kernel = (factor.mT @ factor + torch.diag_embed(diagonal))[0].numpy()
-    d = balance(factor, diagonal, completed=completed).scaling[0].numpy()
+    d = sinkhorn_balance(factor, diagonal, completed=completed).scaling[0].numpy()
     np.testing.assert_allclose(d[:, None] * kernel * d, reference.balanced(kernel), atol=1e-11)
 
 
 @given(scale=st.floats(1e-2, 1e2))
 def test_a_kernel_times_c_is_scaled_by_its_root(scale: float) -> None:
     factor, diagonal = problem(1, 5, 80)
-    d = balance(factor, diagonal).scaling
-    scaled = balance(factor * scale**0.5, diagonal * scale).scaling
+    d = sinkhorn_balance(factor, diagonal).scaling
+    scaled = sinkhorn_balance(factor * scale**0.5, diagonal * scale).scaling
     torch.testing.assert_close(scaled, d / scale**0.5, rtol=1e-9, atol=0)
 
 
 @pytest.mark.parametrize(("completed", "pixels"), [(False, 500), (True, 500), (True, 20000)])
 def test_the_residual_is_that_of_the_scaling(completed: bool, pixels: int) -> None:
     factor, diagonal = problem(3, 6, pixels)
-    result = balance(factor, diagonal, tolerance=1e-3, completed=completed)
+    result = sinkhorn_balance(factor, diagonal, tolerance=1e-3, completed=completed)
     measured = (row_sums(factor, diagonal, result.scaling) - 1).abs().amax(1)
     torch.testing.assert_close(result.residual, measured, atol=1e-12, rtol=0)
     assert result.residual.max() <= 1e-3
-    assert 1 <= result.steps <= balance(factor, diagonal, completed=completed).steps
+    assert 1 <= result.steps <= sinkhorn_balance(factor, diagonal, completed=completed).steps
 
 
 def test_one_slow_step_is_not_the_end() -> None:
@@ -72,15 +72,15 @@ def test_one_slow_step_is_not_the_end() -> None:
 
 @pytest.mark.parametrize("completed", [False, True])
 def test_identity_is_balanced_already(completed: bool) -> None:
-    result = balance(torch.zeros(1, 3, 50), torch.ones(1, 50), completed=completed)
+    result = sinkhorn_balance(torch.zeros(1, 3, 50), torch.ones(1, 50), completed=completed)
     torch.testing.assert_close(result.scaling, torch.ones(1, 50))
 
 
 @pytest.mark.parametrize(("completed", "pixels"), [(False, 500), (True, 500), (True, 20000)])
 def test_a_batch_is_its_images(completed: bool, pixels: int) -> None:
     factor, diagonal = problem(3, 6, pixels)
-    together = balance(factor, diagonal, completed=completed).scaling
-    alone = [balance(factor[i : i + 1], diagonal[i : i + 1], completed=completed).scaling for i in range(3)]
+    together = sinkhorn_balance(factor, diagonal, completed=completed).scaling
+    alone = [sinkhorn_balance(factor[i : i + 1], diagonal[i : i + 1], completed=completed).scaling for i in range(3)]
     torch.testing.assert_close(together, torch.cat(alone), rtol=1e-10, atol=0)
 
 
@@ -90,7 +90,7 @@ def test_the_estimated_jacobian_leaves_the_gradient_exact() -> None:
     gradients = []
     for (factor, diagonal), completed in zip(problems, (False, True), strict=True):
         weights = torch.randn(2, 4000, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-        loss = (balance(factor, diagonal, completed=completed).scaling * weights).sum()
+        loss = (sinkhorn_balance(factor, diagonal, completed=completed).scaling * weights).sum()
         gradients.append(torch.autograd.grad(loss, (factor, diagonal)))
     for found, expected in zip(*gradients, strict=True):
         torch.testing.assert_close(found, expected, atol=1e-10, rtol=1e-8)
@@ -109,7 +109,7 @@ def test_row_sums_that_stay_off_are_told() -> None:
     with pytest.warns(
         UserWarning, match=r"balancing left row sums that differ from 1 by up to .*completion='diagonal'"
     ):
-        result = balance(factor, torch.zeros(1, 4))
+        result = sinkhorn_balance(factor, torch.zeros(1, 4))
     assert result.scaling.isfinite().all()
     assert (result.scaling > 0).all()
 
@@ -119,7 +119,7 @@ def test_implicit_gradient_is_the_unrolled_one(completed: bool) -> None:
     factor, diagonal = (t.requires_grad_() for t in problem(2, 4, 40))
     weights = torch.randn(2, 40, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     implicit = torch.autograd.grad(
-        (balance(factor, diagonal, completed=completed).scaling * weights).sum(), (factor, diagonal)
+        (sinkhorn_balance(factor, diagonal, completed=completed).scaling * weights).sum(), (factor, diagonal)
     )
 
     d = torch.ones(2, 40, dtype=torch.float64)

@@ -226,19 +226,19 @@ def check_scale(bandwidth: float | Tensor, name: str, largest: Tensor, what: str
 
     Skipped if :func:`~nlfilter_torch.core.values.is_hidden`.
     """
-    given = bandwidth.detach() if isinstance(bandwidth, Tensor) else torch.tensor(bandwidth, dtype=torch.float64)
-    if is_hidden(largest) or is_hidden(given):
+    bandwidths = bandwidth.detach() if isinstance(bandwidth, Tensor) else torch.tensor(bandwidth, dtype=torch.float64)
+    if is_hidden(largest) or is_hidden(bandwidths):
         return
     limits = torch.finfo(largest.dtype)
     # Squared differences of features are summed; the margin allows for gradients.
     smallest = (largest.double() / (limits.max**0.5 / 64)).clamp(min=4 * limits.tiny)
-    given = given.double().reshape(-1).expand_as(smallest)
-    if bool((given < smallest).any()):
-        worst = int((given / smallest).argmin())
+    bandwidths = bandwidths.double().reshape(-1).expand_as(smallest)
+    if bool((bandwidths < smallest).any()):
+        worst = int((bandwidths / smallest).argmin())
         least = 1.06 * float(smallest[worst])  # the message shows two digits, rounded up
         raise ValueError(
             f"{name} must be at least {least:.2g} for {what} up to {float(largest[worst]):.2g}, "
-            f"got {float(given[worst]):.2g}; raise it"
+            f"got {float(bandwidths[worst]):.2g}; raise it"
         )
 
 
@@ -379,23 +379,14 @@ def check_weights(weights: Tensor, features: Tensor) -> Tensor:
         )
     weights = weights.detach().to(features).expand(batch, points).clone(memory_format=torch.contiguous_format)
     if not is_hidden(weights) and not bool(((weights >= LEAST_WEIGHT) & (weights <= 1 / LEAST_WEIGHT)).all()):
-        allowed, found = f"{LEAST_WEIGHT:g} to {1 / LEAST_WEIGHT:g}", "{:g} to {:g}".format(*weights.aminmax())
-        raise ValueError(f"weights must be from {allowed}, got {found}; drop points of negligible weight")
+        allowed, actual = f"{LEAST_WEIGHT:g} to {1 / LEAST_WEIGHT:g}", "{:g} to {:g}".format(*weights.aminmax())
+        raise ValueError(f"weights must be from {allowed}, got {actual}; drop points of negligible weight")
     return weights
 
 
 def warn(message: str) -> None:
     """Warn with the location of the line that called this package, through any number of wrappers and modules."""
-    warnings.warn(message, stacklevel=1 + len(_modules_inside()))
-
-
-def called_by_edit() -> bool:
-    """Whether the caller is an edit, which has checked the image already."""
-    edits = ("nlfilter_torch.photo.", "nlfilter_torch.filtering.fitted")
-    return any(module.startswith(edits) for module in _modules_inside())
-
-
-def _modules_inside() -> list[str]:
-    """Modules of all frames from the caller's up to, but not including, the one that called this package."""
-    modules = (str(frame.f_globals.get("__name__", "")) for frame, _ in walk_stack(sys._getframe(1)))
-    return list(takewhile(lambda module: module.split(".")[0] in ("nlfilter_torch", "torch"), modules))
+    frames = walk_stack(sys._getframe())
+    packages = (str(frame.f_globals.get("__name__", "")).partition(".")[0] for frame, _ in frames)
+    inside = list(takewhile(lambda package: package in ("nlfilter_torch", "torch"), packages))
+    warnings.warn(message, stacklevel=1 + len(inside))

@@ -217,44 +217,46 @@ class _Halo(torch.autograd.Function):
     """The rows of this rank and ``margin`` rows on either side, possibly of several ranks with few rows each."""
 
     @staticmethod
-    def forward(ctx: Any, guide: Tensor, margin: int, among: RowCommunicator) -> Tensor:
-        ctx.margin, ctx.among = margin, among
-        wanted, lent = _overlaps(among, margin)
-        first = among.first_row
+    def forward(ctx: Any, guide: Tensor, margin: int, communicator: RowCommunicator) -> Tensor:
+        ctx.margin, ctx.communicator = margin, communicator
+        wanted, lent = _overlaps(communicator, margin)
+        first = communicator.first_row
         base = max(0, first - margin)
-        height = min(among.height, first + guide.shape[2] + margin) - base
+        height = min(communicator.height, first + guide.shape[2] + margin) - base
         extended = guide.new_empty(*guide.shape[:2], height, guide.shape[3])
         extended[:, :, first - base : first - base + guide.shape[2]] = guide
         sent = {peer: guide[:, :, rows.start - first : rows.stop - first] for peer, rows in lent.items()}
         shapes = {peer: rows.stop - rows.start for peer, rows in wanted.items()}
-        for peer, rows in _swap(sent, shapes, guide, among).items():
+        for peer, rows in _swap(sent, shapes, guide, communicator).items():
             extended[:, :, wanted[peer].start - base : wanted[peer].stop - base] = rows
         return extended
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> Gradients:
-        among: RowCommunicator = ctx.among
-        wanted, lent = _overlaps(among, ctx.margin)
-        base = max(0, among.first_row - ctx.margin)
-        own = grad[:, :, among.first_row - base : among.first_row - base + among.rows[among.rank]].clone()
+        communicator: RowCommunicator = ctx.communicator
+        wanted, lent = _overlaps(communicator, ctx.margin)
+        base = max(0, communicator.first_row - ctx.margin)
+        own = grad[
+            :, :, communicator.first_row - base : communicator.first_row - base + communicator.rows[communicator.rank]
+        ].clone()
         sent = {peer: grad[:, :, rows.start - base : rows.stop - base] for peer, rows in wanted.items()}
         shapes = {peer: rows.stop - rows.start for peer, rows in lent.items()}
-        for peer, rows in _swap(sent, shapes, grad, among).items():
-            own[:, :, lent[peer].start - among.first_row : lent[peer].stop - among.first_row] += rows
+        for peer, rows in _swap(sent, shapes, grad, communicator).items():
+            own[:, :, lent[peer].start - communicator.first_row : lent[peer].stop - communicator.first_row] += rows
         return own, None, None
 
 
-def _overlaps(among: RowCommunicator, margin: int) -> tuple[dict[int, slice], dict[int, slice]]:
+def _overlaps(communicator: RowCommunicator, margin: int) -> tuple[dict[int, slice], dict[int, slice]]:
     """Rows of other ranks that are needed here, and rows from here that other ranks need, by rank."""
-    ends = list(accumulate(among.rows))
-    owned = [range(end - rows, end) for end, rows in zip(ends, among.rows, strict=True)]
+    ends = list(accumulate(communicator.rows))
+    owned = [range(end - rows, end) for end, rows in zip(ends, communicator.rows, strict=True)]
     needed = [range(max(0, rows.start - margin), min(ends[-1], rows.stop + margin)) for rows in owned]
 
-    def common(one: range, other: range) -> slice:
-        return slice(max(one.start, other.start), min(one.stop, other.stop))
+    def common(owned_rows: range, wanted_rows: range) -> slice:
+        return slice(max(owned_rows.start, wanted_rows.start), min(owned_rows.stop, wanted_rows.stop))
 
-    here = among.rank
+    here = communicator.rank
     wanted: dict[int, slice] = {}
     lent: dict[int, slice] = {}
     for peer in range(len(owned)):
@@ -264,19 +266,25 @@ def _overlaps(among: RowCommunicator, margin: int) -> tuple[dict[int, slice], di
     return wanted, lent
 
 
-def _swap(sent: dict[int, Tensor], heights: dict[int, int], like: Tensor, among: RowCommunicator) -> dict[int, Tensor]:
+def _swap(
+    sent: dict[int, Tensor], heights: dict[int, int], like: Tensor, communicator: RowCommunicator
+) -> dict[int, Tensor]:
     """Send rows (B, C, h, W) to some ranks and receive others, of these heights, from some."""
     received = {peer: like.new_empty(*like.shape[:2], height, like.shape[3]) for peer, height in heights.items()}
     transfers = [
-        dist.P2POp(dist.isend, rows.contiguous(), among.global_rank(peer), among.group) for peer, rows in sent.items()
+        dist.P2POp(dist.isend, rows.contiguous(), communicator.global_rank(peer), communicator.group)
+        for peer, rows in sent.items()
     ]
-    transfers += [dist.P2POp(dist.irecv, rows, among.global_rank(peer), among.group) for peer, rows in received.items()]
+    transfers += [
+        dist.P2POp(dist.irecv, rows, communicator.global_rank(peer), communicator.group)
+        for peer, rows in received.items()
+    ]
 
     def transfer() -> None:
         for request in dist.batch_isend_irecv(transfers) if transfers else ():
             request.wait()
 
-    _exchange(transfer, among.group)
+    _exchange(transfer, communicator.group)
     return received
 
 

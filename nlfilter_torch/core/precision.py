@@ -163,14 +163,14 @@ def once_differentiable(backward: Callable[..., Gradients]) -> Callable[..., Gra
     @functools.wraps(backward)
     def wrapper(ctx: Any, *gradients: Tensor) -> Gradients:
         with torch.no_grad():
-            found = exact(ctx, *gradients)
+            results = exact(ctx, *gradients)
         if not torch.is_grad_enabled() or torch.compiler.is_compiling():
-            return found
-        formed = [g.formed() if isinstance(g, OuterProduct) else g for g in found if g is not None]
+            return results
+        formed = [g.formed() if isinstance(g, OuterProduct) else g for g in results if g is not None]
         # Connected to everything the gradients depend on: autograd visits only nodes on a path to a requested tensor.
         causes = [t for t in (*ctx.saved_tensors, *gradients) if t is not None and t.requires_grad]
         refused = iter(_Refusal.apply(len(formed), *formed, *causes))  # type: ignore[no-untyped-call]
-        return tuple(None if g is None else next(refused) for g in found)
+        return tuple(None if g is None else next(refused) for g in results)
 
     return wrapper
 

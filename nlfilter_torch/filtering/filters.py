@@ -146,11 +146,11 @@ def polynomial_filter(
         batch = max(len(operator.factor), *(len(t) for t in (image, alpha) if t.ndim > 1), 1)
         check_values(residual, "residual", "finite", batch)
     order = (alpha.shape[0] if alpha.ndim == 1 else alpha.shape[1]) - 1
-    alpha = alpha if alpha.ndim == 4 else operator.among.copy_to_group(alpha)
+    alpha = alpha if alpha.ndim == 4 else operator.communicator.copy_to_group(alpha)
     filtered = weigh_layers(_layers(operator, image, order), alpha)
     if residual is not None and len(filtered):
         captured = spectral_filter(operator.spectrum(), image.to(filtered), torch.ones_like)
-        weight = operator.among.copy_to_group(residual)
+        weight = operator.communicator.copy_to_group(residual)
         filtered = filtered + residual_change(alpha, weight, image.to(filtered) - captured, operator.diagonal_share)
     return as_given(filtered, image)
 
@@ -232,7 +232,7 @@ def spectral_filter(
         check_shape(coefficients, shape, "coefficients", "use spectrum.coefficients(image)")
     if isinstance(residual, int | float) and residual == 0:
         return as_given(spectrum.synthesize(response, coefficients), image)
-    rho = per_image(spectrum.among.copy_to_group(residual), spectrum.root, 2)
+    rho = per_image(spectrum.communicator.copy_to_group(residual), spectrum.root, 2)
     # V f V^T y + rho (y - V V^T y) = V (f - rho) V^T y + rho y, still in two passes over the factor.
     filtered = spectrum.synthesize(lambda eigenvalues: response(eigenvalues) - rho, coefficients)
     return as_given(filtered + rho.to(filtered).reshape(-1, 1, 1, 1) * image.to(filtered), image)
@@ -259,7 +259,7 @@ def captured_energy(spectrum: Spectrum, image: Tensor) -> Tensor:
     captured = spectral_filter(spectrum, image.to(spectrum.factor.dtype), torch.ones_like)
     exact = image.double()
     energy, inner = (  # |y|^2 and y^T V V^T y, in the sum over weighted points; in float32 they might overflow
-        spectrum.among.sum(weighted((planes * exact).flatten(2).sum(1), spectrum.weights).sum(1))
+        spectrum.communicator.sum(weighted((planes * exact).flatten(2).sum(1), spectrum.weights).sum(1))
         for planes in (exact, captured)
     )
     share = torch.where(energy > 0, inner / energy.clamp(min=torch.finfo(energy.dtype).tiny), 1.0)
@@ -357,7 +357,7 @@ def filter_regions(
     # Averaged over the regions with the masks as weights, (B, k+1, H, W). Outside all regions they are 1, but depend on
     # the masks, and so does the filtered image, from which the result has its gradient there.
     weights = masks / torch.where(outside, 1.0, total)
-    sliders = compose_alpha(weights, operator.among.copy_to_group(alpha))
+    sliders = compose_alpha(weights, operator.communicator.copy_to_group(alpha))
     filtered = polynomial_filter(operator, image, sliders, residual=residual)
     edited = torch.lerp(image, filtered, torch.where(outside, 1.0, total.clamp(max=1.0)).to(image))
     return torch.where(outside, image.detach() + (edited - edited.detach()), edited)

@@ -102,7 +102,7 @@ def fit_alpha(
     if loss is not None and not callable(loss):
         raise TypeError(f"loss must be a function of two images, got {type(loss).__name__}; pass a function or None")
     if loss is not None:
-        operator.among.check_whole("a loss")
+        operator.communicator.check_whole("a loss")
     check_order(order)
     check_image(image, "image")
     check_image(target, "target", channels=image.shape[1], batch=max(image.shape[0], operator.factor.shape[0]))
@@ -116,7 +116,7 @@ def fit_alpha(
     weights = _pixel_weights(mask, operator, layers).flatten(1)
     aims = target.detach().double().flatten(1)
     if rounding is None:
-        zone = _roundings(aims, weights, operator.among)
+        zone = _roundings(aims, weights, operator.communicator)
         ignored = bool((zone > 0.0).any())
     else:
         zone, ignored = aims.new_full((1, 1), rounding), rounding > 0.0
@@ -128,7 +128,7 @@ def fit_alpha(
         ridge=ridge,
         shared=shared,
         precision=operator.factor.dtype,
-        among=operator.among,
+        communicator=operator.communicator,
     )
     change = problem.fit()
     if loss is not None:
@@ -159,7 +159,7 @@ def fit_layers(layers: Tensor, image: Tensor, target: Tensor, weights: Tensor, r
         ridge=0.0,
         shared=False,
         precision=layers.dtype,
-        among=ALONE,
+        communicator=ALONE,
     )
     return 1.0 + problem.fit()[0]
 
@@ -169,11 +169,11 @@ def _check_not_negative(value: float, name: str) -> None:
     check_values(value, name, "not negative", remedy="0.0 is plain least squares")
 
 
-def _roundings(target: Tensor, weights: Tensor, among: Communicator) -> Tensor:
+def _roundings(target: Tensor, weights: Tensor, communicator: Communicator) -> Tensor:
     """Half a level (B, 1) for targets (B, P) whose values of positive weight are multiples of 1/255, 0 for others."""
     levels = 255 * target
     off = torch.where(weights > 0, (levels - levels.round()).abs(), 0.0)
-    return HALF_LEVEL * (among.max(off.amax(1, keepdim=True)) < OFF_LEVEL).double()
+    return HALF_LEVEL * (communicator.max(off.amax(1, keepdim=True)) < OFF_LEVEL).double()
 
 
 def _dead_zone(target: Tensor, rounding: Tensor) -> tuple[Tensor, Tensor]:
@@ -208,7 +208,7 @@ class _Problem:
     ridge: float
     shared: bool
     precision: torch.dtype
-    among: Communicator
+    communicator: Communicator
 
     def fit(self) -> Tensor:
         """Least-squares change (B, k+1) with the dead zone.
@@ -255,7 +255,7 @@ class _Problem:
 
     def _weighed(self, weights: Tensor) -> Tensor:
         """Gram matrix of the layers, (B, k+1, k+1), under weights (B, P)."""
-        return self._pool(self.among.sum((self.layers * weights.unsqueeze(1)) @ self.layers.mT))
+        return self._pool(self.communicator.sum((self.layers * weights.unsqueeze(1)) @ self.layers.mT))
 
     def _errors(self, change: Tensor) -> Tensor:
         """Remaining error of the edit, (B, P)."""
@@ -266,14 +266,14 @@ class _Problem:
         return values.mean(0, keepdim=True) if self.shared else values
 
     def _cost(self, change: Tensor) -> Tensor:
-        squares = self.among.sum((self.weights * self._errors(change).square()).sum(1))
+        squares = self.communicator.sum((self.weights * self._errors(change).square()).sum(1))
         return self._pool(squares) + self.ridge * change.square().sum(1)
 
     def _step(self, change: Tensor) -> Tensor:
         """Newton's step (B, k+1); without a dead zone it leads to the solution from any point."""
         errors = self._errors(change)
         products = self._products if self.dead_zone is None else self._weighed(self.weights * (errors != 0.0))
-        slope = self.among.sum((self.layers @ (self.weights * errors).unsqueeze(2)).squeeze(2))
+        slope = self.communicator.sum((self.layers @ (self.weights * errors).unsqueeze(2)).squeeze(2))
         slope = self._pool(slope) - self.ridge * change
         scale, inverse = self._inverse(products)
         return scale * (inverse @ (scale * slope).unsqueeze(2)).squeeze(2)
@@ -328,16 +328,16 @@ class _Problem:
             filtered = image + (change.unsqueeze(1) @ self.layers).view(filtered_shape)
             if shares is not None:
                 filtered = torch.lerp(target, filtered, shares)
-            found = loss(filtered, target)
-            check_tensor(found, "loss", "return a number that depends on the first image")
-            if found.numel() != 1 or not found.requires_grad:
+            value = loss(filtered, target)
+            check_tensor(value, "loss", "return a number that depends on the first image")
+            if value.numel() != 1 or not value.requires_grad:
                 raise ValueError(
-                    f"loss must return a single number with a gradient, got a tensor of shape {tuple(found.shape)}; "
+                    f"loss must return a single number with a gradient, got a tensor of shape {tuple(value.shape)}; "
                     "compute it from the first image in torch"
                 )
-            value = found.sum() + self.ridge * change.square().sum()
-            value.backward()
-            return value
+            objective = value.sum() + self.ridge * change.square().sum()
+            objective.backward()
+            return objective
 
         optimizer.step(closure)
         return change_of(coefficients.detach())
@@ -355,7 +355,7 @@ def _pixel_weights(mask: Tensor | None, operator: NonlocalOperator, layers: Tens
         counted = mask.double()
     if operator.weights is not None:
         counted = counted * operator.weights.unflatten(1, operator.size).unsqueeze(1)
-    total = operator.among.sum(counted.sum((2, 3), keepdim=True))
+    total = operator.communicator.sum(counted.sum((2, 3), keepdim=True))
     if not is_hidden(counted) and bool((total <= 0).any()):
         raise ValueError(
             "mask must hold a pixel of positive weight for every image, got zeros only; select some pixels"

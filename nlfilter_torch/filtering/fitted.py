@@ -170,7 +170,7 @@ def fit_filter(operator: NonlocalOperator, image: Tensor, *, order: int = 3) -> 
     powers = operator.powers(image, order)[0]  # (k, C, H, W)
     before = torch.cat([image.to(powers), powers[:-1]]).flatten(2)  # y, ..., W^(k-1) y: (k, C, N)
     scaling = weighted(operator.scaling, operator.weights).unsqueeze(1)  # (1, 1, N)
-    factor, among = operator.factor, operator.among
-    moments = torch.stack([among.sum(moment(factor, scaling * y)) for y in before.unsqueeze(1)], dim=1)
+    factor, communicator = operator.factor, operator.communicator
+    moments = torch.stack([communicator.sum(moment(factor, scaling * y)) for y in before.unsqueeze(1)], dim=1)
     captured = operator.spectrum().gain(torch.ones_like) @ moments[:, 0]
     return FittedFilter(operator.kernel, operator.differentiable_balancing(), moments, captured)

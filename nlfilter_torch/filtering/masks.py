@@ -86,7 +86,7 @@ def diffusion_mask(
     check_positive(time, "time", spectrum.factor.shape[0])
     check_positive(width, "width", max(spectrum.factor.shape[0], weights.shape[0]))
     _warn_of_unlike(spectrum, weights)
-    exponent = per_image(spectrum.among.copy_to_group(time), spectrum.root, 2)
+    exponent = per_image(spectrum.communicator.copy_to_group(time), spectrum.root, 2)
     others = None if negative is None else region_weights(spectrum, negative, name="negative")
     if others is not None:
         check_negative(others.shape[1], weights.shape[1])
@@ -95,7 +95,7 @@ def diffusion_mask(
     # The constant eigenvector does not contribute to distances, so it is kept, and no eigenvectors need to be formed.
     distances = _distances_to_means(spectrum, spectrum.basis(lambda eigenvalues: eigenvalues.pow(exponent)), weights)
     pixels = per_image(spectrum.pixels, distances, 3)
-    width = per_image(spectrum.among.copy_to_group(width), distances, 3)
+    width = per_image(spectrum.communicator.copy_to_group(width), distances, 3)
     exponents = pixels / width.clamp(min=NARROWEST) * distances  # of the regions, then of negative ones
     inner, outer = exponents[:, : region.shape[1]], exponents[:, region.shape[1] :]
     mask = torch.exp(-inner.clamp(max=FARTHEST))
@@ -150,11 +150,13 @@ def region_weights(spectrum: Spectrum, region: Tensor, *, name: str = "region") 
     """Check regions (B, K, H, W) and scale each to unit sum over the pixels, (B, K, N), in the spectrum's dtype."""
     check_image(region, name, batch=spectrum.factor.shape[0], empty=len(spectrum.factor) == 0)
     check_same_size(region, spectrum.size, name, "spectrum", spectrum.factor)
-    largest = spectrum.among.max(region.detach().abs().amax((2, 3), keepdim=True))  # sums of huge values overflow
+    largest = spectrum.communicator.max(
+        region.detach().abs().amax((2, 3), keepdim=True)
+    )  # sums of huge values overflow
     flat = (region / torch.where(largest > 0, largest, 1.0)).to(spectrum.factor).flatten(2)
     if not is_hidden(flat) and bool((flat < 0).any()):
         raise ValueError(f"{name} must be non-negative, got {flat.min().item():g}; clamp it at 0")
-    total = spectrum.among.sum(weighted(flat, spectrum.weights).sum(2, keepdim=True))
+    total = spectrum.communicator.sum(weighted(flat, spectrum.weights).sum(2, keepdim=True))
     if not is_hidden(flat) and bool((total <= 0).any()):
         raise ValueError(
             f"{name} must hold a pixel of positive weight in every mask, got an empty one; paint or select some pixels"
@@ -197,13 +199,13 @@ def segment(spectrum: Spectrum, regions: Tensor, time: float | Tensor, valid: Te
         for _ in range(ITERATIONS):
             members = torch.zeros_like(weights).scatter_(1, assignment.unsqueeze(1), 1.0)
             counts = weighted(members, spectrum.weights).sum(2, dtype=torch.float64)
-            sizes = spectrum.among.sum(counts).unsqueeze(1)  # (B, 1, K)
+            sizes = spectrum.communicator.sum(counts).unsqueeze(1)  # (B, 1, K)
             empty = sizes == 0
             centres = torch.where(empty, centres, _sums(spectrum, basis, members) / torch.where(empty, 1.0, sizes))
             previous, assignment = assignment, _nearest(spectrum, basis, centres, valid)
             if is_hidden(members):  # a comparison would wait for the device
                 continue
-            if not spectrum.among.max((previous != assignment).any().to(members)):
+            if not spectrum.communicator.max((previous != assignment).any().to(members)):
                 break
         mask = torch.zeros_like(weights).scatter_(1, assignment.unsqueeze(1), 1.0)
     return mask.unflatten(2, spectrum.size).to(regions.dtype)
@@ -211,7 +213,7 @@ def segment(spectrum: Spectrum, regions: Tensor, time: float | Tensor, valid: Te
 
 def _sums(spectrum: Spectrum, basis: Tensor, weights: Tensor) -> Tensor:
     """Weighted sums (B, M, K) of the coordinates ``basis @ F`` of all pixels, with weights (B, K, N); float64."""
-    return basis @ spectrum.among.sum(moment(spectrum.factor, spectrum.mass.unsqueeze(1) * weights))
+    return basis @ spectrum.communicator.sum(moment(spectrum.factor, spectrum.mass.unsqueeze(1) * weights))
 
 
 def _nearest(spectrum: Spectrum, basis: Tensor, centres: Tensor, valid: Tensor | None) -> Tensor:

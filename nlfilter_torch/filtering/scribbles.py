@@ -80,7 +80,7 @@ def propagate_strokes(
         tensor([0., 0., 1., 1.])
     """
     check_instance(spectrum, Spectrum, "spectrum", "take operator.spectrum()")
-    among = spectrum.among
+    communicator = spectrum.communicator
     batch = spectrum.factor.shape[0]
     check_image(strokes, "strokes")
     check_image(stroke_mask, "stroke_mask")
@@ -88,12 +88,12 @@ def propagate_strokes(
     for tensor, name, channels in ((strokes, "strokes", None), (stroke_mask, "stroke_mask", 1)):
         check_image(tensor, name, channels=channels, batch=images)
         check_same_size(tensor, spectrum.size, name, "spectrum", spectrum.factor)
-    check_painted(stroke_mask, among=among)
+    check_painted(stroke_mask, communicator=communicator)
     check_values(strength, "strength", "share", images)
     check_values(reach, "reach", "below 1", batch)
     check_positive(smoothness, "smoothness", images)
 
-    strength, reach, smoothness = (among.copy_to_group(value) for value in (strength, reach, smoothness))
+    strength, reach, smoothness = (communicator.copy_to_group(value) for value in (strength, reach, smoothness))
     factor = spectrum.factor
     weights = weighted(stroke_mask.to(factor).flatten(2), spectrum.weights)  # (B or 1, 1, N)
     values = strokes.to(factor).flatten(2)  # (B or 1, C, N)
@@ -107,7 +107,7 @@ def propagate_strokes(
         strength=strength,
         reach=reach,
         smoothness=smoothness,
-        among=among,
+        communicator=communicator,
     )
     return fitted(spectrum.factor).unflatten(2, spectrum.size).to(strokes.dtype)
 
@@ -138,18 +138,18 @@ def fit_strokes(
     strength: float | Tensor,
     reach: float | Tensor,
     smoothness: float | Tensor,
-    among: Communicator = ALONE,
+    communicator: Communicator = ALONE,
 ) -> FittedStrokes:
     """Fit the regression of :func:`propagate_strokes`, from sums over the scribbled pixels.
 
     ``painted`` is called more than once and returns an iterable over all scribbled pixels, in blocks of columns of the
     factor (B, M, n), weights (B, 1, n) and values (B, C, n). ``pixels`` is the number N of pixels of the whole image,
-    or (B,), whose rows are distributed over the ranks of ``among``.
+    or (B,), whose rows are distributed over the ranks of ``communicator``.
     """
     walk = per_image(reach, pairs.root, 2)  # s, (B or 1, 1)
     basis = pairs.basis(lambda eigenvalues: (eigenvalues.clamp(min=FLOOR) / (1 - walk * eigenvalues)).sqrt())
     half = basis.mT  # R, where X = R R^T
-    effective_weights = EffectiveWeights.of(painted, half, _dab(pixels), among)
+    effective_weights = EffectiveWeights.of(painted, half, _dab(pixels), communicator)
 
     gram, target, sums = torch.zeros(()), torch.zeros(()), torch.zeros(())
     for factor, weights, values in painted():
@@ -159,7 +159,7 @@ def fit_strokes(
         gram = gram + moment(factor * effective, factor)  # (B, M, M)
         target = target + moment(factor.expand(images, -1, -1), effective * known)  # (B, M, C+1)
         sums = sums + (effective * known).double().sum(2)  # (B, C+1)
-    gram, target, sums = (among.sum(total) for total in (gram, target, sums))
+    gram, target, sums = (communicator.sum(total) for total in (gram, target, sums))
 
     # X (G X + v)^-1 = R (R^T G R + v)^-1 R^T, where the inverted matrix is symmetric and positive definite.
     inner = half.mT @ gram @ half
@@ -198,14 +198,16 @@ class EffectiveWeights:
     noise: Tensor
 
     @staticmethod
-    def of(painted: ScribbledBlocks, half: Tensor, dab: float | Tensor, among: Communicator) -> "EffectiveWeights":
+    def of(
+        painted: ScribbledBlocks, half: Tensor, dab: float | Tensor, communicator: Communicator
+    ) -> "EffectiveWeights":
         """Compute the attributes from sums over the scribbled pixels."""
         gram, residual, total = torch.zeros(()), torch.zeros(()), torch.zeros(())
         for factor, weights, _ in painted():
             gram = gram + moment(factor * weights, factor)
             residual = residual + (weights * diagonal_residual(factor)).double().sum((1, 2))
             total = total + weights.double().sum((1, 2))
-        gram, residual, total = (among.sum(part) for part in (gram, residual, total))
+        gram, residual, total = (communicator.sum(part) for part in (gram, residual, total))
         core = half @ half.mT
         variance = (half.mT @ gram @ half).diagonal(dim1=1, dim2=2).sum(1) / total  # mean of u^T X u
         noise = NOISE * (variance + residual / total).reshape(-1, 1, 1)
@@ -236,12 +238,12 @@ def diagonal_residual(factor: Tensor) -> Tensor:
     return (1 - factor.square().sum(1, keepdim=True)).clamp(min=0.0)
 
 
-def check_painted(stroke_mask: Tensor, name: str = "stroke_mask", *, among: Communicator = ALONE) -> None:
+def check_painted(stroke_mask: Tensor, name: str = "stroke_mask", *, communicator: Communicator = ALONE) -> None:
     """Raise unless every image of ``stroke_mask`` (B, 1, H, W) has a scribbled pixel and all values are in [0, 1]."""
     check_unit_range(stroke_mask, name)
     if is_hidden(stroke_mask):
         return
-    empty = among.max(stroke_mask.detach().amax((1, 2, 3))) <= 0
+    empty = communicator.max(stroke_mask.detach().amax((1, 2, 3))) <= 0
     if bool(empty.any()):
         raise ValueError(
             f"{name} must hold a painted pixel in every image, got none in image(s) "

@@ -15,18 +15,27 @@ from nlfilter_torch.operator.features import GuideChannels, unit_window
 from nlfilter_torch.operator.landmarks import Sampling
 from nlfilter_torch.operator.nystrom import Completion
 from nlfilter_torch.operator.operator import NonlocalOperator
-from nlfilter_torch.operator.options import Construction
+from nlfilter_torch.operator.options import AUTO, OperatorOptions
 
 
 class NonlocalAffinity(Learnable):
     """Layer that builds an operator from a guide by :func:`nonlocal_operator`, with the same options.
 
     Args:
+        patch_size: as for :func:`nonlocal_operator`.
+        photometric_bandwidth: a positive number in units of the guide, or ``"auto"``.
+        spatial_bandwidth: a positive number of pixels, or None.
+        num_landmarks: as for :func:`nonlocal_operator`.
+        landmarks: as for :func:`nonlocal_operator`.
+        completion: as for :func:`nonlocal_operator`.
+        guide_channels: as for :func:`nonlocal_operator`.
+        patch_weights: as for :func:`nonlocal_operator`.
+        tolerance: as for :func:`nonlocal_operator`.
+        generator: as for :func:`nonlocal_operator`. Every call then draws different landmarks; do not combine it with
+            gradient checkpointing, which expects two runs of the layer to agree.
+        group: as for :func:`nonlocal_operator`. A layer with a group cannot be pickled or copied.
         learn: the options to learn: any of ``"photometric_bandwidth"`` and ``"spatial_bandwidth"`` (which need initial
             values) and ``"patch_weights"``. All stay positive.
-        **options: of :func:`nonlocal_operator`. With a ``generator`` every call draws different landmarks; do not
-            combine it with gradient checkpointing, which expects two runs of the layer to agree. A layer with a
-            ``group`` cannot be pickled or copied.
 
     Raises:
         TypeError, ValueError: if ``learn`` has any other name, or an option is not valid for :func:`nonlocal_operator`.
@@ -49,23 +58,29 @@ class NonlocalAffinity(Learnable):
     def __init__(
         self,
         *,
-        patch_size: int = 5,
-        photometric_bandwidth: float | Literal["auto"] = "auto",
+        patch_size: int = OperatorOptions.patch_size,
+        photometric_bandwidth: float | Literal["auto"] = AUTO,
         spatial_bandwidth: float | None = None,
-        num_landmarks: int = 100,
-        landmarks: Sampling = "kmeans",
-        completion: Completion = "diagonal",
-        guide_channels: GuideChannels = "luminance",
-        patch_weights: Tensor | None = None,
-        tolerance: float | None = None,
-        generator: torch.Generator | None = None,
-        group: Any = None,
+        num_landmarks: int = OperatorOptions.num_landmarks,
+        landmarks: Sampling = OperatorOptions.landmarks,
+        completion: Completion = OperatorOptions.completion,
+        guide_channels: GuideChannels = OperatorOptions.guide_channels,
+        patch_weights: Tensor | None = OperatorOptions.patch_weights,
+        tolerance: float | None = OperatorOptions.tolerance,
+        generator: torch.Generator | None = OperatorOptions.generator,
+        group: Any = OperatorOptions.group,
         learn: Collection[str] = (),
     ) -> None:
         super().__init__()
         names = check_learn(learn, tuple(self.learnable))
-        check_choice(guide_channels, "guide_channels", ("luminance", "all"))
-        Construction(num_landmarks, landmarks, completion, tolerance, generator)  # checks the options
+        OperatorOptions(
+            num_landmarks=num_landmarks,
+            landmarks=landmarks,
+            completion=completion,
+            guide_channels=guide_channels,
+            tolerance=tolerance,
+            generator=generator,
+        ).check()
         check_group(group)
         window = unit_window(patch_size, patch_weights).detach()  # learned only with learn=("patch_weights",)
         self.patch_size = patch_size

@@ -18,7 +18,11 @@ from nlfilter_torch.core.checks import (
 from nlfilter_torch.filtering.filters import filter_regions, polynomial_filter, weigh_layers
 from nlfilter_torch.nn.affinity import NonlocalAffinity
 from nlfilter_torch.nn.parameters import check_learn
+from nlfilter_torch.operator.features import GuideChannels
+from nlfilter_torch.operator.landmarks import Sampling
+from nlfilter_torch.operator.nystrom import Completion
 from nlfilter_torch.operator.operator import NonlocalOperator
+from nlfilter_torch.operator.options import AUTO, OperatorOptions
 
 LEARNABLE = ("alpha", "residual")
 
@@ -125,7 +129,17 @@ class NonlocalFilter(nn.Module):
         learn: the parameters to learn: any of ``"alpha"``, ``"residual"``, ``"photometric_bandwidth"``,
             ``"spatial_bandwidth"`` and ``"patch_weights"``; see the two layers. Gradients with respect to image and
             guide are always available.
-        **options: of :func:`nonlocal_operator`.
+        patch_size: as for :class:`NonlocalAffinity`.
+        photometric_bandwidth: a positive number in units of the guide, or ``"auto"``.
+        spatial_bandwidth: a positive number of pixels, or None.
+        num_landmarks: as for :class:`NonlocalAffinity`.
+        landmarks: as for :class:`NonlocalAffinity`.
+        completion: as for :class:`NonlocalAffinity`.
+        guide_channels: as for :class:`NonlocalAffinity`.
+        patch_weights: as for :class:`NonlocalAffinity`.
+        tolerance: as for :class:`NonlocalAffinity`.
+        generator: as for :class:`NonlocalAffinity`.
+        group: as for :class:`NonlocalAffinity`.
 
     Raises:
         TypeError, ValueError: if ``learn`` has any other name, or ``alpha``, ``residual`` or an option is invalid.
@@ -167,11 +181,34 @@ class NonlocalFilter(nn.Module):
         *,
         residual: float | None = None,
         learn: Collection[str] = ("alpha",),
-        **options: Any,
+        patch_size: int = OperatorOptions.patch_size,
+        photometric_bandwidth: float | Literal["auto"] = AUTO,
+        spatial_bandwidth: float | None = None,
+        num_landmarks: int = OperatorOptions.num_landmarks,
+        landmarks: Sampling = OperatorOptions.landmarks,
+        completion: Completion = OperatorOptions.completion,
+        guide_channels: GuideChannels = OperatorOptions.guide_channels,
+        patch_weights: Tensor | None = OperatorOptions.patch_weights,
+        tolerance: float | None = OperatorOptions.tolerance,
+        generator: torch.Generator | None = OperatorOptions.generator,
+        group: Any = OperatorOptions.group,
     ) -> None:
         super().__init__()
         names = check_learn(learn, (*LEARNABLE, *NonlocalAffinity.learnable))
-        self.affinity = NonlocalAffinity(learn=names.intersection(NonlocalAffinity.learnable), **options)
+        self.affinity = NonlocalAffinity(
+            patch_size=patch_size,
+            photometric_bandwidth=photometric_bandwidth,
+            spatial_bandwidth=spatial_bandwidth,
+            num_landmarks=num_landmarks,
+            landmarks=landmarks,
+            completion=completion,
+            guide_channels=guide_channels,
+            patch_weights=patch_weights,
+            tolerance=tolerance,
+            generator=generator,
+            group=group,
+            learn=names.intersection(NonlocalAffinity.learnable),
+        )
         self.sliders = PolynomialSliders(alpha, residual=residual, learn=names.intersection(LEARNABLE))
 
     def forward(

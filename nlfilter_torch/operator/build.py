@@ -1,6 +1,7 @@
 """Building an operator from a guide or from features: landmarks, Nystrom factor, balancing. Paper: Sec. II."""
 
 from dataclasses import replace
+from functools import partial
 from typing import Any, Literal
 
 import torch
@@ -8,8 +9,6 @@ from torch import Tensor
 
 from nlfilter_torch.core.blocks import root_weighted
 from nlfilter_torch.core.checks import (
-    called_by_edit,
-    check_choice,
     check_features,
     check_image,
     check_scale,
@@ -20,7 +19,6 @@ from nlfilter_torch.core.checks import (
 from nlfilter_torch.core.communicator import ALONE, Communicator, all_gather_shapes
 from nlfilter_torch.core.precision import full_precision, uncompiled, uncompiled_with, working_dtype
 from nlfilter_torch.core.values import is_hidden, refuse_transforms
-from nlfilter_torch.operator.balancing import TOLERANCE, balance, balance_in_graph, balance_in_rounds, warn_of_residual
 from nlfilter_torch.operator.eigenvalue_bound import exceeds, is_bounded, limiter, shifted_gram, slack
 from nlfilter_torch.operator.features import (
     GuideChannels,
@@ -35,8 +33,15 @@ from nlfilter_torch.operator.features import (
 from nlfilter_torch.operator.landmarks import Sampling, choose_in_graph, choose_landmarks
 from nlfilter_torch.operator.nystrom import Completion, inverse_cholesky
 from nlfilter_torch.operator.operator import Kernel, NonlocalOperator
-from nlfilter_torch.operator.options import Construction, check_bandwidths
+from nlfilter_torch.operator.options import Construction, OperatorOptions, check_bandwidths
 from nlfilter_torch.operator.scaling import Balancing, KernelMatrix, PixelScaling
+from nlfilter_torch.operator.sinkhorn import (
+    TOLERANCE,
+    sinkhorn_balance,
+    sinkhorn_in_graph,
+    sinkhorn_in_rounds,
+    warn_of_residual,
+)
 
 
 def _is_small(bandwidth: float | Tensor | str) -> bool:
@@ -58,17 +63,17 @@ def _largest(guide: Tensor) -> Tensor:
 def nonlocal_operator(
     guide: Tensor,
     *,
-    patch_size: int = 5,
-    photometric_bandwidth: float | Tensor | Literal["auto"] = "auto",
-    spatial_bandwidth: SpatialBandwidth | None = None,
-    num_landmarks: int = 100,
-    landmarks: Sampling = "kmeans",
-    completion: Completion = "diagonal",
-    guide_channels: GuideChannels = "luminance",
-    patch_weights: Tensor | None = None,
-    tolerance: float | None = None,
-    generator: torch.Generator | None = None,
-    group: Any = None,
+    patch_size: int = OperatorOptions.patch_size,
+    photometric_bandwidth: float | Tensor | Literal["auto"] = OperatorOptions.photometric_bandwidth,
+    spatial_bandwidth: SpatialBandwidth | None = OperatorOptions.spatial_bandwidth,
+    num_landmarks: int = OperatorOptions.num_landmarks,
+    landmarks: Sampling = OperatorOptions.landmarks,
+    completion: Completion = OperatorOptions.completion,
+    guide_channels: GuideChannels = OperatorOptions.guide_channels,
+    patch_weights: Tensor | None = OperatorOptions.patch_weights,
+    tolerance: float | None = OperatorOptions.tolerance,
+    generator: torch.Generator | None = OperatorOptions.generator,
+    group: Any = OperatorOptions.group,
 ) -> NonlocalOperator:
     """Build the global filter of an image: patches, landmarks, Nystrom factor, completion and balancing.
 
@@ -115,34 +120,71 @@ def nonlocal_operator(
         >>> bool((operator.row_sums() - 1).abs().max() < 1e-4)
         True
     """
-    refuse_transforms("guide", guide, photometric_bandwidth, *bandwidths_of(spatial_bandwidth), patch_weights)
-    check_image(guide, "guide", empty=True)
-    check_choice(guide_channels, "guide_channels", ("luminance", "all"))
-    method = Construction(num_landmarks, landmarks, completion, tolerance, generator)
-    check_bandwidths(photometric_bandwidth, spatial_bandwidth, guide.shape[0])
-    if not is_hidden(guide) and _is_small(photometric_bandwidth) and not called_by_edit():
+    options = OperatorOptions(
+        patch_size=patch_size,
+        photometric_bandwidth=photometric_bandwidth,
+        spatial_bandwidth=spatial_bandwidth,
+        num_landmarks=num_landmarks,
+        landmarks=landmarks,
+        completion=completion,
+        guide_channels=guide_channels,
+        patch_weights=patch_weights,
+        tolerance=tolerance,
+        generator=generator,
+        group=group,
+    )
+    _check_guide(guide, options)
+    if not is_hidden(guide) and _is_small(photometric_bandwidth):
         warn_of_scale(guide, "guide")
-    guide = reduce_channels(guide.to(working_dtype(guide)), guide_channels)
-    among = all_gather_shapes(guide, group)
+    return _from_guide(guide, options)
+
+
+def operator_from_guide(guide: Tensor, options: OperatorOptions) -> NonlocalOperator:
+    """:func:`nonlocal_operator` for a guide whose scale has been checked: without the warning about values above 16."""
+    drawn = options.generator is not None or options.group is not None  # neither can be compiled
+    return (_built_uncompiled if drawn else _built)(guide, options)
+
+
+@full_precision
+def _built(guide: Tensor, options: OperatorOptions) -> NonlocalOperator:
+    _check_guide(guide, options)
+    return _from_guide(guide, options)
+
+
+_built_uncompiled = uncompiled(_built)
+
+
+def _check_guide(guide: Tensor, options: OperatorOptions) -> None:
+    """Raise an error for an invalid guide or option."""
+    spatial = bandwidths_of(options.spatial_bandwidth)
+    refuse_transforms("guide", guide, options.photometric_bandwidth, *spatial, options.patch_weights)
+    check_image(guide, "guide", empty=True)
+    options.check()
+    check_bandwidths(options.photometric_bandwidth, options.spatial_bandwidth, guide.shape[0])
+
+
+def _from_guide(guide: Tensor, options: OperatorOptions) -> NonlocalOperator:
+    """Build an operator from a checked guide and checked options."""
+    guide = reduce_channels(guide.to(working_dtype(guide)), options.guide_channels)
+    communicator = all_gather_shapes(guide, options.group)
     size = (guide.shape[2], guide.shape[3])  # of the rows of this rank
-    height, width = among.whole(size)
-    weights = unit_window(patch_size, among.copy_to_group(patch_weights)).to(guide)
-    guide, halo = among.with_halo(guide, max(weights.shape[0] // 2, 1))
-    if isinstance(photometric_bandwidth, str):
-        bandwidth: float | Tensor = bandwidth_of_rows(guide, halo, among)
+    window = unit_window(options.patch_size, communicator.copy_to_group(options.patch_weights)).to(guide)
+    guide, halo = communicator.with_halo(guide, max(window.shape[0] // 2, 1))
+    if isinstance(options.photometric_bandwidth, str):
+        bandwidth: float | Tensor = bandwidth_of_rows(guide, halo, communicator)
     else:
-        bandwidth = among.copy_to_group(photometric_bandwidth)
+        bandwidth = communicator.copy_to_group(options.photometric_bandwidth)
     largest = _largest(guide.detach())
     check_scale(bandwidth, "photometric_bandwidth", largest, "values of the guide")
-    if spatial_bandwidth is not None:
-        farthest = torch.full_like(largest, max(height, width))
-        for one in bandwidths_of(spatial_bandwidth):
-            check_scale(one, "spatial_bandwidth", farthest, "coordinates")
-        spatial_bandwidth = tuple(_copy(among.copy_to_group(one)) for one in bandwidths_of(spatial_bandwidth))
-    bandwidth = _copy(bandwidth)
-    recipe = GuideFeatures(weights, bandwidth, spatial_bandwidth, guide_channels)
-    features = recipe(guide, origin=(among.first_row - halo[0], 0), halo=halo)
-    return _assemble(features, size, method, recipe=recipe, among=among)
+    spatial = options.spatial_bandwidth
+    if spatial is not None:
+        farthest = torch.full_like(largest, max(communicator.whole(size)))
+        for axis_bandwidth in bandwidths_of(spatial):
+            check_scale(axis_bandwidth, "spatial_bandwidth", farthest, "coordinates")
+        spatial = tuple(_copy(communicator.copy_to_group(value)) for value in bandwidths_of(spatial))
+    recipe = GuideFeatures(window, _copy(bandwidth), spatial, options.guide_channels)
+    features = recipe(guide, origin=(communicator.first_row - halo[0], 0), halo=halo)
+    return _assemble(features, size, options, recipe=recipe, communicator=communicator)
 
 
 @uncompiled
@@ -152,12 +194,12 @@ def operator_from_features(
     *,
     size: tuple[int, ...],
     weights: Tensor | None = None,
-    num_landmarks: int = 100,
-    landmarks: Sampling = "kmeans",
-    completion: Completion = "diagonal",
-    tolerance: float | None = None,
-    generator: torch.Generator | None = None,
-    group: Any = None,
+    num_landmarks: int = Construction.num_landmarks,
+    landmarks: Sampling = Construction.landmarks,
+    completion: Completion = Construction.completion,
+    tolerance: float | None = Construction.tolerance,
+    generator: torch.Generator | None = Construction.generator,
+    group: Any = Construction.group,
 ) -> NonlocalOperator:
     """Build the filter of any points from their features: landmarks, Nystrom factor, completion and balancing.
 
@@ -192,13 +234,21 @@ def operator_from_features(
     """
     refuse_transforms("features", features)
     check_features(features, "features", empty=True)
-    method = Construction(num_landmarks, landmarks, completion, tolerance, generator)
+    method = Construction(
+        num_landmarks=num_landmarks,
+        landmarks=landmarks,
+        completion=completion,
+        tolerance=tolerance,
+        generator=generator,
+        group=group,
+    )
+    method.check()
     shape = check_size(size, features.shape[2])
     features = features.to(working_dtype(features))
     if weights is not None:
         weights = check_weights(weights, features)
-    among = all_gather_shapes(features.unflatten(2, shape), group)
-    return _assemble(features, shape, method, weights=weights, among=among)
+    communicator = all_gather_shapes(features.unflatten(2, shape), group)
+    return _assemble(features, shape, method, weights=weights, communicator=communicator)
 
 
 def _copy(value: float | Tensor) -> float | Tensor:
@@ -223,7 +273,8 @@ def sampled_operator(
     the error of sums over a sample. ``places`` (n,) are row-major indices of pixels that are spread evenly over the
     picture. The images of the operator have the size (1, n).
     """
-    method = Construction(num_landmarks, landmarks, "diagonal", None, generator)
+    method = Construction(num_landmarks=num_landmarks, landmarks=landmarks, generator=generator)
+    method.check()
     if isinstance(photometric_bandwidth, str):
         photometric_bandwidth = estimate_bandwidth(guide)
     window = unit_window(patch_size, None).to(guide)
@@ -242,14 +293,14 @@ def _assemble(
     *,
     recipe: GuideFeatures | None = None,
     weights: Tensor | None = None,
-    among: Communicator = ALONE,
+    communicator: Communicator = ALONE,
     chosen: Tensor | None = None,
 ) -> NonlocalOperator:
     """Build an operator from features (B, D, N), which ``recipe`` computed if they come from a guide.
 
     Landmarks (B, D, M) are chosen by the method unless they are already ``chosen``.
     """
-    whole = among.whole(size)
+    whole = communicator.whole(size)
     points, tolerance = whole[0] * whole[1], method.tolerance
     count = method.count(points)
     if features.shape[0] == 0:
@@ -259,39 +310,43 @@ def _assemble(
         chosen = (
             choose_in_graph(features, size, count, method.landmarks)
             if in_graph
-            else choose_landmarks(features, whole, count, method.landmarks, method.generator, among, weights)
+            else choose_landmarks(features, whole, count, method.landmarks, method.generator, communicator, weights)
         )
     kernel = Kernel(chosen, inverse_cholesky(chosen), method.completion, features=recipe)
     factor, diagonal = kernel.factor(features)
     completed, watched = method.completion == "diagonal", not is_hidden(factor)
     bound = is_bounded(method.landmarks, points, count)
 
-    def balanced(factor: Tensor, diagonal: Tensor) -> tuple[Balancing, float]:
-        found = balance(factor, diagonal, tolerance=tolerance, completed=completed, among=among, weights=weights)
-        return found, float(found.residual.max()) if watched else 0.0
-
+    balanced = partial(
+        _balanced,
+        tolerance=tolerance,
+        completed=completed,
+        communicator=communicator,
+        weights=weights,
+        watched=watched,
+    )
     if in_graph:
         worst, goal = 0.0, tolerance or TOLERANCE[factor.dtype]
-        factor, diagonal, balancing, before = balance_in_graph(factor, diagonal, goal, completed, bound)
+        factor, diagonal, balancing, before = sinkhorn_in_graph(factor, diagonal, goal, completed, bound)
     else:
-        rounds = balance_in_rounds(
-            factor, diagonal, balanced, completed=completed and watched, among=among, weights=weights
+        rounds = sinkhorn_in_rounds(
+            factor, diagonal, balanced, completed=completed and watched, communicator=communicator, weights=weights
         )
-        factor, diagonal, balancing = rounds.factor, rounds.diagonal, rounds.found
+        factor, diagonal, balancing = rounds.factor, rounds.diagonal, rounds.result
         worst, before = rounds.residual, rounds.before
     scaling, residual = balancing.scaling, balancing.residual
     remainder = scaling * (scaling * diagonal)  # in this order: without completion d^2 may overflow
-    gram = shifted_gram(factor, root_weighted(scaling, weights), remainder, among)
+    gram = shifted_gram(factor, root_weighted(scaling, weights), remainder, communicator)
     allowed = slack(factor.dtype, worst)
     if watched and bound and exceeds(gram, balancing.moment, allowed):
-        limit = limiter(gram, KernelMatrix(factor, diagonal, weights, among).moment(scaling), allowed)
+        limit = limiter(gram, KernelMatrix(factor, diagonal, weights, communicator).moment(scaling), allowed)
         factor, kernel = limit.to(factor) @ factor, replace(kernel, limiter=limit.to(factor))
         before = tuple(torch.linalg.solve(limit.detach(), total) for total in before)  # preserves u . total
-        limited = KernelMatrix(factor.detach(), diagonal.detach(), weights, among)
+        limited = KernelMatrix(factor.detach(), diagonal.detach(), weights, communicator)
         sums = limited.row_sums(scaling.detach(), limited.moment(scaling.detach()))
-        residual = among.max((sums - 1).abs().amax(1))
+        residual = communicator.max((sums - 1).abs().amax(1))
         warn_of_residual(residual, tolerance, factor.dtype, completed=completed)
-    least = None if weights is None else -among.max(-weights.amin(1, keepdim=True))
+    least = None if weights is None else -communicator.max(-weights.amin(1, keepdim=True))
     return NonlocalOperator(
         factor=factor,
         diagonal=diagonal,
@@ -303,23 +358,40 @@ def _assemble(
         residual=residual,
         balancing_steps=balancing.steps,
         weights=weights,
-        among=among,
+        communicator=communicator,
     )
+
+
+def _balanced(
+    factor: Tensor,
+    diagonal: Tensor,
+    *,
+    tolerance: float | None,
+    completed: bool,
+    communicator: Communicator,
+    weights: Tensor | None,
+    watched: bool,
+) -> tuple[Balancing, float]:
+    """Balance a kernel; also return its residual, 0 unless ``watched``."""
+    balancing = sinkhorn_balance(
+        factor, diagonal, tolerance=tolerance, completed=completed, communicator=communicator, weights=weights
+    )
+    return balancing, float(balancing.residual.max()) if watched else 0.0
 
 
 def _empty(
     features: Tensor, size: tuple[int, int], count: int, completion: Completion, recipe: GuideFeatures | None
 ) -> NonlocalOperator:
     """The operator of an empty batch of features (0, D, N)."""
-    each, total = features.new_empty(0, features.shape[2]), features.new_empty(0, count, 1, dtype=torch.float64)
+    per_pixel, total = features.new_empty(0, features.shape[2]), features.new_empty(0, count, 1, dtype=torch.float64)
     kernel = Kernel(features[:, :, :count], features.new_empty(0, count, count), completion, features=recipe)
     return NonlocalOperator(
         factor=features.new_empty(0, count, features.shape[2]),
-        diagonal=each,
-        scaling=each,
+        diagonal=per_pixel,
+        scaling=per_pixel,
         size=size,
         kernel=kernel,
-        remainder=each,
+        remainder=per_pixel,
         balancing=PixelScaling(total, completion == "diagonal"),
         residual=features.new_empty(0),
         balancing_steps=0,

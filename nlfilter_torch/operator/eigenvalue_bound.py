@@ -9,6 +9,7 @@ differs from W only in the directions whose eigenvalues of S exceed 1.
 """
 
 from collections.abc import Callable
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -35,14 +36,16 @@ def is_bounded(sampling: str, pixels: int, num_landmarks: int) -> bool:
     return sampling != "kmeans" or pixels * num_landmarks <= ALWAYS
 
 
-def shifted_gram(factor: Tensor, scaling: Tensor, remainder: Tensor, among: Communicator) -> ShiftedGram:
+def shifted_gram(factor: Tensor, scaling: Tensor, remainder: Tensor, communicator: Communicator) -> ShiftedGram:
     """Function that computes S for factor (B, M, N), d (B, N) and r (B, N) in memory; differentiable."""
+    return partial(_shifted_gram, factor, scaling, remainder, communicator)
 
-    def gram(at: Tensor, power: int) -> Tensor:
-        weights = shift(at, remainder).pow(-power / 2)
-        return among.sum(compute_grams(factor, (scaling * weights).to(factor), None, 1)[:, 0])
 
-    return gram
+def _shifted_gram(
+    factor: Tensor, scaling: Tensor, remainder: Tensor, communicator: Communicator, at: Tensor, power: int
+) -> Tensor:
+    weights = shift(at, remainder).pow(-power / 2)
+    return communicator.sum(compute_grams(factor, (scaling * weights).to(factor), None, 1)[:, 0])
 
 
 def shift(at: Tensor, remainder: Tensor) -> Tensor:

@@ -136,7 +136,7 @@ class GuideFeatures:
 
     def coordinates(self, places: Tensor) -> Tensor:
         """Features (1 or B, 2, N) of rows and columns (2, N) of pixels; there must be a spatial bandwidth."""
-        bandwidths = [per_image(one, places, 2) for one in bandwidths_of(self.spatial_bandwidth)]
+        bandwidths = [per_image(bandwidth, places, 2) for bandwidth in bandwidths_of(self.spatial_bandwidth)]
         return places / torch.stack(torch.broadcast_tensors(*bandwidths), dim=1)
 
 
@@ -239,16 +239,16 @@ def estimate_bandwidth(guide: Tensor, *, guide_channels: GuideChannels = "lumina
     check_choice(guide_channels, "guide_channels", ("luminance", "all"))
     with torch.no_grad():
         rows = reduce_channels(guide.to(working_dtype(guide)), guide_channels)
-        among = all_gather_shapes(rows, group)
-        return bandwidth_of_rows(*among.with_halo(rows, 1), among)
+        communicator = all_gather_shapes(rows, group)
+        return bandwidth_of_rows(*communicator.with_halo(rows, 1), communicator)
 
 
-def bandwidth_of_rows(guide: Tensor, halo: tuple[int, int], among: Communicator) -> Tensor:
+def bandwidth_of_rows(guide: Tensor, halo: tuple[int, int], communicator: Communicator) -> Tensor:
     """:func:`estimate_bandwidth` from part of the rows of an image, given with a halo of neighbouring rows."""
     with torch.no_grad():
         magnitude = gradients(guide, halo)
-        count = magnitude.shape[1] * among.pixels(magnitude.shape[2] * magnitude.shape[3])
-        mean = among.sum(magnitude.sum((1, 2, 3), dtype=torch.float64)) / count
+        count = magnitude.shape[1] * communicator.pixels(magnitude.shape[2] * magnitude.shape[3])
+        mean = communicator.sum(magnitude.sum((1, 2, 3), dtype=torch.float64)) / count
         return bandwidth_of_gradient(mean).clamp(max=torch.finfo(guide.dtype).max).to(guide)
 
 

@@ -39,7 +39,7 @@ def choose_landmarks(
     count: int,
     sampling: Sampling,
     generator: torch.Generator | None,
-    among: Communicator = ALONE,
+    communicator: Communicator = ALONE,
     weights: Tensor | None = None,
 ) -> Tensor:
     """Choose or compute ``count`` landmarks.
@@ -51,8 +51,8 @@ def choose_landmarks(
         sampling: ``"kmeans"``: Lloyd centroids of a random subset; ``"uniform"``: the paper's spatial grid;
             ``"random"``: distinct random pixels.
         generator: source of randomness; None means a new one with seed 0, so that equal calls give equal landmarks.
-        among: ranks that the rows of the image are distributed over; N is then the number of pixels of this rank, and
-            all ranks use what the first one draws.
+        communicator: ranks that the rows of the image are distributed over; N is then the number of pixels of this
+            rank, and all ranks use what the first one draws.
         weights: (B, N), number of pixels that each point represents; k-means candidates are drawn in proportion to it.
 
     Returns:
@@ -60,15 +60,15 @@ def choose_landmarks(
         drawn for all images of a batch, so that a batch without weights gives the same results as single calls.
     """
     generator = torch.Generator().manual_seed(0) if generator is None else generator
-    if count == features.shape[-1] and among.size == 1:
+    if count == features.shape[-1] and communicator.size == 1:
         return features.clone()
     pixels = (
         _candidates_by_weight(weights.mean(0), count, generator)
         if weights is not None and sampling == "kmeans"
         else candidate_pixels(size, count, sampling, generator)
     )
-    pixels = among.broadcast(pixels.to(features.device))
-    return condense(among.columns(features, pixels), count, generator, among)
+    pixels = communicator.broadcast(pixels.to(features.device))
+    return condense(communicator.columns(features, pixels), count, generator, communicator)
 
 
 def candidate_pixels(size: tuple[int, int], count: int, sampling: Sampling, generator: torch.Generator) -> Tensor:
@@ -97,23 +97,25 @@ def _candidates_by_weight(weights: Tensor, count: int, generator: torch.Generato
     )
 
 
-def condense(subset: Tensor, count: int, generator: torch.Generator, among: Communicator = ALONE) -> Tensor:
+def condense(subset: Tensor, count: int, generator: torch.Generator, communicator: Communicator = ALONE) -> Tensor:
     """Compute landmarks (B, D, M) from features (B, D, S) of the candidates: centroids if S > M."""
     if subset.shape[2] == count:
         return subset
-    return means_of_clusters(subset, *clusters(subset.detach(), count, generator, among))
+    return means_of_clusters(subset, *clusters(subset.detach(), count, generator, communicator))
 
 
 def clusters(
-    points: Tensor, count: int, generator: torch.Generator, among: Communicator = ALONE
+    points: Tensor, count: int, generator: torch.Generator, communicator: Communicator = ALONE
 ) -> tuple[Tensor, Tensor]:
     """Cluster points (B, D, S) by k-means: indices (B, 1, M) of the initial centroids, and assignment (B, S)."""
     points = points - points.mean(dim=2, keepdim=True)  # small offsets keep ||x||^2 + ||z||^2 - 2xz accurate
     points = points.clamp(-LARGEST, LARGEST).float()  # float32 suffices here, and the kernels in C take nothing else
     few = draw_few(points.shape[2], count, generator).to(points.device)
     chosen = _pivots(pick(points, few.expand(len(points), 1, -1)), count, generator)
-    start = among.broadcast(few[chosen]).unsqueeze(1)  # (B, 1, M)
-    assignment = among.broadcast(lloyd(points, pick(points, start), ITERATIONS, TIE * torch.finfo(points.dtype).eps))
+    start = communicator.broadcast(few[chosen]).unsqueeze(1)  # (B, 1, M)
+    assignment = communicator.broadcast(
+        lloyd(points, pick(points, start), ITERATIONS, TIE * torch.finfo(points.dtype).eps)
+    )
     return start, assignment
 
 
@@ -176,9 +178,9 @@ def _pivots_by_blocks(points: Tensor, draws: Tensor, offsets: Tensor) -> Tensor:
     norms = points.square().sum(1, keepdim=True)  # (B, 1, S)
     residual = torch.ones_like(norms)
     columns = points.new_empty(batch, len(draws), size)
-    found: list[Tensor] = []
+    drawn: list[Tensor] = []
     for block, offset in zip(draws.split(BLOCK), offsets, strict=False):
-        first = sum(pivot.shape[2] for pivot in found)
+        first = sum(pivot.shape[2] for pivot in drawn)
         before = columns[:, :first]
         odds = chance(residual, CAPTURED)
         odds += odds.mean(2, keepdim=True)
@@ -190,13 +192,13 @@ def _pivots_by_blocks(points: Tensor, draws: Tensor, offsets: Tensor) -> Tensor:
         chosen, rows, scales = draw_pivots(
             partial(_row, shared), pick(residual, proposed), pick(odds, proposed), block, CAPTURED
         )
-        found.append(proposed.gather(2, chosen))  # (B, 1, n)
+        drawn.append(proposed.gather(2, chosen))  # (B, 1, n)
         few, lengths, known = (pick(planes, chosen) for planes in (few, lengths, known))
         rest = torch.baddbmm(affinities_between(points, norms, few, lengths), known.mT, before, alpha=-1)  # (B, n, S)
         lower = pick(rows, chosen).mT.tril(-1) + torch.diag_embed(scales)
         columns[:, first : first + len(block)] = torch.linalg.solve_triangular(lower, rest, upper=False)
         residual -= columns[:, first : first + len(block)].square().sum(1, keepdim=True)
-    return torch.cat(found, dim=2).squeeze(1)
+    return torch.cat(drawn, dim=2).squeeze(1)
 
 
 def _row(matrices: Tensor, pivot: Tensor) -> Tensor:

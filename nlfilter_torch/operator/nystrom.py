@@ -56,7 +56,7 @@ def _squared_distances(points: Tensor) -> Tensor:
     # Matrix products cancel where points are many bandwidths apart, and the affinity matrix may then have a negative
     # eigenvalue.
     if not is_hidden(points) and not float(norms.detach().max()) * torch.finfo(points.dtype).eps < CANCELLATION:
-        return torch.stack([(points - one.unsqueeze(2)).square().sum(1) for one in points.unbind(2)], dim=1)
+        return torch.stack([(points - landmark.unsqueeze(2)).square().sum(1) for landmark in points.unbind(2)], dim=1)
     return norms.unsqueeze(2) + norms.unsqueeze(1) - 2 * points.mT @ points
 
 

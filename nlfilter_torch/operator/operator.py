@@ -144,7 +144,8 @@ class NonlocalOperator:
         balancing: computes the scaling of other pixels.
         residual: largest deviation of a row sum of W from 1, (B,).
         balancing_steps: number of sweeps over the factor in balancing.
-        among: ranks that the rows of the image are distributed over; all attributes are then those of this rank's rows.
+        communicator: ranks that the rows of the image are distributed over; all attributes are then those of this
+            rank's rows.
     """
 
     factor: Tensor
@@ -157,7 +158,7 @@ class NonlocalOperator:
     residual: Tensor
     balancing_steps: int
     weights: Tensor | None = None
-    among: Communicator = ALONE
+    communicator: Communicator = ALONE
 
     def to(self, target: Target, dtype: torch.dtype | None = None) -> "NonlocalOperator":
         """Move the operator to another device, or convert it to another precision.
@@ -202,7 +203,7 @@ class NonlocalOperator:
         if not self.factor.requires_grad:
             return self.balancing
         scaling = weighted(self.scaling, self.weights).unsqueeze(1)
-        return replace(self.balancing, moment=self.among.sum(moment(self.factor, scaling)))
+        return replace(self.balancing, moment=self.communicator.sum(moment(self.factor, scaling)))
 
     def matmul(self, image: Tensor) -> Tensor:
         """Compute ``W y``, also written ``operator @ image``. Paper: eq. (2).
@@ -231,7 +232,7 @@ class NonlocalOperator:
         folded = fold_batch(image.to(self.factor), self.factor.shape[0])
         if folded.numel() == 0:  # an empty batch
             return image[:0].to(self.factor).unsqueeze(1).expand(-1, order, -1, -1, -1)
-        planes = apply_powers(self.factor, self.scaling, self.remainder, folded, order, self.among, self.weights)
+        planes = apply_powers(self.factor, self.scaling, self.remainder, folded, order, self.communicator, self.weights)
         return unfold_batch(planes, image.shape[0], self.size)
 
     @property
@@ -251,7 +252,7 @@ class NonlocalOperator:
         Raises:
             ValueError: if the image has more than 16384 pixels, or this rank holds only some of its rows.
         """
-        self.among.check_whole("to_dense")
+        self.communicator.check_whole("to_dense")
         pixels = self.factor.shape[2]
         if pixels > DENSE_LIMIT:
             raise ValueError(
@@ -276,7 +277,7 @@ class NonlocalOperator:
             check_count(rank, "rank")
         remainder = self.remainder if self.kernel.completion == "diagonal" else None
         return compute_spectrum(
-            self.factor, self.scaling, remainder, self.size, rank, self.residual, self.among, self.weights
+            self.factor, self.scaling, remainder, self.size, rank, self.residual, self.communicator, self.weights
         )
 
     @full_precision
@@ -298,13 +299,13 @@ class NonlocalOperator:
         x, y = images.expand(batch, -1, -1, -1).split(1, dim=1)
         products = torch.cat([x * (self @ y), y * (self @ x)], dim=1).double().flatten(2)
         products = weighted(products, self.weights).sum(2)
-        inner = self.among.sum(products)
-        lengths = self.among.sum(images.double().square().sum((0, 2, 3)))
-        highest, lowest = (self.among.max((sign * self.remainder).amax(1)) for sign in (1, -1))
-        gram = shifted_gram(self.factor, root_weighted(self.scaling, self.weights), self.remainder, self.among)
+        inner = self.communicator.sum(products)
+        lengths = self.communicator.sum(images.double().square().sum((0, 2, 3)))
+        highest, lowest = (self.communicator.max((sign * self.remainder).amax(1)) for sign in (1, -1))
+        gram = shifted_gram(self.factor, root_weighted(self.scaling, self.weights), self.remainder, self.communicator)
         return Certificate(
             symmetry=((inner[:, 0] - inner[:, 1]).abs() / lengths.prod().sqrt()).tolist(),
-            row_sums=self.among.max((self.row_sums() - 1).abs().amax((1, 2, 3))).tolist(),
+            row_sums=self.communicator.max((self.row_sums() - 1).abs().amax((1, 2, 3))).tolist(),
             smallest_eigenvalue=(-lowest).tolist(),
             largest_eigenvalue=largest_eigenvalue(gram, highest, self.factor.dtype).tolist(),
         )
@@ -320,11 +321,11 @@ class NonlocalOperator:
         for part, eigenvalues in zip(vectors.split(16, dim=1), spectrum.eigenvalues.split(16, dim=1), strict=True):
             error = (self.matmul(part) - eigenvalues[:, :, None, None] * part).square().flatten(2)
             errors.append(weighted(error, self.weights).sum(2))
-        residual = self.among.sum(torch.cat(errors, dim=1)).sqrt()
+        residual = self.communicator.sum(torch.cat(errors, dim=1)).sqrt()
         flat = vectors.flatten(2)
-        inner = self.among.sum(weighted(flat, self.weights) @ flat.mT)
+        inner = self.communicator.sum(weighted(flat, self.weights) @ flat.mT)
         occupied = torch.diag_embed(spectrum.support[:, :rank].to(flat))
-        matrix = KernelMatrix(self.factor, self.diagonal, self.weights, self.among)
+        matrix = KernelMatrix(self.factor, self.diagonal, self.weights, self.communicator)
         kernel_sums = matrix.affinities(matrix.moment(torch.ones_like(self.scaling))) + self.diagonal
         recipe = self.kernel.features
         pixels = torch.as_tensor(spectrum.pixels).to(self.factor)
@@ -336,11 +337,11 @@ class NonlocalOperator:
             photometric_bandwidth=bandwidth.expand(self.factor.shape[0]).tolist(),
             balancing_steps=self.balancing_steps,
             row_sum_residual=certificate.row_sums,
-            smallest_row_sum=(-self.among.max(-kernel_sums.amin(1))).tolist(),
+            smallest_row_sum=(-self.communicator.max(-kernel_sums.amin(1))).tolist(),
             largest_eigenvalue=certificate.largest_eigenvalue,
             eigenvector_residual=residual.amax(1).tolist(),
             orthogonality=(inner - occupied).abs().amax((1, 2)).tolist(),
-            diagonal_share=(self.among.sum(weighted(self.remainder, self.weights).sum(1)) / pixels).tolist(),
+            diagonal_share=(self.communicator.sum(weighted(self.remainder, self.weights).sum(1)) / pixels).tolist(),
         )
 
 

@@ -1,6 +1,7 @@
-"""Checked options for building an operator, from a guide, from features or from the rows of a picture."""
+"""Options for building an operator, from a guide, from features or from the rows of a picture: defaults and checks."""
 
 from dataclasses import dataclass
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -14,22 +15,28 @@ from nlfilter_torch.core.checks import (
     described,
     warn,
 )
-from nlfilter_torch.operator.features import SpatialBandwidth, bandwidths_of
+from nlfilter_torch.operator.features import GuideChannels, SpatialBandwidth, bandwidths_of
 from nlfilter_torch.operator.landmarks import Sampling
 from nlfilter_torch.operator.nystrom import Completion
 
+AUTO: Literal["auto"] = "auto"  # photometric bandwidth: estimate it from the guide
 
-@dataclass(frozen=True)
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Construction:
-    """Checked options for building an operator from features; see :func:`nonlocal_operator`."""
+    """How an operator is built from features; see :func:`operator_from_features` for the meaning of the options.
 
-    num_landmarks: int
-    landmarks: Sampling
-    completion: Completion
-    tolerance: float | None
-    generator: torch.Generator | None
+    The only declaration of their defaults.
+    """
 
-    def __post_init__(self) -> None:
+    num_landmarks: int = 100
+    landmarks: Sampling = "kmeans"
+    completion: Completion = "diagonal"
+    tolerance: float | None = None
+    generator: torch.Generator | None = None
+    group: Any = None
+
+    def check(self) -> None:
         """Raise an error for an invalid option."""
         remedy = "choose one of these, and pass the number of landmarks as num_landmarks"
         check_choice(self.landmarks, "landmarks", ("kmeans", "uniform", "random"), remedy)
@@ -49,6 +56,25 @@ class Construction:
         return min(self.num_landmarks, points)
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class OperatorOptions(Construction):
+    """How an operator is built from a guide; see :func:`nonlocal_operator` for the meaning of the options.
+
+    The only declaration of their defaults.
+    """
+
+    patch_size: int = 5
+    photometric_bandwidth: float | Tensor | Literal["auto"] = AUTO
+    spatial_bandwidth: SpatialBandwidth | None = None
+    guide_channels: GuideChannels = "luminance"
+    patch_weights: Tensor | None = None
+
+    def check(self) -> None:
+        """Raise an error for an invalid option, except for bandwidths, whose shape depends on the guide."""
+        check_choice(self.guide_channels, "guide_channels", ("luminance", "all"))
+        super().check()
+
+
 def check_bandwidths(
     photometric: float | Tensor | str, spatial: SpatialBandwidth | None, batch: int | None = None
 ) -> None:
@@ -63,5 +89,5 @@ def check_bandwidths(
             f"{len(spatial)} in a {type(spatial).__name__}; pass two numbers"
         )
     if spatial is not None:
-        for one in bandwidths_of(spatial):
-            check_positive(one, "spatial_bandwidth", batch)
+        for bandwidth in bandwidths_of(spatial):
+            check_positive(bandwidth, "spatial_bandwidth", batch)

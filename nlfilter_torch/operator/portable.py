@@ -17,7 +17,6 @@ from torch.utils._python_dispatch import _disable_current_modes
 
 from nlfilter_torch.core.kernels.clusters import chance, pick
 from nlfilter_torch.core.kernels.columns import PLAIN_EXPONENT, SMALLEST_EXPONENT
-from nlfilter_torch.operator.balancing import LARGEST_SCALING, SMALLEST_SUM, TRUSTED, Rounds, chebyshev_weights
 from nlfilter_torch.operator.landmarks import (
     CAPTURED,
     DRAWN_SINGLY,
@@ -29,6 +28,7 @@ from nlfilter_torch.operator.landmarks import (
     draw_few,
 )
 from nlfilter_torch.operator.nystrom import JITTER
+from nlfilter_torch.operator.sinkhorn import LARGEST_SCALING, SMALLEST_SUM, TRUSTED, Rounds, chebyshev_weights
 
 SWEEPS = 16
 CONVERGED = 1e-12  # distance from 1, the limit of all eigenvalues of the Newton-Schulz iteration
@@ -72,19 +72,19 @@ def _pivots(points: Tensor, draws: list[float]) -> Tensor:
     size, last = points.shape[1], points.shape[2] - 1
     norms = points.square().sum(1, keepdim=True)
     rows, residual = points[:, :0], torch.ones_like(norms)
-    found: list[Tensor] = []
+    chosen: list[Tensor] = []
     for draw in draws:
         summed = chance(residual, CAPTURED).double().cumsum(2)
         pivot = (summed < draw * summed[:, :, -1:]).sum(2, keepdim=True).clamp(max=last)
         known = torch.cat([points, norms, rows], dim=1)
-        point, norm, before = pick(known, pivot).split([size, 1, len(found)], dim=1)
+        point, norm, before = pick(known, pivot).split([size, 1, len(chosen)], dim=1)
         affinities = (2 * torch.bmm(point.mT, points) - norms - norm).clamp(PLAIN_EXPONENT, 0.0).exp()
-        row = affinities - torch.bmm(before.mT, rows) if found else affinities
+        row = affinities - torch.bmm(before.mT, rows) if chosen else affinities
         row = row / row.gather(2, pivot).clamp(min=CAPTURED).sqrt()
         residual = residual - row.square()
         rows = torch.cat([rows, row], dim=1)
-        found.append(pivot)
-    return torch.cat(found, dim=2).squeeze(1)
+        chosen.append(pivot)
+    return torch.cat(chosen, dim=2).squeeze(1)
 
 
 def _lloyd(points: Tensor, start: Tensor) -> Tensor:
@@ -139,23 +139,23 @@ def inverse_root(affinity: Tensor) -> Tensor:
     return inverse / most.sqrt()
 
 
-def settle(
+def _row_sums(factor: Tensor, diagonal: Tensor, scaling: Tensor) -> tuple[Tensor, Tensor]:
+    """Row sums (B, N, 1) of W for a scaling (B, N, 1), and the moment (B, M, 1)."""
+    total = torch.bmm(factor, scaling)
+    return scaling * (torch.bmm(factor.mT, total) + diagonal * scaling), total
+
+
+def sinkhorn(
     factor: Tensor, diagonal: Tensor, tolerance: float, completed: bool, bound: bool
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """As :func:`nlfilter_torch.operator.balancing.settle`, by Chebyshev semi-iteration alone."""
+    """As :func:`nlfilter_torch.operator.sinkhorn.sinkhorn`, by Chebyshev semi-iteration alone."""
     diagonal = diagonal.unsqueeze(2)
-    rows = factor.mT
-
-    def row_sums(scaling: Tensor) -> tuple[Tensor, Tensor]:
-        total = torch.bmm(factor, scaling)
-        return scaling * (torch.bmm(rows, total) + diagonal * scaling), total
-
-    scaling = row_sums(torch.ones_like(diagonal))[0].clamp(min=SMALLEST_SUM).rsqrt()
+    scaling = _row_sums(factor, diagonal, torch.ones_like(diagonal))[0].clamp(min=SMALLEST_SUM).rsqrt()
     move = torch.zeros_like(scaling)
     for momentum, gain in islice(chebyshev_weights(1.0, 2.0), SWEEPS):
-        move = momentum * move - gain * row_sums(scaling)[0].clamp(*TRUSTED).log()
+        move = momentum * move - gain * _row_sums(factor, diagonal, scaling)[0].clamp(*TRUSTED).log()
         scaling = (scaling * move.exp()).clamp(max=LARGEST_SCALING)
-    sums, total = row_sums(scaling)
+    sums, total = _row_sums(factor, diagonal, scaling)
     identity = torch.eye(factor.shape[1], dtype=torch.float64, device=factor.device).expand(len(factor), -1, -1)
     moments = total.double().unsqueeze(0).expand(Rounds.MOST + 1, -1, -1, -1)
     residual, removed = (sums - 1).abs().amax((1, 2)), torch.zeros_like(scaling, dtype=torch.bool)
@@ -173,7 +173,7 @@ def moment(factor: Tensor, images: Tensor) -> Tensor:
 
 
 def without(factor: Tensor, removed: Tensor) -> Tensor:
-    """As :func:`nlfilter_torch.operator.balancing.without`, for no removed pixel."""
+    """As :func:`nlfilter_torch.operator.sinkhorn.without`, for no removed pixel."""
     return factor
 
 
@@ -188,7 +188,7 @@ FORMS: dict[Callable[..., Any], Callable[..., Any]] = {
     torch.ops.nlfilter.columns.default: columns,
     torch.ops.nlfilter.invert.default: inverse_root,
     torch.ops.nlfilter.moment.default: moment,
-    torch.ops.nlfilter.settle.default: settle,
+    torch.ops.nlfilter.sinkhorn.default: sinkhorn,
     torch.ops.nlfilter.spread.default: spread,
     torch.ops.nlfilter.without.default: without,
 }

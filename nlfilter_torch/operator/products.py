@@ -33,7 +33,7 @@ def apply_powers(
     remainder: Tensor,
     image: Tensor,
     order: int,
-    among: Communicator = ALONE,
+    communicator: Communicator = ALONE,
     weights: Tensor | None = None,
 ) -> Tensor:
     """Compute ``W y, W^2 y, ..., W^k y``, (B, k, C, N), for y (B, C, N), factor (B, M, N), d, r and weights (B, N).
@@ -42,9 +42,9 @@ def apply_powers(
     image, also in forward mode.
     """
     if torch.is_grad_enabled() and (factor.requires_grad or scaling.requires_grad or remainder.requires_grad):
-        result: Tensor = _Powers.apply(factor, scaling, remainder, image, order, among, weights)  # type: ignore[no-untyped-call]
+        result: Tensor = _Powers.apply(factor, scaling, remainder, image, order, communicator, weights)  # type: ignore[no-untyped-call]
         return result
-    images, _ = _powers(factor, scaling, remainder, image, order, among, weights)
+    images, _ = _powers(factor, scaling, remainder, image, order, communicator, weights)
     return torch.stack(images[1:], dim=1)
 
 
@@ -54,14 +54,14 @@ def _powers(
     remainder: Tensor,
     image: Tensor,
     order: int,
-    among: Communicator,
+    communicator: Communicator,
     weights: Tensor | None,
 ) -> tuple[list[Tensor], list[Tensor]]:
     """Compute the k + 1 images y, ..., W^k y, and the k moments (B, M, C) of the images y, ..., W^(k-1) y."""
     images, moments = [image], []
-    each = weighted(scaling.unsqueeze(1), weights)
+    mass = weighted(scaling.unsqueeze(1), weights)
     for _ in range(order):
-        moments.append(among.sum(moment(factor, each * images[-1])).to(factor))
+        moments.append(communicator.sum(moment(factor, mass * images[-1])).to(factor))
         smooth = spread(moments[-1].mT, factor, scaling)
         images.append(torch.addcmul(smooth, remainder.unsqueeze(1), images[-1]))
     return images, moments
@@ -77,7 +77,7 @@ class _Powers(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, *arguments: Any) -> Tensor:
         images, moments = _powers(*arguments)
-        factor, scaling, remainder, _, _, ctx.among, weights = arguments
+        factor, scaling, remainder, _, _, ctx.communicator, weights = arguments
         ctx.save_for_backward(factor, scaling, remainder, weights, *images, *moments)
         return torch.stack(images[1:], dim=1)
 
@@ -94,7 +94,7 @@ class _Powers(torch.autograd.Function):
         for i in range(order, 0, -1):
             adjoint = adjoint + grad[:, i - 1]
             before = images[i - 1]
-            total = ctx.among.sum(moment(factor, d * adjoint)).to(factor)
+            total = ctx.communicator.sum(moment(factor, d * adjoint)).to(factor)
             affinity = spread(total.mT, factor)  # the image of the adjoint, before scaling
             summed = weighted(before, weights)
             # The scaling multiplies the factor on both sides; each side contributes a product with the other.

@@ -93,23 +93,23 @@ class KernelMatrix:
     factor: Tensor
     diagonal: Tensor
     weights: Tensor | None = None
-    among: Communicator = ALONE
+    communicator: Communicator = ALONE
 
     def moment(self, values: Tensor) -> Tensor:
         """``U (weights * values)`` for values (B, N), summed over the ranks: (B, M, 1) in float64."""
-        return self.among.sum(moment(self.factor, weighted(values, self.weights).unsqueeze(1)))
+        return self.communicator.sum(moment(self.factor, weighted(values, self.weights).unsqueeze(1)))
 
     def affinities(self, total: Tensor) -> Tensor:
         """``U^T total``, (B, N), for a vector of length M, (B, M, 1)."""
         return spread(total.to(self.factor).mT, self.factor).squeeze(1)
 
-    def row_sums(self, scaling: Tensor, found: Tensor) -> Tensor:
-        """Row sums (B, N) of W for a scaling d with the moment ``found``."""
-        return scaling * (self.affinities(found) + self.diagonal * scaling)
+    def row_sums(self, scaling: Tensor, actual: Tensor) -> Tensor:
+        """Row sums (B, N) of W for a scaling d with the moment ``actual``."""
+        return scaling * (self.affinities(actual) + self.diagonal * scaling)
 
     def largest(self, values: Tensor) -> Tensor:
         """Largest magnitude of the values (B, N) of each image, (B,); infinite if one of the values is NaN."""
-        return self.among.max(values.abs().amax(1).nan_to_num(nan=torch.inf))
+        return self.communicator.max(values.abs().amax(1).nan_to_num(nan=torch.inf))
 
 
 def isolated(scaling: Tensor, diagonal: Tensor, residual: float, weights: Tensor | None = None) -> Tensor:
@@ -167,27 +167,27 @@ class JacobianSample(KernelMatrix):
 
     def moment(self, values: Tensor) -> Tensor:
         """Estimate of ``factor @ values``, (B, M, 1), summed in the precision of the factor."""
-        return self.among.sum(gather(weighted(values, self.weights).unsqueeze(1), self.factor).mT.double())
+        return self.communicator.sum(gather(weighted(values, self.weights).unsqueeze(1), self.factor).mT.double())
 
     def jacobian(self, scaling: Tensor) -> Tensor:
         """J, (B, M, M) in float64."""
         slope = scaling.square()
         slope = weighted(slope, self.weights) / (1 + self.diagonal * slope)
-        total = self.among.sum(gram(self.factor, slope))
+        total = self.communicator.sum(gram(self.factor, slope))
         return total.double() + torch.eye(total.shape[1], dtype=torch.float64, device=total.device)
 
-    def residual(self, total: Tensor, found: Tensor) -> Tensor:
-        """Largest deviation of a row sum of the sample from 1, (B,), if d(total) has the moment ``found``."""
+    def residual(self, total: Tensor, actual: Tensor) -> Tensor:
+        """Largest deviation of a row sum of the sample from 1, (B,), if d(total) has the moment ``actual``."""
         # As d is the root for the given total, row sums are 1 - d u . (total - found).
-        lacking = spread((total - found).to(self.factor).mT, self.factor, self.scaling(total))
-        return self.among.max(lacking.abs().amax((1, 2)))
+        deficit = spread((total - actual).to(self.factor).mT, self.factor, self.scaling(total))
+        return self.communicator.max(deficit.abs().amax((1, 2)))
 
 
 def _draw(matrix: KernelMatrix, scaling: Tensor, count: int) -> tuple[JacobianSample, Tensor]:
     """Draw a systematic sample in proportion to leverage scores; also return its part of ``scaling``, (B, n)."""
-    factor, diagonal, weights, among = matrix.factor, matrix.diagonal, matrix.weights, matrix.among
+    factor, diagonal, weights, communicator = matrix.factor, matrix.diagonal, matrix.weights, matrix.communicator
     if 2 * count >= factor.shape[2]:
-        return JacobianSample(factor, diagonal, weights, among), scaling
+        return JacobianSample(factor, diagonal, weights, communicator), scaling
     slope = scaling.square()
     leverage = weighted(slope * (1 - diagonal) / (1 + slope * diagonal), weights)  # |u|^2 is 1 - c
     leverage = leverage + leverage.mean(1, keepdim=True) * UNIFORM + torch.finfo(leverage.dtype).tiny
@@ -197,22 +197,22 @@ def _draw(matrix: KernelMatrix, scaling: Tensor, count: int) -> tuple[JacobianSa
     weight = (summed[:, -1:] / count).to(factor) / leverage.gather(1, chosen)
     weight = weight if weights is None else weight * weights.gather(1, chosen)
     columns = factor.gather(2, chosen.unsqueeze(1).expand(-1, factor.shape[1], -1))
-    return JacobianSample(columns, diagonal.gather(1, chosen), weight, among), scaling.gather(1, chosen)
+    return JacobianSample(columns, diagonal.gather(1, chosen), weight, communicator), scaling.gather(1, chosen)
 
 
 def _guess(matrix: KernelMatrix) -> Tensor:
     """Initial guess of t (B, M, 1), from a few thousand pixels distributed evenly over the image."""
     factor, diagonal = matrix.factor, matrix.diagonal
-    sample = JacobianSample(factor, diagonal, matrix.weights, matrix.among)
+    sample = JacobianSample(factor, diagonal, matrix.weights, matrix.communicator)
     pixels = factor.shape[2]
     count = min(max(pixels // SHARE, 16 * factor.shape[1]), EXPLORED)
     if 2 * count < pixels:
         # One random pixel from each interval: a fixed stride could coincide with the period of a texture.
         chosen = stratified(pixels, count, torch.Generator().manual_seed(0)).to(factor.device)
-        each = weighted(torch.ones_like(diagonal), matrix.weights)
-        each = each[:, chosen] * (each.sum(1, keepdim=True) / each[:, chosen].sum(1, keepdim=True))
+        counts = weighted(torch.ones_like(diagonal), matrix.weights)
+        counts = counts[:, chosen] * (counts.sum(1, keepdim=True) / counts[:, chosen].sum(1, keepdim=True))
         few = factor.gather(2, chosen.expand(*factor.shape[:2], -1))
-        sample = JacobianSample(few, diagonal[:, chosen], each, matrix.among)
+        sample = JacobianSample(few, diagonal[:, chosen], counts, matrix.communicator)
     sums = sample.affinities(sample.moment(torch.ones_like(sample.diagonal))) + sample.diagonal
     total = sample.moment(sums.clamp_(min=1.0).rsqrt_())  # no row of K sums to less than its unit diagonal
     for _ in range(GUESSES):
@@ -223,8 +223,8 @@ def _guess(matrix: KernelMatrix) -> Tensor:
 def _sweep(matrix: KernelMatrix, total: Tensor) -> tuple[Tensor, Tensor]:
     """Compute d(t) for all points, (B, N), and its moment (B, M, 1), in one read of the factor."""
     half = (total / 2).squeeze(2).to(matrix.factor)
-    scaling, found = sweep(matrix.factor, matrix.diagonal, half, LARGEST, matrix.weights)
-    return scaling, matrix.among.sum(found.unsqueeze(2))
+    scaling, actual = sweep(matrix.factor, matrix.diagonal, half, LARGEST, matrix.weights)
+    return scaling, matrix.communicator.sum(actual.unsqueeze(2))
 
 
 def newton(matrix: KernelMatrix, tolerance: float) -> Solution:
@@ -238,22 +238,22 @@ def newton(matrix: KernelMatrix, tolerance: float) -> Solution:
 
 def _quasi_newton(matrix: KernelMatrix, tolerance: float) -> Solution:
     """Newton's method with the Jacobian of a sample, corrected by BFGS updates from the sweeps over all pixels."""
-    watched, ranks = not is_hidden(matrix.factor), matrix.among.size
+    watched, ranks = not is_hidden(matrix.factor), matrix.communicator.size
     landmarks, pixels = matrix.factor.shape[1:]
     least, usual, most = (bound * landmarks // ranks for bound in PER_LANDMARK)
     count = max(min(pixels // SHARE, max(most, pixels // LARGE)), min(usual, EXPLORED // ranks), least)
     total = _guess(matrix)
-    scaling, found = _sweep(matrix, total)
+    scaling, actual = _sweep(matrix, total)
     worst, slow, gain, inverse = 1.0, 0, 1.0, total.new_zeros(len(total), landmarks, landmarks)
     for sweeps in range(1, (MAX_SWEEPS if watched else ACCELERATOR_SWEEPS) + 1):
-        before, error = total, total - found
+        before, error = total, total - actual
         resampled = gain > RESAMPLED if watched else sweeps < 3
         if resampled:
             sample, part = _draw(matrix, scaling, count)
             # The sample predicts how the moment changes with t. Its error at the current t, where the true moment is
             # known, is subtracted.
-            bias = found - sample.moment(part)
-            total = found
+            bias = actual - sample.moment(part)
+            total = actual
             for _ in range(REFINEMENTS):
                 part = sample.scaling(total)
                 # J is positive definite. Cholesky is safe with several threads; batched LU of MKL is not.
@@ -262,45 +262,45 @@ def _quasi_newton(matrix: KernelMatrix, tolerance: float) -> Solution:
             inverse = torch.cholesky_inverse(lower)
         else:
             total = total - inverse @ error
-        scaling, found = _sweep(matrix, total)
+        scaling, actual = _sweep(matrix, total)
         if not resampled:  # steps with a new sample are so long that the Jacobian changes along them
-            inverse = _updated(inverse, total - before, total - found - error)
+            inverse = _updated(inverse, total - before, total - actual - error)
         if not watched:
             continue
-        previous, worst = worst, sample.residual(total, found).max().item()
+        previous, worst = worst, sample.residual(total, actual).max().item()
         gain = worst / previous
         slow = slow + 1 if not gain <= 0.5 else 0
         if worst <= tolerance or slow > 1:
-            measured = _measure(matrix, scaling, total, found)
+            measured = _measure(matrix, scaling, total, actual)
             if slow > 1 or bool((measured[1] <= tolerance).all()):
                 break
     else:
-        measured = _measure(matrix, scaling, total, found)
-    return Solution(scaling, found, measured[0], sweeps, inverse)
+        measured = _measure(matrix, scaling, total, actual)
+    return Solution(scaling, actual, measured[0], sweeps, inverse)
 
 
 def _refined(matrix: KernelMatrix, tolerance: float) -> Solution:
     """Find a float64 solution by steps that are computed from a float32 copy of the factor, by the kernels in C."""
-    each = None if matrix.weights is None else matrix.weights.float()
-    single = KernelMatrix(matrix.factor.float(), matrix.diagonal.float(), each, matrix.among)
+    weights = None if matrix.weights is None else matrix.weights.float()
+    single = KernelMatrix(matrix.factor.float(), matrix.diagonal.float(), weights, matrix.communicator)
     rough = _quasi_newton(single, max(tolerance, FIRST_TOLERANCE))
     total, sweeps = rough.moment, rough.steps
     for _ in range(MAX_SWEEPS):
-        scaling, found = _sweep(matrix, total)
+        scaling, actual = _sweep(matrix, total)
         sweeps += 1
-        error, d = total - found, scaling.float()
-        lacking = spread(error.to(single.factor).mT, single.factor, d).squeeze(1)
-        if bool((single.largest(lacking) <= tolerance / 2).all()):
+        error, d = total - actual, scaling.float()
+        deficit = spread(error.to(single.factor).mT, single.factor, d).squeeze(1)
+        if bool((single.largest(deficit) <= tolerance / 2).all()):
             break
-        weight = weighted(d.square() / (1 + d.square() * single.diagonal), each)
-        total = total - conjugate_gradients(single.factor, weight, error, rough.inverse, matrix.among)
-    residual = matrix.largest(matrix.row_sums(scaling, found) - 1)
-    return Solution(scaling, found, residual, sweeps, rough.inverse)
+        weight = weighted(d.square() / (1 + d.square() * single.diagonal), weights)
+        total = total - conjugate_gradients(single.factor, weight, error, rough.inverse, matrix.communicator)
+    residual = matrix.largest(matrix.row_sums(scaling, actual) - 1)
+    return Solution(scaling, actual, residual, sweeps, rough.inverse)
 
 
-def _measure(matrix: KernelMatrix, scaling: Tensor, total: Tensor, found: Tensor) -> tuple[Tensor, Tensor]:
+def _measure(matrix: KernelMatrix, scaling: Tensor, total: Tensor, actual: Tensor) -> tuple[Tensor, Tensor]:
     """Largest deviation of a row sum from 1, (B,): including rounding errors of d = d(total), and excluding them."""
-    both = torch.cat([found, total - found], dim=2).to(matrix.factor)
+    both = torch.cat([actual, total - actual], dim=2).to(matrix.factor)
     rows = spread(both.mT, matrix.factor)  # (B, 2, N): one read of the factor
     sums = scaling * (rows[:, 0] + matrix.diagonal * scaling)
     return matrix.largest(sums - 1), matrix.largest(scaling * rows[:, 1])
@@ -324,42 +324,44 @@ def damped(matrix: KernelMatrix, start: Solution, goal: float) -> Solution:
     ``(I + W) x = 1 - W 1``, which reduces to M equations with the Jacobian J of all pixels. Along x the function is a
     quadratic plus a sum of logarithms, whose minimum is found without reading the factor again.
     """
-    factor, weights, among = matrix.factor, matrix.weights, matrix.among
+    factor, weights, communicator = matrix.factor, matrix.weights, matrix.communicator
     tiny = torch.finfo(factor.dtype).tiny
     usable = start.scaling.isfinite() & (start.scaling > 0)
     scaling = torch.where(usable, start.scaling, torch.ones_like(start.scaling))
     best, slow = start, 0
     for steps in range(1, MAX_STEPS + 1):
         total = matrix.moment(scaling)
-        lacking = 1 - matrix.row_sums(scaling, total)
+        deficit = 1 - matrix.row_sums(scaling, total)
         share = 1 / (1 + scaling * (scaling * matrix.diagonal))  # 1 / (1 + r)
-        sums = among.sum(sum_grams(factor, scaling * weighted(share, weights).sqrt(), None, 1)[:, 0])
+        sums = communicator.sum(sum_grams(factor, scaling * weighted(share, weights).sqrt(), None, 1)[:, 0])
         lower = torch.linalg.cholesky_ex(sums + torch.eye(sums.shape[1], dtype=sums.dtype, device=sums.device)).L
-        residual = matrix.largest(lacking)
-        found = Solution(scaling, total, residual, start.steps + 3 * steps, torch.cholesky_inverse(lower))
+        residual = matrix.largest(deficit)
+        candidate = Solution(scaling, total, residual, start.steps + 3 * steps, torch.cholesky_inverse(lower))
         slow = 0 if bool((residual.max() < 0.5 * best.residual.max()).all()) else slow + 1
         if bool(residual.max() <= best.residual.max()):
-            best = found
-        right = matrix.moment(scaling * (share * lacking))
+            best = candidate
+        right = matrix.moment(scaling * (share * deficit))
         affinity = spread(torch.cholesky_solve(right, lower).to(factor).mT, factor, scaling).squeeze(1)
-        step = share * (lacking - affinity)
+        step = share * (deficit - affinity)
         small = bool(matrix.largest(step).max() < SMALL_STEP)
         if bool((residual <= goal).all()) or (small and slow > 2) or not bool(torch.isfinite(step).all()):
             break
-        length = 1.0 if small else _line_search(step.double(), lacking.double(), among, weights)
+        length = 1.0 if small else _line_search(step.double(), deficit.double(), communicator, weights)
         scaling = (scaling * (1 + length * step)).clamp(min=tiny).to(factor)
     return best
 
 
-def _line_search(step: Tensor, lacking: Tensor, among: Communicator, weights: Tensor | None) -> Tensor:
+def _line_search(step: Tensor, deficit: Tensor, communicator: Communicator, weights: Tensor | None) -> Tensor:
     """Find s (B, 1) that minimises ``(1 + s x)^T W (1 + s x) / 2 - sum log(1 + s x)``, given x and 1 - W 1 (B, N)."""
     # W 1 = 1 - lacking and W x = lacking - x determine the quadratic.
 
     def total(values: Tensor) -> Tensor:
-        return among.sum(weighted(values, weights).sum(1, keepdim=True))
+        return communicator.sum(weighted(values, weights).sum(1, keepdim=True))
 
-    linear, square = total(step * (1 - lacking)), total(step * (lacking - step))
-    longest = among.max((-step).amax(1, keepdim=True)).clamp(min=1e-12).reciprocal()  # here the first d reaches zero
+    linear, square = total(step * (1 - deficit)), total(step * (deficit - step))
+    longest = (
+        communicator.max((-step).amax(1, keepdim=True)).clamp(min=1e-12).reciprocal()
+    )  # here the first d reaches zero
     low, high = torch.zeros_like(longest), 0.999 * longest
     length = torch.minimum(torch.ones_like(high), 0.5 * high)
     for _ in range(40):
@@ -373,12 +375,14 @@ def _line_search(step: Tensor, lacking: Tensor, among: Communicator, weights: Te
     return length
 
 
-def weighted_moment(factor: Tensor, weight: Tensor, among: Communicator, total: Tensor) -> Tensor:
+def weighted_moment(factor: Tensor, weight: Tensor, communicator: Communicator, total: Tensor) -> Tensor:
     """``factor @ (weight * (factor^T total))``, (B, M, 1) in float64."""
-    return among.sum(weigh(factor, weight, total.to(factor).squeeze(2)).unsqueeze(2))
+    return communicator.sum(weigh(factor, weight, total.to(factor).squeeze(2)).unsqueeze(2))
 
 
-def conjugate_gradients(factor: Tensor, weight: Tensor, right: Tensor, inverse: Tensor, among: Communicator) -> Tensor:
+def conjugate_gradients(
+    factor: Tensor, weight: Tensor, right: Tensor, inverse: Tensor, communicator: Communicator
+) -> Tensor:
     """Solve ``(I + factor diag(weight) factor^T) s = right`` for s, (B, M, 1) in float64."""
     tiny = torch.finfo(torch.float64).tiny  # avoids 0 / 0: if the right side is zero, so is the solution
     solution, residual = torch.zeros_like(right), right
@@ -386,7 +390,7 @@ def conjugate_gradients(factor: Tensor, weight: Tensor, right: Tensor, inverse: 
     direction, size = preconditioned, (residual * preconditioned).sum(1, keepdim=True)
     goal = SOLVED[factor.dtype] ** 2 * size
     for _ in range(STEPS[factor.dtype]):
-        image = direction + weighted_moment(factor, weight, among, direction)
+        image = direction + weighted_moment(factor, weight, communicator, direction)
         step = size / (direction * image).sum(1, keepdim=True).clamp(min=tiny)
         solution, residual = solution + step * direction, residual - step * image
         preconditioned = inverse @ residual

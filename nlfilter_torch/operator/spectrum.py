@@ -111,7 +111,7 @@ class Spectrum(RitzPairs):
     largest: Tensor
     residual: Tensor
     weights: Tensor | None = None
-    among: Communicator = ALONE
+    communicator: Communicator = ALONE
 
     def to(self, target: Target, dtype: torch.dtype | None = None) -> "Spectrum":
         """Move the spectrum to another device or precision, as :meth:`NonlocalOperator.to`."""
@@ -121,8 +121,8 @@ class Spectrum(RitzPairs):
     def pixels(self) -> float | Tensor:
         """Number of pixels N of the whole image; for weighted points the sums of the weights, (B,)."""
         if self.weights is not None:
-            return self.among.sum(self.weights.sum(1))
-        return self.among.pixels(self.scaling.shape[1])
+            return self.communicator.sum(self.weights.sum(1))
+        return self.communicator.pixels(self.scaling.shape[1])
 
     @property
     def mass(self) -> Tensor:
@@ -179,7 +179,7 @@ class Spectrum(RitzPairs):
         check_image(image, "image")
         check_same_size(image, self.size, "image", "spectrum", self.factor)
         planes = fold_batch(image.to(self.factor), self.factor.shape[0])
-        total = self.among.sum(moment(self.factor, self.mass.unsqueeze(1) * planes))  # (B, M, C)
+        total = self.communicator.sum(moment(self.factor, self.mass.unsqueeze(1) * planes))  # (B, M, C)
         return unfold_batch(total.mT.unsqueeze(1), image.shape[0], (total.shape[1], 1))[:, 0, :, :, 0]
 
     @full_precision
@@ -195,7 +195,7 @@ class Spectrum(RitzPairs):
     def _constant_first(self, vectors: Tensor) -> Tensor:
         """Reflect the eigenvectors (B, M, R) of the eigenvalue 1 so that the first of them is the constant image."""
         with torch.no_grad():
-            ones = self.among.sum(moment(self.factor, self.mass.unsqueeze(1)))  # F 1, (B, M, 1)
+            ones = self.communicator.sum(moment(self.factor, self.mass.unsqueeze(1)))  # F 1, (B, M, 1)
             # The residual is larger if the operator was balanced in float32 and converted to float64.
             distance = (10 * self.residual).clamp(CLUSTER[self.factor.dtype], CLUSTER[torch.float32])
             cluster = self.eigenvalues > 1 - distance.unsqueeze(1)
@@ -221,19 +221,19 @@ def compute_spectrum(
     size: tuple[int, int],
     rank: int | None,
     residual: Tensor,
-    among: Communicator = ALONE,
+    communicator: Communicator = ALONE,
     weights: Tensor | None = None,
 ) -> Spectrum:
     """Compute the spectrum of ``W``; ``remainder`` is its diagonal part r, or None if it has none."""
     # F F^T and F diag(r) F^T, (B, J, M, M)
     count = 1 if remainder is None else 2
-    each = root_weighted(scaling, weights)
-    pairs = RitzPairs.of_sums(among.sum(compute_grams(factor, each, remainder, count)), factor.dtype)
+    root_scaling = root_weighted(scaling, weights)
+    pairs = RitzPairs.of_sums(communicator.sum(compute_grams(factor, root_scaling, remainder, count)), factor.dtype)
     seen = factor.shape[0] > 0 and not is_hidden(factor)
     checked = factor.dtype == torch.float32 and seen
     if checked and float(pairs.root.detach().square().sum((1, 2)).max()) > WEAK:
-        grams = compute_grams(factor, each, remainder, count, exact=True)
-        pairs = RitzPairs.of_sums(among.sum(grams), factor.dtype)
+        grams = compute_grams(factor, root_scaling, remainder, count, exact=True)
+        pairs = RitzPairs.of_sums(communicator.sum(grams), factor.dtype)
     shown = int(pairs.support.sum(1).max()) if seen else factor.shape[1]
     shown = shown if rank is None else min(rank, shown)
     support = pairs.support & (torch.arange(factor.shape[1], device=factor.device) < shown)
@@ -243,5 +243,5 @@ def compute_spectrum(
     eigenvalues = (values.clamp(0.0, 1.0) * support)[:, :shown].to(factor)
     largest = values[:, 0].detach()
     return Spectrum(
-        pairs.ritz, pairs.root, support, eigenvalues, factor, scaling, size, largest, residual, weights, among
+        pairs.ritz, pairs.root, support, eigenvalues, factor, scaling, size, largest, residual, weights, communicator
     )

@@ -23,7 +23,7 @@ def draw_pivots(
         captured: lower bound of residuals; a smaller residual counts as captured.
     """
     rows = residual.new_zeros(residual.shape[0], len(draws), residual.shape[2])
-    found, scales = [], []
+    chosen, scales = [], []
     for step, draw in enumerate(draws.unbind()):
         # Summed in float64, as in C, so that rounding does not decide which of thousands of points is drawn.
         summed = (chance(residual, captured) / divisor).cumsum(2, dtype=torch.float64)
@@ -34,9 +34,9 @@ def draw_pivots(
         row /= scale
         residual = residual - row.square()
         rows[:, step] = row.squeeze(1)
-        found.append(pivot)
+        chosen.append(pivot)
         scales.append(scale)
-    return torch.cat(found, dim=2), rows, torch.cat(scales, dim=2).squeeze(1)
+    return torch.cat(chosen, dim=2), rows, torch.cat(scales, dim=2).squeeze(1)
 
 
 def chance(residual: Tensor, captured: float) -> Tensor:
@@ -57,10 +57,10 @@ def pick(planes: Tensor, at: Tensor) -> Tensor:
 def _compiled_pivots(points: Tensor, draws: Tensor, captured: float) -> Tensor:
     points, draws = contiguous(points, draws)
     batch, size, count = points.shape
-    found = torch.empty(batch, len(draws), dtype=torch.long)
-    arguments = (size, count, len(draws), captured, points.data_ptr(), draws.data_ptr(), found.data_ptr())
+    chosen = torch.empty(batch, len(draws), dtype=torch.long)
+    arguments = (size, count, len(draws), captured, points.data_ptr(), draws.data_ptr(), chosen.data_ptr())
     run("pivots", torch.get_num_threads(), batch, *arguments)
-    return found
+    return chosen
 
 
 def _fake_pivots(points: Tensor, draws: Tensor, captured: float) -> Tensor:

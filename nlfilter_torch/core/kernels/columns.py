@@ -131,13 +131,13 @@ def columns(features: Tensor, landmarks: Tensor, inverse_cholesky: Tensor, limit
     parts, columns_of, norms_of = strips(features, count), strips(factor, count), norms.view(count * batch, -1)
     for block, (first, second) in buffered_blocks(columns_of, 2):
         kernel, _ = affinity(parts[:, :, block], first)
-        found = torch.bmm(inverses, kernel, out=second)  # into a buffer, since rows of the factor are far apart
+        product = torch.bmm(inverses, kernel, out=second)  # into a buffer, since rows of the factor are far apart
         if limited:
-            norm = torch.sum(torch.square(found, out=first), 1, out=norms_of[:, block])
+            norm = torch.sum(torch.square(product, out=first), 1, out=norms_of[:, block])
             # Norms exceed 1 only by rounding, and most blocks need no scaling. Accelerators scale without checking.
             if is_hidden(features) or norm.max().item() > 1.0:
-                found.mul_(norm.clamp(min=1.0).rsqrt_().unsqueeze(1))
-        columns_of[:, :, block] = found
+                product.mul_(norm.clamp(min=1.0).rsqrt_().unsqueeze(1))
+        columns_of[:, :, block] = product
     return factor, norms
 
 

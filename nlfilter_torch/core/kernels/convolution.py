@@ -71,8 +71,8 @@ def convolve(
     features: Tensor, weight: Tensor, bias: Tensor | None = None, dilation: int = 1, added: Tensor | None = None
 ) -> Tensor:
     """Convolve rectified features (B, C, H, W), with zeros around them, and add (B, O, H, W); channels lie last."""
-    found = F.conv2d(F.leaky_relu(features, SLOPE), weight, bias, padding=dilation, dilation=dilation)
-    return channels_last(found if added is None else found + added)
+    convolved = F.conv2d(F.leaky_relu(features, SLOPE), weight, bias, padding=dilation, dilation=dilation)
+    return channels_last(convolved if added is None else convolved + added)
 
 
 def channels_last(planes: Tensor) -> Tensor:

@@ -34,8 +34,8 @@ def sum_grams(factor: Tensor, scaling: Tensor, remainder: Tensor | None, count: 
     """
     batch, landmarks, pixels = factor.shape
     parts = strip_count(batch, pixels, factor.device)
-    each = scaling if remainder is None else remainder
-    factor, scaling, weights = (strips(t, parts) for t in (factor, scaling.unsqueeze(1), each.unsqueeze(1)))
+    powers = scaling if remainder is None else remainder
+    factor, scaling, weights = (strips(t, parts) for t in (factor, scaling.unsqueeze(1), powers.unsqueeze(1)))
     total = factor.new_zeros(len(factor), count, landmarks, landmarks, dtype=torch.float64)
     for block, (rows, weighted) in buffered_blocks(factor, 2):
         left = torch.mul(factor[:, :, block], scaling[:, :, block], out=rows)

@@ -94,8 +94,8 @@ def register(
 
     def decorate(definition: Definition) -> Definition:
         def on_processors(*arguments: Any) -> Any:
-            found = compiled(*arguments) if compiled is not None and level and _suit(arguments, dtype) else None
-            return definition(*arguments) if found is None else found
+            result = compiled(*arguments) if compiled is not None and level and _suit(arguments, dtype) else None
+            return definition(*arguments) if result is None else result
 
         def under_autograd(keys: Any, *arguments: Any) -> Any:
             if are_derived(arguments):

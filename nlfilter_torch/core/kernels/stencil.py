@@ -39,8 +39,8 @@ def solve_stencil(stencil: Tensor, right: Tensor) -> Tensor:
     """
     # torch.compile supports no functions with a jvp.
     function = solve if torch.compiler.is_compiling() else _Solution.apply
-    found: Tensor = function(stencil.double(), right.double())
-    return found.to(right.dtype)
+    solution: Tensor = function(stencil.double(), right.double())
+    return solution.to(right.dtype)
 
 
 class _Solution(torch.autograd.Function):
@@ -59,19 +59,19 @@ class _Solution(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, Tensor]:
-        stencil, found = ctx.saved_tensors
+        stencil, solution = ctx.saved_tensors
         grad = solve_stencil(_transposed(stencil), grad)
         if not ctx.needs_input_grad[0]:
             return None, grad
-        products = torch.stack([(grad * values).sum(1) for values in _around(found)], dim=1)
+        products = torch.stack([(grad * values).sum(1) for values in _around(solution)], dim=1)
         return -products.view(stencil.shape), grad
 
     @staticmethod
     def jvp(ctx: Any, stencil_tangent: Tensor | None, right_tangent: Tensor | None) -> Tensor:
-        stencil, found = ctx.saved_tensors
-        right = torch.zeros_like(found) if right_tangent is None else right_tangent
+        stencil, solution = ctx.saved_tensors
+        right = torch.zeros_like(solution) if right_tangent is None else right_tangent
         if stencil_tangent is not None:
-            for number, values in enumerate(_around(found)):
+            for number, values in enumerate(_around(solution)):
                 right = right - stencil_tangent[:, number // 3, number % 3, None] * values
         return solve_stencil(stencil, right)
 
@@ -128,10 +128,10 @@ def _by_rows(stencil: Tensor, right: Tensor) -> Tensor:
             eliminated = _tridiagonal_product(bands[0], rows[-1])
             own, constant = own + eliminated[:, :width], constant - eliminated[:, width:]
         rows.append(torch.linalg.solve(own.mT, torch.cat([-after, constant], dim=1).mT).mT)
-    found = [rows.pop()[:, width:]]
+    solved = [rows.pop()[:, width:]]
     for row in reversed(rows):
-        found.append(torch.baddbmm(row[:, width:], found[-1], row[:, :width]))
-    return torch.stack(found[::-1], dim=2)
+        solved.append(torch.baddbmm(row[:, width:], solved[-1], row[:, :width]))
+    return torch.stack(solved[::-1], dim=2)
 
 
 def _tridiagonal(bands: Tensor) -> Tensor:

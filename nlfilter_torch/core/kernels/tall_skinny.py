@@ -130,22 +130,22 @@ def _empty(factor: Tensor) -> tuple[Tensor, Tensor]:
 def _run(
     factor: Tensor, row: Tensor, scaling: Tensor | None, diagonal: Tensor | None, most: float
 ) -> tuple[Tensor, Tensor]:
-    out, found = _empty(factor)
+    out, total = _empty(factor)
     factor = by_rows(factor)
     batch, landmarks, pixels = factor.shape
     row = repeated(row, batch, landmarks)
     scaling, diagonal = (t if t is None else repeated(t, batch, pixels) for t in (scaling, diagonal))
     run_on_factor(
-        "sweep", factor, row.data_ptr(), pointer(scaling), pointer(diagonal), most, out.data_ptr(), found.data_ptr()
+        "sweep", factor, row.data_ptr(), pointer(scaling), pointer(diagonal), most, out.data_ptr(), total.data_ptr()
     )
-    return out, found
+    return out, total
 
 
 def _compiled_sweep(
     factor: Tensor, diagonal: Tensor, half: Tensor, most: float, weights: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
-    scaling, found = _run(factor, half, None, diagonal, most)
-    return scaling, found if weights is None else moment(factor, (weights * scaling).unsqueeze(1)).squeeze(2)
+    scaling, total = _run(factor, half, None, diagonal, most)
+    return scaling, total if weights is None else moment(factor, (weights * scaling).unsqueeze(1)).squeeze(2)
 
 
 @register(
@@ -161,15 +161,15 @@ def sweep(
     It takes ``half`` of t, (B, M), the upper limit ``most`` of d, and the number of pixels that each point represents,
     (B, N); None means one each. The moment is ``factor @ (weights * d)``.
     """
-    scaling, found = _empty(factor)
+    scaling, total = _empty(factor)
     row = half.unsqueeze(2).mT
     for block in pixel_blocks(factor.shape[2], factor.shape[0], factor.device, length=SWEPT):
         columns = factor[:, :, block]
         root = positive_root(spread(row, columns).squeeze(1), diagonal[:, block])
         part = torch.clamp(root, max=most, out=scaling[:, block])
         part = part if weights is None else part * weights[:, block]
-        found += gather(part.unsqueeze(1), columns).squeeze(1)
-    return scaling, found
+        total += gather(part.unsqueeze(1), columns).squeeze(1)
+    return scaling, total
 
 
 def _compiled_weigh(factor: Tensor, weights: Tensor, vector: Tensor) -> Tensor:
@@ -183,9 +183,9 @@ def _compiled_weigh(factor: Tensor, weights: Tensor, vector: Tensor) -> Tensor:
 )
 def weigh(factor: Tensor, weights: Tensor, vector: Tensor) -> Tensor:
     """``factor diag(weights) factor^T vector``, (B, M) in float64, for a factor (B, M, N), (B, N) and (B, M)."""
-    _, found = _empty(factor)
+    _, total = _empty(factor)
     row = vector.unsqueeze(2).mT
     for block in pixel_blocks(factor.shape[2], factor.shape[0], factor.device, length=SWEPT):
         columns = factor[:, :, block]
-        found += gather(weights[:, None, block] * spread(row, columns), columns).squeeze(1)
-    return found
+        total += gather(weights[:, None, block] * spread(row, columns), columns).squeeze(1)
+    return total

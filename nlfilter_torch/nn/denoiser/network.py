@@ -129,9 +129,9 @@ class NonlocalDenoiser(nn.Module):
         """
         refuse_transforms("noisy", noisy, noise)
         if isinstance(noisy, Tensor) and noisy.ndim == 3:
-            one = isinstance(noise, Tensor) and noise.ndim == 3
-            each = noise.unsqueeze(0) if one else noise  # type: ignore[union-attr]
-            return self(noisy.unsqueeze(0), each, turns=turns).squeeze(0)
+            is_map = isinstance(noise, Tensor) and noise.ndim == 3
+            batched = noise.unsqueeze(0) if is_map else noise  # type: ignore[union-attr]
+            return self(noisy.unsqueeze(0), batched, turns=turns).squeeze(0)
         check_photograph(noisy, "noisy")
         dtype = self.log_bandwidths.dtype
         image = noisy.to(dtype)
@@ -149,11 +149,11 @@ class NonlocalDenoiser(nn.Module):
         quarters = range(0, 4, 4 // turns)
 
         def mean(tile: Tensor, levels: Tensor) -> Tensor:
-            found = [
+            estimates = [
                 self.estimate_noise(*(planes.rot90(n, (2, 3)) for planes in (tile, levels))).rot90(-n, (2, 3))
                 for n in quarters
             ]
-            return torch.stack(found).mean(0)
+            return torch.stack(estimates).mean(0)
 
         return in_tiles(image, noise, mean, inner)
 
@@ -165,8 +165,8 @@ class NonlocalDenoiser(nn.Module):
             noise: (B, 1 or C, H, W).
         """
         if noisy.shape[1] not in (1, 3):
-            each = (planes.flatten(0, 1).unsqueeze(1) for planes in (noisy, noise.expand_as(noisy)))
-            return self.estimate_noise(*each).view_as(noisy)
+            channels = (planes.flatten(0, 1).unsqueeze(1) for planes in (noisy, noise.expand_as(noisy)))
+            return self.estimate_noise(*channels).view_as(noisy)
         scale = (noisy.detach().abs().amax((1, 2, 3), keepdim=True) / BRIGHTEST).clamp(min=1.0)
         planes, levels = split_colours(noisy / scale, (noise / scale).clamp(max=NOISIEST))
         seen = torch.cat([_centred(planes), 10 * levels], dim=1)
@@ -176,8 +176,8 @@ class NonlocalDenoiser(nn.Module):
         features, estimate, _ = self._pass(first, planes, levels, pixels)
         for pixels in others:
             again = first + self.again(F.leaky_relu(features, SLOPE))
-            features, found, corrections = self._pass(again, planes, levels, pixels)
-            estimate = torch.lerp(estimate, found, _trust(corrections[:, : noisy.shape[1]]).to(found))
+            features, refined, corrections = self._pass(again, planes, levels, pixels)
+            estimate = torch.lerp(estimate, refined, _trust(corrections[:, : noisy.shape[1]]).to(refined))
         return join_colours(estimate, noisy.shape[1]) * scale
 
     def _pass(self, features: Tensor, planes: Tensor, levels: Tensor, pixels: int) -> tuple[Tensor, Tensor, Tensor]:
@@ -194,15 +194,15 @@ class NonlocalDenoiser(nn.Module):
         """
         for layer in self.before:
             features = layer(features, features)
-        found = (planes - self.smooth(features, planes, pixels)) * (levels / FAINT).clamp(max=1.0)
-        both = channels_last(torch.cat([_centred(planes - found), 2 * found], dim=1))
+        estimate = (planes - self.smooth(features, planes, pixels)) * (levels / FAINT).clamp(max=1.0)
+        both = channels_last(torch.cat([_centred(planes - estimate), 2 * estimate], dim=1))
         weights = self.join.weight.split([WIDTH, 2 * PLANES], dim=1)
         rest = F.conv2d(both, weights[1], self.join.bias, padding=1)
         features = convolve(features, weights[0], added=rest)
         for layer in self.after:
             features = layer(features, features)
         corrections = self.last(features).to(planes)
-        return features, found + levels * corrections.clamp(-LARGEST, LARGEST), corrections
+        return features, estimate + levels * corrections.clamp(-LARGEST, LARGEST), corrections
 
     def smooth(self, features: Tensor, planes: Tensor, pixels: int) -> Tensor:
         """Filter planes (B, 3, H, W) with a guide and sliders computed from ``features``, averaging similar pixels.
@@ -226,8 +226,8 @@ class NonlocalDenoiser(nn.Module):
     @full_precision
     def _guide_of(self, features: Tensor) -> Tensor:
         """Guide and sliders before their normalisation, (B, FEATURES + LEVELS (ORDER + 1), H, W)."""
-        found: Tensor = self.guide(features)
-        return found
+        output: Tensor = self.guide(features)
+        return output
 
 
 def shapes_of(denoiser: NonlocalDenoiser) -> dict[str, tuple[int, ...]]:

@@ -181,8 +181,8 @@ def _level(response: Tensor, slopes: Tensor, light: Tensor) -> tuple[Tensor, Ten
     """Noise level (B,) from responses (B, n, r) in windows with the smallest slopes (B, n), and their brightness."""
     count = max(1, min(slopes.shape[1], max(20, int(FLAT_SHARE * slopes.shape[1]))))
     least = slopes.argsort(1)[:, :count]
-    found = response.gather(1, least[..., None].expand(-1, -1, response.shape[2]))
-    return found.flatten(1).median(1).values / MEDIAN, light.gather(1, least).mean(1)
+    responses = response.gather(1, least[..., None].expand(-1, -1, response.shape[2]))
+    return responses.flatten(1).median(1).values / MEDIAN, light.gather(1, least).mean(1)
 
 
 def _fit_line(light: Tensor, variance: Tensor, counted: Tensor) -> tuple[Tensor, Tensor]:
@@ -207,6 +207,6 @@ def _fit_line(light: Tensor, variance: Tensor, counted: Tensor) -> tuple[Tensor,
         expected = floor[:, None] + gain[:, None] * light
         weight = counted * torch.where(variance > TEXTURE_RATIO * expected, 0.2, 1.0).to(variance)
     even = (constant / ones)[:, None]
-    errors = [((found - variance) / variance).square().mul(weight).sum(1) for found in (even, expected)]
+    errors = [((fitted - variance) / variance).square().mul(weight).sum(1) for fitted in (even, expected)]
     depends = errors[0] - errors[1] > MIN_IMPROVEMENT
     return torch.where(depends, floor.maximum(MIN_FLOOR_RATIO * gain), even[:, 0]), torch.where(depends, gain, 0.0)

@@ -35,9 +35,9 @@ def in_tiles(
         fade = torch.outer(_profile(height), _profile(width)).to(image)
         windows = [(..., *tile) for tile in tiles]
         for first in range(0, len(windows), TILE_BATCH):
-            some = windows[first : first + TILE_BATCH]
-            found = function(*(torch.cat([planes[window] for window in some]) for planes in (image, noise)))
-            for window, tile in zip(some, found.split(len(image)), strict=True):
+            group = windows[first : first + TILE_BATCH]
+            results = function(*(torch.cat([planes[window] for window in group]) for planes in (image, noise)))
+            for window, tile in zip(group, results.split(len(image)), strict=True):
                 total[window] += fade * tile
                 weight[window] += fade
     return total[rest] / weight[rest].clamp(min=torch.finfo(weight.dtype).tiny)

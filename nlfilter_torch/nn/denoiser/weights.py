@@ -30,17 +30,17 @@ def read_weights(path: Path, shapes: Mapping[str, tuple[int, ...]]) -> dict[str,
         end = LENGTH + int.from_bytes(content[:LENGTH], "little")
         header = json.loads(content[LENGTH:end])
         header.pop("__metadata__", None)
-        found = {name: _tensor(entry, memoryview(content)[end:]) for name, entry in header.items()}
+        weights = {name: _tensor(entry, memoryview(content)[end:]) for name, entry in header.items()}
     except (ValueError, KeyError, TypeError, AttributeError, RuntimeError) as error:
         raise ValueError(f"weights must be a complete safetensors file, but {path} is damaged: {error}") from None
     for name, shape in shapes.items():
-        got = tuple(found[name].shape) if name in found else None
+        got = tuple(weights[name].shape) if name in weights else None
         if got != shape:
             raise ValueError(
                 f"weights must hold {name} of shape {shape}, but {path} has {'none' if got is None else got}; "
                 "they belong to another layer"
             )
-    return {name: found[name] for name in shapes}
+    return {name: weights[name] for name in shapes}
 
 
 def _tensor(entry: Mapping[str, Any], data: memoryview) -> Tensor:

@@ -9,8 +9,9 @@ from torch import Tensor
 from nlfilter_torch.core.checks import check_alpha, check_image, check_photograph, check_same_size, check_values
 from nlfilter_torch.core.precision import working_dtype
 from nlfilter_torch.filtering.fitted import fit_filter
-from nlfilter_torch.operator.build import nonlocal_operator
+from nlfilter_torch.operator.build import operator_from_guide
 from nlfilter_torch.operator.features import reduce_channels
+from nlfilter_torch.operator.options import OperatorOptions
 from nlfilter_torch.photo.declared.parameters import DETAIL
 from nlfilter_torch.photo.picture.changes import activity, limit_by_activity, split_sliders
 from nlfilter_torch.photo.picture.in_memory import InMemory
@@ -84,7 +85,7 @@ def filter_frames(
     stacked = torch.cat([InMemory(f.to(working_dtype(f))).resized(viewed).image for f in references], dim=2)
     grey = reduce_channels(stacked, "luminance")
     filtered = stacked if channels == "all" else grey
-    fitted = fit_filter(nonlocal_operator(grey, **options), filtered, order=alpha.shape[-1] - 1)
+    fitted = fit_filter(operator_from_guide(grey, OperatorOptions(**options)), filtered, order=alpha.shape[-1] - 1)
     planes = (lambda pixels: pixels.image) if channels == "all" else luminance
 
     def change(source: Source) -> Fitted:

@@ -9,8 +9,9 @@ from torch import Tensor
 from nlfilter_torch.core.precision import working_dtype
 from nlfilter_torch.filtering.filters import detail_layers
 from nlfilter_torch.filtering.fit import HALF_LEVEL, OFF_LEVEL
-from nlfilter_torch.operator.build import nonlocal_operator, sampled_operator
+from nlfilter_torch.operator.build import operator_from_guide, sampled_operator
 from nlfilter_torch.operator.features import reduce_channels
+from nlfilter_torch.operator.options import OperatorOptions
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.look_fitting.alignment import inside_frame
 from nlfilter_torch.photo.look_fitting.look_fit import MOST, Layout, Sums, columns_of, sample, sums_of
@@ -115,7 +116,7 @@ class EditedPhotograph:
     @cached_property
     def layers(self) -> Tensor:
         """Of luminance before the edit, (k+1, N)."""
-        operator = nonlocal_operator(self.luminance, **self.options, generator=self.generator)
+        operator = operator_from_guide(self.luminance, OperatorOptions(**self.options, generator=self.generator))
         return detail_layers(operator, self.luminance, order=self.order)[0, :, 0].flatten(1)
 
     def regions(self) -> list[SomePixels]:

@@ -12,9 +12,10 @@ from nlfilter_torch.core.checks import check_count, check_image
 from nlfilter_torch.core.precision import as_given, working_dtype
 from nlfilter_torch.filtering.filters import polynomial_filter
 from nlfilter_torch.nn.parameters import check_learn
-from nlfilter_torch.operator.build import nonlocal_operator
+from nlfilter_torch.operator.build import nonlocal_operator, operator_from_guide
 from nlfilter_torch.operator.features import reduce_channels
 from nlfilter_torch.operator.operator import NonlocalOperator
+from nlfilter_torch.operator.options import OperatorOptions
 from nlfilter_torch.photo.declared.shading import LANDMARKS, LEVELS, NEAR
 from nlfilter_torch.photo.looks.histogram import KINDS, STRENGTHS
 from nlfilter_torch.photo.looks.look_filter import BLURS, NAMES, acts, check_part, filter_look
@@ -101,6 +102,6 @@ class Look(nn.Module):
         exact = image.to(working_dtype(image))
         if operator is None and acts(used["alpha"]):
             near = {"spatial_bandwidth": NEAR * min(image.shape[-2:])}
-            operator = nonlocal_operator(reduce_channels(exact, "luminance"), **near | self.options)
+            operator = operator_from_guide(reduce_channels(exact, "luminance"), OperatorOptions(**near | self.options))
         detail = None if operator is None else partial(polynomial_filter, operator)
         return as_given(filter_look(exact, used, detail), image)

@@ -14,8 +14,9 @@ from nlfilter_torch.core.inner import EVERYWHERE
 from nlfilter_torch.core.precision import full_precision, working_dtype
 from nlfilter_torch.filtering.filters import detail_layers
 from nlfilter_torch.filtering.scribbles import check_painted
-from nlfilter_torch.operator.build import nonlocal_operator
+from nlfilter_torch.operator.build import nonlocal_operator, operator_from_guide
 from nlfilter_torch.operator.operator import NonlocalOperator
+from nlfilter_torch.operator.options import OperatorOptions
 from nlfilter_torch.operator.products import Columns
 from nlfilter_torch.operator.spectrum import RitzPairs, Spectrum
 from nlfilter_torch.photo.picture.ends import ends_of
@@ -48,7 +49,7 @@ class InMemory:
         """
 
         def build() -> InMemoryOperator:
-            operator = nonlocal_operator(guide(self.image), **guide.options)
+            operator = operator_from_guide(guide(self.image), OperatorOptions(**guide.options))
             return InMemoryOperator(operator, self, guide.sampled, None if self.cache is None else {})
 
         options = [(name, value) for name, value in sorted(guide.options.items()) if name != "generator"]

@@ -15,7 +15,6 @@ from torch import Tensor
 
 from nlfilter_torch.core.blocks import stratified
 from nlfilter_torch.core.checks import check_choice
-from nlfilter_torch.operator.balancing import balance
 from nlfilter_torch.operator.features import (
     GuideChannels,
     GuideFeatures,
@@ -31,6 +30,7 @@ from nlfilter_torch.operator.nystrom import Completion, inverse_cholesky
 from nlfilter_torch.operator.operator import Kernel
 from nlfilter_torch.operator.options import Construction, check_bandwidths
 from nlfilter_torch.operator.products import Columns
+from nlfilter_torch.operator.sinkhorn import sinkhorn_balance
 from nlfilter_torch.photo.picture.source import Guide
 from nlfilter_torch.photo.tiled.pictures import Picture, Tile
 from nlfilter_torch.photo.tiled.statistics import Block, Pass
@@ -187,7 +187,8 @@ def take_pilot(
     Bandwidth and landmarks are those of :func:`nonlocal_operator`, to rounding.
     """
     check_choice(guide_channels, "guide_channels", ("luminance", "all"))
-    method = Construction(num_landmarks, landmarks, completion, None, generator)
+    method = Construction(num_landmarks=num_landmarks, landmarks=landmarks, completion=completion, generator=generator)
+    method.check()
     window = unit_window(patch_size, None).to(picture.dtype)
     check_bandwidths(photometric_bandwidth, spatial_bandwidth)
     num_landmarks = method.count(picture.pixels)
@@ -223,7 +224,9 @@ def take_pilot(
         points = condense(features[:, :, : len(candidates)], num_landmarks, generator)
         kernel = Kernel(points, inverse_cholesky(points), completion, features=recipe)
         columns = kernel.factor(features[:, :, len(candidates) :])
-        found = balance(*columns, tolerance=PILOT_TOLERANCE, completed=completion == "diagonal", weights=weights)
+        found = sinkhorn_balance(
+            *columns, tolerance=PILOT_TOLERANCE, completed=completion == "diagonal", weights=weights
+        )
         return Pilot(kernel, Block(*columns, image, weights), found.moment, rest.initial_seed())
 
     with single_threaded(workers):  # so few pixels that a second thread would wait most of the time

@@ -1,17 +1,27 @@
-"""Balancing: the vector d that makes ``W = diag(d) K diag(d)`` doubly stochastic. Paper: Sec. II-C, Fig. 2.
+"""Sinkhorn balancing: the vector d that makes ``W = diag(d) K diag(d)`` doubly stochastic. Paper: Sec. II-C, Fig. 2.
 
-A kernel with a completed diagonal is balanced by Newton's method (:mod:`~nlfilter_torch.operator.scaling`), any other
-kernel by Chebyshev semi-iteration on ``log d``. On CPUs, a damped Newton method continues where these do not converge.
-The gradient is implicit and the same for all methods.
+K is symmetric, so that one vector scales both rows and columns (symmetric Sinkhorn-Knopp scaling, in the literature
+also matrix balancing). It solves ``d * (K d) = 1``, or with ``v = log d``
 
-With ``v = log d`` the equation is ``v + log(K d) = 0``. Its Jacobian at the solution is ``I + W``, whose spectrum lies
-in [1, 2]. The semi-iteration for that interval reduces the error by a factor of 5.8 per sweep; plain Sinkhorn iteration
-barely converges. The semi-iteration balances the kernels of the paper's method (``completion="none"``), whose
-affinities may be negative and whose scalings are large.
+    v + log(K d) = 0.
+
+The Jacobian at the solution is ``I + W``. The eigenvalues of W lie in [0, 1], and so those of the Jacobian in [1, 2].
+Three methods solve the equation; the result does not depend on which:
+
+- The fixed-point iteration of Sinkhorn and Knopp, ``v <- -log(K d)``, multiplies the error by -W. It does not converge
+  for the eigenvalue 1 of W, and barely with damping, so it serves only as the start of the others.
+- Chebyshev semi-iteration for the interval [1, 2] reduces the error by a factor of 5.8 per sweep over the factor. It
+  balances the kernels of the paper's method (``completion="none"``), whose affinities may be negative and whose
+  scalings are large.
+- Newton's method on M unknowns (:mod:`~nlfilter_torch.operator.scaling`) balances kernels with a completed diagonal.
+
+On CPUs a damped Newton method continues where these do not converge. The gradient is implicit, by the same equation,
+and therefore the same for all methods.
 """
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, ClassVar, Generic, TypeVar
 
 import torch
@@ -35,7 +45,7 @@ from nlfilter_torch.operator.scaling import (
     newton,
 )
 
-Found = TypeVar("Found", bound=Balancing)
+Result = TypeVar("Result", bound=Balancing)
 
 TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-12}
 # Larger residuals cause a warning, unless the tolerance allows them.
@@ -49,16 +59,16 @@ STALL = 1e-3  # below this residual, the iteration ends after two consecutive sw
 LARGEST_SCALING = 1e30  # for pixels that no scaling balances because their approximate affinities are negative
 
 
-def balance(
+def sinkhorn_balance(
     factor: Tensor,
     diagonal: Tensor,
     *,
     tolerance: float | None = None,
     completed: bool = False,
-    among: Communicator = ALONE,
+    communicator: Communicator = ALONE,
     weights: Tensor | None = None,
 ) -> Balancing:
-    """Scale ``K = factor^T factor + diag(diagonal)`` to unit row sums.
+    """Scale ``K = factor^T factor + diag(diagonal)`` to unit row sums, by one vector for rows and columns.
 
     Args:
         factor: (B, M, N).
@@ -67,16 +77,16 @@ def balance(
             residual above both this and 1e-4 (1e-9 in float64) causes a warning.
         completed: whether K has a unit diagonal and, up to approximation errors, no negative entries; a faster method
             then applies.
-        among: ranks that the rows of the image are distributed over.
+        communicator: ranks that the rows of the image are distributed over.
         weights: number of identical pixels that each point represents, (B, N), a constant; None means one each.
     """
     tolerance = tolerance or TOLERANCE[factor.dtype]
     with torch.no_grad():
-        found = solve(KernelMatrix(factor, diagonal, weights, among), tolerance, completed)
-    warn_of_residual(found.residual, tolerance, factor.dtype, completed=completed)
-    known = found.scaling, found.moment, found.inverse
-    scaling = _Balanced.apply(factor, diagonal, *known, completed, among, weights)  # type: ignore[no-untyped-call]
-    return Balancing(scaling, found.moment, found.residual, found.steps)
+        solution = solve(KernelMatrix(factor, diagonal, weights, communicator), tolerance, completed)
+    warn_of_residual(solution.residual, tolerance, factor.dtype, completed=completed)
+    known = solution.scaling, solution.moment, solution.inverse
+    scaling = _ImplicitScaling.apply(factor, diagonal, *known, completed, communicator, weights)  # type: ignore[no-untyped-call]
+    return Balancing(scaling, solution.moment, solution.residual, solution.steps)
 
 
 def warn_of_residual(residual: Tensor, tolerance: float | None, dtype: torch.dtype, *, completed: bool) -> None:
@@ -88,14 +98,14 @@ def warn_of_residual(residual: Tensor, tolerance: float | None, dtype: torch.dty
         warn(f"balancing left row sums that differ from 1 by up to {residual.max().item():.1e}; {remedy}")
 
 
-def attainable(factor: Tensor, tolerance: float, among: Communicator) -> float:
+def attainable(factor: Tensor, tolerance: float, communicator: Communicator) -> float:
     """Return the target residual: the tolerance, or the rounding error of row sums if that is larger."""
-    pixels = among.pixels(factor.shape[2])
+    pixels = communicator.pixels(factor.shape[2])
     # u . t is a sum of terms of magnitude up to |u| |t|, and |t|^2 is at most the number of pixels.
     return max(tolerance, 0.5 * torch.finfo(factor.dtype).eps * pixels**0.5)
 
 
-class _Balanced(torch.autograd.Function):
+class _ImplicitScaling(torch.autograd.Function):
     """The scaling d (B, N) that a balancing found, with implicit differentiation of ``log d + log(K d) = 0``.
 
     Differentiating gives ``(I + W) d(log d) = -diag(d) dK d``. With g the gradient of the loss with respect to d,
@@ -116,19 +126,19 @@ class _Balanced(torch.autograd.Function):
         moment: Tensor,
         inverse: Tensor,
         completed: bool,
-        among: Communicator,
+        communicator: Communicator,
         weights: Tensor | None,
     ) -> Tensor:
         scaling = scaling.clone()
         ctx.save_for_backward(factor, diagonal, scaling, moment, inverse, weights)
-        ctx.among, ctx.completed = among, completed
+        ctx.communicator, ctx.completed = communicator, completed
         return scaling
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         factor, diagonal, scaling, moment, inverse, weights = ctx.saved_tensors
-        matrix = KernelMatrix(factor, diagonal, weights, ctx.among)
+        matrix = KernelMatrix(factor, diagonal, weights, ctx.communicator)
         solution = Balancing(scaling, moment, scaling, 0)  # the residual is not used
         gradients = implicit_gradients(matrix, solution, inverse, grad, ctx.completed)
         return *gradients, None, None, None, None, None, None
@@ -136,26 +146,29 @@ class _Balanced(torch.autograd.Function):
 
 def solve(matrix: KernelMatrix, tolerance: float, completed: bool) -> Solution:
     """Balance a kernel by the method that suits it, and continue with the damped method if that does not converge."""
-    found = newton(matrix, tolerance) if completed else _chebyshev(matrix, tolerance)
-    goal = attainable(matrix.factor, tolerance, matrix.among)
-    if not is_hidden(matrix.factor) and not bool((found.residual <= goal).all()):
-        found = damped(matrix, found, goal)
-    return found
+    solution = newton(matrix, tolerance) if completed else _chebyshev(matrix, tolerance)
+    goal = attainable(matrix.factor, tolerance, matrix.communicator)
+    if not is_hidden(matrix.factor) and not bool((solution.residual <= goal).all()):
+        solution = damped(matrix, solution, goal)
+    return solution
 
 
 def implicit_gradients(
     matrix: KernelMatrix, balancing: Balancing, inverse: Tensor, grad: Tensor, completed: bool
 ) -> tuple[Tensor, Tensor]:
-    """Gradients with respect to factor and diagonal from that with respect to the scaling; see :class:`_Balanced`."""
-    factor, diagonal, weights, among = matrix.factor, matrix.diagonal, matrix.weights, matrix.among
+    """Gradients with respect to factor and diagonal from that with respect to the scaling.
+
+    See :class:`_ImplicitScaling`.
+    """
+    factor, diagonal, weights, communicator = matrix.factor, matrix.diagonal, matrix.weights, matrix.communicator
     scaling, total, dtype = balancing.scaling, balancing.moment, factor.dtype
     if not completed:  # without completion d may reach 1e25, and its square overflows float32
         factor, diagonal, scaling, grad = (tensor.double() for tensor in (factor, diagonal, scaling, grad))
     share = 1 / (1 + scaling * (scaling * diagonal))  # 1 / (1 + r)
     weight = scaling.square() * share
-    matrix = KernelMatrix(factor, diagonal, None, among)
+    matrix = KernelMatrix(factor, diagonal, None, communicator)
     right = matrix.moment(weight * grad)
-    solution = conjugate_gradients(factor, weighted(weight, weights), right, inverse, among)
+    solution = conjugate_gradients(factor, weighted(weight, weights), right, inverse, communicator)
     affinity = weighted(matrix.affinities(solution), weights)
     a = scaling * scaling * share * (grad - affinity)
     totals = torch.cat([total, solution], dim=2).to(dtype)  # (B, M, 2)
@@ -164,7 +177,7 @@ def implicit_gradients(
 
 
 @dataclass(frozen=True)
-class Rounds(Generic[Found]):
+class Rounds(Generic[Result]):
     """A balancing without isolated pixels, and the rounds that led to it.
 
     Attributes:
@@ -180,34 +193,34 @@ class Rounds(Generic[Found]):
 
     factor: Tensor
     diagonal: Tensor
-    found: Found
+    result: Result
     residual: float
     before: tuple[Tensor, ...]
     removed: Tensor | None
 
 
-def balance_in_rounds(
+def sinkhorn_in_rounds(
     factor: Tensor,
     diagonal: Tensor,
-    balanced: Callable[[Tensor, Tensor], tuple[Found, float]],
+    balanced: Callable[[Tensor, Tensor], tuple[Result, float]],
     *,
     completed: bool,
-    among: Communicator = ALONE,
+    communicator: Communicator = ALONE,
     weights: Tensor | None = None,
-) -> Rounds[Found]:
+) -> Rounds[Result]:
     """Balance a kernel. If it is ``completed``, remove isolated pixels and repeat until there are none."""
-    found, worst = balanced(factor, diagonal)
+    result, worst = balanced(factor, diagonal)
     before: list[Tensor] = []
     removed: Tensor | None = None
     while completed and len(before) < Rounds.MOST:
-        alone = isolated(found.scaling.detach(), diagonal.detach(), worst, weights)
-        if not bool(among.max(alone.any().to(factor))):
+        alone = isolated(result.scaling.detach(), diagonal.detach(), worst, weights)
+        if not bool(communicator.max(alone.any().to(factor))):
             break
-        before.append(found.moment)
+        before.append(result.moment)
         removed = alone if removed is None else removed | alone
         factor, diagonal = factor * ~alone.unsqueeze(1), torch.where(alone, 1.0, diagonal)
-        found, worst = balanced(factor, diagonal)
-    return Rounds(factor, diagonal, found, worst, tuple(before), removed)
+        result, worst = balanced(factor, diagonal)
+    return Rounds(factor, diagonal, result, worst, tuple(before), removed)
 
 
 def chebyshev_weights(low: float, high: float) -> Iterator[tuple[float, float]]:
@@ -223,7 +236,7 @@ def chebyshev_weights(low: float, high: float) -> Iterator[tuple[float, float]]:
 
 def _chebyshev(matrix: KernelMatrix, tolerance: float) -> Solution:
     """Balance any kernel by Chebyshev semi-iteration; on CPUs until the residual reaches ``tolerance`` or stalls."""
-    factor, diagonal, weights, among = matrix.factor, matrix.diagonal, matrix.weights, matrix.among
+    factor, diagonal, weights, communicator = matrix.factor, matrix.diagonal, matrix.weights, matrix.communicator
     sums = matrix.affinities(matrix.moment(torch.ones_like(diagonal))) + diagonal
     scaling = sums.clamp(min=SMALLEST_SUM).rsqrt()  # initial guess: (K 1)^(-1/2)
     total = matrix.moment(scaling)
@@ -243,7 +256,7 @@ def _chebyshev(matrix: KernelMatrix, tolerance: float) -> Solution:
             torch.mul(d, step.exp(), out=following[:, block]).clamp_(max=LARGEST_SCALING)
             part = None if weights is None else weights[:, block]
             next_total += gather(weighted(following[:, None, block], part), rows).mT
-        residual, next_total = among.max(residual), among.sum(next_total)
+        residual, next_total = communicator.max(residual), communicator.sum(next_total)
         previous, worst = worst, residual.max().item() if watched else worst
         slow = slow + 1 if worst > previous / 2 else 0
         stalled = worst < STALL and slow > 1  # because of rounding; a single slow sweep may have other causes
@@ -254,7 +267,14 @@ def _chebyshev(matrix: KernelMatrix, tolerance: float) -> Solution:
     return Solution(scaling, total, residual.nan_to_num(nan=torch.inf), sweeps, identity)
 
 
-def _fake_settled(
+def _solve_and_warn(factor: Tensor, diagonal: Tensor, *, tolerance: float, completed: bool) -> tuple[Solution, float]:
+    """Balance a kernel without a gradient; return the solution and its residual, 0 on accelerators."""
+    solution = solve(KernelMatrix(factor, diagonal), tolerance, completed)
+    warn_of_residual(solution.residual, tolerance, factor.dtype, completed=completed)
+    return solution, float(solution.residual.max()) if factor.device.type == "cpu" else 0.0
+
+
+def _fake_sinkhorn(
     factor: Tensor, diagonal: Tensor, tolerance: float, completed: bool, bound: bool
 ) -> tuple[Tensor, ...]:
     batch, landmarks, _ = factor.shape
@@ -265,12 +285,12 @@ def _fake_settled(
 
 
 @register(
-    "settle(Tensor factor, Tensor diagonal, float tolerance, bool completed, bool bound) "
+    "sinkhorn(Tensor factor, Tensor diagonal, float tolerance, bool completed, bool bound) "
     "-> (Tensor, Tensor, Tensor, Tensor, Tensor)",
     None,
-    _fake_settled,
+    _fake_sinkhorn,
 )
-def settle(
+def sinkhorn(
     factor: Tensor, diagonal: Tensor, tolerance: float, completed: bool, bound: bool
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Balance a kernel: return d (B, N), moments, residual (B,), inverse Jacobian and a mask of the removed pixels.
@@ -278,22 +298,17 @@ def settle(
     The moments are those of the rounds, padded with copies of the last to ``Rounds.MOST + 1``. With ``bound``, warn if
     eigenvalues exceed 1.
     """
-
-    def balanced(factor: Tensor, diagonal: Tensor) -> tuple[Any, float]:
-        found = solve(KernelMatrix(factor, diagonal), tolerance, completed)
-        warn_of_residual(found.residual, tolerance, factor.dtype, completed=completed)
-        return found, float(found.residual.max()) if factor.device.type == "cpu" else 0.0
-
-    rounds = balance_in_rounds(factor, diagonal, balanced, completed=completed and factor.device.type == "cpu")
-    found, factor, diagonal = rounds.found, rounds.factor, rounds.diagonal
+    balanced = partial(_solve_and_warn, tolerance=tolerance, completed=completed)
+    rounds = sinkhorn_in_rounds(factor, diagonal, balanced, completed=completed and factor.device.type == "cpu")
+    result, factor, diagonal = rounds.result, rounds.factor, rounds.diagonal
     if bound and factor.device.type == "cpu":
-        remainder = found.scaling * (found.scaling * diagonal)
-        gram = shifted_gram(factor, found.scaling, remainder, ALONE)
-        if exceeds(gram, found.moment, slack(factor.dtype, rounds.residual)):
+        remainder = result.scaling * (result.scaling * diagonal)
+        gram = shifted_gram(factor, result.scaling, remainder, ALONE)
+        if exceeds(gram, result.moment, slack(factor.dtype, rounds.residual)):
             warn("eigenvalues exceed 1, which compiled programs do not correct; use landmarks='kmeans'")
-    moments = [*rounds.before, *[found.moment] * (Rounds.MOST + 1 - len(rounds.before))]
+    moments = [*rounds.before, *[result.moment] * (Rounds.MOST + 1 - len(rounds.before))]
     removed = torch.zeros_like(diagonal, dtype=torch.bool) if rounds.removed is None else rounds.removed
-    return found.scaling, torch.stack(moments), found.residual, found.inverse.contiguous(), removed
+    return result.scaling, torch.stack(moments), result.residual, result.inverse.contiguous(), removed
 
 
 def _fake_without(factor: Tensor, removed: Tensor) -> Tensor:
@@ -309,14 +324,14 @@ def without(factor: Tensor, removed: Tensor) -> Tensor:
     return factor * ~removed.unsqueeze(1)
 
 
-def balance_in_graph(
+def sinkhorn_in_graph(
     factor: Tensor, diagonal: Tensor, tolerance: float, completed: bool, bound: bool
 ) -> tuple[Tensor, Tensor, Balancing, tuple[Tensor, ...]]:
     """Factor and diagonal without isolated pixels, their balancing, and the moments of the rounds before it."""
-    scaling, moments, residual, inverse, removed = settle(
+    scaling, moments, residual, inverse, removed = sinkhorn(
         factor.detach(), diagonal.detach(), tolerance, completed, bound
     )
     factor, diagonal = without(factor, removed), torch.where(removed, 1.0, diagonal)
     known = scaling, moments[-1], inverse
-    scaling = _Balanced.apply(factor, diagonal, *known, completed, ALONE, None)  # type: ignore[no-untyped-call]
+    scaling = _ImplicitScaling.apply(factor, diagonal, *known, completed, ALONE, None)  # type: ignore[no-untyped-call]
     return factor, diagonal, Balancing(scaling, moments[-1], residual, 0), moments[:-1].unbind()
