@@ -1,6 +1,5 @@
-"""Files that the command line reads and writes: pipes, links, odd and long names, and parts left by others."""
+"""Files that the command line reads and writes: pipes, links, odd names, and output that cannot be written."""
 
-import fcntl
 import os
 import subprocess
 import sys
@@ -11,9 +10,7 @@ import pytest
 import tifffile
 
 from nlfilter_torch.photo.cli import main
-from nlfilter_torch.photo.io import writing as files
 from nlfilter_torch.photo.io.photographs import read_photograph
-from nlfilter_torch.photo.io.writing import open_beside
 from tests.commands import refused, small_photo
 
 
@@ -62,12 +59,6 @@ def test_links_that_lead_nowhere(photo: Path, tmp_path: Path, capsys: pytest.Cap
     assert (tmp_path / "loop.png").is_symlink()
 
 
-def test_a_file_is_no_array_of_zarr(photo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "out.zarr").write_text("mine")
-    assert "is a file, not a zarr array" in refused(capsys, "detail", photo, tmp_path / "out.zarr")
-    assert (tmp_path / "out.zarr").read_text() == "mine"
-
-
 def test_damaged_tiff_is_one_sentence(photo: Path, tmp_path: Path) -> None:
     """In a separate process, since pytest handles log messages, which otherwise go to standard error."""
     whole = tmp_path / "whole.tif"
@@ -92,53 +83,6 @@ def test_odd_names(
     source.write_bytes(photo.read_bytes())
     assert main(["inspect", str(source), str(tmp_path / "looks"), "--landmarks", "20"]) == 0
     assert name.removesuffix(".png") in capsys.readouterr().out.replace("\n", "")
-
-
-def part_of(path: Path) -> Path:
-    """Make the file that a process leaves when it is killed while writing ``path``."""
-    part = files.name_beside(path)
-    part.write_text("half")
-    return part
-
-
-def test_stale_parts_of_the_same_output_are_removed(photo: Path, tmp_path: Path) -> None:
-    out = tmp_path / "out.png"
-    stale, other = part_of(out), part_of(tmp_path / "other.png")
-    unlike = tmp_path / ".out.png.mine.part"  # of another file
-    unlike.write_text("mine")
-    assert main(["detail", str(photo), str(out), "--alpha", "1,1"]) == 0
-    assert not stale.exists()
-    assert other.exists()
-    assert unlike.exists()
-
-
-def test_parts_that_are_being_written_stay(tmp_path: Path) -> None:
-    out, claimed = tmp_path / "out.txt", part_of(tmp_path / "out.txt")
-    with claimed.open() as stream:
-        fcntl.flock(stream, fcntl.LOCK_EX)  # like another process that is writing it
-        with open_beside(out) as first:
-            first.write(b"first")
-            with open_beside(out) as second:
-                second.write(b"second")
-            assert out.read_bytes() == b"second"
-        assert out.read_bytes() == b"first"
-        assert claimed.exists()
-    with open_beside(out) as stream:
-        stream.write(b"third")
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["out.txt"]
-    assert not files.unfinished
-
-
-@pytest.mark.parametrize("letter", ["x", "é"])
-def test_the_longest_names_can_be_written(letter: str, photo: Path, tmp_path: Path) -> None:
-    out = tmp_path / f"{letter * (251 // len(letter.encode()))}.png"
-    assert main(["detail", str(photo), str(out), "--alpha", "1,1"]) == 0
-    assert sorted(path.name for path in tmp_path.iterdir()) == sorted([photo.name, out.name])
-
-
-def test_names_too_long_are_told(photo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    told = refused(capsys, "detail", photo, tmp_path / f"{'x' * 252}.png")
-    assert told.endswith(": File name too long; check the name and the permissions\n")
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="is a device of Linux")

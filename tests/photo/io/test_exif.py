@@ -1,17 +1,37 @@
-"""Metadata of image files: invalid fields are ignored, and the others are kept."""
+"""Orientation is applied and reset; invalid fields are ignored, and the others are kept."""
 
-import io
 import struct
 from pathlib import Path
 
+import numpy as np
 import pytest
-import tifffile
 import torch
-from PIL import ExifTags, Image, PngImagePlugin
+from PIL import ExifTags, Image, ImageOps
 
 from nlfilter_torch.photo.io.exif import writable
 from nlfilter_torch.photo.io.photographs import read_photograph, write_photograph
-from tests.test_files import photograph, stored_values, tags
+from tests.files import exif_block, photograph, same, stored_values, tags
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+@pytest.mark.parametrize("suffix", [".png", ".tif"])
+def test_exif_orientation_is_applied_and_reset(tmp_path: Path, orientation: int, suffix: str) -> None:
+    values = stored_values(3, "uint8")
+    image, exif = Image.fromarray(values), exif_block(orientation)
+    image.save(tmp_path / f"in{suffix}", exif=exif)
+    image.save(tmp_path / "with_tag.png", exif=exif)
+    with Image.open(tmp_path / "with_tag.png") as stored:
+        upright = np.asarray(ImageOps.exif_transpose(stored))
+    found = read_photograph(tmp_path / f"in{suffix}")
+    assert torch.equal(found.pixels, photograph(upright).pixels)
+    main, details, gps = tags(found.exif)
+    assert main == {ExifTags.Base.Make: "Maker", ExifTags.Base.Orientation: 1}
+    height, width = found.pixels.shape[-2:]
+    assert (details[ExifTags.Base.ExifImageWidth], details[ExifTags.Base.ExifImageHeight]) == (width, height)
+    assert details[ExifTags.Base.LensModel] == "a lens with a long name"
+    assert gps == {ExifTags.GPS.GPSLatitudeRef: "N"}
+    write_photograph(found, tmp_path / f"again{suffix}")
+    same(read_photograph(tmp_path / f"again{suffix}"), found)
 
 
 def odd_exif(kind: str) -> bytes:
@@ -52,14 +72,6 @@ def test_fields_of_exif_without_sense_are_ignored(tmp_path: Path, kind: str, suf
     for other in (".png", ".tif", ".jpg"):
         write_photograph(found, tmp_path / f"out{other}")
         assert tags(read_photograph(tmp_path / f"out{other}").exif)[0][ExifTags.Base.Make] == "Maker"
-
-
-@pytest.mark.parametrize("tag", [(274, 2, 4, "top"), (274, 5, 1, (1, 0)), (274, 3, 2, (6, 1)), (34675, 3, 1, 5)])
-def test_tags_of_tiff_without_sense_are_ignored(tmp_path: Path, tag: tuple[object, ...]) -> None:
-    tifffile.imwrite(tmp_path / "in.tif", stored_values(3, "uint8"), extratags=[(*tag, True)], metadata=None)
-    found = read_photograph(tmp_path / "in.tif")
-    assert torch.equal(found.pixels, photograph(stored_values(3, "uint8")).pixels)
-    assert found.icc is None
 
 
 @pytest.mark.parametrize(
@@ -113,62 +125,3 @@ def test_a_pointer_of_exif_to_nothing_is_left_out(tmp_path: Path) -> None:
     write_photograph(photograph(stored_values(3, "uint8"), exif=exif.tobytes()), tmp_path / "out.tif")
     with Image.open(tmp_path / "out.tif") as image:
         assert image.getexif().get_ifd(ExifTags.IFD.Exif) == {ExifTags.Base.LensModel: "a lens"}
-
-
-# --- colours described by numbers
-
-
-def with_chunk(path: Path, name: bytes, content: bytes) -> None:
-    """Write a PNG file with a chunk before the pixels."""
-    Image.fromarray(stored_values(3, "uint8")).save(path)
-    chunk, whole = io.BytesIO(), path.read_bytes()
-    PngImagePlugin.putchunk(chunk, name, content)
-    path.write_bytes(whole[:33] + chunk.getvalue() + whole[33:])
-
-
-WIDE = (31270, 32900, 68000, 32000, 26500, 69000, 15000, 6000)
-
-
-@pytest.mark.parametrize(
-    ("name", "content", "sentence"),
-    [
-        (b"gAMA", struct.pack(">I", 100_000), "has a gamma of 1 without a colour profile, which the output will not"),
-        (b"cHRM", struct.pack(">8I", *WIDE), "has other primaries than sRGB without a colour profile"),
-        (b"cICP", bytes((12, 13, 0, 1)), "has Display P3 without a colour profile"),
-        (b"cICP", bytes((9, 8, 0, 1)), "has BT.2020 and linear light without a colour profile"),
-    ],
-)
-def test_colours_that_png_describes_by_numbers(tmp_path: Path, name: bytes, content: bytes, sentence: str) -> None:
-    path = tmp_path / "in.png"
-    with_chunk(path, name, content)
-    with pytest.warns(UserWarning, match=sentence):
-        found = read_photograph(path)
-    assert torch.equal(found.pixels, photograph(stored_values(3, "uint8")).pixels)
-
-
-@pytest.mark.parametrize(
-    ("name", "content"),
-    [
-        (b"gAMA", struct.pack(">I", 45_455)),
-        (b"gAMA", bytes(4)),
-        (b"cHRM", struct.pack(">8I", 31270, 32900, 64000, 33000, 30000, 60000, 15000, 6000)),
-        (b"cICP", bytes((1, 13, 0, 1))),
-        (b"cICP", bytes((2, 2, 0, 1))),
-    ],
-)
-def test_usual_colours_of_png_cause_no_warning(tmp_path: Path, name: bytes, content: bytes) -> None:
-    with_chunk(tmp_path / "in.png", name, content)
-    read_photograph(tmp_path / "in.png")
-
-
-def test_colours_that_avif_describes_by_numbers(tmp_path: Path) -> None:
-    path = tmp_path / "in.avif"
-    Image.fromarray(stored_values(3, "uint8")).save(path)
-    whole = path.read_bytes()
-    place = whole.index(b"colrnclx") + 8
-    path.write_bytes(whole[:place] + struct.pack(">HH", 12, 13) + whole[place + 4 :])
-    with pytest.warns(UserWarning, match=r"in\.avif has Display P3 without a colour profile"):
-        read_photograph(path)
-    path.write_bytes(whole[:place] + struct.pack(">HH", 9, 18) + whole[place + 4 :])
-    with pytest.raises(ValueError, match=r"in\.avif is an HDR picture \(HLG\), which is not supported; convert it"):
-        read_photograph(path)

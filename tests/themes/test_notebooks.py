@@ -15,7 +15,7 @@ from PIL import Image
 
 from benchmarks.notebooks import WIDEST, tidy
 
-FOLDER = Path(__file__).parent.parent / "notebooks"
+FOLDER = Path(__file__).parents[2] / "notebooks"
 SCRIPTS = sorted(FOLDER.glob("*.py"))
 # Drags the first slider of the first notebook and prints what was drawn.
 DRAG = """

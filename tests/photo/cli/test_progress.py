@@ -1,0 +1,31 @@
+"""Progress on the terminal, and as lines elsewhere."""
+
+import time
+from pathlib import Path
+
+import pytest
+
+from nlfilter_torch.photo.cli import progress
+
+
+def test_lines_where_there_is_no_terminal(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(progress, "PAUSE", 0.01)
+    said = ""
+    with progress.stages() as report:
+        report("Averaging", 0, 10)
+        for _ in range(1000):  # until a line is printed
+            said += capsys.readouterr().err
+            if "Averaging" in said:
+                break
+            time.sleep(0.01)
+    assert "Averaging, 1 s so far\n" in said
+    assert "nlfilter-torch:" not in said  # the prefix of errors and notes
+    with progress.steps(2) as begin:
+        begin("Reading")
+    assert "\x1b" not in said + capsys.readouterr().err
+
+
+def test_quick_work_says_nothing(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    with progress.steps(1) as begin:
+        begin("Reading")
+    assert capfd.readouterr() == ("", "")
