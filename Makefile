@@ -55,9 +55,10 @@ lint: $(VENV)/.installed-test
 	@$(MAKE) --no-print-directory lint-page
 
 # The script and the style sheet of the editor's page; skipped where their linters cannot be installed.
+# "make" is written out, as a line with $(MAKE) would run even under make -n.
 lint-page:
 	@if ! command -v npm >/dev/null; then echo "There is no node here; the editor's page is not linted."; \
-	elif ! $(MAKE) --no-print-directory node_modules/.installed; then \
+	elif ! make --no-print-directory node_modules/.installed; then \
 	echo "The linters of package.json could not be installed; the editor's page is not linted."; \
 	else npm run --silent lint; fi
 
