@@ -19,7 +19,7 @@ from nlfilter_torch.photo.picture.colour import edit_luminance
 from nlfilter_torch.photo.picture.source import Guide
 from nlfilter_torch.photo.tiled import sampling, stream_detail
 from nlfilter_torch.photo.tiled.pictures import Picture
-from nlfilter_torch.photo.tiled.sampling import ColumnCache, Draws, GuidePicture, draw, over_all
+from nlfilter_torch.photo.tiled.sampling import ColumnCache, Draws, GuidePicture, PassOverPicture, draw
 from nlfilter_torch.photo.tiled.source import Tiled
 from nlfilter_torch.photo.tiled.statistics import Block, Guess, balance_by_passes
 from nlfilter_torch.photo.tiled.tiles import Passes
@@ -187,7 +187,9 @@ def test_sample_holds_about_as_many_pixels_as_asked_for_and_stands_for_all(compl
     guess = Guess(pilot.moment, torch.zeros(1, 0, 30, 1), lambda block, _: block.image, spectral=True)
     draw_from, moment, grams = Draws(pilot, guess.columns(pilot.sample), 3000, picture.pixels), 0.0, 0.0
     drawn = []
-    for block in over_all(picture, pilot.kernel, silent, "Sampling", 2, ColumnCache(2400, 5000))(lambda block: block):
+    for block in PassOverPicture(picture, pilot.kernel, silent, "Sampling", 2, ColumnCache(2400, 5000))(
+        lambda block: block
+    ):
         columns, totals = guess.totals(block)
         drawn.append(draw_from(block, columns))
         moment, grams = moment + totals.moment, grams + totals.grams

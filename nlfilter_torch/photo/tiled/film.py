@@ -7,7 +7,8 @@ again for every other frame, so that equal patches are edited equally in all fra
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, TypeVar, cast
+from functools import partial
+from typing import TypeVar, cast
 
 import numpy as np
 import torch
@@ -42,7 +43,7 @@ class References:
     """Frames that an edit is fitted to, and the results computed from them so far, in order."""
 
     pictures: list[Picture]
-    results: list[Any] = field(default_factory=list)
+    results: list[object] = field(default_factory=list)
 
     def forget_pixels(self) -> None:
         """Free the frames and keep only the results, once all of them are known."""
@@ -71,20 +72,22 @@ class FrameOperator(TiledOperator):
     @property
     def pairs(self) -> RitzPairs:
         """The spectrum."""
+        return self.frame.cached_result(self._pairs_of_references)
 
-        def found() -> RitzPairs:
-            sums = self._summed_up(first_plane, 1, self.over("Summing up"))
-            return RitzPairs.of_sums(sums.grams[:, :2], sums.dtype)
-
-        return self.frame.cached_result(found)
+    def _pairs_of_references(self) -> RitzPairs:
+        sums = self._sums_of_references(first_plane, 1)
+        return RitzPairs.of_sums(sums.grams[:, :2], sums.dtype)
 
     def sums(self, planes: Planes, order: int) -> Sums:
         """The sums over the references for the first ``order`` powers of W."""
-        return self.frame.cached_result(lambda: self._summed_up(planes, order, self.over("Summing up")))
+        return self.frame.cached_result(partial(self._sums_of_references, planes, order))
+
+    def _sums_of_references(self, planes: Planes, order: int) -> Sums:
+        return self._summed_up(planes, order, self.over("Summing up"))
 
     def mean(self, planes: Planes) -> Tensor:
         """Means over the references."""
-        return self.frame.cached_result(lambda: TiledOperator.mean(self, planes))
+        return self.frame.cached_result(partial(super().mean, planes))
 
 
 class Frame(Tiled):
@@ -102,18 +105,18 @@ class Frame(Tiled):
         self.num_requested += 1
         return cast(Cached, self.references.results[self.num_requested - 1])
 
-    def each_reference(self) -> Iterator["Frame"]:
+    def reference_frames(self) -> Iterator["Frame"]:
         """Yield the references, as frames that share the operators of this one."""
         for picture in self.references.pictures:
-            other = Frame(picture, self.passes, self.references)
-            other.operators, other.tile_floats = self.operators, self.tile_floats
-            yield other
+            frame = Frame(picture, self.passes, self.references)
+            frame.operators, frame.tile_floats = self.operators, self.tile_floats
+            yield frame
 
     @full_precision
     def operator(self, guide: Guide) -> FrameOperator:
         """The filter of the references."""
-        learnt = self.cached_result(lambda: learn_filter(self.references.pictures, guide))
-        found = FrameOperator(
+        learnt = self.cached_result(partial(learn_filter, self.references.pictures, guide))
+        operator = FrameOperator(
             GuidePicture(self.picture, guide),
             learnt.pilot,
             self.passes.report,
@@ -124,19 +127,18 @@ class Frame(Tiled):
             workers=self.passes.workers(learnt.pilot.moment.shape[1]),
             cache=ColumnCache(1, 0),
         )
-        found.frame, found._pixel_scaling, found._sample = self, learnt.pixel_scaling, learnt.blocks
-        self.operators.append(found)
+        operator.frame, operator._pixel_scaling, operator._sample = self, learnt.pixel_scaling, learnt.blocks
+        self.operators.append(operator)
         self.tile_floats += learnt.pilot.kernel.landmarks.shape[1]
-        return found
+        return operator
 
     def resized(self, size: tuple[int, int]) -> "Frame":
         """The frame, with the references, in a smaller size."""
-
-        def reduced() -> References:
-            return References([Tiled.resized(other, size).picture for other in self.each_reference()])
-
-        references = self.cached_result(reduced)
+        references = self.cached_result(partial(self._resized_references, size))
         return Frame(super().resized(size).picture, replace(self.plain, tile_rows=None), references)
+
+    def _resized_references(self, size: tuple[int, int]) -> References:
+        return References([Tiled.resized(frame, size).picture for frame in self.reference_frames()])
 
     def cached(self, fitted: Fitted) -> Fitted:
         """Return the edit unchanged: stored planes would be those of the frame, but means are over the references."""
@@ -144,26 +146,27 @@ class Frame(Tiled):
 
     def mean(self, planes: Planes) -> Tensor:
         """Means over the references."""
-        return self.cached_result(lambda: average([Tiled.mean(other, planes) for other in self.each_reference()]))
+        return self.cached_result(partial(self._average, lambda frame: Tiled.mean(frame, planes)))
 
     def mean_of(self, fitted: Fitted, function: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
         """Means over the references."""
-        return self.cached_result(
-            lambda: average([Tiled.mean_of(other, fitted, function) for other in self.each_reference()])
-        )
+        return self.cached_result(partial(self._average, lambda frame: Tiled.mean_of(frame, fitted, function)))
 
     def ends(self, planes: Planes) -> tuple[Tensor, Tensor]:
         """Means of the least and largest values of the references."""
+        return self.cached_result(partial(self._average_ends, planes))
 
-        def found() -> tuple[Tensor, Tensor]:
-            least, largest = zip(*(Tiled.ends(other, planes) for other in self.each_reference()), strict=True)
-            return average(least), average(largest)
-
-        return self.cached_result(found)
+    def _average_ends(self, planes: Planes) -> tuple[Tensor, Tensor]:
+        least, largest = zip(*(Tiled.ends(frame, planes) for frame in self.reference_frames()), strict=True)
+        return average(least), average(largest)
 
     def measured(self, function: Callable[[Source], Tensor]) -> Tensor:
         """The mean of a measurement over the references."""
-        return self.cached_result(lambda: average([function(other) for other in self.each_reference()]))
+        return self.cached_result(partial(self._average, function))
+
+    def _average(self, function: "Callable[[Frame], Tensor]") -> Tensor:
+        """The mean of a function over the references."""
+        return average([function(frame) for frame in self.reference_frames()])
 
 
 def average(values: Sequence[Tensor]) -> Tensor:
@@ -186,12 +189,12 @@ def learn_filter(pictures: Sequence[Picture], guide: Guide) -> LearntFilter:
         guides = (reduce_channels(guide(whole(picture)), channels) for picture in pictures)
         bandwidth = average([estimate_bandwidth(compared, guide_channels=channels) for compared in guides])
     recipe = GuideFeatures(window, bandwidth, spatial, channels)
-    each = min(pictures[0].pixels, max(1, REFERENCE_PIXELS // len(pictures)))
+    count = min(pictures[0].pixels, max(1, REFERENCE_PIXELS // len(pictures)))
     drawn = torch.Generator().manual_seed(generator.initial_seed() % (1 << 63))
     features, images = [], []
     for picture in pictures:
         image = whole(picture)
-        places = stratified(picture.pixels, each, drawn)
+        places = stratified(picture.pixels, count, drawn)
         features.append(recipe(guide(image))[:, :, places])
         images.append(image.flatten(2)[:, :, places])
     points, colours = torch.cat(features, dim=2), torch.cat(images, dim=2)

@@ -1,9 +1,8 @@
 """The filter of a picture that is read a few rows at a time: the sums that define it, and its columns."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
-from functools import cached_property
-from typing import Any
+from functools import cached_property, partial
 
 import torch
 from torch import Tensor
@@ -22,10 +21,10 @@ from nlfilter_torch.photo.tiled.sampling import (
     ColumnCache,
     Draws,
     GuidePicture,
+    PassOverPicture,
     Pilot,
     Report,
     in_silence,
-    over_all,
     patches_at,
     scaled_patches,
     visit,
@@ -35,6 +34,7 @@ from nlfilter_torch.photo.tiled.statistics import (
     Block,
     Guess,
     Pass,
+    Result,
     Sums,
     Totals,
     balance_by_passes,
@@ -52,7 +52,7 @@ class TilePixels:
 
     Attributes:
         image: their colours, (1, C, h, W).
-        features: computes their features (1, D, h W) for the guide of an operator.
+        features: computes their features (1, D, h W), those that an operator compares.
         first: row-major index of the first pixel in the picture.
         width: W of the picture.
     """
@@ -61,24 +61,24 @@ class TilePixels:
     features: "Callable[[TiledOperator], Tensor]"
     first: int
     width: int
-    _columns: dict[int, Columns] = field(default_factory=dict)
-    _layers: tuple[Planes, Tensor] | None = None
+    _columns: dict["TiledOperator", Columns] = field(default_factory=dict)
+    _layers: "tuple[LayerPlanes, Tensor] | None" = None
 
     def columns(self, operator: "TiledOperator") -> Columns:
         """Columns of the pixels, computed once per operator."""
-        if id(operator) not in self._columns:
+        if operator not in self._columns:
             known = None
             if self.image.shape[3] == self.width:
                 known = operator.cache.find(slice(self.first, self.first + self.image[0, 0].numel()))
-            self._columns[id(operator)] = (
+            self._columns[operator] = (
                 operator.columns(self.features(operator)) if known is None else operator.scaled(*known)
             )
-        return self._columns[id(operator)]
+        return self._columns[operator]
 
-    def cached(self, layers: Planes) -> Tensor:
-        """Apply a function to the pixels, and cache its result until another function is given."""
-        if self._layers is None or self._layers[0] is not layers:
-            self._layers = layers, layers(self)
+    def layers(self, planes: "LayerPlanes") -> Tensor:
+        """The detail layers of the pixels, cached until those of other planes are asked for."""
+        if self._layers is None or self._layers[0] is not planes:
+            self._layers = planes, planes.compute(self)
         return self._layers[1]
 
 
@@ -87,17 +87,84 @@ class BlockPixels:
     """Pixels in a sum of an operator: their colours (1, C, 1, n), and their columns."""
 
     image: Tensor
-    found: Columns
+    known_columns: Columns
 
     def columns(self, operator: "TiledOperator") -> Columns:
         """Columns of the pixels."""
-        return self.found
+        return self.known_columns
+
+    def layers(self, planes: "LayerPlanes") -> Tensor:
+        """The detail layers of the pixels."""
+        return planes.compute(self)
 
 
-def first_plane(pixels: Any) -> Tensor:
+PixelsOfPicture = TilePixels | BlockPixels
+
+
+def first_plane(pixels: PixelsOfPicture) -> Tensor:
     """The first channel of a picture."""
-    image: Tensor = pixels.image[:, :1]
-    return image
+    return pixels.image[:, :1]
+
+
+@dataclass(frozen=True, eq=False)
+class ColumnPlanes:
+    """Planes computed by a function of the columns of an operator."""
+
+    operator: "TiledOperator"
+    function: Callable[[Columns], Tensor]
+
+    def __call__(self, pixels: PixelsOfPicture) -> Tensor:
+        """The planes (1, C, h, w) at some pixels."""
+        height, width = pixels.image.shape[-2:]
+        return self.function(pixels.columns(self.operator)).unflatten(2, (height, width))
+
+
+@dataclass(frozen=True, eq=False)
+class LayerPlanes:
+    """Detail layers of planes of the picture, from the coefficients of powers of W."""
+
+    operator: "TiledOperator"
+    planes: Planes
+    coefficients: Tensor
+
+    def __call__(self, pixels: PixelsOfPicture) -> Tensor:
+        """The layers (1, k+1, C, h, w) at some pixels."""
+        return pixels.layers(self)
+
+    def compute(self, pixels: PixelsOfPicture) -> Tensor:
+        """The layers at some pixels, without a cache."""
+        image = self.planes(pixels)
+        layers = layers_of_columns(pixels.columns(self.operator), self.coefficients, image.flatten(2))
+        return layers.unflatten(-1, image.shape[-2:])
+
+
+@dataclass(frozen=True)
+class PassOverBlocks:
+    """A pass over blocks in memory."""
+
+    blocks: list[Block]
+    workers: int
+
+    def __call__(self, function: Callable[[Block], Result]) -> Iterator[Result]:
+        """Apply a function to each block, and yield the results in order."""
+        return in_order(function, self.blocks, self.workers)
+
+
+@dataclass(frozen=True)
+class SampleDraw:
+    """Draws the sample of a block, and computes the sums over all its pixels at a guess."""
+
+    guess: Guess
+    draws: Draws
+
+    def __call__(self, block: Block) -> tuple[Block, Totals]:
+        """The drawn pixels, and the sums."""
+        columns, totals = self.guess.totals(block)
+        return self.draws(block, columns), totals
+
+    def totals(self, block: Block) -> Totals:
+        """The sums alone."""
+        return self.guess.totals(block)[1]
 
 
 @dataclass(eq=False)
@@ -129,17 +196,12 @@ class TiledOperator:
     cache: ColumnCache
     _pixel_scaling: PixelScaling | None = None
     _sample: list[Block] | None = None
-    _sums: dict[int, tuple[Planes, Sums]] = field(default_factory=dict)
+    _sums: dict[Planes, Sums] = field(default_factory=dict)
     _grams: Tensor | float = 0.0  # added to those of the sample
 
-    def __getstate__(self) -> dict[str, Any]:
+    def __getstate__(self) -> dict[str, object]:
         """The operator in another process: without columns that can be computed again."""
-        sums = list(self._sums.values())
-        return self.__dict__ | {"report": in_silence, "cache": ColumnCache(1, 0), "_sums": sums}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        """Restore the operator; planes have other ids in another process."""
-        self.__dict__.update(state | {"_sums": {id(known[0]): known for known in state["_sums"]}})
+        return self.__dict__ | {"report": in_silence, "cache": ColumnCache(1, 0)}
 
     @torch.no_grad()
     @full_precision
@@ -173,42 +235,31 @@ class TiledOperator:
             )
         self._grams = difference.grams
         sample = self._summed_up(planes, order, self.over("Summing up"))
-        self._sums[id(planes)] = (planes, replace(sample, correction=difference.coefficients))
+        self._sums[planes] = replace(sample, correction=difference.coefficients)
 
     def _draw_sample(self, count: int, planes: Planes, order: int) -> tuple[list[Block], Totals]:
         """Draw about ``count`` pixels; also return the sums over all pixels minus theirs, both at the pilot's guess."""
-        pilot = self.pilot
-
-        def values(block: Block, columns: Columns) -> Tensor:
-            return planes(BlockPixels(block.image.unsqueeze(2), columns)).flatten(2)
-
+        pilot, values = self.pilot, partial(_planes_of_block, planes)
         guess = Guess(pilot.moment, torch.empty(1, 0, pilot.moment.shape[1], 1), values, self.guide.guide.spectral)
         columns = guess.columns(pilot.sample)
-        known = sum_up(self._over_blocks([pilot.sample]), lambda block: (values(block, columns), columns), order)
+        known = sum_up(
+            PassOverBlocks([pilot.sample], self.workers), lambda block: (values(block, columns), columns), order
+        )
         guess = replace(guess, coefficients=known.coefficients()[:, :-1])
-        draw, drawn, total = Draws(pilot, columns, count, self.guide.pixels), [], None
-
-        def look(block: Block) -> tuple[Block, Totals]:
-            columns, totals = guess.totals(block)
-            return draw(block, columns), totals
-
-        for some, totals in self._over_all("Sampling")(look):
-            drawn.append(some)
+        draw, drawn, total = SampleDraw(guess, Draws(pilot, columns, count, self.guide.pixels)), [], None
+        for block, totals in self._over_picture("Sampling")(draw):
+            drawn.append(block)
             total = totals if total is None else total.plus(totals)
         assert total is not None  # for mypy; a picture has a pixel
-        each = -(-len(drawn) // SAMPLE_BLOCKS)
-        sample = [Block.concatenate(drawn[first : first + each]) for first in range(0, len(drawn), each)]
-        for totals in self._over_blocks(sample)(lambda block: guess.totals(block)[1]):
+        step = -(-len(drawn) // SAMPLE_BLOCKS)
+        sample = [Block.concatenate(drawn[first : first + step]) for first in range(0, len(drawn), step)]
+        for totals in PassOverBlocks(sample, self.workers)(draw.totals):
             total = total.plus(totals, sign=-1)
         return sample, total
 
-    def _over_all(self, stage: str) -> Pass:
+    def _over_picture(self, stage: str) -> PassOverPicture:
         """A pass over every pixel."""
-        return lambda of: over_all(self.guide, self.kernel, self.report, stage, self.workers, self.cache)(of)
-
-    def _over_blocks(self, blocks: list[Block]) -> Pass:
-        """A pass over the given blocks."""
-        return lambda function: in_order(function, blocks, self.workers)
+        return PassOverPicture(self.guide, self.kernel, self.report, stage, self.workers, self.cache)
 
     @property
     def pixel_scaling(self) -> PixelScaling:
@@ -244,9 +295,9 @@ class TiledOperator:
     def over(self, stage: str) -> Pass:
         """A pass over the sample, or over all pixels if there is none."""
         if self._sample is None:
-            return self._over_all(stage)
+            return self._over_picture(stage)
         self.report(stage, 0, 1)
-        return self._over_blocks(self._sample)
+        return PassOverBlocks(self._sample, self.workers)
 
     def pixels(self, block: Block) -> BlockPixels:
         """The pixels of a block, with their columns."""
@@ -261,18 +312,18 @@ class TiledOperator:
         and is off by several grey levels for planes that are large at a few pixels.
         """
         self.prepare(planes, order)
-        known = self._sums.get(id(planes))
-        if known is None or known[1].moments.shape[1] < order:
-            known = (planes, self._summed_up(planes, order, self._over_all("Summing up")))
-            self._sums[id(planes)] = known  # holds the planes too, so that their id is not reused
-        return known[1]
+        known = self._sums.get(planes)
+        if known is None or known.moments.shape[1] < order:
+            known = self._sums[planes] = self._summed_up(planes, order, self._over_picture("Summing up"))
+        return known
 
     def _summed_up(self, planes: Planes, order: int, blocks: Pass) -> Sums:
-        def values(block: Block) -> tuple[Tensor, Columns]:
-            pixels = self.pixels(block)
-            return planes(pixels).flatten(2), pixels.found
+        return sum_up(blocks, partial(self._planes_and_columns, planes), order)
 
-        return sum_up(blocks, values, order)
+    def _planes_and_columns(self, planes: Planes, block: Block) -> tuple[Tensor, Columns]:
+        """Planes (1, C, n) of the pixels of a block, and their columns."""
+        pixels = self.pixels(block)
+        return planes(pixels).flatten(2), pixels.known_columns
 
     @cached_property
     def pairs(self) -> RitzPairs:
@@ -281,34 +332,25 @@ class TiledOperator:
         if self.guide.guide.sampled and count > SAMPLE:
             features = self.features_at(sampled_places(count))
             return sampled_pairs(map(self.columns, features.split(sampling.CHUNK, dim=2)), count, self.guide.dtype)
-        known = next((sums for _, sums in self._sums.values()), None)
-        sums = known or self.sums(first_plane, 1)
+        sums = next(iter(self._sums.values()), None) or self.sums(first_plane, 1)
         return RitzPairs.of_sums(sums.grams[:, :2] + self._grams, sums.dtype)
 
     def each(self, function: Callable[[Columns], Tensor]) -> Planes:
         """Planes computed by a function of columns."""
-
-        def planes(pixels: Any) -> Tensor:
-            shape: tuple[int, int] = pixels.image.shape[-2:]
-            return function(pixels.columns(self)).unflatten(2, shape)
-
-        return planes
+        return ColumnPlanes(self, function)
 
     def at(self, places: Tensor) -> Blocks:
         """Columns of single pixels, whose features are read now and kept in memory."""
-        features = self.features_at(places)
-        return lambda: (self.columns(part).factor for part in features.split(sampling.CHUNK, dim=2))
+        return partial(self._factors, self.features_at(places))
+
+    def _factors(self, features: Tensor) -> Iterator[Tensor]:
+        """Columns (1, M, n) of the factor at pixels with features (1, D, n), block by block."""
+        for part in features.split(sampling.CHUNK, dim=2):
+            yield self.columns(part).factor
 
     def layers(self, planes: Planes, order: int) -> Planes:
         """Detail layers, from the sums for powers of W."""
-        coefficients = self.sums(planes, order).coefficients()
-
-        def layers(pixels: Any) -> Tensor:
-            image = planes(pixels)
-            found = layers_of_columns(pixels.columns(self), coefficients, image.flatten(2))
-            return found.unflatten(-1, image.shape[-2:])
-
-        return lambda pixels: pixels.cached(layers) if isinstance(pixels, TilePixels) else layers(pixels)
+        return LayerPlanes(self, planes, self.sums(planes, order).coefficients())
 
     def coefficients(self, planes: Planes) -> Tensor:
         """``F y``."""
@@ -320,14 +362,14 @@ class TiledOperator:
         """Means over the sample, or over all pixels if there is none."""
         total, weight = torch.zeros(()), torch.zeros((), dtype=torch.float64)
         self.prepare()
-
-        def part(block: Block) -> tuple[Tensor, Tensor]:
-            values = planes(self.pixels(block)).flatten(2) * block.weights.unsqueeze(1)
-            return values.double().sum(2), block.weights.double().sum()
-
-        for values, weights in self.over("Averaging")(part):
+        for values, weights in self.over("Averaging")(partial(self._weighted_sums, planes)):
             total, weight = total + values, weight + weights
         return (total / weight).to(self.guide.dtype)
+
+    def _weighted_sums(self, planes: Planes, block: Block) -> tuple[Tensor, Tensor]:
+        """Weighted sums (1, C) of planes over a block, and the sum of the weights."""
+        values = planes(self.pixels(block)).flatten(2) * block.weights.unsqueeze(1)
+        return values.double().sum(2), block.weights.double().sum()
 
     def features_at(self, places: Tensor) -> Tensor:
         """Features (1, D, n) of single pixels, read from their rows."""
@@ -338,3 +380,8 @@ class TiledOperator:
             guide = reduce_channels(seen.pixels, recipe.guide_channels)
             patches.append(patches_at(guide, seen, chosen, size))
         return scaled_patches(torch.cat(patches, dim=2), places, self.guide, recipe)
+
+
+def _planes_of_block(planes: Planes, block: Block, columns: Columns) -> Tensor:
+    """Planes (1, C, n) of the pixels of a block with the given columns."""
+    return planes(BlockPixels(block.image.unsqueeze(2), columns)).flatten(2)

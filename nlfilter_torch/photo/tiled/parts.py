@@ -7,6 +7,7 @@ the rectangle's own pixels are needed. This is how the editor shows a part of a 
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -18,7 +19,7 @@ from nlfilter_torch.photo.edits.applying import fit_step, scribbles_of
 from nlfilter_torch.photo.picture.resizing import resized
 from nlfilter_torch.photo.picture.source import Fitted
 from nlfilter_torch.photo.tiled.operator import TiledOperator, TilePixels
-from nlfilter_torch.photo.tiled.pictures import LazyRows, Picture, RowSource
+from nlfilter_torch.photo.tiled.pictures import LazyRows, Picture, RowSource, Tile
 from nlfilter_torch.photo.tiled.sampling import ColumnCache, GuidePicture, Report, in_silence
 from nlfilter_torch.photo.tiled.scribbles import colour_rows, mask_rows
 from nlfilter_torch.photo.tiled.source import Tiled
@@ -67,28 +68,51 @@ def _grown(places: range, margin: int, length: int) -> range:
     return range(max(0, places.start - margin), min(length, places.stop + margin))
 
 
-def some_columns(whole: RowSource, columns: range) -> LazyRows:
-    """Some columns of rows (H, W) or (H, W, S)."""
+def select_columns(whole: RowSource, columns: range) -> LazyRows:
+    """A range of columns of rows (H, W) or (H, W, S)."""
     shape = (whole.shape[0], len(columns), *whole.shape[2:])
     return LazyRows(shape, lambda rows: np.asarray(whole[rows])[:, columns.start : columns.stop], whole.dtype)
+
+
+@dataclass(frozen=True, eq=False)
+class PartFeatures:
+    """Features of the pixels of a rectangle.
+
+    Attributes:
+        picture: the columns of the picture around the rectangle.
+        tile: the rows of the rectangle in it, with the rows around them.
+        first_column: of ``picture``, in the whole picture.
+        inside: the columns of the rectangle in ``picture``.
+    """
+
+    picture: Picture
+    tile: Tile
+    first_column: int
+    inside: slice
+
+    def __call__(self, operator: TiledOperator) -> Tensor:
+        """Features (1, D, n) for an operator of the whole picture."""
+        recipe = operator.kernel.recipe
+        guide = GuidePicture(self.picture, operator.guide.guide).seen(self.tile, recipe.patch_weights.shape[0] // 2)
+        features = recipe(guide.pixels, origin=(guide.origin[0], self.first_column), halo=guide.halo)
+        return features.unflatten(2, (len(self.tile.stored), -1))[..., self.inside].flatten(2)
 
 
 def pixels_of_part(tiled: Tiled, part: Rectangle) -> TilePixels:
     """Read the pixels of a rectangle."""
     margin = tiled.margin
     around = part.grown(margin, tiled.size)
-    picture = Picture(some_columns(tiled.picture.source, around.columns), tiled.picture.name)
+    picture = Picture(select_columns(tiled.picture.source, around.columns), tiled.picture.name)
     tile = picture.tile(part.rows.start, part.rows.stop, margin)
     columns = part.inside(around)[1]
-
-    def features(operator: TiledOperator) -> Tensor:
-        recipe = operator.kernel.recipe
-        seen = GuidePicture(picture, operator.guide.guide).seen(tile, recipe.patch_weights.shape[0] // 2)
-        found = recipe(seen.pixels, origin=(seen.origin[0], around.columns.start), halo=seen.halo)
-        return found.unflatten(2, (len(part.rows), -1))[..., columns].flatten(2)
-
+    features = PartFeatures(picture, tile, around.columns.start, columns)
     first = part.rows.start * tiled.size[1] + part.columns.start
     return TilePixels(tile.inner[..., columns], features, first, tiled.size[1])
+
+
+def planes_of_part(tiled: Tiled, fitted: Fitted, part: Rectangle) -> Tensor:
+    """The planes (1, C, h, w) that an edit computes from a rectangle, before ``finish``."""
+    return fitted.pixels(pixels_of_part(tiled, part))
 
 
 @torch.no_grad()
@@ -104,11 +128,8 @@ def edited_part(tiled: Tiled, fitted: Fitted, part: Rectangle) -> Tensor:
     ]
     for operator in tiled.operators:
         operator.prepare()  # before several workers need it
-
-    def planes_of(strip: Rectangle) -> Tensor:
-        return fitted.pixels(pixels_of_part(tiled, strip))
-
-    planes = torch.cat(list(in_order(planes_of, strips, tiled.passes.workers(tiled.num_landmarks))), dim=2)
+    workers = tiled.passes.workers(tiled.num_landmarks)
+    planes = torch.cat(list(in_order(partial(planes_of_part, tiled, fitted), strips, workers)), dim=2)
     if fitted.finish is None:
         return planes
     inner = part.inside(around)
@@ -201,18 +222,18 @@ class Parts:
 
         ``report`` is told how many of the rows are done, and may raise an error to interrupt.
         """
+        return resized(partial(self._rows, report), self._stages[0].picture.size, size).clamp(0, 1)
+
+    def _rows(self, report: Report, start: int, stop: int) -> Tensor:
+        """The edited rows from ``start`` to ``stop``."""
         height, width = self._stages[0].picture.size
-
-        def read(start: int, stop: int) -> Tensor:
-            report("Full size", start, height)
-            return self.edited(Rectangle(range(start, stop), range(width)))
-
-        return resized(read, (height, width), size).clamp(0, 1)
+        report("Full size", start, height)
+        return self.edited(Rectangle(range(start, stop), range(width)))
 
     def original(self, part: Rectangle) -> Tensor:
         """A rectangle (1, C, h, w) of the picture, in [0, 1]."""
         picture = self._stages[0].picture
-        columns = Picture(some_columns(picture.source, part.columns), picture.name)
+        columns = Picture(select_columns(picture.source, part.columns), picture.name)
         return columns.tile(part.rows.start, part.rows.stop, 0).inner.clamp(0, 1)
 
     def close(self) -> None:

@@ -3,11 +3,11 @@
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from nlfilter_torch.core.checks import warn_of_scale
@@ -15,9 +15,13 @@ from nlfilter_torch.operator.features import reduce_channels
 
 WHITE = {"uint8": 255, "uint16": 65535}  # the integer that stands for 1.0
 KINDS = ("uint8", "uint16", "float16", "float32", "float64")
-Rows = Iterator[tuple[slice, NDArray[Any]]]  # (h, W, S), with their position in the picture
+Stored = NDArray[np.generic]  # rows (h, W, S) of a picture, in the dtype of its file
+Rows = Iterator[tuple[slice, Stored]]  # with their position in the picture
 CHUNK_ROWS = 64  # of rows that are only searched
 STATISTICS_PIXELS = 1 << 15  # in a block of a pass; independent of the tile size, so that sums agree bit by bit
+
+
+FLOAT32: np.dtype[np.generic] = np.dtype(np.float32)
 
 
 class RowSource(Protocol):
@@ -28,10 +32,10 @@ class RowSource(Protocol):
         """(H, W) or (H, W, S)."""
 
     @property
-    def dtype(self) -> Any:
+    def dtype(self) -> np.dtype[np.generic]:
         """A numpy dtype."""
 
-    def __getitem__(self, rows: slice, /) -> Any:
+    def __getitem__(self, rows: slice, /) -> ArrayLike:
         """The rows from ``rows.start`` to ``rows.stop``."""
 
 
@@ -46,10 +50,10 @@ class LazyRows:
     """
 
     shape: tuple[int, ...]
-    read: Callable[[slice], NDArray[Any]]
-    dtype: Any = np.float32
+    read: Callable[[slice], Stored]
+    dtype: np.dtype[np.generic] = FLOAT32
 
-    def __getitem__(self, rows: slice) -> NDArray[Any]:
+    def __getitem__(self, rows: slice) -> Stored:
         """The rows from ``rows.start`` to ``rows.stop``."""
         return self.read(rows)
 
@@ -67,10 +71,10 @@ class RowTarget(Protocol):
         """Of the source."""
 
     @property
-    def dtype(self) -> Any:
+    def dtype(self) -> np.dtype[np.generic]:
         """Type of the stored channels; integers are clipped and rounded."""
 
-    def __setitem__(self, rows: slice, values: Any, /) -> None:
+    def __setitem__(self, rows: slice, values: Stored, /) -> None:
         """Store these rows."""
 
 
@@ -88,7 +92,7 @@ class Tile:
     start: int
     convert: Callable[[], Tensor]
     halo: tuple[int, int]
-    stored: NDArray[Any]
+    stored: Stored
 
     @cached_property
     def pixels(self) -> Tensor:
@@ -162,9 +166,9 @@ class Picture:
         halo = (start - first, last - stop)
         return Tile(start, partial(self._converted, stored), halo, stored[halo[0] : last - first - halo[1]])
 
-    def _converted(self, stored: NDArray[Any]) -> Tensor:
+    def _converted(self, stored: Stored) -> Tensor:
         """The colours (1, C, h, W) of rows (h, W, S)."""
-        values: NDArray[np.floating[Any]] = stored[..., : self.colours].astype(
+        values: NDArray[np.float32 | np.float64] = stored[..., : self.colours].astype(
             np.float64 if self.kind == "float64" else np.float32
         )
         if self.kind in WHITE:
@@ -196,15 +200,15 @@ class Picture:
         return 2 * max(1, STATISTICS_PIXELS // 2 // self.size[1])
 
 
-def stored_as(values: Tensor, kind: str) -> NDArray[Any]:
+def stored_as(values: Tensor, kind: str) -> Stored:
     """Convert channels (1, C, h, W) to rows (h, W, C) of dtype ``kind``; integers are clipped and rounded."""
-    rows: NDArray[Any] = values[0].permute(1, 2, 0).numpy(force=True)
+    rows: NDArray[np.float32 | np.float64] = values[0].permute(1, 2, 0).numpy(force=True)
     if kind in WHITE:
         rows = np.rint(rows.clip(0, 1) * WHITE[kind])
     return np.ascontiguousarray(rows.astype(kind))
 
 
-def transparency(tile: Tile, kind: str) -> NDArray[Any]:
+def transparency(tile: Tile, kind: str) -> Stored:
     """The transparency (h, W, 0 or 1) of a tile, as dtype ``kind``."""
     extra = tile.stored[..., 3 if tile.stored.shape[2] >= 3 else 1 :]
     if extra.dtype.name == kind:

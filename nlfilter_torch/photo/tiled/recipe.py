@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -54,20 +54,28 @@ def edit_regions(
     Raises:
         ValueError, OSError: as :func:`edit_tiling`.
     """
-    each, edited = replace(passes, kind="float32"), []
+    floats, edited = replace(passes, kind="float32"), []
     with ExitStack() as stack:
         for steps in edits:
-            with edit_tiling(each, source, steps, name) as tiling:
+            with edit_tiling(floats, source, steps, name) as tiling:
                 edited.append(Picture(stack.enter_context(passes.stored(tiling))))
-        shares = [Picture(mask) for mask in masks]
+        blend = Blend(edited, [Picture(mask) for mask in masks])
+        yield tile_by_tile(passes, Picture(source, name), blend)
 
-        def blended(tile: Tile) -> Tensor:
-            image, stop = tile.inner, tile.start + tile.inner.shape[2]
-            found = [one.tile(tile.start, stop, 0).inner.to(image) for one in edited]
-            grey = [mask_of(one.tile(tile.start, stop, 0)).to(image) for one in shares]
-            return blend_edited(image, found, torch.cat(grey, dim=1))
 
-        yield tile_by_tile(passes, Picture(source, name), blended)
+@dataclass(frozen=True)
+class Blend:
+    """A blend of edited pictures, each in the region of its mask."""
+
+    edited: list[Picture]
+    masks: list[Picture]
+
+    def __call__(self, tile: Tile) -> Tensor:
+        """The blended rows (1, C, h, W) of a tile of the original picture."""
+        image, stop = tile.inner, tile.start + tile.inner.shape[2]
+        edited = [picture.tile(tile.start, stop, 0).inner.to(image) for picture in self.edited]
+        masks = [mask_of(picture.tile(tile.start, stop, 0)).to(image) for picture in self.masks]
+        return blend_edited(image, edited, torch.cat(masks, dim=1))
 
 
 @contextmanager

@@ -7,7 +7,8 @@ for the sums that define the filter, favours rare pixels and has no gaps.
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any, Literal
+from functools import partial
+from typing import Literal
 
 import numpy as np
 import torch
@@ -33,7 +34,7 @@ from nlfilter_torch.operator.products import Columns
 from nlfilter_torch.operator.sinkhorn import sinkhorn_balance
 from nlfilter_torch.photo.picture.source import Guide
 from nlfilter_torch.photo.tiled.pictures import Picture, Tile
-from nlfilter_torch.photo.tiled.statistics import Block, Pass
+from nlfilter_torch.photo.tiled.statistics import Block, Result
 from nlfilter_torch.photo.tiled.workers import in_order, single_threaded
 
 PILOT = 1 << 15  # pixels of the first sample: their factor, 13 MB at m = 100, is balanced in memory
@@ -61,7 +62,7 @@ class GuidePicture(Picture):
         self.picture, self.guide = picture, guide
         self.stored: Tensor | None = None
 
-    def __getstate__(self) -> dict[str, Any]:
+    def __getstate__(self) -> dict[str, object]:
         """The guide in another process, which computes it from the picture."""
         return self.__dict__ | {"stored": None}
 
@@ -69,11 +70,15 @@ class GuidePicture(Picture):
         """Compute the whole guide in tiles of ``rows``, and keep it in memory for further passes."""
         planes: Tensor | None = None
         tiles = self.picture.tiles(self.margin, rows)
-        for start, part in in_order(lambda tile: (tile.start, self.seen(tile, 0).pixels), tiles, workers):
+        for start, part in in_order(self._start_and_guide, tiles, workers):
             if planes is None:
                 planes = part.new_empty(*part.shape[:2], *self.size)
             planes[:, :, start : start + part.shape[2]] = part
         self.stored = planes
+
+    def _start_and_guide(self, tile: Tile) -> tuple[int, Tensor]:
+        """The first row of a tile of the picture, and its guide."""
+        return tile.start, self.seen(tile, 0).pixels
 
     @property
     def margin(self) -> int:
@@ -89,16 +94,19 @@ class GuidePicture(Picture):
         stop = tile.start + tile.stored.shape[0]
         halo = (min(tile.start, margin), min(self.size[0] - stop, margin))
         if self.stored is not None:
-            seen = self.stored[:, :, tile.start - halo[0] : stop + halo[1]]
-            return Tile(tile.start, lambda: seen, halo, tile.stored)
-        around = tuple(min(have, want + self.guide.margin) for have, want in zip(tile.halo, halo, strict=True))
+            stored = self.stored[:, :, tile.start - halo[0] : stop + halo[1]]
+            return Tile(tile.start, partial(_unchanged, stored), halo, tile.stored)
+        return Tile(tile.start, partial(self._computed, tile, halo), halo, tile.stored)
 
-        def guide() -> Tensor:
-            rows = tile.pixels.shape[2]
-            image = tile.pixels[:, :, tile.halo[0] - around[0] : rows - tile.halo[1] + around[1]]
-            return self.guide(image)[:, :, around[0] - halo[0] : image.shape[2] - around[1] + halo[1]]
+    def _computed(self, tile: Tile, halo: tuple[int, int]) -> Tensor:
+        """The guide of a tile of the picture and of a halo of rows around it."""
+        above, below = (min(have, want + self.guide.margin) for have, want in zip(tile.halo, halo, strict=True))
+        image = tile.pixels[:, :, tile.halo[0] - above : tile.pixels.shape[2] - tile.halo[1] + below]
+        return self.guide(image)[:, :, above - halo[0] : image.shape[2] - below + halo[1]]
 
-        return Tile(tile.start, guide, halo, tile.stored)
+
+def _unchanged(planes: Tensor) -> Tensor:
+    return planes
 
 
 class ColumnCache:
@@ -123,27 +131,52 @@ class ColumnCache:
         return known[0][:, :, inside], known[1][:, inside]
 
 
-def over_all(
-    picture: GuidePicture, kernel: Kernel, report: Report, stage: str, workers: int, cache: ColumnCache
-) -> Pass:
-    """A pass over every pixel of a picture."""
-    size = kernel.recipe.patch_weights.shape[0] // 2
+@dataclass(frozen=True)
+class PassOverPicture:
+    """A pass over every pixel of a picture.
 
-    def tiles() -> Iterator[Tile]:
-        for tile in picture.picture.tiles(size + picture.margin, picture.statistics_rows):
-            report(stage, tile.start, picture.size[0])
+    Attributes:
+        picture: guide of the picture.
+        kernel: computes the columns of the pixels.
+        report: called with the progress of the ``stage``.
+        stage: name for the progress.
+        workers: number of tiles computed at once.
+        cache: columns cached from earlier passes.
+    """
+
+    picture: GuidePicture
+    kernel: Kernel
+    report: Report
+    stage: str
+    workers: int
+    cache: ColumnCache
+
+    def __call__(self, function: Callable[[Block], Result]) -> Iterator[Result]:
+        """Apply a function to each block, and yield the results in order."""
+        return in_order(partial(self._applied, function), self._tiles(), self.workers)
+
+    def _applied(self, function: Callable[[Block], Result], tile: Tile) -> Result:
+        return function(self._block(tile))
+
+    @property
+    def _radius(self) -> int:
+        """Radius of a patch."""
+        return self.kernel.recipe.patch_weights.shape[0] // 2
+
+    def _tiles(self) -> Iterator[Tile]:
+        picture = self.picture
+        for tile in picture.picture.tiles(self._radius + picture.margin, picture.statistics_rows):
+            self.report(self.stage, tile.start, picture.size[0])
             yield tile
 
-    def block_of(tile: Tile) -> Block:
-        image, first = tile.inner.flatten(2), tile.start * picture.size[1]
-        columns = cache.find(slice(first, first + image.shape[2]))
+    def _block(self, tile: Tile) -> Block:
+        image, first = tile.inner.flatten(2), tile.start * self.picture.size[1]
+        columns = self.cache.find(slice(first, first + image.shape[2]))
         if columns is None:
-            guide = picture.seen(tile, size)
-            columns = kernel.columns(guide.pixels, origin=guide.origin, halo=guide.halo)
-            cache.keep(first, columns)
+            guide = self.picture.seen(tile, self._radius)
+            columns = self.kernel.columns(guide.pixels, origin=guide.origin, halo=guide.halo)
+            self.cache.keep(first, columns)
         return Block(*columns, image, torch.ones_like(columns[1]), tile.start)
-
-    return lambda function: in_order(lambda tile: function(block_of(tile)), tiles(), workers)
 
 
 @dataclass(frozen=True)
@@ -166,6 +199,38 @@ class Pilot:
     def completed(self) -> bool:
         """Whether the kernel has a unit diagonal."""
         return self.kernel.completion == "diagonal"
+
+
+@dataclass(frozen=True)
+class PatchReader:
+    """Reads the patches and colours of chosen pixels of a tile, and measures its gradient.
+
+    Attributes:
+        picture: guide of the picture.
+        patch_size: width of a patch in pixels.
+        guide_channels: channels of the guide that are compared.
+        measures_gradient: whether the gradient is needed; it is 0 otherwise.
+    """
+
+    picture: GuidePicture
+    patch_size: int
+    guide_channels: GuideChannels
+    measures_gradient: bool
+
+    @property
+    def margin(self) -> int:
+        """Number of rows of the guide around a tile that are read."""
+        return max(self.patch_size // 2, 1)
+
+    def __call__(self, part: tuple[Tile, Tensor]) -> tuple[Tensor, Tensor, float]:
+        """Patches (1, C p^2, n), colours (1, C, n), and the sum of the squared gradients of all pixels of the tile."""
+        tile, chosen = part
+        seen = self.picture.seen(tile, self.margin)
+        guide = reduce_channels(seen.pixels, self.guide_channels)
+        gradient = 0.0
+        if self.measures_gradient:
+            gradient = float(gradients(guide, seen.halo).double().mean((0, 1)).sum())
+        return patches_at(guide, seen, chosen, self.patch_size), tile.inner.flatten(2)[:, :, chosen], gradient
 
 
 def take_pilot(
@@ -198,17 +263,9 @@ def take_pilot(
     rest = torch.Generator().manual_seed(int(candidates.sum()) % 2**32)  # ``generator`` is for the landmarks alone
     even = stratified(picture.pixels, min(PILOT, picture.pixels), rest)
     wanted = torch.cat([candidates, even])
-    margin, automatic = max(patch_size // 2, 1), isinstance(photometric_bandwidth, str)
-
-    def look(part: tuple[Tile, Tensor]) -> tuple[Tensor, Tensor, float]:
-        tile, chosen = part
-        seen = picture.seen(tile, margin)
-        guide = reduce_channels(seen.pixels, guide_channels)
-        slope = float(gradients(guide, seen.halo).double().mean((0, 1)).sum()) if automatic else 0.0
-        return patches_at(guide, seen, chosen, patch_size), tile.inner.flatten(2)[:, :, chosen], slope
-
-    parts = visit(picture.picture, margin + picture.margin, wanted.sort().values, report, "Looking")
-    patches, values, slopes = zip(*in_order(look, parts, workers), strict=True)
+    reader = PatchReader(picture, patch_size, guide_channels, isinstance(photometric_bandwidth, str))
+    parts = visit(picture.picture, reader.margin + picture.margin, wanted.sort().values, report, "Looking")
+    patches, values, slopes = zip(*in_order(reader, parts, workers), strict=True)
     if isinstance(photometric_bandwidth, str):
         photometric_bandwidth = float(
             bandwidth_of_gradient(torch.tensor(sum(slopes) / picture.pixels, dtype=torch.float64))
@@ -219,26 +276,23 @@ def take_pilot(
     features = scaled_patches(torch.cat(patches, dim=2)[:, :, order], wanted, picture, recipe)
     image = torch.cat(values, dim=2)[:, :, order[len(candidates) :]]
     weights = torch.full((1, len(even)), picture.pixels / len(even), dtype=picture.dtype)
-
-    def fitted() -> Pilot:
+    with single_threaded(workers):  # so few pixels that a second thread would wait most of the time
         points = condense(features[:, :, : len(candidates)], num_landmarks, generator)
         kernel = Kernel(points, inverse_cholesky(points), completion, features=recipe)
         columns = kernel.factor(features[:, :, len(candidates) :])
-        found = sinkhorn_balance(
+        balancing = sinkhorn_balance(
             *columns, tolerance=PILOT_TOLERANCE, completed=completion == "diagonal", weights=weights
         )
-        return Pilot(kernel, Block(*columns, image, weights), found.moment, rest.initial_seed())
-
-    with single_threaded(workers):  # so few pixels that a second thread would wait most of the time
-        return fitted()
+        return Pilot(kernel, Block(*columns, image, weights), balancing.moment, rest.initial_seed())
 
 
 def visit(
     picture: Picture, margin: int, pixels: Tensor, report: Report, stage: str, *, every: bool = True
 ) -> Iterator[tuple[Tile, Tensor]]:
-    """Yield the tiles of a pass, each with the indices within the tile of those of the sorted ``pixels`` that it holds.
+    """Yield the tiles of a pass, each with the chosen pixels that it contains.
 
-    Tiles without any of the pixels are skipped unless ``every`` is True.
+    ``pixels`` are ascending indices in the picture; those that are yielded are indices in the tile. Tiles without any
+    of the pixels are skipped unless ``every`` is True.
     """
     (height, width), rows = picture.size, picture.statistics_rows
     for start in range(0, height, rows):
@@ -250,7 +304,7 @@ def visit(
 
 
 def patches_at(guide: Tensor, tile: Tile, chosen: Tensor, size: int) -> Tensor:
-    """Unweighted patches (1, C p^2, n) around some pixels of a tile with the guide (1, C, H, W)."""
+    """Unweighted patches (1, C p^2, n) around the chosen pixels of a tile with the guide (1, C, H, W)."""
     padded = pad_border(guide, size // 2)[..., tile.halo[0] :, :]
     columns, stride = guide.shape[-1], padded.shape[-1]
     corners = chosen // columns * stride + chosen % columns
@@ -275,7 +329,7 @@ EVEN_SHARE = 0.1  # share of a sample that is spread evenly over the picture
 
 
 class Draws:
-    """Draws about ``count`` pixels of a picture, rare ones more likely than common ones.
+    """A random sample of about ``count`` pixels of a picture, in which rare pixels are more likely than common ones.
 
     Estimated sums have the largest errors where few pixels contribute: from an even sample of a million pixels, the
     rarest patches of a photograph are off by two grey levels and more. The leverage score of a pixel, ``d^2 |u|^2``, is
@@ -311,7 +365,7 @@ def draw(rates: Tensor, generator: np.random.Generator) -> tuple[Tensor, Tensor]
 
     Args:
         rates: expected counts (n,) in (0, 1], float64. A pixel of rate 1 is drawn exactly once, others at most twice.
-        generator: of the positions.
+        generator: source of randomness for the positions.
 
     Returns:
         The indices (k,) of the drawn pixels, ascending, and how often each was drawn, (k,).
@@ -324,8 +378,8 @@ def draw(rates: Tensor, generator: np.random.Generator) -> tuple[Tensor, Tensor]
     summed = (rates * ~certain).cumsum(0)
     ticks = np.arange(math.ceil(float(summed[-1])))
     places = torch.from_numpy(ticks + generator.random(len(ticks)))
-    found = torch.searchsorted(summed, places[places < summed[-1]], right=True)
-    counts = torch.bincount(found, minlength=len(rates)) + certain
+    drawn = torch.searchsorted(summed, places[places < summed[-1]], right=True)
+    counts = torch.bincount(drawn, minlength=len(rates)) + certain
     chosen = counts.nonzero().squeeze(1)
     return chosen, counts[chosen]
 

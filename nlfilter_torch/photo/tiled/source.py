@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.core.checks import check_count
+from nlfilter_torch.core.inner import Inner
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.operator.eigenvalue_bound import is_bounded
 from nlfilter_torch.photo.picture.ends import ends_of
@@ -34,6 +35,53 @@ from nlfilter_torch.photo.tiled.workers import Result, in_order, single_threaded
 
 CACHED_SHARE = 1 / 16  # largest share of the memory for planes that an edit reuses
 FINISH_FLOATS = 64  # floats per pixel of a tile during ``Fitted.finish``: images, their transforms and products
+
+
+def _pixels(tile: Tile) -> Tensor:
+    return tile.pixels
+
+
+def _features(tile: Tile, operator: TiledOperator) -> Tensor:
+    return operator.features(tile)
+
+
+def _call(compute: Callable[[], Tensor]) -> Tensor:
+    return compute()
+
+
+class TileFeatures:
+    """Features of the parts of a tile, computed for the whole tile at once."""
+
+    def __init__(self, tile: Tile, part_pixels: int) -> None:
+        self._tile, self._part_pixels = tile, part_pixels
+        self._features: dict[TiledOperator, tuple[Tensor, ...]] = {}
+
+    def of_part(self, part: int, operator: TiledOperator) -> Tensor:
+        """Features (1, D, n) of a part, numbered from 0, for an operator."""
+        if operator not in self._features:
+            self._features[operator] = operator.features(self._tile).split(self._part_pixels, dim=2)
+        return self._features[operator][part]
+
+
+@dataclass(frozen=True, eq=False)
+class Finish:
+    """The second half of an edit that depends on the neighbourhood of a pixel: :attr:`Fitted.finish` of tiles.
+
+    Attributes:
+        function: ``finish`` of the edit.
+        planes: result of the first half, of the whole picture.
+        margin: radius of the neighbourhood.
+    """
+
+    function: Callable[[Tensor, Tensor, Inner], Tensor]
+    planes: Picture
+    margin: int
+
+    def __call__(self, tile: Tile) -> Tensor:
+        """The edited rows (1, C, h, W) of a tile that has the margin."""
+        stop = tile.start + tile.inner.shape[2]
+        inner = slice(tile.halo[0], tile.pixels.shape[2] - tile.halo[1]), slice(None)
+        return self.function(tile.pixels, self.planes.tile(tile.start, stop, self.margin).pixels, inner)[..., *inner]
 
 
 class Tiled:
@@ -79,7 +127,7 @@ class Tiled:
         sampled, count = passes.sample < picture.pixels, pilot.moment.shape[1]
         cached_pixels = cacheable_pixels(picture, passes, num_features, count, self.stored_floats(num_features))
         self.cached_floats = cached_pixels * (count + 2)
-        found = TiledOperator(
+        operator = TiledOperator(
             picture,
             pilot,
             passes.report,
@@ -90,9 +138,9 @@ class Tiled:
             workers=workers,
             cache=ColumnCache(picture.statistics_rows * self.size[1], cached_pixels),
         )
-        self.operators.append(found)
+        self.operators.append(operator)
         self.tile_floats += num_features
-        return found
+        return operator
 
     def fitting_rows(self, num_features: int, num_landmarks: int) -> int:
         """Rows of a tile that fit in memory, with ``num_features`` more features per pixel.
@@ -147,20 +195,24 @@ class Tiled:
 
     def colours(self, places: Tensor) -> Tensor:
         """Read the colours (1, C, n) of single pixels."""
-        seen = visit(self.picture, 0, places, self.passes.report, "Looking", every=False)
-        return torch.cat([tile.inner.flatten(2)[:, :, chosen] for tile, chosen in seen], dim=2)
+        parts = visit(self.picture, 0, places, self.passes.report, "Looking", every=False)
+        return torch.cat([tile.inner.flatten(2)[:, :, chosen] for tile, chosen in parts], dim=2)
 
     @torch.no_grad()
     def resized(self, size: tuple[int, int]) -> "Tiled":
         """The picture in a smaller size, in memory, as another tiled source."""
-        planes = self._resized(lambda tile: tile.pixels, size)[0].permute(1, 2, 0).numpy()
+        planes = self._resized(_pixels, size)[0].permute(1, 2, 0).numpy()
         passes = replace(self.plain, tile_rows=None)
         return Tiled(Picture(np.ascontiguousarray(planes), self.picture.name), passes, self.strokes)
 
     @torch.no_grad()
     def shrunk(self, planes: Planes, size: tuple[int, int]) -> Tensor:
         """Planes (1, C, h, w) of all pixels in a smaller size."""
-        return self._resized(lambda tile: planes(self.pixels_of(tile)), size)
+        return self._resized(partial(self._planes_of, planes), size)
+
+    def _planes_of(self, planes: Planes, tile: Tile) -> Tensor:
+        """Planes (1, C, h, W) of a tile of the picture."""
+        return planes(self.pixels_of(tile))
 
     @torch.no_grad()
     def resized_weights(self, weights: RowSource, size: tuple[int, int], name: str) -> RowSource:
@@ -187,13 +239,13 @@ class Tiled:
 
     def _resized(self, planes: Callable[[Tile], Tensor], size: tuple[int, int]) -> Tensor:
         """Resize planes of tiles, which are computed by several threads."""
+        parts = resized_parts(partial(self._to_resize, planes), self.size, size)
+        return torch.cat(list(in_order(_call, parts, self.passes.workers(1))), dim=2)
 
-        def read(start: int, stop: int) -> Callable[[], Tensor]:
-            self.passes.report("Reducing", start, self.size[0])
-            return partial(planes, self.picture.tile(start, stop, 0))
-
-        parts = resized_parts(read, self.size, size)
-        return torch.cat(list(in_order(lambda part: part(), parts, self.passes.workers(1))), dim=2)
+    def _to_resize(self, planes: Callable[[Tile], Tensor], start: int, stop: int) -> Callable[[], Tensor]:
+        """A function that computes the planes of the rows from ``start`` to ``stop``, which are read now."""
+        self.passes.report("Reducing", start, self.size[0])
+        return partial(planes, self.picture.tile(start, stop, 0))
 
     def all(self, fitted: Fitted) -> Tensor:
         """The planes (1, C, H, W) that an edit makes of all pixels."""
@@ -215,48 +267,49 @@ class Tiled:
     @torch.no_grad()
     def mean(self, planes: Planes) -> Tensor:
         """Means (1, C, 1, 1) over all pixels."""
-
-        def summed(tile: Tile) -> Tensor:
-            return planes(self.pixels_of(tile)).double().sum((2, 3), keepdim=True)
-
-        total = sum(self._map_tiles(summed, self.picture.statistics_rows, "Averaging"))
+        total = sum(self._map_tiles(partial(self._sums_of, planes), self.picture.statistics_rows, "Averaging"))
         return torch.as_tensor(total / self.picture.pixels).to(self.dtype)
+
+    def _sums_of(self, planes: Planes, tile: Tile) -> Tensor:
+        """Sums (1, C, 1, 1) of planes over a tile."""
+        return self._planes_of(planes, tile).double().sum((2, 3), keepdim=True)
 
     @torch.no_grad()
     def ends(self, planes: Planes) -> tuple[Tensor, Tensor]:
         """Least and largest values over all pixels."""
-
-        def part(tile: Tile) -> tuple[Tensor, Tensor]:
-            return ends_of(planes(self.pixels_of(tile)))
-
-        parts = list(self._map_tiles(part, self.picture.statistics_rows, "Finding black and white"))
+        rows, stage = self.picture.statistics_rows, "Finding black and white"
+        parts = list(self._map_tiles(partial(self._ends_of, planes), rows, stage))
         least, largest = (torch.cat(values, dim=2) for values in zip(*parts, strict=True))
         return least.amin(2, keepdim=True), largest.amax(2, keepdim=True)
+
+    def _ends_of(self, planes: Planes, tile: Tile) -> tuple[Tensor, Tensor]:
+        """Least and largest values of planes in a tile."""
+        return ends_of(self._planes_of(planes, tile))
 
     @torch.no_grad()
     def reduced(self, planes: Planes, step: int) -> Tensor:
         """Means over blocks of ``step`` pixels in both directions."""
         rows = max(1, self.picture.statistics_rows // step) * step
+        return torch.cat(list(self._map_tiles(partial(self._block_means, planes, step), rows, "Reducing")), dim=2)
 
-        def part(tile: Tile) -> Tensor:
-            return block_means(planes(self.pixels_of(tile)), step)
-
-        return torch.cat(list(self._map_tiles(part, rows, "Reducing")), dim=2)
+    def _block_means(self, planes: Planes, step: int, tile: Tile) -> Tensor:
+        """Means over blocks of a tile."""
+        return block_means(self._planes_of(planes, tile), step)
 
     def _map_tiles(self, function: Callable[[Tile], Result], rows: int, stage: str) -> Iterator[Result]:
         """Apply a function to each tile, and yield the results in order.
 
         The first tile is finished before the others begin, since it may compute the sums of an operator.
         """
+        tiles = self._tiles(rows, stage)
+        yield function(next(tiles))
+        yield from in_order(function, tiles, self.passes.workers(1))
 
-        def tiles() -> Iterator[Tile]:
-            for tile in self.picture.tiles(0, rows):
-                self.passes.report(stage, tile.start, self.size[0])
-                yield tile
-
-        each = tiles()
-        yield function(next(each))
-        yield from in_order(function, each, self.passes.workers(1))
+    def _tiles(self, rows: int, stage: str) -> Iterator[Tile]:
+        """Yield tiles of so many rows, and report the progress."""
+        for tile in self.picture.tiles(0, rows):
+            self.passes.report(stage, tile.start, self.size[0])
+            yield tile
 
     def blocks(self, step: float, floats: int) -> InMemory:
         """The picture, reduced by means over blocks of an integer number of pixels along each axis, in memory.
@@ -284,7 +337,7 @@ class Tiled:
     def pixels_of(self, tile: Tile) -> TilePixels:
         """All pixels of a tile of the picture."""
         width = self.size[1]
-        return TilePixels(tile.inner, lambda operator: operator.features(tile), tile.start * width, width)
+        return TilePixels(tile.inner, partial(_features, tile), tile.start * width, width)
 
     def parts_of(self, tile: Tile) -> Iterator[TilePixels]:
         """Split a tile into groups of a few rows, which are the same for tiles of any height.
@@ -293,16 +346,10 @@ class Tiled:
         shape.
         """
         width, step = self.size[1], self.passes.chunk_rows(self.size[1], self.num_landmarks)
-        features: dict[int, tuple[Tensor, ...]] = {}
-
-        def features_of(operator: TiledOperator, part: int) -> Tensor:
-            if id(operator) not in features:
-                features[id(operator)] = operator.features(tile).split(step * width, dim=2)
-            return features[id(operator)][part]
-
+        features = TileFeatures(tile, step * width)
         for part, image in enumerate(tile.inner.split(step, dim=2)):
             first = (tile.start + part * step) * width
-            yield TilePixels(image, lambda operator, part=part: features_of(operator, part), first, width)  # type: ignore[misc]
+            yield TilePixels(image, partial(features.of_part, part), first, width)
 
     @full_precision
     def edited(self, fitted: Fitted, tile: Tile) -> Tensor:
@@ -346,7 +393,7 @@ class Tiled:
         tiling = Tiling(
             passes,
             self.picture,
-            lambda tile: self.edited(fitted, tile),
+            partial(self.edited, fitted),
             self.margin,
             rows,
             together,
@@ -356,18 +403,11 @@ class Tiled:
         if fitted.finish is None:
             yield tiling
             return
-        finish, margin = fitted.finish, fitted.margin
         before = replace(tiling, passes=replace(passes, kind=self.plain.kind), transparent=False, stage="Comparing")
         with passes.stored(before) as planes:
-            stored = Picture(planes, self.picture.name, channels=planes.shape[2])
-
-            def finished(tile: Tile) -> Tensor:
-                stop = tile.start + tile.inner.shape[2]
-                inner = slice(tile.halo[0], tile.pixels.shape[2] - tile.halo[1]), slice(None)
-                return finish(tile.pixels, stored.tile(tile.start, stop, margin).pixels, inner)[..., *inner]
-
+            finish = Finish(fitted.finish, Picture(planes, self.picture.name, channels=planes.shape[2]), fitted.margin)
             rows, workers = self._rows_to_finish(fitted, rows, workers)
-            yield replace(tiling, edit=finished, margin=margin, rows=rows, together=fitted.step, workers=workers)
+            yield replace(tiling, edit=finish, margin=fitted.margin, rows=rows, together=fitted.step, workers=workers)
 
     def _rows_to_finish(self, fitted: Fitted, rows: int, workers: int) -> tuple[int, int]:
         """Rows per tile and number of workers for ``finish``.

@@ -14,7 +14,8 @@ The error is the error of the sample times that of the guess.
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Any
+from functools import partial
+from typing import Protocol, TypeVar
 
 import torch
 from torch import Tensor
@@ -34,9 +35,20 @@ MAX_PASSES = 12
 ALARM = 1e-3
 
 
+Result = TypeVar("Result")
+
+
 @dataclass(frozen=True)
 class Block:
-    """Some pixels: factor (1, M, n), diagonal (1, n), colours (1, C, n), how many each represents (1, n); first row."""
+    """A block of pixels in a pass.
+
+    Attributes:
+        factor: their columns of the factor, (1, M, n).
+        diagonal: their diagonal, (1, n).
+        image: their colours, (1, C, n).
+        weights: number of pixels that each represents, (1, n).
+        start_row: row of the first pixel in the picture.
+    """
 
     factor: Tensor
     diagonal: Tensor
@@ -53,7 +65,28 @@ class Block:
         return Block(torch.cat(factors, 2), torch.cat(diagonals, 1), torch.cat(images, 2), torch.cat(weights, 1))
 
 
-Pass = Callable[[Callable[[Block], Any]], Iterable[Any]]  # maps a function over blocks, in order
+class Pass(Protocol):
+    """A pass over the blocks of a picture or of a sample."""
+
+    def __call__(self, function: Callable[[Block], Result]) -> Iterable[Result]:
+        """Apply a function to each block, and yield the results in order."""
+
+
+@dataclass(frozen=True)
+class NewtonTerms:
+    """Terms of a step of Newton's method at the moment ``total``, with scalings of at most ``largest``."""
+
+    total: Tensor
+    largest: float
+
+    def __call__(self, block: Block) -> tuple[Tensor, Tensor, torch.dtype]:
+        """The sums, the Jacobian and the dtype of a block."""
+        scaling = scaling_from_moment(block.factor, block.diagonal, self.total.to(block.factor))
+        scaling = scaling.clamp(max=self.largest)
+        remainder = scaling * (scaling * block.diagonal)
+        weights = scaling * (block.weights / (1 + remainder)).sqrt()
+        sums = moment(block.factor, (block.weights * scaling).unsqueeze(1))
+        return sums, sum_grams(block.factor, weights, remainder, 1)[:, 0], block.factor.dtype
 
 
 def balance_by_passes(blocks: Pass, total: Tensor, *, completed: bool, correction: Tensor | float = 0.0) -> Tensor:
@@ -66,17 +99,9 @@ def balance_by_passes(blocks: Pass, total: Tensor, *, completed: bool, correctio
     largest = LARGEST if completed else float("inf")
     identity = torch.eye(total.shape[1], dtype=total.dtype, device=total.device)
     change, tolerance = float("inf"), 0.0
-
-    def terms(block: Block) -> tuple[Tensor, Tensor, torch.dtype]:
-        scaling = scaling_from_moment(block.factor, block.diagonal, total.to(block.factor)).clamp(max=largest)
-        remainder = scaling * (scaling * block.diagonal)
-        weights = scaling * (block.weights / (1 + remainder)).sqrt()
-        sums = moment(block.factor, (block.weights * scaling).unsqueeze(1))
-        return sums, sum_grams(block.factor, weights, remainder, 1)[:, 0], block.factor.dtype
-
     for _ in range(MAX_PASSES):
         sums, jacobian = torch.zeros_like(total), identity.expand(total.shape[0], -1, -1)
-        for part, slope, dtype in blocks(terms):
+        for part, slope, dtype in blocks(NewtonTerms(total, largest)):
             sums, jacobian, tolerance = sums + part, jacobian + slope, CONVERGED[dtype]
         step = torch.cholesky_solve(sums + correction - total, torch.linalg.cholesky_ex(jacobian).L)
         total = total + step
@@ -91,18 +116,26 @@ def balance_by_passes(blocks: Pass, total: Tensor, *, completed: bool, correctio
     return total
 
 
+@dataclass(frozen=True)
+class GramByPasses:
+    """Computes ``F (x I - R)^-k F^T`` in a pass over the pixels for each x and k."""
+
+    blocks: Pass
+    pixel_scaling: PixelScaling
+
+    def __call__(self, at: Tensor, power: int) -> Tensor:
+        """The sum for x, of shape (1,), and k."""
+        return torch.stack(list(self.blocks(partial(self._of_block, at, power)))).sum(0)
+
+    def _of_block(self, at: Tensor, power: int, block: Block) -> Tensor:
+        scaling, remainder = self.pixel_scaling(block.factor, block.diagonal)
+        weights = block.weights * shift(at, remainder).pow(-power)
+        return sum_grams(block.factor, (scaling * weights.sqrt()).to(block.factor), None, 1)[:, 0]
+
+
 def limiter_by_passes(blocks: Pass, pixel_scaling: PixelScaling, dtype: torch.dtype) -> Tensor | None:
     """Compute the ``X^(1/2)`` (1, M, M) to multiply the factor by, or None if no eigenvalue exceeds 1."""
-
-    def gram(at: Tensor, power: int) -> Tensor:
-        def part(block: Block) -> Tensor:
-            scaling, remainder = pixel_scaling(block.factor, block.diagonal)
-            weights = block.weights * shift(at, remainder).pow(-power)
-            return sum_grams(block.factor, (scaling * weights.sqrt()).to(block.factor), None, 1)[:, 0]
-
-        return torch.stack(list(blocks(part))).sum(0)
-
-    allowed = slack(dtype, CONVERGED[dtype])
+    gram, allowed = GramByPasses(blocks, pixel_scaling), slack(dtype, CONVERGED[dtype])
     return limiter(gram, pixel_scaling.moment, allowed) if exceeds(gram, pixel_scaling.moment, allowed) else None
 
 
@@ -125,10 +158,10 @@ class Sums:
     def coefficients(self) -> Tensor:
         """The c_i of ``W^i y = F^T c_i + r W^(i-1) y`` for i = 1 ... k, (1, k, M, C)."""
         known = self.moments if self.correction is None else self.moments + self.correction
-        found = [known[:, 0]]
+        coefficients = [known[:, 0]]
         for i in range(1, known.shape[1]):
-            found.append(known[:, i] + sum(self.grams[:, j] @ found[i - 1 - j] for j in range(i)))
-        return torch.stack(found, dim=1)
+            coefficients.append(known[:, i] + sum(self.grams[:, j] @ coefficients[i - 1 - j] for j in range(i)))
+        return torch.stack(coefficients, dim=1)
 
 
 @dataclass(frozen=True)
@@ -200,18 +233,21 @@ def sum_up(blocks: Pass, values: Callable[[Block], tuple[Tensor, Columns]], orde
 
     ``values`` computes the planes y (1, C, n) to filter in a block, and its columns.
     """
-
-    def part(block: Block) -> tuple[Tensor, Tensor, torch.dtype]:
-        planes, columns = values(block)
-        factor, scaling, remainder = columns.factor, columns.scaling, columns.remainder
-        grams = sum_grams(factor, scaling * block.weights.sqrt(), remainder, max(order - 1, 2))
-        powers = [(scaling * block.weights).unsqueeze(1) * planes]
-        for _ in range(order - 1):
-            powers.append(remainder.unsqueeze(1) * powers[-1])
-        sums = moment(factor, torch.cat(powers, dim=1))  # (1, M, k C)
-        return grams, sums.unflatten(2, (order, -1)).transpose(1, 2), factor.dtype
-
     grams, moments, dtype = torch.zeros(()), torch.zeros(()), torch.float64
-    for gram, sums, dtype in blocks(part):  # noqa: B007
+    for gram, sums, dtype in blocks(partial(_sums_of_block, values, order)):  # noqa: B007
         grams, moments = grams + gram, moments + sums
     return Sums(grams, moments, dtype)
+
+
+def _sums_of_block(
+    values: Callable[[Block], tuple[Tensor, Columns]], order: int, block: Block
+) -> tuple[Tensor, Tensor, torch.dtype]:
+    """Gram matrices, moments and dtype of a block, for :func:`sum_up`."""
+    planes, columns = values(block)
+    factor, scaling, remainder = columns.factor, columns.scaling, columns.remainder
+    grams = sum_grams(factor, scaling * block.weights.sqrt(), remainder, max(order - 1, 2))
+    powers = [(scaling * block.weights).unsqueeze(1) * planes]
+    for _ in range(order - 1):
+        powers.append(remainder.unsqueeze(1) * powers[-1])
+    sums = moment(factor, torch.cat(powers, dim=1))  # (1, M, k C)
+    return grams, sums.unflatten(2, (order, -1)).transpose(1, 2), factor.dtype

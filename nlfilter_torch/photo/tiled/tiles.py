@@ -6,21 +6,22 @@ from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryFile, gettempdir
-from typing import Any, Literal, Protocol
+from typing import Literal, Protocol
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from nlfilter_torch.core.checks import check_choice, check_count
 from nlfilter_torch.photo.tiled import sampling
 from nlfilter_torch.photo.tiled.pictures import (
+    FLOAT32,
     KINDS,
     Picture,
     Rows,
     RowSource,
     RowTarget,
+    Stored,
     Tile,
     stored_as,
     transparency,
@@ -33,7 +34,8 @@ TILE_PIXELS = 1 << 17  # longer tiles are no faster
 # Pixels that are computed together, for speed, with columns of a filter and without, if that many bytes may be used.
 CHUNK_PIXELS, PLAIN_CHUNK_PIXELS, LARGE_MEMORY = 1 << 14, 1 << 16, 1 << 28
 Statistics = Literal["sample", "full"]
-TileEdit = Callable[[Tile], Tensor]  # to the colours (1, C, h, W) of its rows
+TileEdit = Callable[[Tile], Tensor]  # computes the colours (1, C, h, W) of its rows
+Comparison = tuple[float, int]  # a sum over pixels of rows before and after an edit, and the number of values
 
 
 @dataclass(frozen=True)
@@ -70,7 +72,7 @@ class Passes:
         if self.tile_rows is not None:
             check_count(self.tile_rows, "tile_rows")
 
-    def __getstate__(self) -> dict[str, Any]:
+    def __getstate__(self) -> dict[str, object]:
         """The options in another process, which reports nothing."""
         return self.__dict__ | {"report": in_silence, "processes": None}
 
@@ -115,8 +117,8 @@ class Tiling:
         workers: number of threads of this process, with a tile each.
         transparent: whether the output has the transparency of the picture.
         stage: name for the progress.
-        compare: computes something from rows before and after the edit, both as they are stored.
-        compared: called with each of these results, in this process.
+        compare: compares rows before and after the edit, both as they are stored.
+        compared: called with each of these comparisons, in this process.
     """
 
     passes: Passes
@@ -128,32 +130,32 @@ class Tiling:
     workers: int = 1
     transparent: bool = True
     stage: str = "Filtering"
-    compare: Callable[[NDArray[Any], NDArray[Any]], Any] | None = None
-    compared: Callable[[Any], None] | None = None
+    compare: Callable[[Stored, Stored], Comparison] | None = None
+    compared: Callable[[Comparison], None] | None = None
 
-    def __getstate__(self) -> dict[str, Any]:
+    def __getstate__(self) -> dict[str, object]:
         """The tiling in another process."""
         return self.__dict__ | {"compared": None}
 
     def __iter__(self) -> Rows:
         """Yield the edited rows, in order."""
-
-        def tiles() -> Iterator[Tile]:
-            for tile in self.picture.tiles(self.margin, self.rows):
-                self.passes.report(self.stage, tile.start, self.picture.size[0])
-                yield tile
-
-        def found(tile: Tile) -> tuple[slice, NDArray[Any], list[Any]]:
-            values = self._edited(tile)
-            return slice(tile.start, tile.start + len(values)), values, self._comparison(tile.stored, values)
-
-        for part, values, comparison in in_order(found, tiles(), self.workers):
+        for part, values, comparison in in_order(self._rows, self._tiles(), self.workers):
             self.note(comparison)
             yield part, values
         self.passes.report(self.stage, self.picture.size[0], self.picture.size[0])
 
+    def _tiles(self) -> Iterator[Tile]:
+        for tile in self.picture.tiles(self.margin, self.rows):
+            self.passes.report(self.stage, tile.start, self.picture.size[0])
+            yield tile
+
+    def _rows(self, tile: Tile) -> tuple[slice, Stored, list[Comparison]]:
+        """The place of a tile's rows, these rows after the edit, and what :attr:`compare` returns for them."""
+        values = self._edited(tile)
+        return slice(tile.start, tile.start + len(values)), values, self._comparison(tile.stored, values)
+
     @torch.no_grad()
-    def part(self, start: int, stop: int) -> tuple[NDArray[Any], list[Any]]:
+    def part(self, start: int, stop: int) -> tuple[Stored, list[Comparison]]:
         """The edited rows from ``start`` to ``stop``, computed in this thread, and the results for :meth:`note`."""
         last = min(-(-stop // self.together) * self.together, self.picture.size[0])
         parts, comparisons = [], []
@@ -164,19 +166,19 @@ class Tiling:
             comparisons += self._comparison(tile.stored[wanted], parts[-1])
         return np.concatenate(parts), comparisons
 
-    def note(self, comparisons: list[Any]) -> None:
-        """Pass results of ``compare`` on."""
+    def note(self, comparisons: list[Comparison]) -> None:
+        """Pass comparisons on to :attr:`compared`."""
         if self.compared is not None:
             for comparison in comparisons:
                 self.compared(comparison)
 
-    def _edited(self, tile: Tile) -> NDArray[Any]:
+    def _edited(self, tile: Tile) -> Stored:
         values = stored_as(self.edit(tile), self.passes.kind)
         if not self.transparent:
             return values
         return np.concatenate([values, transparency(tile, self.passes.kind)], axis=2)
 
-    def _comparison(self, before: NDArray[Any], after: NDArray[Any]) -> list[Any]:
+    def _comparison(self, before: Stored, after: Stored) -> list[Comparison]:
         return [] if self.compare is None else [self.compare(before, after)]
 
 
@@ -204,7 +206,7 @@ def intermediate(rows: Rows, size: tuple[int, int], folder: Path | None) -> Iter
         OSError: if the file does not fit.
     """
     with TemporaryFile(dir=folder) as file:
-        shape, kind = (*size, 0), np.dtype(np.float32)
+        shape, kind = (*size, 0), FLOAT32
         for _, values in rows:
             shape, kind = (*size, values.shape[2]), values.dtype
             try:
@@ -246,8 +248,8 @@ def bytes_needed(picture: Picture, passes: Passes, num_features: int, num_landma
     factors = workers * factor_bytes(rows * picture.size[1], num_landmarks) // 4
     # First the pilot, with copies of its features and its factor; later the factors of both samples, and blocks.
     pilot, block = min(sampling.PILOT, picture.pixels), min(picture.statistics_rows * picture.size[1], picture.pixels)
-    some = (pilot + min(picture.pixels, passes.sample)) * (num_landmarks + picture.colours + 2)
-    later = some + workers * block * (num_landmarks + num_features + 8)
+    samples = (pilot + min(picture.pixels, passes.sample)) * (num_landmarks + picture.colours + 2)
+    later = samples + workers * block * (num_landmarks + num_features + 8)
     return size * (extra_floats + factors + max(pilot * (num_landmarks + 3 * num_features), later))
 
 

@@ -23,8 +23,8 @@ def in_order(function: Callable[[Item], Result], items: Iterable[Item], workers:
 
     Args:
         function: called by several threads at once.
-        items: up to twice as many as there are workers, and one more, are in memory, so that no worker waits for
-            another one that is slower.
+        items: up to twice as many as there are workers, plus one, are in memory at once, so that no worker waits for
+            a slower one.
         workers: number of threads, which share torch's threads for operations; 1 runs in the calling thread.
     """
     call = torch.no_grad()(function)
@@ -32,16 +32,10 @@ def in_order(function: Callable[[Item], Result], items: Iterable[Item], workers:
         yield from map(call, items)
         return
     started = Barrier(workers + 1)
-
-    def start(threads: int) -> None:
-        torch.get_num_threads()  # the first call in a thread sets their number
-        torch.set_num_threads(max(1, threads // workers))
-        started.wait()
-
     with ThreadPoolExecutor(workers) as pool:
-        with _for_some_threads() as threads:
+        with _for_new_threads() as threads:
             for _ in range(workers):
-                pool.submit(start, threads)
+                pool.submit(_begin, max(1, threads // workers), started)
             started.wait()
         waiting: deque[Future[Result]] = deque()
         for item in items:
@@ -50,6 +44,13 @@ def in_order(function: Callable[[Item], Result], items: Iterable[Item], workers:
                 yield waiting.popleft().result()
         while waiting:
             yield waiting.popleft().result()
+
+
+def _begin(threads: int, started: Barrier) -> None:
+    """Set the number of threads among which a new worker divides an operation, and wait for the other workers."""
+    torch.get_num_threads()  # the first call in a thread sets their number
+    torch.set_num_threads(threads)
+    started.wait()
 
 
 @contextmanager
@@ -62,7 +63,7 @@ def single_threaded(workers: int) -> Iterator[None]:
     if workers == 1 or before == 1:
         yield
         return
-    with _for_some_threads():
+    with _for_new_threads():
         torch.set_num_threads(1)
     try:
         yield
@@ -71,8 +72,8 @@ def single_threaded(workers: int) -> Iterator[None]:
 
 
 @contextmanager
-def _for_some_threads() -> Iterator[int]:
-    """Yield the number of threads that new threads divide an operation among, and restore it afterwards.
+def _for_new_threads() -> Iterator[int]:
+    """Yield the number of threads that an operation in a new thread is divided among, and restore it afterwards.
 
     Torch has a number for each thread; a new thread begins with the number that was last set in any thread.
     """
