@@ -15,7 +15,7 @@ AROUND = 100_000  # bytes that a form adds to a file
 
 
 def names_of(host: str) -> frozenset[str]:
-    """Names under which an editor that listens on ``host`` may be addressed, beside addresses in figures.
+    """Names under which an editor that listens on ``host`` may be addressed, beside numeric addresses.
 
     >>> sorted(names_of("127.0.0.1"))
     ['127.0.0.1', '::1', 'localhost']
@@ -32,11 +32,11 @@ def refusal(headers: Headers, *, websocket: bool, host: str, names: Iterable[str
     A page of another site can reach the editor in two ways: by a name of its own that leads to this machine (DNS
     rebinding), which ``Host`` shows, or by the editor's address, which ``Origin`` shows.
     """
-    given = _split(f"//{headers.get('host', '')}")
-    if given is None or not (given[0] in names or (host not in LOCAL and _is_figures(given[0]))):
+    address = _split(f"//{headers.get('host', '')}")
+    if address is None or not (address[0] in names or (host not in LOCAL and _is_numeric(address[0]))):
         return 400, "the host must be the address of the editor, as it was printed at its start"
     origin = headers.get("origin")
-    if origin is not None and _split(origin) != given:
+    if origin is not None and _split(origin) != address:
         return 403, "requests must come from the page of the editor itself"
     foreign = not websocket and headers.get("sec-fetch-site") in ("cross-site", "same-site")
     # Sent without an origin by links, which are harmless, and by scripts and pictures of other sites.
@@ -60,7 +60,7 @@ def _split(address: str) -> tuple[str, int | None] | None:
         return None
 
 
-def _is_figures(host: str) -> bool:
+def _is_numeric(host: str) -> bool:
     try:
         ipaddress.ip_address(host)
     except ValueError:

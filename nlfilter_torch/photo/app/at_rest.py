@@ -4,15 +4,29 @@ import asyncio
 from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
+from typing import Protocol
 
 from torch import Tensor
 
 from nlfilter_torch.core.progress import Progress
-from nlfilter_torch.photo.app.closeup import OutdatedError, Run, Start, interrupted
-from nlfilter_torch.photo.app.session import Session
+from nlfilter_torch.photo.app.work import Interruptible, OutdatedError, Run, Start
 from nlfilter_torch.photo.declared.presets import Recipe
+from nlfilter_torch.photo.tiled.sampling import Report
 
 QUIET = 1.0  # seconds without a change, after which the whole photograph is edited
+
+
+class Reduced(Protocol):
+    """The session of a photograph, as far as its reduced picture is concerned."""
+
+    recipe: Recipe
+
+    @property
+    def is_reduced(self) -> bool:
+        """Whether the preview has fewer pixels than the photograph."""
+
+    def at_rest(self, recipe: Recipe, report: Report) -> Tensor:
+        """The photograph under an edit, reduced to the size of the preview."""
 
 
 class AtRest:
@@ -23,15 +37,15 @@ class AtRest:
     """
 
     def __init__(
-        self, run: Run, start: Start, wanted: Callable[[Session], bool], show: Callable[[Tensor], None]
+        self, run: Run, start: Start, wanted: Callable[[Reduced], bool], show: Callable[[Tensor], None]
     ) -> None:
         self._run, self._start, self._wanted, self._show = run, start, wanted, show
         self._working = False
-        self._again: Session | None = None
+        self._again: Reduced | None = None
 
-    def drawn(self, session: Session) -> None:
+    def drawn(self, session: Reduced) -> None:
         """Begin anew: the preview of a session has been drawn."""
-        if session.preview.stride > 1 and session.recipe.acting:
+        if session.is_reduced and session.recipe.acting:
             self._again = session
             if not self._working:
                 self._start(self._work())
@@ -47,12 +61,12 @@ class AtRest:
         finally:
             self._working = False
 
-    async def _edit(self, session: Session, recipe: Recipe) -> None:
-        def is_outdated() -> bool:
-            return self._again is not None or session.recipe.acting != recipe.acting or not self._wanted(session)
+    def _is_outdated(self, session: Reduced, recipe: Recipe) -> bool:
+        return self._again is not None or session.recipe.acting != recipe.acting or not self._wanted(session)
 
+    async def _edit(self, session: Reduced, recipe: Recipe) -> None:
         progress = Progress()
-        report = interrupted(progress, is_outdated)
+        report = Interruptible(progress, partial(self._is_outdated, session, recipe))
         report("Full size", 0, 1)
         picture = await self._run("Full size", partial(session.at_rest, recipe, report), progress)
         report("Full size", 1, 1)

@@ -1,92 +1,112 @@
 """The large picture with its overlays, and the brush that draws on it."""
 
 from collections.abc import Callable
+from typing import Protocol
 
 from nicegui import ui
 from torch import Tensor
 
 from nlfilter_torch.photo.app import drawing
-from nlfilter_torch.photo.app.panel import BRUSHES, Brush
-from nlfilter_torch.photo.app.session import Opened, Session
+from nlfilter_torch.photo.app.brush import BRUSHES, Brush
+from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.declared.strokes import Stroke
+
+
+class Painted(Protocol):
+    """The session of an open photograph, as far as its preview and its strokes are concerned."""
+
+    recipe: Recipe
+
+    def render(self, upto: str | None = None) -> Tensor:
+        """The preview under the edit up to a step, (1, C, h, w) in [0, 1]."""
+
+    def mask(self) -> Tensor | None:
+        """The mask of the region, (1, 1, h, w) in [0, 1]."""
+
+    def add_stroke(self, step: str, points: list[tuple[float, float]], radius: float, paint: str) -> None:
+        """Add a stroke to a step: points (x, y) in pixels of the preview."""
 
 
 class Canvas:
     """A photograph with its mask, its scribbles and the version before the edit, built into the open element.
 
-    Pictures are image files, by their kind, at addresses that hold the token. ``drawn`` is called when a stroke is
-    complete, ``show_error`` with a sentence for the user. ``session`` may be replaced by another.
+    Args:
+        brush: what draws.
+        token: part of the addresses of the pictures.
+        drawn: is called when a stroke is complete.
+        show_error: is called with a sentence for the user.
+
+    Attributes:
+        pictures: image files, by their kind.
     """
 
-    def __init__(
-        self,
-        session: Session,
-        brush: Brush,
-        token: str,
-        drawn: Callable[[], None],
-        show_error: Callable[[str], None],
-    ) -> None:
+    def __init__(self, brush: Brush, token: str, drawn: Callable[[], None], show_error: Callable[[str], None]) -> None:
         self.pictures: dict[str, bytes] = {}
-        self.session = session
-        self._brush = brush
-        self._token = token
-        self._drawn = drawn
-        self._frame = 0
         self.histogram = ""
         self.clipped = self.clipped_before = (0.0, 0.0)  # shares of white and of black, after and before the edit
+        self._session: Painted | None = None
+        self._preview_size = (1, 1)
+        self._brush, self._token, self._drawn = brush, token, drawn
+        self._frame = 0
         self._flashes = 0
         self._mask_shown: bytes | None = None  # the mask that was shown last
         self._step = "detail"  # the step whose strokes are shown
         self._line: list[tuple[float, float]] = []  # of the stroke that is being drawn
         with ui.element("div").classes("canvas"):
-            with ui.element("div").classes("welcome") as self._welcome:
-                ui.icon("photo", size="64px")
-                ui.label("Open a photograph to begin").classes("text-h6 q-mt-sm")
-                ui.label("PNG, JPEG, TIFF, WebP or AVIF. It stays on this machine.").classes("hint")
-            self._photo = ui.interactive_image(
-                events=["pointerdown", "pointermove", "pointerup", "pointerleave"], sanitize=False
-            ).classes("photo")
-            with self._photo:
-                ui.element("div").classes("over pieces")
-                self._mask = ui.element("img").classes("over mask").props('alt="mask"')
-                self._clipped = ui.element("img").classes("over").props('alt="clipped"')
-                self._before = ui.element("img").classes("over before").props('alt="before"')
-                ui.element("div").classes("over before originals")
-                ui.element("div").classes("edge")
-                ui.label("before").classes("tag")
+            self._build_welcome(show_error)
+            self._build_photo()
             _build_zoom()
-            # Moves without a pressed button are not sent.
-            self._photo.on(
-                "mouse",
-                lambda event: self._pointer(*event.args),
-                js_handler="(event) => page.point(event, emit)",
-            )
-        self._photo.set_visibility(False)
-        self._clipped.set_visibility(False)
-        self._mask.set_visibility(False)
+        self._build_bar()
+
+    def _build_welcome(self, show_error: Callable[[str], None]) -> None:
+        with ui.element("div").classes("welcome") as self._welcome:
+            ui.icon("photo", size="64px")
+            ui.label("Open a photograph to begin").classes("text-h6 q-mt-sm")
+            ui.label("PNG, JPEG, TIFF, WebP or AVIF. It stays on this machine.").classes("hint")
         self._welcome.on("pointerdown", lambda: show_error("open a photograph first; there is nothing to paint on"))
+
+    def _build_photo(self) -> None:
+        self._photo = ui.interactive_image(
+            events=["pointerdown", "pointermove", "pointerup", "pointerleave"], sanitize=False
+        ).classes("photo")
+        with self._photo:
+            ui.element("div").classes("over pieces")
+            self._mask = ui.element("img").classes("over mask").props('alt="mask"')
+            self._clipped = ui.element("img").classes("over").props('alt="clipped"')
+            self._before = ui.element("img").classes("over before").props('alt="before"')
+            ui.element("div").classes("over before originals")
+            ui.element("div").classes("edge")
+            ui.label("before").classes("tag")
+        self._photo.on(
+            "mouse", lambda event: self._pointer(*event.args), js_handler="(event) => page.point(event, emit)"
+        )
+        for element in (self._photo, self._clipped, self._mask):
+            element.set_visibility(False)
+
+    def _build_bar(self) -> None:
         with ui.row().classes("bar"):
             ui.label("Before").classes("hint wide")
             wipe = ui.slider(min=0, max=100, value=0).style("max-width: 320px")
             wipe.props('dense aria-label="Before and after"')
-            wipe.on("update:model-value", js_handler="(v) => closeup.wipe(v)")
+            wipe.on("update:model-value", js_handler="(share) => closeup.wipe(share)")
             self._show_strokes = ui.checkbox("Strokes", value=True, on_change=self.draw_strokes).props("dense")
             self._show_mask = ui.checkbox("Mask", value=False, on_change=lambda: self.draw_mask()).props("dense")
             self._show_mask.tooltip(
                 "Keep the mask of the region in sight; otherwise it shows for a second after a stroke"
             )
-            self._show_clipped = ui.checkbox("Clipped", value=False, on_change=lambda: self._draw_clipped())
+            self._show_clipped = ui.checkbox("Clipped", value=False, on_change=self._draw_clipped)
             self._show_clipped.props("dense").tooltip("Mark what has become white (red) or black (blue)")
             ui.space()
             self._size = ui.label("").classes("hint wide")
 
-    def open(self, opened: Opened) -> None:
-        """Show a photograph that was opened."""
-        preview = opened.preview
-        self._edited = preview.pixels.clamp(0, 1)
-        height, width = opened.photograph.size
-        self._size.set_text(f"{width}\u00d7{height} pixels, shown at {preview.size[1]}\u00d7{preview.size[0]}")
-        fitting = f"min(100cqw, calc(100cqh * {preview.size[1] / preview.size[0]:.4f}))"
+    def open(self, session: Painted, preview: Tensor, size: tuple[int, int]) -> None:
+        """Show a photograph of ``size`` (height, width) that was opened, first its preview (1, C, h, w)."""
+        self._session = session
+        self._edited = preview.clamp(0, 1)
+        self._preview_size = (preview.shape[-2], preview.shape[-1])
+        (height, width), (preview_height, preview_width) = size, self._preview_size
+        self._size.set_text(f"{width}\u00d7{height} pixels, shown at {preview_width}\u00d7{preview_height}")
+        fitting = f"min(100cqw, calc(100cqh * {preview_width / preview_height:.4f}))"
         self._photo.style(f"width: var(--photo-width, {fitting})")
         ui.run_javascript(f"closeup.open({width}, {height}, '/picture/{self._token}')")
         self._mask_shown = None
@@ -106,8 +126,11 @@ class Canvas:
 
     def draw(self, upto: str | None) -> None:
         """Compute the picture after a step, or after the last one, and its mask; may run in a thread."""
-        self.take(self.session.render(upto))
-        mask = self.session.mask()
+        session = self._session
+        if session is None:
+            return
+        self.take(session.render(upto))
+        mask = session.mask()
         self.pictures["mask"] = b"" if mask is None else drawing.mask_picture(mask)
 
     def take(self, edited: Tensor) -> None:
@@ -140,7 +163,7 @@ class Canvas:
 
     def _draw_clipped(self) -> None:
         """Show what is clipped, if it is asked for."""
-        wanted = bool(self._show_clipped.value) and self.session.opened is not None
+        wanted = bool(self._show_clipped.value) and self._session is not None
         if wanted and not self.pictures.get("clipped"):
             self.pictures["clipped"] = drawing.clipped_picture(self._edited)
         if wanted:
@@ -150,17 +173,17 @@ class Canvas:
     def draw_strokes(self) -> None:
         """Show the strokes of the step and the one being drawn, unless strokes are hidden."""
         strokes: tuple[Stroke, ...] = ()
-        if self.session.opened is not None and self._show_strokes.value:
-            strokes = self.session.recipe.last(self._step).strokes
+        if self._session is not None and self._show_strokes.value:
+            strokes = self._session.recipe.last(self._step).strokes
             if self._line:
-                height, width = self.session.preview.size
+                height, width = self._preview_size
                 points = tuple((x / width, y / height) for x, y in self._line)
                 strokes += (Stroke(points, self._brush.radius[self._step], self._brush.paint(self._step)),)
-            self._photo.set_content(drawing.strokes_svg(strokes, self.session.preview.size))
+            self._photo.set_content(drawing.strokes_svg(strokes, self._preview_size))
 
     def _pointer(self, kind: str, x: float, y: float) -> None:
         """Begin, continue or end a stroke."""
-        if self._step not in BRUSHES or self.session.opened is None:
+        if self._step not in BRUSHES or self._session is None:
             return
         if kind == "pointerdown":
             self._line = [(x, y)]
@@ -170,7 +193,7 @@ class Canvas:
             self._line.append((x, y))
         else:
             line, self._line = self._line, []
-            self.session.add_stroke(self._step, line, self._brush.radius[self._step], self._brush.paint(self._step))
+            self._session.add_stroke(self._step, line, self._brush.radius[self._step], self._brush.paint(self._step))
             self._drawn()
         self.draw_strokes()
 
@@ -190,18 +213,15 @@ class Canvas:
 
 def _build_zoom() -> None:
     """Buttons for what ``static/closeup.js`` does."""
-
-    def button(label: str, icon: str, tip: str, action: str) -> ui.button:
-        found = ui.button(icon=icon).props(f'flat dense color=white aria-label="{label}"').tooltip(tip)
-        return found.on("click", js_handler=f"() => closeup.{action}")
-
     with ui.element("div").classes("zoom").props('role="group" aria-label="Zoom"'):
-        button("Zoom out", "remove", "The minus key, or the wheel", "step(-1)")
+        _zoom_button("Zoom out", "remove", "The minus key, or the wheel", "step(-1)")
         ui.label("").classes("zoom-level").props('aria-live="polite"')
-        button("Zoom in", "add", "The plus key, or the wheel", "step(1)")
-        button("Fit", "fit_screen", "The whole photograph; the key 0", "fit()")
-        button("Full size", "crop_free", "One pixel of the photograph for each of the screen; the key 1", "full()")
-        hand = button(
+        _zoom_button("Zoom in", "add", "The plus key, or the wheel", "step(1)")
+        _zoom_button("Fit", "fit_screen", "The whole photograph; the key 0", "fit()")
+        _zoom_button(
+            "Full size", "crop_free", "One pixel of the photograph for each of the screen; the key 1", "full()"
+        )
+        hand = _zoom_button(
             "Move",
             "pan_tool",
             "Drag the photograph in place of the brush; also the space bar, the middle "
@@ -209,3 +229,8 @@ def _build_zoom() -> None:
             "hand()",
         )
         hand.classes("grab").props('aria-pressed="false"')
+
+
+def _zoom_button(label: str, icon: str, tip: str, action: str) -> ui.button:
+    button = ui.button(icon=icon).props(f'flat dense color=white aria-label="{label}"').tooltip(tip)
+    return button.on("click", js_handler=f"() => closeup.{action}")

@@ -1,15 +1,15 @@
 """The part of a photograph that is seen at full size, in pieces that the page lays over the preview."""
 
-from collections.abc import Awaitable, Callable
+from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any
+from typing import Protocol
 
 import torch
 from torch import Tensor
 
 from nlfilter_torch.core.progress import Progress
 from nlfilter_torch.photo.app import drawing
-from nlfilter_torch.photo.app.session import Session
+from nlfilter_torch.photo.app.work import Interruptible, OutdatedError, Run, Start
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.tiled.parts import Rectangle
 from nlfilter_torch.photo.tiled.sampling import Report
@@ -20,23 +20,20 @@ KEPT = 24_000_000  # pixels of all pieces; those that are not seen go first
 LARGEST = 40_000_000  # pixels that a page may ask for at once
 
 
-Run = Callable[[str, Callable[[], Any], Progress], Awaitable[Any]]  # in a thread, while the page says what it does
-Start = Callable[[Awaitable[None]], None]  # a task in the background, whose failure is reported
+class Enlarged(Protocol):
+    """The session of an open photograph, as far as its pixels at full size are concerned."""
 
+    recipe: Recipe
 
-class OutdatedError(Exception):
-    """The edit has changed meanwhile."""
+    @property
+    def size(self) -> tuple[int, int]:
+        """(height, width) of the photograph."""
 
+    def original(self, place: Rectangle) -> Tensor:
+        """A part of the photograph before the edit, (1, C, h, w) in [0, 1]."""
 
-def interrupted(report: Report, is_outdated: Callable[[], bool]) -> Report:
-    """Pass reports on, and raise OutdatedError at the first one after something is outdated."""
-
-    def interrupting(stage: str, done: int, total: int) -> None:
-        if is_outdated():
-            raise OutdatedError
-        report(stage, done, total)
-
-    return interrupting
+    def part(self, place: Rectangle, recipe: Recipe, report: Report) -> Tensor:
+        """A part of the photograph under an edit, (1, C, h, w) in [0, 1]."""
 
 
 class Closeup:
@@ -46,7 +43,7 @@ class Closeup:
     """
 
     def __init__(self, run: Run, start: Start, tell: Callable[[str], object]) -> None:
-        self.session: Session | None = None
+        self.session: Enlarged | None = None
         self._run, self._start, self._tell = run, start, tell
         self._view: Rectangle | None = None
         self._recipe = Recipe()
@@ -56,11 +53,10 @@ class Closeup:
         self._pieces: dict[str, tuple[Rectangle, bytes]] = {}  # in the order in which they were made
         self._covered = torch.zeros(0, 0, dtype=torch.bool)  # cells
 
-    def open(self, session: Session) -> None:
+    def open(self, session: Enlarged) -> None:
         """Show a photograph that was opened."""
-        assert session.opened is not None  # for mypy
         self.session, self._view = session, None
-        height, width = session.opened.photograph.size
+        height, width = session.size
         self._covered = torch.zeros(-(-height // CELL), -(-width // CELL), dtype=torch.bool)
         self._forget()
 
@@ -69,7 +65,7 @@ class Closeup:
         """Whether a part is shown at full size, or a slider is moving."""
         return self._held or self._view is not None
 
-    def look(self, view: Any) -> None:
+    def look(self, view: Sequence[float] | None) -> None:
         """Show a part: left, top, right and bottom in pixels of the photograph, or None for no part."""
         self._view = None if view is None else self._part(view)
         self._wake()
@@ -92,8 +88,7 @@ class Closeup:
 
     def file(self, name: str) -> bytes | None:
         """A piece as a PNG file."""
-        found = self._pieces.get(name)
-        return None if found is None else found[1]
+        return self._pieces[name][1] if name in self._pieces else None
 
     def original(self, place: str) -> bytes | None:
         """A part of the photograph before the edit as a PNG file; ``place`` as of :meth:`look`, with commas."""
@@ -101,15 +96,13 @@ class Closeup:
             part = self._part([int(number) for number in place.split(",")])
         except ValueError:
             return None
-        if self.session is None or self.session.opened is None or part is None:
-            return None
-        return drawing.lossless(self.session.opened.parts.original(part))
+        return None if self.session is None or part is None else drawing.lossless(self.session.original(part))
 
-    def _part(self, view: Any) -> Rectangle | None:
+    def _part(self, view: Sequence[float]) -> Rectangle | None:
         """What a page asks for, as far as the photograph has it."""
-        if self.session is None or self.session.opened is None or len(view) != 4:
+        if self.session is None or len(view) != 4:
             return None
-        height, width = self.session.opened.photograph.size
+        height, width = self.session.size
         left, top, right, bottom = (int(number) for number in view)
         part = Rectangle(range(max(0, top), min(height, bottom)), range(max(0, left), min(width, right)))
         return part if 0 < len(part.rows) * len(part.columns) <= LARGEST else None
@@ -129,9 +122,8 @@ class Closeup:
         """Make pieces until all that is seen is there."""
         self._working = True
         try:
-            while (part := self._next()) is not None:
-                session = self.session
-                assert session is not None  # for mypy
+            while (piece := self._next()) is not None:
+                session, part = piece
                 recipe = session.recipe
                 if recipe.acting != self._recipe.acting:
                     self._forget()
@@ -139,7 +131,7 @@ class Closeup:
                 try:
                     progress = Progress()
                     work = partial(self._work_out, session, recipe, part, progress)
-                    content: bytes = await self._run("Full size", work, progress)
+                    content = await self._run("Full size", work, progress)
                 except OutdatedError:
                     continue
                 if not self._is_outdated(session, recipe):
@@ -147,12 +139,12 @@ class Closeup:
         finally:
             self._working = False
 
-    def _is_outdated(self, session: Session, recipe: Recipe) -> bool:
+    def _is_outdated(self, session: Enlarged, recipe: Recipe) -> bool:
         return self._held or self.session is not session or session.recipe.acting != recipe.acting
 
-    def _work_out(self, session: Session, recipe: Recipe, part: Rectangle, progress: Progress) -> bytes:
+    def _work_out(self, session: Enlarged, recipe: Recipe, part: Rectangle, progress: Progress) -> bytes:
         """A piece; runs in a thread."""
-        report = interrupted(progress, lambda: self._is_outdated(session, recipe))
+        report = Interruptible(progress, partial(self._is_outdated, session, recipe))
         return drawing.lossless(session.part(part, recipe, report))
 
     def _add(self, part: Rectangle, content: bytes) -> None:
@@ -177,18 +169,17 @@ class Closeup:
         rows, columns = (slice(axis.start // CELL, -(-axis.stop // CELL)) for axis in (part.rows, part.columns))
         return self._covered[rows, columns]
 
-    def _next(self) -> Rectangle | None:
-        """A piece that is seen but not there, or None."""
-        if self._view is None or self._held:
+    def _next(self) -> tuple[Enlarged, Rectangle] | None:
+        """A piece that is seen but not there, and the session that it is of, or None."""
+        if self.session is None or self._view is None or self._held:
             return None
-        height, width = self.session.opened.photograph.size  # type: ignore[union-attr]
-        missing = ~self._cells(self._view)
-        found = first_block(missing, PIECE // CELL**2)
-        if found is None:
+        height, width = self.session.size
+        block = first_block(~self._cells(self._view), PIECE // CELL**2)
+        if block is None:
             return None
         top, left = self._view.rows.start // CELL, self._view.columns.start // CELL
-        rows, columns = found
-        return Rectangle(
+        rows, columns = block
+        return self.session, Rectangle(
             range((top + rows.start) * CELL, min((top + rows.stop) * CELL, height)),
             range((left + columns.start) * CELL, min((left + columns.stop) * CELL, width)),
         )

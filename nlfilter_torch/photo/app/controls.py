@@ -1,8 +1,7 @@
 """The sliders of the editor: what each of them sets, and the widget that shows and changes it."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
 
 from nicegui import ui
 
@@ -11,7 +10,7 @@ from nlfilter_torch.photo.declared.declaration import Parameter
 from nlfilter_torch.photo.declared.parameters import EDITS
 from nlfilter_torch.photo.declared.presets import Recipe
 
-Change = Callable[[str, dict[str, Any], bool], None]  # step, entries, whether the change is complete
+Change = Callable[[str, Mapping[str, object], bool], None]  # step, values, whether the change is complete
 UNITS = {"gain": "\u00d7", "%": "%"}
 
 
@@ -35,26 +34,28 @@ class Control:
 
     def read(self, recipe: Recipe) -> float:
         """The slider's value for an edit."""
-        value = self._value(recipe)
         if self.index is not None:
-            value = value[self.index]
+            return float(self._numbers(recipe)[self.index])
+        value: float | None = recipe.last(self.edit)[self.parameter.name]
         if value is None:
             return self.slider.low if self.slider.none is None else self.slider.none
         return float(value)
 
-    def _value(self, recipe: Recipe) -> Any:
+    def _numbers(self, recipe: Recipe) -> tuple[float, ...]:
+        """The numbers of which the slider sets one."""
         step = recipe.last(self.edit)
-        return step.sliders_inside if self.parameter.name == "inside" else step[self.parameter.name]
+        numbers: tuple[float, ...] = step[self.parameter.name]
+        return step.sliders_inside if self.parameter.name == "inside" else numbers
 
-    def entries(self, recipe: Recipe, value: float) -> dict[str, Any]:
-        """The entries of the step for a value of the slider."""
+    def entries(self, recipe: Recipe, value: float) -> dict[str, object]:
+        """The values of the step's parameters for a value of the slider."""
         name = self.parameter.name
         if self.slider.none is not None:
             return {name: None if value == self.slider.none else round(value)}
         value = round(value, 4)
         if self.index is None:
             return {name: value}
-        numbers = list(self._value(recipe))
+        numbers = list(self._numbers(recipe))
         numbers[self.index] = value
         return {name: tuple(numbers)}
 
@@ -106,7 +107,7 @@ class SteadySlider(ui.slider):
 class Slider:
     """A slider on the page that shows the current edit and calls ``change`` with changes.
 
-    For screen readers ``suffix`` is appended to the label, where two sliders have the same one.
+    Where two sliders have the same label, ``suffix`` tells them apart for screen readers.
     """
 
     def __init__(self, control: Control, recipe: Callable[[], Recipe], change: Change, suffix: str = "") -> None:

@@ -2,6 +2,7 @@
 
 import io
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -14,8 +15,6 @@ from nlfilter_torch.photo.declared.strokes import Stroke
 QUALITY = 95
 TINT, OPACITY = (255, 40, 80), 120  # of the mask
 WORDS = {"in": "#22c55e", "out": "#ef4444", "keep": "#9ca3af"}  # colours of strokes that have a meaning instead
-
-
 WHITE_TINT, BLACK_TINT = (255, 60, 60, 255), (60, 120, 255, 255)  # where a picture is clipped
 BINS = 64  # of a histogram
 
@@ -104,39 +103,65 @@ def strokes_svg(strokes: Iterable[Stroke], size: tuple[int, int]) -> str:
     return "".join(paths)
 
 
+@dataclass(frozen=True)
+class Axes:
+    """A plot of gains from ``low`` to ``high`` over eigenvalues from 0 to 1, in units of the SVG."""
+
+    low: float
+    high: float
+    left = 26
+    right = 292
+    top = 10
+    bottom = 112
+
+    def x(self, eigenvalue: float) -> float:
+        """Place of an eigenvalue."""
+        return self.left + (self.right - self.left) * eigenvalue
+
+    def y(self, gain: float) -> float:
+        """Place of a gain."""
+        return self.bottom - (self.bottom - self.top) * (gain - self.low) / (self.high - self.low)
+
+    def grid(self) -> list[str]:
+        """Lines, with their labels, at 1 and at about five whole gains."""
+        parts = []
+        for level in _levels(self.low, self.high):
+            y, style = self.y(level), "unit" if level == 1 else "grid"
+            parts.append(f'<line x1="{self.left}" x2="{self.right}" y1="{y:.1f}" y2="{y:.1f}" class="{style}" />')
+            parts.append(f'<text x="{self.left - 4}" y="{y + 3:.1f}" text-anchor="end">{level:g}</text>')
+        return parts
+
+    def marks(self, eigenvalues: Sequence[float]) -> list[str]:
+        """Marks of eigenvalues below the plot."""
+        ends = f'y1="{self.bottom}" y2="{self.bottom + 5}"'
+        return [f'<line x1="{self.x(v):.1f}" x2="{self.x(v):.1f}" {ends} class="mark" />' for v in eigenvalues]
+
+    def curve(self, places: Sequence[float], gains: Sequence[float], colour: str) -> str:
+        """A line through gains at places."""
+        points = " ".join(f"{self.x(v):.1f},{self.y(g):.1f}" for v, g in zip(places, gains, strict=True))
+        return f'<polyline points="{points}" stroke="{colour}" class="curve" />'
+
+    def dots(self, places: Sequence[float], gains: Sequence[float], colour: str) -> list[str]:
+        """Dots for gains at places."""
+        return [
+            f'<circle cx="{self.x(v):.1f}" cy="{self.y(g):.1f}" r="1.6" fill="{colour}" />'
+            for v, g in zip(places, gains, strict=True)
+        ]
+
+
 def response_svg(eigenvalues: Tensor, curves: Sequence[tuple[str, Sequence[float]]]) -> str:
     """SVG of the sliders' gain f(lambda), with the eigenvalues (R,) of the filter marked; curves: (colour, sliders)."""
-    left, right, top, bottom = 26, 292, 10, 112
     steps = torch.linspace(0, 1, 101)
     gains = [polynomial_response(steps, torch.tensor(tuple(alpha))).tolist() for _, alpha in curves]
-    low = min(0.0, *(min(gain) for gain in gains))
-    high = max(2.0, *(max(gain) for gain in gains))
-
-    def x(eigenvalue: float) -> float:
-        return left + (right - left) * eigenvalue
-
-    def y(gain: float) -> float:
-        return bottom - (bottom - top) * (gain - low) / (high - low)
-
+    axes = Axes(min(0.0, *(min(gain) for gain in gains)), max(2.0, *(max(gain) for gain in gains)))
     parts = ['<svg viewBox="0 0 300 142" class="response" role="img" aria-label="response of the sliders">']
-    for level in _levels(low, high):
-        style = "unit" if level == 1 else "grid"
-        parts.append(f'<line x1="{left}" x2="{right}" y1="{y(level):.1f}" y2="{y(level):.1f}" class="{style}" />')
-        parts.append(f'<text x="{left - 4}" y="{y(level) + 3:.1f}" text-anchor="end">{level:g}</text>')
-    parts += [
-        f'<line x1="{x(v):.1f}" x2="{x(v):.1f}" y1="{bottom}" y2="{bottom + 5}" class="mark" />'
-        for v in eigenvalues.tolist()
-    ]
+    parts += axes.grid() + axes.marks(eigenvalues.tolist())
     for (colour, alpha), gain in zip(curves, gains, strict=True):
-        line = " ".join(f"{x(v):.1f},{y(g):.1f}" for v, g in zip(steps.tolist(), gain, strict=True))
-        parts.append(f'<polyline points="{line}" stroke="{colour}" class="curve" />')
-        dots = polynomial_response(eigenvalues, torch.tensor(tuple(alpha))).tolist()
-        parts += [
-            f'<circle cx="{x(v):.1f}" cy="{y(g):.1f}" r="1.6" fill="{colour}" />'
-            for v, g in zip(eigenvalues.tolist(), dots, strict=True)
-        ]
-    parts.append(f'<text x="{left}" y="130">texture, \u03bb = 0</text>')
-    parts.append(f'<text x="{right}" y="130" text-anchor="end">shading, \u03bb = 1</text></svg>')
+        parts.append(axes.curve(steps.tolist(), gain, colour))
+        at_eigenvalues = polynomial_response(eigenvalues, torch.tensor(tuple(alpha))).tolist()
+        parts += axes.dots(eigenvalues.tolist(), at_eigenvalues, colour)
+    parts.append(f'<text x="{axes.left}" y="130">texture, \u03bb = 0</text>')
+    parts.append(f'<text x="{axes.right}" y="130" text-anchor="end">shading, \u03bb = 1</text></svg>')
     return "".join(parts)
 
 

@@ -1,15 +1,14 @@
 """The editor's page: the canvas, the controls beside it, and the reactions to them."""
 
-import asyncio
 import secrets
 import tempfile
-from collections.abc import Awaitable, Callable
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Protocol
 from urllib.parse import quote
 
-from nicegui import background_tasks, events, ui
+from nicegui import events, ui
 from nicegui.elements.upload_files import FileUpload
 from torch import Tensor
 
@@ -17,20 +16,19 @@ from nlfilter_torch.core.progress import Progress
 from nlfilter_torch.photo.app import drawing
 from nlfilter_torch.photo.app.access import LARGEST
 from nlfilter_torch.photo.app.at_rest import AtRest
+from nlfilter_torch.photo.app.brush import Brush
 from nlfilter_torch.photo.app.canvas import Canvas
 from nlfilter_torch.photo.app.closeup import Closeup
-from nlfilter_torch.photo.app.library import Library
-from nlfilter_torch.photo.app.panel import Brush, Panel
+from nlfilter_torch.photo.app.dialogs import NameDialog
+from nlfilter_torch.photo.app.panel import Panel
 from nlfilter_torch.photo.app.session import Session
+from nlfilter_torch.photo.app.tasks import EXPECTED, Tasks
+from nlfilter_torch.photo.app.uploads import Upload
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.tiled.sampling import Report
 
 Save = Callable[[str, Report], Path]  # name and progress
-EXPECTED = (ValueError, OSError, MemoryError)  # for unusable files and values; the message says why
 LARGEST_PRESET = 20_000_000  # bytes
-PATIENCE = 0.3  # seconds until the page shows that it is working
-SHOWN = 0.5  # seconds between two texts of the progress
-LASTING = 10.0  # seconds that an error is shown
 INSIDE, OUTSIDE = "#4ade80", "#60a5fa"  # colours of the sliders' response in the region, and elsewhere
 EDITORS: dict[str, "Editor"] = {}  # open pages by the token in the addresses of their pictures
 STATIC = Path(__file__).with_name("static")  # the script and the style sheet of the page
@@ -40,13 +38,28 @@ SCRIPTS = "".join(
 )
 
 
-class Editor:
-    """One tab of the browser, and the session, from a library, of the photograph that it shows."""
+class Photographs(Protocol):
+    """Where the sessions of photographs come from; all raise ValueError, OSError or MemoryError if there is none."""
 
-    def __init__(self, library: Library) -> None:
-        self.library = library
-        self.session = library.new()
-        self._error: ui.notification | None = None
+    def new(self) -> Session:
+        """A session without a photograph."""
+
+    def open(self, path: Path) -> Session:
+        """The session of a file."""
+
+    def open_upload(self, copy: Path, name: str) -> Session:
+        """The session of a file that the browser sent."""
+
+    def reopen(self, address: str) -> Session:
+        """The session of an address that a page had."""
+
+
+class Editor:
+    """One tab of the browser, and the session of the photograph that it shows."""
+
+    def __init__(self, photographs: Photographs) -> None:
+        self._photographs = photographs
+        self.session = photographs.new()
         self._told: str | None = None  # the last trouble of the session that was shown
         self._token = secrets.token_urlsafe(16)
         self._wanted: list[str | None] = []  # at most one: the last step of the picture to draw next
@@ -59,17 +72,19 @@ class Editor:
         self._client.on_delete(self._leave)
         ui.add_css(STATIC / "page.css")
         ui.add_head_html(SCRIPTS)
-        self._closeup = Closeup(self._run, self._start, self._tell)
-        self._at_rest = AtRest(self._run, self._start, self._is_preview, self._take)
         self._build_header()
+        self._closeup = Closeup(self._tasks.run, self._tasks.start, self._tell)
+        self._at_rest = AtRest(self._tasks.run, self._tasks.start, self._is_preview, self._take)
         brush = Brush()
         with ui.element("div").classes("editor"):
             with ui.element("div").classes("viewer"):
-                self._canvas = Canvas(self.session, brush, self._token, self._changed, self._show_error)
+                self._canvas = Canvas(brush, self._token, self._changed, self._tasks.show_error)
             with ui.column().classes("panel"):
                 handle = ui.button(icon="drag_handle").props('flat dense aria-label="Show or hide the controls"')
                 handle.classes("handle").on("click", js_handler="() => page.fold()")
-                self._panel = Panel(self.session, brush, self._change, self._canvas.switch)
+                self._panel = Panel(
+                    lambda: self.session.recipe, brush, self._change, self._clear_strokes, self._canvas.switch
+                )
         ui.keyboard(on_key=self._key)
         ui.on("closeup", lambda event: self._look(event.args))
         ui.on("stroke_dropped", self._canvas.drop_stroke)
@@ -96,52 +111,31 @@ class Editor:
             ui.label("nlfilter-torch").classes("text-weight-medium text-body1 wide")
             self._title = ui.label("").classes("hint q-ml-sm ellipsis title")
             ui.space()
-            with ui.row().classes("items-center gap-2 no-wrap working") as self._working:
-                ui.spinner(size="20px", color="white")
-                self._doing = ui.label("").classes("hint")
-            self._working.set_visibility(False)
-            photographs = self._upload(self._take_photograph, "image/*", LARGEST)
-            presets = self._upload(self._take_preset, ".json,application/json", LARGEST_PRESET)
+            self._tasks = Tasks()
+            show_error = self._tasks.show_error
+            photographs = Upload(self._take_photograph, "image/*", LARGEST, show_error)
+            presets = Upload(self._take_preset, ".json,application/json", LARGEST_PRESET, show_error)
             kinds = f"A PNG, JPEG, TIFF, WebP or AVIF file of at most {LARGEST / 1e9:g} GB"
-            _button("Open", "folder_open", kinds, js=_pick(photographs))
+            _button("Open", "folder_open", kinds, js=photographs.choosing)
             self._undo_button = _button("Undo", "undo", "Ctrl+Z", self._undo)
             self._redo_button = _button("Redo", "redo", "Ctrl+Shift+Z", self._redo)
             self._reset_button = _button(
                 "Reset", "restart_alt", "Begin the edit anew; Undo brings it back", self._reset
             )
-            _button("Load edit", "tune", "A saved edit, or sliders found by nlfilter-torch fit", js=_pick(presets))
+            _button("Load edit", "tune", "A saved edit, or sliders found by nlfilter-torch fit", js=presets.choosing)
             _button("Save edit", "bookmark_add", "For other photographs, and for the command line", self._ask_edit_name)
             _button("Save photo", "save", "At full size, into a file", self._ask_photo_name).props(
                 "color=primary unelevated", remove="flat"
             )
 
-    def _upload(
-        self, action: Callable[[events.UploadEventArguments], Awaitable[None]], accept: str, largest: int
-    ) -> ui.upload:
-        upload = ui.upload(auto_upload=True, on_upload=action, max_file_size=largest)
-        upload.on(
-            "rejected",
-            lambda event: self._refuse(event.args[0], event.args[1], largest),
-            js_handler="(entries) => page.refuse(entries, emit)",
-        )
-        return upload.props(f'accept="{accept}"').classes("hidden")
-
-    def _refuse(self, reason: str, name: str, largest: int) -> None:
-        """Say why the browser did not send a file."""
-        if reason == "max-file-size":
-            size = f"{largest / 1e9:g} GB" if largest >= 1e9 else f"{largest / 1e6:g} MB"
-            self._show_error(f"{name} must be at most {size}; make it smaller, or use the command line")
-        else:
-            self._show_error(f"{name} is not a file of the kind that is opened here; choose another")
-
     # Changes
 
-    def _change(self, step: str, entries: dict[str, Any], complete: bool) -> None:
-        """Change entries of a step; ``complete`` when the pointer is released."""
+    def _change(self, step: str, values: Mapping[str, object], complete: bool) -> None:
+        """Change parameters of a step; ``complete`` when the pointer is released."""
         if self.session.opened is None:  # it would be lost when one is opened
             self._panel.follow()
             return
-        self.session.set(step, **entries)
+        self.session.set(step, strokes=None, **values)
         if complete:
             self.session.commit()
             self._changed()
@@ -149,9 +143,15 @@ class Editor:
             self._closeup.hold()
             self._redraw(step)
 
+    def _clear_strokes(self, step: str) -> None:
+        if self.session.opened is not None:
+            self.session.set(step, strokes=())
+            self.session.commit()
+            self._changed()
+
     def _changed(self) -> None:
         """Show the edit after a complete change, in all tabs."""
-        self._clear_error()
+        self._tasks.clear_error()
         for editor in list(EDITORS.values()):
             if editor.session is self.session:
                 editor.follow()
@@ -173,7 +173,7 @@ class Editor:
         if session.trouble != self._told:
             self._told = session.trouble
             if session.trouble is not None:
-                self._show_error(session.trouble)
+                self._tasks.show_error(session.trouble)
 
     def _undo(self) -> None:
         if self.session.undo():
@@ -200,14 +200,14 @@ class Editor:
             return
         self._wanted = [upto]
         if not self._drawing:
-            self._start(self._keep_drawing())
+            self._tasks.start(self._keep_drawing())
 
     async def _keep_drawing(self) -> None:
         self._drawing = True
         try:
             while self._wanted:
                 upto = self._wanted.pop()
-                await self._run("Working", partial(self._canvas.draw, upto))
+                await self._tasks.run("Working", partial(self._canvas.draw, upto))
                 self._show()
                 self._draw_response()
                 self._canvas.draw_mask(moving=upto is not None)
@@ -224,13 +224,13 @@ class Editor:
         self._canvas.take(picture)
         self._show()
 
-    def _look(self, view: Any) -> None:
+    def _look(self, view: Sequence[float] | None) -> None:
         """Show a part at full size, or the whole photograph if ``view`` is None."""
         self._closeup.look(view)
         if view is None and self.session.opened is not None:
             self._at_rest.drawn(self.session)
 
-    def _is_preview(self, session: Session) -> bool:
+    def _is_preview(self, session: object) -> bool:
         """Whether the page shows the preview of a session, and nothing is being drawn or moved."""
         gone, drawing = self._client.is_deleted, self._drawing or bool(self._wanted)
         return self.session is session and not (gone or drawing or self._closeup.is_busy)
@@ -248,30 +248,30 @@ class Editor:
         if self.session.opened is not None:  # a browser that reconnects keeps its edit
             return
         if address and (image is None or address != image.name):
-            self._start(self._open(lambda: self.library.reopen(address)))
+            self._tasks.start(self._open(partial(self._photographs.reopen, address)))
         elif image is not None:
-            self._start(self._open(lambda: self.library.open(image)))
+            self._tasks.start(self._open(partial(self._photographs.open, image)))
 
     async def _take_photograph(self, event: events.UploadEventArguments) -> None:
         event.sender.run_method("reset")
-        self._start(self._open_upload(event.file))
+        self._tasks.start(self._open_upload(event.file))
 
     async def _open_upload(self, file: FileUpload) -> None:
         with tempfile.TemporaryDirectory(prefix="nlfilter-torch-") as folder:
             copy = Path(folder) / "photograph"
             await file.save(copy)
-            await self._open(lambda: self.library.open_upload(copy, file.name))
+            await self._open(partial(self._photographs.open_upload, copy, file.name))
 
     async def _open(self, find: Callable[[], Session]) -> None:
-        self.session = self._canvas.session = self._panel.session = await self._run("Opening", find)
+        self.session = await self._tasks.run("Opening", find)
         opened = self.session.opened
         if opened is None or self._client.is_deleted:
             return
         self._title.set_text(opened.name)
-        self._clear_error()
+        self._tasks.clear_error()
         self._closeup.open(self.session)
         with self._client:
-            self._canvas.open(opened)
+            self._canvas.open(self.session, opened.preview.pixels, opened.photograph.size)
         self.follow()
         with self._client:
             ui.navigate.history.replace(f"/?photo={quote(self.session.address)}")
@@ -286,13 +286,13 @@ class Editor:
         try:
             self.session.load_preset(content, event.file.name)
         except EXPECTED as error:
-            self._show_error(str(error))
+            self._tasks.show_error(str(error))
         else:
             self._changed()
 
     async def _ask_photo_name(self) -> None:
         if self.session.opened is None:
-            self._show_error("open a photograph first; there is nothing to save")
+            self._tasks.show_error("open a photograph first; there is nothing to save")
             return
         session = self.session
         await self._ask("Save the photograph", session.suggested_name(), session.check_photograph, session.save)
@@ -302,100 +302,29 @@ class Editor:
         await self._ask("Save the edit", f"{name}.json", self.session.check_preset, self.session.save_preset)
 
     async def _ask(self, title: str, name: str, check: Callable[[str], Path], save: Save) -> None:
-        """Ask for a name that passes a check, and whether to replace a file of that name, and save."""
-        with self._client, ui.dialog().props(f'aria-label="{title}"') as dialog, ui.card().classes("dialog"):
-            ui.label(title).classes("text-h6")
-            field = ui.input("Name", value=name).props("outlined autofocus").classes("w-full")
-            note = ui.label(f"In {self.session.folder.resolve()}").classes("hint")
-            with ui.row().classes("w-full justify-end"):
-                ui.button("Cancel", on_click=lambda: dialog.submit(None)).props("flat no-caps")
-                ok = ui.button("Save").props("unelevated no-caps color=primary")
-
-            def confirm() -> None:
-                try:
-                    exists = check(field.value).exists()
-                except EXPECTED as error:
-                    note.set_text(str(error))
-                    return
-                if exists and ok.text != "Replace":
-                    ok.set_text("Replace")
-                    note.set_text("A file of that name is there already.")
-                    return
-                dialog.submit(field.value)
-
-            field.on_value_change(lambda: ok.set_text("Save"))
-            field.on("keydown.enter", confirm)
-            ok.on_click(confirm)
-        chosen = await dialog
-        if not dialog.is_deleted:  # a tab that is closed takes its dialogs with it
-            dialog.delete()
+        """Ask for a name that passes a check, and save under it."""
+        with self._client:
+            dialog = NameDialog(title, name, self.session.folder, check)
+        chosen = await dialog.answer()
         if chosen is not None:
-            self._start(self._save(save, chosen))
+            self._tasks.start(self._save(save, chosen))
 
     async def _save(self, save: Save, name: str) -> None:
         progress = Progress()
-        path: Path = await self._run("Saving", lambda: save(name, progress), progress)
-        self._clear_error()
+        path = await self._tasks.run("Saving", partial(save, name, progress), progress)
+        self._tasks.clear_error()
         if self._client.is_deleted:
             return
         self._show_state()
         with self._client:
             ui.notify(f"Saved {path.resolve()}", type="positive", position="bottom-left", timeout=6000)
 
-    # Work
-
-    def _start(self, work: Awaitable[None]) -> None:
-        """Run a task in the background, and report its failure."""
-        background_tasks.create(self._reported(work))
-
-    async def _reported(self, work: Awaitable[None]) -> None:
-        try:
-            await work
-        except EXPECTED as error:
-            self._show_error(str(error))
-        except Exception:
-            self._show_error("this failed, and it is not your fault; the terminal that runs the editor shows more")
-            raise  # for the log
-
-    def _show_error(self, sentence: str) -> None:
-        """Show a sentence until something succeeds, or for some seconds."""
-        self._clear_error()
-        if not self._client.is_deleted:
-            with self._client:
-                self._error = ui.notification(
-                    sentence, type="negative", position="bottom", timeout=LASTING, close_button="OK", multi_line=True
-                )
-
-    def _clear_error(self) -> None:
-        error, self._error = self._error, None
-        if error is not None and not error.is_deleted:
-            error.dismiss()
-
-    async def _run(self, doing: str, work: Callable[[], Any], progress: Progress | None = None) -> Any:
-        """Run something in a thread; the page shows ``doing`` if it takes long, and its progress."""
-        task = asyncio.ensure_future(asyncio.to_thread(work))
-        done, _ = await asyncio.wait({task}, timeout=PATIENCE)
-        if not done:
-            self._doing.set_text(f"{doing}\u2026")
-            self._working.set_visibility(True)
-            while not task.done():
-                await asyncio.wait({task}, timeout=SHOWN)
-                known = "" if progress is None else str(progress)
-                self._doing.set_text(f"{doing}: {known}" if known else f"{doing}\u2026")
-            self._working.set_visibility(False)
-        return await task
-
 
 def _button(
-    label: str, icon: str, tip: str, action: Callable[[], Any] | None = None, *, js: str | None = None
+    label: str, icon: str, tip: str, action: Callable[[], object] | None = None, *, js: str | None = None
 ) -> ui.button:
     button = ui.button(label, icon=icon, on_click=action).props("flat no-caps dense color=white").classes("q-px-sm")
     button.props(f'aria-label="{label}"')
     if js is not None:
         button.on("click", js_handler=js)
     return button.tooltip(tip)
-
-
-def _pick(upload: ui.upload) -> str:
-    """JavaScript that lets the user choose a file for an upload."""
-    return f"() => getElement({upload.id}).$refs.qRef.pickFiles()"

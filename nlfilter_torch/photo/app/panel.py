@@ -1,54 +1,42 @@
 """The controls beside the picture, a tab for each step of an edit."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from functools import partial
-from typing import Any
 
 from nicegui import ui
 
 from nlfilter_torch.photo.app import controls
+from nlfilter_torch.photo.app.brush import BRUSHES, COLOURS, Brush
 from nlfilter_torch.photo.app.controls import Change, Control, Slider
-from nlfilter_torch.photo.app.session import Session
 from nlfilter_torch.photo.declared.parameters import EDITS
-from nlfilter_torch.photo.declared.presets import PRESETS, PURPOSES
+from nlfilter_torch.photo.declared.presets import PRESETS, PURPOSES, Recipe
 from nlfilter_torch.photo.declared.steps import NONE, Step
 
-COLOURS = ("#2f6fde", "#12a15f", "#e0b321", "#dd5c21", "#c8283c", "#8a46c8", "#8b5e3c", "#808080")
-BRUSHES: dict[str, dict[str, str]] = {edit.name: dict(edit.brushes) for edit in EDITS.values() if edit.brushes}
 TABS = ("detail", *(edit for edit in EDITS if edit != "detail"))
 CLIPPED = 0.001  # share of the picture that an edit may clip without a warning
 BANDWIDTH = 20.0  # grey levels, the start when the bandwidth is not automatic
 
 
-@dataclass
-class Brush:
-    """The settings of the brush, for each step.
-
-    Attributes:
-        word: meaning of the strokes; ``colour`` stands for :attr:`colour`.
-        radius: as a share of the short side.
-        colour: for all steps that take one.
-    """
-
-    word: dict[str, str] = field(default_factory=lambda: {step: next(iter(words)) for step, words in BRUSHES.items()})
-    radius: dict[str, float] = field(default_factory=lambda: dict.fromkeys(BRUSHES, 0.02))
-    colour: str = COLOURS[0]
-
-    def paint(self, step: str) -> str:
-        """The meaning or colour of a stroke for a step."""
-        return self.colour if self.word[step] == "colour" else self.word[step]
-
-
 class Panel:
     """Tabs with sliders, brushes and presets, built into the open element.
 
-    They show the settings of the brush, call ``change`` with changes of a step, and ``switch`` with the step of a tab
-    that was opened. ``session`` may be replaced by another.
+    Args:
+        recipe: returns the current edit.
+        brush: its settings, which the panel shows and changes.
+        change: is called with changes of the parameters of a step.
+        clear: is called with a step whose strokes are to be removed.
+        switch: is called with the step whose tab was opened.
     """
 
-    def __init__(self, session: Session, brush: Brush, change: Change, switch: Callable[[str], None]) -> None:
-        self.session, self._brush, self._change = session, brush, change
+    def __init__(
+        self,
+        recipe: Callable[[], Recipe],
+        brush: Brush,
+        change: Change,
+        clear: Callable[[str], None],
+        switch: Callable[[str], None],
+    ) -> None:
+        self._recipe, self._brush, self._change, self._clear = recipe, brush, change, clear
         self._following = False
         self._sliders: list[Slider] = []
         self._layout: tuple[int, bool] = (0, False)
@@ -71,7 +59,7 @@ class Panel:
 
     def follow(self) -> None:
         """Show the current edit."""
-        detail = self.session.recipe.last("detail")
+        detail = self._recipe().last("detail")
         self._following = True
         if self._layout != (len(detail["alpha"]), detail.has_region()):
             self._layout = (len(detail["alpha"]), detail.has_region())
@@ -100,7 +88,7 @@ class Panel:
         self._response.set_content(svg)
 
     def _slider(self, control: Control, suffix: str = "") -> Slider:
-        return Slider(control, lambda: self.session.recipe, self._change, suffix)
+        return Slider(control, self._recipe, self._change, suffix)
 
     def _build_levels(self) -> None:
         ui.label("Histogram").classes("group q-px-sm")
@@ -152,7 +140,7 @@ class Panel:
             words = ui.toggle(BRUSHES[step], value=brush.word[step]).props("dense no-caps unelevated")
             words.on_value_change(lambda event: brush.word.update({step: event.value}))
             ui.space()
-            clear = ui.button("Clear strokes", on_click=lambda: self._change(step, {"strokes": ()}, True))
+            clear = ui.button("Clear strokes", on_click=partial(self._clear, step))
             clear.props("flat dense no-caps")
         if "colour" in BRUSHES[step]:
             self._build_colours(brush)
@@ -164,11 +152,7 @@ class Panel:
 
     @staticmethod
     def _build_colours(brush: Brush) -> None:
-        def choose(value: object) -> None:
-            if isinstance(value, str) and len(value) == 7 and value.startswith("#"):
-                brush.colour = value.lower()
-
-        field = ui.color_input("Colour", value=brush.colour, on_change=lambda event: choose(event.value))
+        field = ui.color_input("Colour", value=brush.colour, on_change=lambda event: brush.choose_colour(event.value))
         field.props("dense outlined").classes("w-full q-mt-xs")
         with ui.row().classes("gap-2 q-mt-xs"):
             for colour in COLOURS:
@@ -180,10 +164,9 @@ class Panel:
         if name is None or self._following:
             return
         self._started = name
-        inside = self.session.recipe.last("detail")["inside"]
-        entries = entries_of(name)
-        entries["inside"] = inside if inside is not None and len(inside) == len(entries["alpha"]) else None
-        self._change("detail", entries, True)
+        inside = self._recipe().last("detail")["inside"]
+        fits = inside is not None and len(inside) == len(PRESETS[name].steps[0]["alpha"])
+        self._change("detail", {**entries_of(name), "inside": inside if fits else None}, True)
 
     def _name_preset(self, detail: Step) -> None:
         """Show the preset that the sliders are; or the one that they began with, which can then be chosen again."""
@@ -201,7 +184,7 @@ class Panel:
             self._change("detail", {"bandwidth": value}, True)
 
 
-def entries_of(name: str) -> dict[str, Any]:
+def entries_of(name: str) -> dict[str, object]:
     """What a preset sets."""
     detail = PRESETS[name].steps[0]
     return {entry: detail[entry] for entry in ("alpha", "bandwidth", "spatial_bandwidth", "landmarks")}

@@ -13,7 +13,6 @@ from bisect import bisect_right
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -37,7 +36,7 @@ from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.edits.applying import filter_key, prepare, scribbles_of
 from nlfilter_torch.photo.picture.changes import activity, change_of_mean, limit_by_activity, split_sliders
 from nlfilter_torch.photo.picture.in_memory import InMemory
-from nlfilter_torch.photo.picture.pixels import Fitted, Pixels, part_of
+from nlfilter_torch.photo.picture.pixels import Fitted, Pixels, Planes, part_of
 from nlfilter_torch.photo.picture.resizing import resize
 from nlfilter_torch.photo.picture.source import seeded
 from nlfilter_torch.photo.picture.viewing import MEGAPIXEL, viewed_size, within_limits
@@ -63,10 +62,10 @@ def sampled_operator(
     patch_size: int,
 ) -> NonlocalOperator:
     """The operator of every ``stride``-th pixel of a guide, from the patches around them at full resolution."""
-    recipe = GuideFeatures(unit_window(patch_size, None).to(guide), bandwidth, distance, channels)
+    features = GuideFeatures(unit_window(patch_size, None).to(guide), bandwidth, distance, channels)
     size = (guide.shape[-2] // stride, guide.shape[-1] // stride)
     return operator_from_features(
-        recipe(guide, stride=stride),
+        features(guide, stride=stride),
         size=size,
         num_landmarks=min(detail["landmarks"], size[0] * size[1]),
         landmarks=detail["sampling"],
@@ -74,34 +73,68 @@ def sampled_operator(
     )
 
 
-def between_knots(declared: Edit, edit: Callable[[Step], Tensor], image: Tensor) -> Callable[[Step], Tensor]:
-    """Return an edit of an image that is computed only at the knots of its slider, if that has any.
+class AtKnots:
+    """An edit of an image that is computed only at the knots of a slider, and interpolated linearly between them."""
 
-    Between two knots the pictures are interpolated linearly.
-    """
-    slow = [(p.name, p.slider.knots) for p in declared if p.slider is not None and p.slider.knots]
-    if not slow:
-        return edit
-    name, knots = slow[0]
+    def __init__(self, name: str, knots: tuple[float, ...], edit: Callable[[Step], Tensor], image: Tensor) -> None:
+        self._name, self._knots, self._edit, self._image = name, knots, edit, image
+        self._computed = lru_cache(maxsize=4)(self._compute)
 
-    @lru_cache(maxsize=4)
-    def computed(step: Step) -> Tensor:
-        return edit(step) if step.changes() else image
-
-    def with_value(step: Step, value: float) -> Step:
-        values: dict[str, Any] = {name: value}
-        return step.changed(**values)
-
-    def interpolated(step: Step) -> Tensor:
-        value = step[name]
+    def __call__(self, step: Step) -> Tensor:
+        """The edited image."""
+        value, knots = step[self._name], self._knots
         if value in knots or value > knots[-1]:
-            return computed(step)
+            return self._computed(step)
         above = bisect_right(knots, value)
-        ends = knots[above - 1], knots[above]
-        low, high = (computed(with_value(step, end)) for end in ends)
-        return torch.lerp(low, high, (value - ends[0]) / (ends[1] - ends[0]))
+        low, high = knots[above - 1], knots[above]
+        return torch.lerp(self._at(step, low), self._at(step, high), (value - low) / (high - low))
 
-    return interpolated
+    def _at(self, step: Step, value: float) -> Tensor:
+        """The image under the step with another value of the slider."""
+        return self._computed(step.changed(strokes=None, **{self._name: value}))
+
+    def _compute(self, step: Step) -> Tensor:
+        return self._edit(step) if step.changes() else self._image
+
+
+def between_knots(declared: Edit, edit: Callable[[Step], Tensor], image: Tensor) -> Callable[[Step], Tensor]:
+    """Return an edit of an image that is computed only at the knots of its slider, if that has any."""
+    slow = [(p.name, p.slider.knots) for p in declared if p.slider is not None and p.slider.knots]
+    return AtKnots(*slow[0], edit, image) if slow else edit
+
+
+@dataclass(frozen=True, eq=False)
+class WeighedLayers:
+    """The change of a picture by detail sliders, which weigh the layers of its luminance.
+
+    Attributes:
+        layers: layers (1, k+1, 1, h, w).
+        activity: the activity, by which changes are limited.
+        threshold: the threshold of the activity.
+        sliders: the sliders outside the region.
+        sliders_inside: those in the region.
+        mask: the region, or None for no region.
+    """
+
+    layers: Planes
+    activity: Planes
+    threshold: float
+    sliders: tuple[float, ...]
+    sliders_inside: tuple[float, ...]
+    mask: Planes | None
+
+    def __call__(self, pixels: Pixels) -> Tensor:
+        """The change at some pixels of the picture."""
+        layers = self.layers(pixels)
+        change = _change_by(layers, self.sliders)
+        if self.mask is not None:
+            change = torch.lerp(change, _change_by(layers, self.sliders_inside), self.mask(pixels))
+        return limit_by_activity(change, self.activity(pixels), self.threshold)
+
+
+def _change_by(layers: Tensor, sliders: tuple[float, ...]) -> Tensor:
+    """The changes of layers by sliders, of the details and of the shading."""
+    return torch.cat([weigh_layers(layers, part) for part in split_sliders(torch.tensor(sliders) - 1)], dim=1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -240,18 +273,14 @@ class Preview:
 
     def _blend(self, detail: Step) -> Tensor:
         mask = self.mask(detail)
-        layers, active = part_of(self.layers(detail).layers), part_of(self._activity(detail))
-
-        def changes(of: Tensor, alpha: tuple[float, ...]) -> Tensor:
-            return torch.cat([weigh_layers(of, part) for part in split_sliders(torch.tensor(alpha) - 1)], dim=1)
-
-        def change(pixels: Pixels) -> Tensor:
-            some = layers(pixels)
-            found = changes(some, detail["alpha"])
-            if mask is not None:
-                found = torch.lerp(found, changes(some, detail.sliders_inside), part_of(mask)(pixels))
-            return limit_by_activity(found, active(pixels), detail["threshold"] / 255)
-
+        change = WeighedLayers(
+            part_of(self.layers(detail).layers),
+            part_of(self._activity(detail)),
+            detail["threshold"] / 255,
+            detail["alpha"],
+            detail.sliders_inside,
+            None if mask is None else part_of(mask),
+        )
         rows = [detail["alpha"], detail.sliders_inside]
         brighter = detail["alpha"][-1] - 1 if mask is None else change_of_mean(torch.tensor(rows) - 1)
         return self._source.all(within_limits(self._source, Fitted(change), detail["limits"], brighter))
@@ -264,8 +293,8 @@ class Preview:
         if keep:
             self._filter = None  # first, since two of them would take twice the memory
         # A reduced photograph goes a little beyond its range, also where saving reduces it.
-        given = image.clamp(0, 1) if before else image
-        edit = between_knots(step.declared, prepare(step, given, stride=self.stride), given)
+        image = image.clamp(0, 1) if before else image
+        edit = between_knots(step.declared, prepare(step, image, stride=self.stride), image)
         if keep:
             self._filter = (key, edit)
         return edit

@@ -9,6 +9,7 @@ import socket
 import sys
 import threading
 import time
+from dataclasses import dataclass
 from pathlib import Path
 
 from fastapi import Response
@@ -22,6 +23,27 @@ TITLE = "nlfilter-torch"
 STARTING, PAUSE = 30.0, 0.05  # seconds for the server to accept connections, and between two attempts
 
 
+@dataclass(frozen=True)
+class Pages:
+    """What the server answers: pages that begin with an image, if there is one, and their pictures."""
+
+    library: Library
+    image: Path | None
+
+    def picture(self, token: str, kind: str, at: str = "") -> Response:
+        """A picture of the page with a token, by its kind; of the original at a place."""
+        editor = EDITORS.get(token)
+        content = None if editor is None else editor.picture(kind, at)
+        if not content:
+            return Response(status_code=404)
+        media_type = "image/jpeg" if kind in ("before", "after") else "image/png"
+        return Response(content, media_type=media_type, headers={"Cache-Control": "no-store"})
+
+    def page(self, photo: str = "") -> None:
+        """Build a page, for the photograph of an address that a page had before, if there is one."""
+        Editor(self.library).build(self.image, photo)
+
+
 def serve(image: Path | None, folder: Path, *, host: str, port: int, open_page: bool) -> None:
     """Run the editor until it is interrupted; it begins with an image, if there is one, and saves in the folder.
 
@@ -31,23 +53,11 @@ def serve(image: Path | None, folder: Path, *, host: str, port: int, open_page: 
     port = _check_address(host, port)
     binding.MAX_PROPAGATION_TIME = 1.0  # otherwise NiceGUI warns, on standard error, whenever the machine is busy
     app.add_middleware(Guard, host=host)
-    library = Library(folder, None if image is None else image.parent)
+    pages = Pages(Library(folder, None if image is None else image.parent), image)
     app.config.quasar_config["loadingBar"] = {"skipHijack": True}  # the page shows what it is doing itself
     app.add_static_files(STATIC_ADDRESS, STATIC, max_cache_age=0)  # another version must not find old files
-
-    @app.get("/picture/{token}/{kind}")
-    def _picture(token: str, kind: str, at: str = "") -> Response:
-        editor = EDITORS.get(token)
-        content = None if editor is None else editor.picture(kind, at)
-        if not content:
-            return Response(status_code=404)
-        media_type = "image/jpeg" if kind in ("before", "after") else "image/png"
-        return Response(content, media_type=media_type, headers={"Cache-Control": "no-store"})
-
-    @ui.page("/", title=TITLE, language="en-US")
-    def _page(photo: str = "") -> None:
-        Editor(library).build(image, photo)
-
+    app.get("/picture/{token}/{kind}")(pages.picture)
+    ui.page("/", title=TITLE, language="en-US")(pages.page)
     app.on_startup(threading.Thread(target=_tell_when_ready, args=(host, port), daemon=True).start)
     ui.run(
         host=host,

@@ -4,7 +4,6 @@ import threading
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -122,10 +121,10 @@ class Session:
     def restore(self) -> None:
         """Load what is kept if another program has changed it."""
         if self._sidecar is not None:
-            found = self._sidecar.read() or Recipe()
-            if found != self._kept:
-                self._kept = found
-                self.load(found)
+            recipe = self._sidecar.read() or Recipe()
+            if recipe != self._kept:
+                self._kept = recipe
+                self.load(recipe)
 
     @property
     def trouble(self) -> str | None:
@@ -154,9 +153,19 @@ class Session:
             raise ValueError("open a photograph first")
         return self.opened.preview
 
-    def set(self, edit: str, **values: Any) -> None:
+    @property
+    def size(self) -> tuple[int, int]:
+        """(height, width) of the photograph; raises ValueError if none is open."""
+        return self._opened_to("show").photograph.size
+
+    @property
+    def is_reduced(self) -> bool:
+        """Whether the preview has fewer pixels than the photograph; raises ValueError if none is open."""
+        return self.preview.stride > 1
+
+    def set(self, edit: str, *, strokes: tuple[Stroke, ...] | None = None, **values: object) -> None:
         """Change the last step of an edit, or add one; :meth:`commit` completes the change."""
-        self.recipe = self.recipe.with_last(self.recipe.last(edit).changed(**values))
+        self.recipe = self.recipe.with_last(self.recipe.last(edit).changed(strokes=strokes, **values))
 
     def commit(self) -> None:
         """Complete a change, which can then be undone."""
@@ -225,6 +234,10 @@ class Session:
         with self._drawing:
             return self.preview.mask(self.recipe.last("detail"))
 
+    def original(self, place: Rectangle) -> Tensor:
+        """A part of the photograph before the edit, (1, C, h, w) in [0, 1]; raises ValueError if none is open."""
+        return self._opened_to("show").parts.original(place)
+
     def part(self, place: Rectangle, recipe: Recipe, report: Report = in_silence) -> Tensor:
         """A part of the photograph under an edit as :meth:`save` makes it, (1, C, h, w) in [0, 1].
 
@@ -250,10 +263,10 @@ class Session:
             if self._at_rest is None or self._at_rest[0] != recipe.acting:
                 pixels = self._edited_at_once(recipe, report)
                 if pixels is None:
-                    found = self._fitted(recipe, report).reduced(self.preview.size, report)
+                    reduced = self._fitted(recipe, report).reduced(self.preview.size, report)
                 else:
-                    found = resize(pixels.clamp(0, 1), self.preview.size).clamp(0, 1)  # a file holds no more
-                self._at_rest = recipe.acting, found
+                    reduced = resize(pixels.clamp(0, 1), self.preview.size).clamp(0, 1)  # a file holds no more
+                self._at_rest = recipe.acting, reduced
             return self._at_rest[1]
 
     def _fitted(self, recipe: Recipe, report: Report) -> Parts:

@@ -1,0 +1,45 @@
+"""Files that the browser sends to the editor."""
+
+from collections.abc import Awaitable, Callable
+
+from nicegui import events, ui
+
+
+class Upload:
+    """A way for the user to choose a file, which is passed to an action; built, invisibly, into the open element.
+
+    Args:
+        action: takes the file.
+        accept: kinds of files, as the ``accept`` attribute of HTML has them.
+        largest: largest size in bytes.
+        show_error: takes a sentence for the user.
+    """
+
+    def __init__(
+        self,
+        action: Callable[[events.UploadEventArguments], Awaitable[None]],
+        accept: str,
+        largest: int,
+        show_error: Callable[[str], None],
+    ) -> None:
+        self._largest, self._show_error = largest, show_error
+        self._upload = ui.upload(auto_upload=True, on_upload=action, max_file_size=largest)
+        self._upload.on(
+            "rejected",
+            lambda event: self._refuse(*event.args),
+            js_handler="(entries) => page.refuse(entries, emit)",
+        )
+        self._upload.props(f'accept="{accept}"').classes("hidden")
+
+    @property
+    def choosing(self) -> str:
+        """JavaScript that lets the user choose a file."""
+        return f"() => getElement({self._upload.id}).$refs.qRef.pickFiles()"
+
+    def _refuse(self, reason: str, name: str) -> None:
+        """Say why the browser did not send a file."""
+        if reason == "max-file-size":
+            size = f"{self._largest / 1e9:g} GB" if self._largest >= 1e9 else f"{self._largest / 1e6:g} MB"
+            self._show_error(f"{name} must be at most {size}; make it smaller, or use the command line")
+        else:
+            self._show_error(f"{name} is not a file of the kind that is opened here; choose another")
