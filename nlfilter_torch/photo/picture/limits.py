@@ -6,6 +6,7 @@ which :func:`balance_of` measures and :func:`balanced` corrects.
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
 import torch
@@ -24,6 +25,7 @@ MAX_CHROMA_LOSS = 0.01  # share of the mean chroma that may be lost in some pixe
 MAX_CURVE = 0.9  # limit of the parameter of the tone curve; 1 would make it flat at one end
 EPSILON = 1e-9
 Limits = Literal["soft", "none"]
+MeanOf = Callable[[Callable[[Tensor, Tensor], Tensor]], Tensor]  # mean of a function of an image and its change
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,7 +115,7 @@ def clamped(image: Tensor, moved: Tensor, saturation: Tensor | None) -> tuple[Te
     return moved, torch.minimum(saturation, _share(image, luminance, chroma, moved))
 
 
-def balance_of(mean: Callable[[Callable[[Tensor, Tensor], Tensor]], Tensor], brighter: float | Tensor = 0.0) -> Balance:
+def balance_of(mean: MeanOf, brighter: float | Tensor = 0.0) -> Balance:
     """Compute the balance of a picture under a change of brightness.
 
     Args:
@@ -121,37 +123,42 @@ def balance_of(mean: Callable[[Callable[[Tensor, Tensor], Tensor]], Tensor], bri
             :func:`limit`; the function returns (B, S, H, W).
         brighter: intended relative change of the mean brightness, (B, 1, 1, 1).
     """
-
-    def curve_of(restraint: float | Tensor) -> Tensor:
-        def shifts(image: Tensor, moved: Tensor) -> Tensor:
-            before, moved = _before(image, moved), _restrained(image, moved, restraint)
-            return torch.cat([moved, before, _bow(before + moved)], dim=1)
-
-        shift, before, room = mean(shifts).chunk(3, dim=1)
-        return ((shift - brighter * before) / room.clamp(min=EPSILON)).clamp(-MAX_CURVE, MAX_CURVE)
-
-    def chroma_of(restraint: float | Tensor, curve: Tensor) -> tuple[Tensor, ...]:
-        """Means of the lost chroma, of the chroma that can be gained, and of the chroma of the picture."""
-
-        def chromas(image: Tensor, moved: Tensor) -> Tensor:
-            if moved.shape[1] == image.shape[1]:
-                return image.new_zeros(len(image), 3, *image.shape[2:])
-            less, more = _saturation(image, _bent(_before(image, moved), _restrained(image, moved, restraint), curve))
-            chroma = split_luminance(image)[1].square().sum(1, keepdim=True).clamp(min=EPSILON).sqrt()
-            return torch.cat([-less * chroma, more * chroma, chroma], dim=1)
-
-        return mean(chromas).chunk(3, dim=1)
-
     restraint: float | Tensor = 0.0
-    curve = curve_of(restraint)
-    lost, gained, chroma = chroma_of(restraint, curve)
+    curve = _curve(mean, restraint, brighter)
+    lost, gained, chroma = _mean_chroma(mean, restraint, curve)
     allowed = MAX_CHROMA_LOSS * chroma
     if is_hidden(lost) or bool((lost > allowed).any()):
         # With a constant curve, the loss is proportional to 1 - restraint.
         restraint = (1 - allowed / lost.clamp(min=EPSILON)).clamp(min=0.0)
-        curve = curve_of(restraint)
-        lost, gained, _ = chroma_of(restraint, curve)
+        curve = _curve(mean, restraint, brighter)
+        lost, gained, _ = _mean_chroma(mean, restraint, curve)
     return Balance(restraint, curve, (lost / gained.clamp(min=EPSILON)).clamp(max=1.0))
+
+
+def _curve(mean: MeanOf, restraint: float | Tensor, brighter: float | Tensor) -> Tensor:
+    """:attr:`Balance.curve`, for a restraint."""
+    shift, before, room = mean(partial(_brightness, restraint=restraint)).chunk(3, dim=1)
+    return ((shift - brighter * before) / room.clamp(min=EPSILON)).clamp(-MAX_CURVE, MAX_CURVE)
+
+
+def _brightness(image: Tensor, moved: Tensor, restraint: float | Tensor) -> Tensor:
+    """Change of brightness under a restraint, brightness before it, and what the tone curve changes of the result."""
+    before, moved = _before(image, moved), _restrained(image, moved, restraint)
+    return torch.cat([moved, before, _bow(before + moved)], dim=1)
+
+
+def _mean_chroma(mean: MeanOf, restraint: float | Tensor, curve: Tensor) -> tuple[Tensor, ...]:
+    """Means of the lost chroma, of the chroma that can be gained, and of the chroma of the picture."""
+    return mean(partial(_chroma, restraint=restraint, curve=curve)).chunk(3, dim=1)
+
+
+def _chroma(image: Tensor, moved: Tensor, restraint: float | Tensor, curve: Tensor) -> Tensor:
+    """Lost chroma, chroma that can be gained, and chroma of pixels; 0 for a change of each channel."""
+    if moved.shape[1] == image.shape[1]:
+        return image.new_zeros(len(image), 3, *image.shape[2:])
+    less, more = _saturation(image, _bent(_before(image, moved), _restrained(image, moved, restraint), curve))
+    chroma = split_luminance(image)[1].square().sum(1, keepdim=True).clamp(min=EPSILON).sqrt()
+    return torch.cat([-less * chroma, more * chroma, chroma], dim=1)
 
 
 def _before(image: Tensor, change: Tensor) -> Tensor:

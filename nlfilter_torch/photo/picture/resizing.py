@@ -71,7 +71,12 @@ def interpolation(places: range, length: int, wanted: int) -> tuple[slice, Tenso
 
 def resize(planes: Tensor, size: tuple[int, int]) -> Tensor:
     """Resize planes (B, C, H, W), see :func:`resized`."""
-    return resized(lambda start, stop: planes[:, :, start:stop], (planes.shape[-2], planes.shape[-1]), size)
+    return resized(partial(rows_of, planes), (planes.shape[-2], planes.shape[-1]), size)
+
+
+def rows_of(planes: Tensor, start: int, stop: int) -> Tensor:
+    """Rows of planes (B, C, H, W)."""
+    return planes[:, :, start:stop]
 
 
 def cubic(distance: Tensor) -> Tensor:

@@ -16,6 +16,7 @@ reduced, is nearly the small result, which the editor shows while a slider moves
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 import torch.nn.functional as F
@@ -25,7 +26,7 @@ from nlfilter_torch.core.values import cached_constants
 from nlfilter_torch.operator.features import pad_border
 from nlfilter_torch.photo.picture.limits import Balance, Limits, balance_of, balanced, clamped, limit, move_luminance
 from nlfilter_torch.photo.picture.pixels import Fitted, Pixels, Planes, corner
-from nlfilter_torch.photo.picture.resizing import interpolation, resized
+from nlfilter_torch.photo.picture.resizing import interpolation, resized, rows_of
 from nlfilter_torch.photo.picture.source import Source
 
 MEGAPIXEL = 1_000_000
@@ -74,8 +75,7 @@ def fit_change(
     before, image = reduced.all(Fitted(planes)), reduced.all(Fitted(lambda pixels: pixels.image))
     after, saturation = balanced(image, reduced.all(fitted), balance, limits)
     coarse = Coarse.of(before, after, saturation, limits)
-    found = coarse.changes(source, planes)
-    return Fitted(lambda pixels: coarse.change(pixels.image, *found(pixels)))
+    return Fitted(coarse.enlarged(source, planes).edited)
 
 
 def within_limits(
@@ -83,11 +83,12 @@ def within_limits(
 ) -> Fitted:
     """The edit that applies a change of brightness to a picture; arguments as those of :func:`fit_change`."""
     fitted, balance = _limited(source, change, limits, brighter)
+    return fitted.then(partial(_with_balance, balance=balance, limits=limits))
 
-    def changed(image: Tensor, moved: Tensor) -> Tensor:
-        return move_luminance(image, *balanced(image, moved, balance, limits))
 
-    return fitted.then(changed)
+def _with_balance(image: Tensor, moved: Tensor, balance: Balance | None, limits: Limits) -> Tensor:
+    """Apply a limited change of brightness to pixels of a picture with that balance."""
+    return move_luminance(image, *balanced(image, moved, balance, limits))
 
 
 def balance(source: Source, change: Fitted, limits: Limits, brighter: float | Tensor) -> Balance | None:
@@ -105,7 +106,7 @@ def _limited(
     if brighter is None or isinstance(brighter, Balance):
         return fitted, brighter
     cached = source.cached(fitted)
-    return cached, balance_of(lambda function: source.mean_of(cached, function), brighter)
+    return cached, balance_of(partial(source.mean_of, cached), brighter)
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,57 +130,79 @@ class Coarse:
         parts = [before, change, slope(before, change), *([] if saturation is None else [saturation])]
         return Coarse(torch.cat(parts, dim=1), before.shape[1], limits)
 
+    def enlarged(self, source: Source, planes: Planes) -> "EnlargedChange":
+        """The change of a larger picture whose ``planes`` it changes."""
+        return EnlargedChange(self, planes, source.size).corrected(source)
+
     def changes(self, source: Source, planes: Planes) -> Callable[[Pixels], tuple[Tensor, Tensor]]:
-        """Function from pixels to the changes of their ``planes`` and of their saturation."""
-        finer = self._of_larger(source, planes)
-        return lambda pixels: finer._moved(planes(pixels), finer._at(pixels, source.size))
+        """Function from pixels of a larger picture to the changes of their ``planes`` and of their saturation."""
+        return self.enlarged(source, planes).changes
 
-    def change(self, image: Tensor, moved: Tensor, saturation: Tensor) -> Tensor:
-        """Apply a change of the planes and of the saturation to pixels of the picture."""
+    @property
+    def size(self) -> tuple[int, int]:
+        """(h, w)."""
+        return self.planes.shape[-2], self.planes.shape[-1]
+
+
+@dataclass(frozen=True, eq=False)
+class EnlargedChange:
+    """A change of brightness at the viewing size, enlarged to a larger picture.
+
+    Attributes:
+        coarse: the change at the viewing size.
+        planes: what is changed of the larger picture.
+        size: (H, W) of the larger picture.
+    """
+
+    coarse: Coarse
+    planes: Planes
+    size: tuple[int, int]
+
+    def changes(self, pixels: Pixels) -> tuple[Tensor, Tensor]:
+        """Changes of the planes and of the saturation of pixels of the larger picture."""
+        count, planes = self.coarse.count, self.planes(pixels)
+        enlarged = self._enlarged(pixels)
+        blurred, changed, steepness = enlarged[:, : 3 * count].chunk(3, dim=1)
+        return changed + steepness * (planes - blurred), enlarged[:, 3 * count :]
+
+    def edited(self, pixels: Pixels) -> Tensor:
+        """Pixels of the larger picture under the change."""
+        moved, saturation = self.changes(pixels)
         changed = moved, saturation if saturation.shape[1] else None
-        return move_luminance(image, *(clamped(image, *changed) if self.limits == "soft" else changed))
+        image = pixels.image
+        return move_luminance(image, *(clamped(image, *changed) if self.coarse.limits == "soft" else changed))
 
-    def _of_larger(self, source: Source, planes: Planes) -> "Coarse":
-        """Correct the change so that its mean over blocks of a larger picture is the change of the small one.
+    def corrected(self, source: Source) -> "EnlargedChange":
+        """Correct the change so that its mean over blocks of the larger picture is the change of the small one.
 
         The change of detail that the small picture lacks has a nonzero mean, which is subtracted here.
         """
-        size, count = (self.planes.shape[-2], self.planes.shape[-1]), self.count
-        before, steepness = slice(0, count), slice(2 * count, 3 * count)
+        planes, count, size = self.coarse.planes, self.coarse.count, self.coarse.size
+        before, change, rest = planes.split([count, count, planes.shape[1] - 2 * count], dim=1)
+        stride = math.sqrt(self.size[0] * self.size[1] / (size[0] * size[1]))
+        change = _restored(change - source.shrunk(self._finer, size), stride)
+        return replace(self, coarse=replace(self.coarse, planes=torch.cat([before, change, rest], dim=1)))
 
-        def beyond(pixels: Pixels) -> Tensor:
-            lacking = planes(pixels) - self._at(pixels, source.size, before)
-            return self._at(pixels, source.size, steepness) * lacking
+    def _finer(self, pixels: Pixels) -> Tensor:
+        """Change of the detail of pixels that the small picture lacks."""
+        count = self.coarse.count
+        detail = self.planes(pixels) - self._enlarged(pixels, slice(0, count))
+        return self._enlarged(pixels, slice(2 * count, 3 * count)) * detail
 
-        parts = list(self.planes.split([count, count, self.planes.shape[1] - 2 * count], dim=1))
-        stride = math.sqrt(source.size[0] * source.size[1] / (size[0] * size[1]))
-        parts[1] = _restored(parts[1] - source.shrunk(beyond, size), stride)
-        return replace(self, planes=torch.cat(parts, dim=1))
-
-    def _at(self, pixels: Pixels, size: tuple[int, int], channels: slice = slice(None)) -> Tensor:
-        """Channels of :attr:`planes`, enlarged to pixels of a picture of size (H, W)."""
+    def _enlarged(self, pixels: Pixels, channels: slice = slice(None)) -> Tensor:
+        """Channels of :attr:`Coarse.planes`, enlarged to pixels of the larger picture."""
         (top, left), (height, width) = corner(pixels), pixels.image.shape[-2:]
         columns = None if width == pixels.width else range(left, left + width)
-        return resized(
-            lambda start, stop: self.planes[:, channels, start:stop],
-            (self.planes.shape[-2], self.planes.shape[-1]),
-            size,
-            range(top, top + height),
-            columns,
-        )
-
-    def _moved(self, planes: Tensor, found: Tensor) -> tuple[Tensor, Tensor]:
-        """Changes of planes of the picture and of its saturation, given :attr:`planes` enlarged to these pixels."""
-        blurred, changed, steepness = found[:, : 3 * self.count].chunk(3, dim=1)
-        return changed + steepness * (planes - blurred), found[:, 3 * self.count :]
+        rows = range(top, top + height)
+        return resized(partial(rows_of, self.coarse.planes[:, channels]), self.coarse.size, self.size, rows, columns)
 
 
 def _restored(planes: Tensor, stride: float) -> Tensor:
-    """Planes for which :func:`enlarged_and_reduced` returns approximately the given ones."""
-    found = planes
+    """Planes that :func:`enlarged_and_reduced` turns into approximately these planes."""
+    estimate = planes
     for _ in range(RESTORED - 1):
-        found = found + planes - enlarged_and_reduced(found, stride)
-    return found
+        estimate = estimate + planes - enlarged_and_reduced(estimate, stride)
+    return estimate
 
 
 def enlarged_and_reduced(planes: Tensor, stride: float) -> Tensor:
@@ -198,10 +221,10 @@ def _smoothed(planes: Tensor, kernel: Tensor, dim: int) -> Tensor:
     radius = len(kernel) // 2
     length = planes.shape[dim] - 2 * radius
     shifted = [planes.narrow(dim, i, length) for i in range(len(kernel))]
-    found = shifted[radius] * kernel[radius]
+    total = shifted[radius] * kernel[radius]
     for i in range(radius):
-        found = found + (shifted[i] + shifted[-1 - i]) * kernel[i]
-    return found
+        total = total + (shifted[i] + shifted[-1 - i]) * kernel[i]
+    return total
 
 
 @cached_constants
@@ -212,8 +235,8 @@ def _round_trip_kernel(stride: float) -> Tensor:
     used, down = interpolation(places, large, length)
     rows = torch.stack([weights @ _up(used, length, large) for weights in down])  # (8, 64)
     around = [rows[i, place - ROUND_TRIP_RADIUS : place + ROUND_TRIP_RADIUS + 1] for i, place in enumerate(places)]
-    found = torch.stack(around).mean(0)
-    return (found + found.flip(0)) / (2 * found.sum())
+    kernel = torch.stack(around).mean(0)
+    return (kernel + kernel.flip(0)) / (2 * kernel.sum())
 
 
 def _up(used: slice, length: int, large: int) -> Tensor:
@@ -224,10 +247,13 @@ def _up(used: slice, length: int, large: int) -> Tensor:
 
 def slope(before: Tensor, change: Tensor) -> Tensor:
     """Slope of a change over the planes (B, C, H, W) before it, by regression over 5x5 pixels; 0 in flat areas."""
-    fifth = before.new_full((5,), 0.2)
+    mean = _mean_around(before)
+    covariance = _mean_around(before * change) - mean * _mean_around(change)
+    variance = (_mean_around(before.square()) - mean.square()).clamp(min=0.0)
+    return covariance / (variance + FAINT_VARIANCE)
 
-    def mean(planes: Tensor) -> Tensor:
-        return _smoothed(_smoothed(pad_border(planes, 2), fifth, 2), fifth, 3)
 
-    together = mean(before * change) - mean(before) * mean(change)
-    return together / ((mean(before.square()) - mean(before).square()).clamp(min=0.0) + FAINT_VARIANCE)
+def _mean_around(planes: Tensor) -> Tensor:
+    """Mean over the 5x5 pixels around each pixel."""
+    fifth = planes.new_full((5,), 0.2)
+    return _smoothed(_smoothed(pad_border(planes, 2), fifth, 2), fifth, 3)
