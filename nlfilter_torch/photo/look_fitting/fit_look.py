@@ -1,6 +1,6 @@
 """Looks from pairs of photographs before and after an edit."""
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import reduce
 
@@ -16,34 +16,33 @@ from nlfilter_torch.photo.declared.shared_parameters import KNOTS, SATURATIONS, 
 from nlfilter_torch.photo.declared.steps import Step, json_of
 from nlfilter_torch.photo.edits.applying import apply_step
 from nlfilter_torch.photo.look_fitting.alignment import inside_frame
-from nlfilter_torch.photo.look_fitting.look_fit import (
+from nlfilter_torch.photo.look_fitting.look_choice import (
     CHOICES,
     RIDGES,
-    Found,
-    Layout,
-    Parts,
-    Sums,
+    Candidate,
     choose,
     choose_from_one,
     fit_parts,
     simplest,
 )
-from nlfilter_torch.photo.look_fitting.look_pixels import EditedPhotograph, SomePixels
+from nlfilter_torch.photo.look_fitting.look_pixels import EditedPhotograph, PixelSample
+from nlfilter_torch.photo.look_fitting.look_sums import Layout, Parts, Sums
 from nlfilter_torch.photo.looks.look_filter import NAMES
 
-Pair = tuple[Tensor, ...]
-FOLDS = 5  # into which pairs are put
-SQUARES = 3  # parts along each side of a picture that are left out in turn if there is one pair
-STIFF, STIFF_ALONE = 3e-3, 1e-2  # least ridge of tone curves and saturation, of several pairs and of one
-SLIDERS_ONLY = 0.98  # share that sliders explain of a pair for which they are found to the last digit
-LIKELY = 0.95  # such a share by the layers of a sample of the pixels
-ALIKE = 0.5  # correlation of the luminance before and after an edit; less do not belong together
+Pair = tuple[Tensor, ...]  # before and after an edit, and masks of regions, if any
+SLIDERS: Parts = ("alpha",)  # of looks that are steps of detail
+FOLDS = 5  # of cross-validation, among which the pairs are divided
+SQUARES = 3  # a single pair is divided into so many parts along each side, which are the folds
+STIFF, STIFF_ALONE = 3e-3, 1e-2  # smallest ridge of tone curves and saturation, for several pairs and for one
+SLIDERS_ONLY = 0.98  # share of the change from which on an edit counts as one by sliders alone
+LIKELY = 0.95  # share that the layers of a sample of the pixels explain of such an edit
+ALIKE = 0.5  # least correlation of the luminance of a photograph with that of its edit
 SHADES = 256
 
 
 @dataclass(frozen=True)
 class FittedLook:
-    """A look that was found, and how much of the edits it explains.
+    """A look fitted to edits, and how much of them it explains.
 
     Attributes:
         step: the look as a step of an edit, of ``look``, or of ``detail`` if sliders alone explain the edits.
@@ -67,13 +66,13 @@ class FittedLook:
     @property
     def tensors(self) -> dict[str, Tensor]:
         """Its parts by name, for :class:`Look`: those of a step of ``detail`` are sliders only."""
-        if self.step.edit == "detail":
+        if self.parts == SLIDERS:
             return {"alpha": torch.tensor(self.step["alpha"])}
         curves = torch.tensor([self.step[channel] for channel in ("red", "green", "blue")])
         matrix = torch.tensor(self.step["matrix"]).view(3, 3)
         named = {name: torch.tensor(self.step[name]) for name in ("alpha", "bands", "texture")}
-        rest = {name: torch.tensor(self.step[name]) for name in ("saturation", "stretch", "local")}
-        return {**named, "curves": curves, "matrix": matrix, **rest}
+        others = {name: torch.tensor(self.step[name]) for name in ("saturation", "stretch", "local")}
+        return {**named, "curves": curves, "matrix": matrix, **others}
 
     def to_json(self) -> str:
         """A file for ``nlfilter-torch apply``: a recipe of one step."""
@@ -92,17 +91,18 @@ def fit_look(
 ) -> FittedLook | tuple[FittedLook, ...]:
     """Find the look that turns photographs into edited ones, whatever program edited them.
 
-    In closed form, from small sums over 65,536 pixels of each pair or all of a smaller one; one pair is in memory at a
-    time. Parts and ridge are chosen by leaving out pairs, or ninths of the picture if there is one pair only, which
-    says nothing of other pictures: the look is kept closer to the identity then, the more it leaves of the edit.
+    The fit is a least-squares problem in closed form, from small sums over 65,536 pixels of each pair, or over all
+    pixels of a smaller one. One pair is in memory at a time. The parts of the look and the strength of a ridge are
+    chosen by cross-validation over the pairs. A single pair is divided into ninths, which say little about other
+    pictures; the look is then kept closer to the identity, the less of the edit it explains.
 
     Args:
         pairs: photographs before and after the edit, two tensors (B, C, H, W) in [0, 1] of the same shape, C = 1 or 3;
             or three, with masks (B, K, H, W) in [0, 1] of K regions that have looks of their own, which may be missing
             in some pairs. Read once. A frame of one colour around an edited photograph is left out.
-        parts: what the look may consist of, any of ``alpha`` (sliders), ``bands`` (gains of blurs),
-            ``texture`` (these without edges), ``curves``,
-            ``matrix``, ``saturation``, ``stretch`` (automatic levels) and ``local`` (local contrast).
+        parts: what the look may consist of, any of ``alpha`` (sliders), ``bands`` (gains of blurs), ``texture`` (these
+            without edges), ``curves``, ``matrix``, ``saturation``, ``stretch`` (automatic levels) and ``local`` (local
+            contrast).
         order: k; k + 1 sliders.
         step: ``look`` with the parameters of the filter; None has the defaults.
         generator: source of randomness for the landmarks; None draws the same for every call.
@@ -123,24 +123,123 @@ def fit_look(
     check_order(order)
     step = Step("look") if step is None else step
     names = check_learn(parts, NAMES, "parts")
-    choices = [tuple(name for name in some if ("curves" if name == "tone" else name) in names) for some in CHOICES]
-    choices = [some for some in dict.fromkeys(choices) if some]
-    if not choices:
-        raise ValueError(f"parts must name one of {', '.join(NAMES)}, got none; leave them out for all")
+    choices = _choices(names)
     layout = Layout(KNOTS, SATURATIONS, order + 1)
     regions: list[_Region] = []
-    number = 0
-    for pair in pairs:
-        for before, after, masks in _images(pair, number):
-            count = 1 if masks is None else len(masks)
-            if number and count != len(regions):
-                raise ValueError(
-                    f"masks must be as many for every pair, got {count} after {len(regions)}; pass one for each region"
-                )
-            regions = regions or [_Region(layout, []) for _ in range(count)]
-            _add(regions, before, after, masks, step, number, generator)
-            number += 1
-    if number == 0:
+    for number, (before, after, masks) in enumerate(_images(pairs)):
+        count = 1 if masks is None else len(masks)
+        regions = regions or [_Region(layout, []) for _ in range(count)]
+        if count != len(regions):
+            raise ValueError(
+                f"masks must be as many for every pair, got {count} after {len(regions)}; pass one for each region"
+            )
+        _add(regions, number, EditedPhotograph(before, after, masks, step, order, generator))
+    _check_regions(regions)
+    looks = tuple(region.look(step, choices) for region in regions)
+    return looks[0] if len(looks) == 1 else looks
+
+
+def _choices(names: Collection[str]) -> list[Parts]:
+    """The :data:`CHOICES` that remain with parts of these names only.
+
+    Raises:
+        ValueError: if there are none.
+    """
+    choices = [tuple(name for name in parts if ("curves" if name == "tone" else name) in names) for parts in CHOICES]
+    choices = [parts for parts in dict.fromkeys(choices) if parts]
+    if not choices:
+        raise ValueError(f"parts must name one of {', '.join(NAMES)}, got none; leave them out for all")
+    return choices
+
+
+@dataclass
+class _Region:
+    """Sums over the pixels of a region in all pairs.
+
+    Attributes:
+        layout: of the sums.
+        folds: sums of the pairs, divided among the folds.
+        squares: sums of the squares of the first photograph that shows the region.
+        sliders: sums of the Gram matrix of the layers, and of its product with the sliders of each pair; None if there
+            is a pair that sliders alone do not explain.
+    """
+
+    layout: Layout
+    folds: list[Sums]
+    squares: list[Sums] | None = None
+    sliders: tuple[Tensor, Tensor] | None = (torch.zeros(1), torch.zeros(1))
+
+    def add(self, number: int, pixels: PixelSample, squares: list[Sums], rounding: float) -> None:
+        """Add the pixels of a pair with that number, and the sums over their squares.
+
+        ``rounding`` is half the step between the values of the edited photograph, or 0.
+        """
+        if not squares:
+            return  # the region is not in this photograph
+        whole = reduce(Sums.__add__, squares)
+        self.squares = self.squares or squares
+        if len(self.folds) < FOLDS:
+            self.folds.append(whole)
+        else:
+            self.folds[number % FOLDS] = self.folds[number % FOLDS] + whole
+        self._add_sliders(pixels, whole, rounding)
+
+    def _add_sliders(self, pixels: PixelSample, sums: Sums, rounding: float) -> None:
+        """Add the least-squares sliders of a pair; what rounding of the edited picture explains is no error."""
+        if self.sliders is None:
+            return
+        if not _are_sliders(sums, self.layout, SLIDERS_ONLY):
+            self.sliders = None
+            return
+        # Sliders add the same to every channel, each of which is rounded by itself.
+        layers = pixels.weighed["alpha"].repeat(1, 3)
+        before, after, weights = (planes.flatten() for planes in (pixels.before, pixels.after, pixels.weights))
+        alpha = fit_layers(layers, before, after, weights, rounding)
+        place = self.layout.place("alpha")
+        gram = sums.gram[:, place, place].sum(0)
+        gram = gram + 1e-9 * gram.diagonal().max() * torch.eye(len(gram), dtype=gram.dtype)
+        total, products = self.sliders
+        self.sliders = (total.double() + gram, products.double() + gram @ alpha.double())
+
+    def look(self, step: Step, choices: Sequence[Parts]) -> FittedLook:
+        """The look, of one of these choices of parts."""
+        if len(self.folds) == 1 and self.squares:
+            best, candidates = choose_from_one(self.squares, self.layout, choices, STIFF_ALONE)
+        else:
+            candidates = choose(self.folds, self.layout, choices, STIFF)
+            best = simplest(candidates)
+        explained = {parts: (look.fitted, look.left_out) for parts, look in candidates.items()}
+        return FittedLook(self._step(best, step), best.parts, best.fitted, best.left_out, explained)
+
+    def _step(self, look: Candidate, step: Step) -> Step:
+        """The look as a step of an edit: of detail if it consists of sliders alone."""
+        changes = {name: look.coefficients[:, self.layout.place(name)] for name in self.layout.lengths}
+        alpha = 1 + changes["alpha"][0]
+        if look.parts == SLIDERS:
+            if self.sliders is not None:
+                alpha = torch.linalg.solve(*self.sliders)
+            plain = {name: step[name] for name in FILTER_NAMES}
+            return Step("detail", alpha=_rounded(alpha), threshold=0.0, limits="none", **plain)
+        curves = torch.tensor(STRAIGHT, dtype=torch.float64) + changes["curves"]
+        matrix = torch.eye(3, dtype=torch.float64) + changes["matrix"]
+        red, green, blue = map(_rounded, curves)
+        return step.changed(
+            alpha=_rounded(alpha),
+            bands=_rounded(1 + changes["bands"][0]),
+            texture=_rounded(1 + changes["texture"][0]),
+            red=red,
+            green=green,
+            blue=blue,
+            matrix=_rounded(matrix.flatten()),
+            saturation=_rounded(1 + changes["saturation"][0]),
+            stretch=_rounded(changes["stretch"][0]),
+            local=_rounded(changes["local"][0]),
+        )
+
+
+def _check_regions(regions: list[_Region]) -> None:
+    """Raise unless there are pairs with an edit, and every region has pixels in them."""
+    if not regions:
         raise ValueError("pairs must hold a pair of photographs, got none; pass (before, after)")
     for i, region in enumerate(regions):
         if not region.folds:
@@ -149,65 +248,6 @@ def fit_look(
             )
     if not any(bool((sums.power > 0).any()) for region in regions for sums in region.folds):
         raise ValueError("pairs must hold an edited photograph, but each is the same before and after; edit one")
-    found = tuple(region.look(step, choices) for region in regions)
-    return found[0] if len(found) == 1 else found
-
-
-@dataclass
-class _Region:
-    """What is known of the edits of a region.
-
-    Attributes:
-        layout: of the sums.
-        folds: by pair, and by squares of the first.
-        sliders: sums of the Gram matrix of layers, and of it times sliders, of pairs that these explain; None if one
-            of the pairs is none of these.
-    """
-
-    layout: Layout
-    folds: list[Sums]
-    squares: list[Sums] | None = None
-    sliders: tuple[Tensor, Tensor] | None = (torch.zeros(1), torch.zeros(1))
-
-    def look(self, step: Step, choices: Sequence[Parts]) -> FittedLook:
-        """The look, of one of these choices of parts."""
-        if len(self.folds) == 1 and self.squares:
-            best, found = choose_from_one(self.squares, self.layout, choices, STIFF_ALONE)
-        else:
-            found = choose(self.folds, self.layout, choices, STIFF)
-            best = simplest(found)
-        return FittedLook(
-            self._step(best, step),
-            best.parts,
-            best.fitted,
-            best.left_out,
-            {parts: (look.fitted, look.left_out) for parts, look in found.items()},
-        )
-
-    def _step(self, found: Found, step: Step) -> Step:
-        """Of the edit whose parameters these are."""
-        values = {name: found.coefficients[:, self.layout.place(name)] for name in self.layout.lengths}
-        alpha = 1 + values["alpha"][0]
-        if found.parts == ("alpha",):
-            if self.sliders is not None:
-                alpha = torch.linalg.solve(*self.sliders)
-            plain = {name: step[name] for name in FILTER_NAMES}
-            return Step("detail", alpha=_rounded(alpha), threshold=0.0, limits="none", **plain)
-        curves = torch.tensor(STRAIGHT, dtype=torch.float64) + values["curves"]
-        matrix = torch.eye(3, dtype=torch.float64) + values["matrix"]
-        red, green, blue = map(_rounded, curves)
-        return step.changed(
-            alpha=_rounded(alpha),
-            bands=_rounded(1 + values["bands"][0]),
-            texture=_rounded(1 + values["texture"][0]),
-            red=red,
-            green=green,
-            blue=blue,
-            matrix=_rounded(matrix.flatten()),
-            saturation=_rounded(1 + values["saturation"][0]),
-            stretch=_rounded(values["stretch"][0]),
-            local=_rounded(values["local"][0]),
-        )
 
 
 FILTER_NAMES = ("bandwidth", "spatial_bandwidth", "patch_size", "landmarks", "sampling", "viewing_size")
@@ -217,28 +257,44 @@ def _rounded(values: Tensor) -> tuple[float, ...]:
     return tuple(round(value, 6) for value in values.tolist())
 
 
-def _images(pair: Pair, number: int) -> Iterable[tuple[Tensor, Tensor, Tensor | None]]:
-    """Each image of a pair, in colour: (3, H, W) before and after the edit, and masks (K, H, W)."""
+def _images(pairs: Iterable[Pair]) -> Iterator[tuple[Tensor, Tensor, Tensor | None]]:
+    """Each image of the pairs, in colour: (3, H, W) before and after the edit, and masks (K, H, W)."""
+    number = 0
+    for pair in pairs:
+        _check_pair(pair, number)
+        before, after = pair[:2]
+        masks = pair[2] if len(pair) == 3 else None
+        names = _names(number)
+        for i in range(before.shape[0]):
+            image, edited = before[i].expand(3, -1, -1), after[i % after.shape[0]].expand(3, -1, -1)
+            check_belong(image, edited, *names)
+            yield image, edited, None if masks is None else masks[i % masks.shape[0]]
+            number += 1
+
+
+def _names(number: int) -> tuple[str, str]:
+    """Names in errors of the two photographs of a pair."""
+    return f"before of pair {number + 1}", f"after of pair {number + 1}"
+
+
+def _check_pair(pair: Pair, number: int) -> None:
+    """Raise unless a pair holds two photographs of the same shape, and masks of their size, if any."""
     if not isinstance(pair, tuple | list) or len(pair) not in (2, 3):
         raise TypeError(
             f"pairs must hold tuples of two photographs, or these and masks, got {type(pair).__name__}; "
             "pass [(before, after)]"
         )
-    before, after = pair[:2]
-    names = (f"before of pair {number + 1}", f"after of pair {number + 1}")
+    before, after, *masks = pair
+    names = _names(number)
     check_photograph(before, names[0])
     check_photograph(after, names[1], channels=before.shape[1], batch=before.shape[0])
     check_same_size(after, (before.shape[-2], before.shape[-1]), names[1], names[0])
     if before.shape[1] not in (1, 3):
         raise ValueError(f"{names[0]} must have 1 or 3 channels, got {before.shape[1]}; pass grey or RGB")
-    masks = pair[2] if len(pair) == 3 else None
-    if masks is not None:
-        check_image(masks, "masks", batch=before.shape[0])
-        check_same_size(masks, (before.shape[-2], before.shape[-1]), "masks", names[0])
-    for i in range(before.shape[0]):
-        one, other = before[i].expand(3, -1, -1), after[i % after.shape[0]].expand(3, -1, -1)
-        check_belong(one, other, *names)
-        yield one, other, None if masks is None else masks[i % masks.shape[0]]
+    for mask in masks:
+        if mask is not None:
+            check_image(mask, "masks", batch=before.shape[0])
+            check_same_size(mask, (before.shape[-2], before.shape[-1]), "masks", names[0])
 
 
 def check_belong(before: Tensor, after: Tensor, first: str, second: str) -> None:
@@ -266,71 +322,44 @@ def check_belong(before: Tensor, after: Tensor, first: str, second: str) -> None
         )
 
 
-def _add(
-    regions: list[_Region],
-    before: Tensor,
-    after: Tensor,
-    masks: Tensor | None,
-    step: Step,
-    number: int,
-    generator: torch.Generator | None,
-) -> None:
-    """Add the sums of an image (3, H, W) before and after an edit."""
-    layout = regions[0].layout
-    photograph = EditedPhotograph(before, after, masks, step, layout.sliders - 1, generator)
+def _add(regions: list[_Region], number: int, photograph: EditedPhotograph) -> None:
+    """Add the pixels of a photograph with that number to each of its regions."""
+    for region, pixels, sums in zip(regions, *_pixels_and_sums(photograph, regions[0].layout), strict=True):
+        region.add(number, pixels, sums, photograph.rounding)
+
+
+def _pixels_and_sums(photograph: EditedPhotograph, layout: Layout) -> tuple[list[PixelSample], list[list[Sums]]]:
+    """Pixels of each region, and sums over their squares.
+
+    They are a sample, unless sliders explain the edit: these are fitted to all pixels.
+    """
     width = photograph.size[1]
+    sample = photograph.regions_of_sample()
+    if sample is not None:
+        sums = [_sums_of_squares(pixels, layout, width) for pixels in sample]
+        if not _are_sliders(reduce(Sums.__add__, sums[0]), layout, LIKELY):
+            return sample, sums
+    regions = photograph.regions()
+    return regions, [_sums_of_squares(pixels, layout, width) for pixels in regions]
 
-    def sums(pixels: SomePixels) -> list[Sums]:
-        """Sums over parts of the picture, one after the other, which take less memory than all pixels at once."""
-        square = _squares(pixels.places, width)
-        return pixels.sums(layout, [(square == i).nonzero().squeeze(1) for i in square.unique()])
 
-    found = photograph.regions_of_sample()
-    known = None if found is None else [sums(pixels) for pixels in found]
-    if found is None or known is None or _of_sliders(reduce(Sums.__add__, known[0]), layout, LIKELY):
-        found = photograph.regions()
-        known = [sums(pixels) for pixels in found]
-    for region, pixels, parts in zip(regions, found, known, strict=True):
-        if not parts:
-            continue  # the region is not in this photograph
-        whole = reduce(Sums.__add__, parts)
-        region.squares = region.squares or parts
-        if len(region.folds) < FOLDS:
-            region.folds.append(whole)
-        else:
-            region.folds[number % FOLDS] = region.folds[number % FOLDS] + whole
-        _add_sliders(region, pixels, whole, photograph.rounding)
+def _sums_of_squares(pixels: PixelSample, layout: Layout, width: int) -> list[Sums]:
+    """Sums over parts of a picture of that width, one after the other, which takes less memory than all at once."""
+    square = _squares(pixels.places, width)
+    return pixels.sums(layout, [(square == i).nonzero().squeeze(1) for i in square.unique()])
 
 
 def _squares(places: Tensor, width: int) -> Tensor:
-    """Whole numbers of pixels (P,) of a picture, by the part of the rectangle around them."""
+    """Number of the part of the picture that each pixel (P,) is in: its bounding box is divided into equal parts."""
     if len(places) == 0:
         return places
     rows, columns = (
-        (found - found.min()) * SQUARES // (found.max() - found.min() + 1)
-        for found in (places // width, places % width)
+        (numbers - numbers.min()) * SQUARES // (numbers.max() - numbers.min() + 1)
+        for numbers in (places // width, places % width)
     )
     return rows * SQUARES + columns
 
 
-def _of_sliders(sums: Sums, layout: Layout, share: float) -> bool:
-    """Whether sliders explain such a share of the change."""
-    return sums.explained(fit_parts(sums, ("alpha",), layout, RIDGES[0])) >= share
-
-
-def _add_sliders(region: _Region, pixels: SomePixels, sums: Sums, rounding: float) -> None:
-    """Add sliders of least squares to which rounding of the edited picture is no error."""
-    if region.sliders is None:
-        return
-    if not _of_sliders(sums, region.layout, SLIDERS_ONLY):
-        region.sliders = None
-        return
-    # Sliders add the same to every channel, each of which is rounded by itself.
-    layers = pixels.weighed["alpha"].repeat(1, 3)
-    before, after, weights = (planes.flatten() for planes in (pixels.before, pixels.after, pixels.weights))
-    alpha = fit_layers(layers, before, after, weights, rounding)
-    place = region.layout.place("alpha")
-    gram = sums.gram[:, place, place].sum(0)
-    gram = gram + 1e-9 * gram.diagonal().max() * torch.eye(len(gram), dtype=gram.dtype)
-    old = region.sliders
-    region.sliders = (old[0].double() + gram, old[1].double() + gram @ alpha.double())
+def _are_sliders(sums: Sums, layout: Layout, share: float) -> bool:
+    """Whether sliders alone explain such a share of the change."""
+    return sums.explained(fit_parts(sums, SLIDERS, layout, RIDGES[0])) >= share

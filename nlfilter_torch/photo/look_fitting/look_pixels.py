@@ -1,4 +1,4 @@
-"""Pixels of a photograph before and after an edit, with all that looks change of them."""
+"""Pixels of a photograph before and after an edit, with what each part of a look changes of them."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -14,25 +14,25 @@ from nlfilter_torch.operator.features import reduce_channels
 from nlfilter_torch.operator.options import OperatorOptions
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.look_fitting.alignment import inside_frame
-from nlfilter_torch.photo.look_fitting.look_fit import MOST, Layout, Sums, columns_of, sample, sums_of
+from nlfilter_torch.photo.look_fitting.look_sums import MOST, Layout, Sums, columns_of, sample, sums_of
 from nlfilter_torch.photo.looks.histogram import LocalCurves
 from nlfilter_torch.photo.looks.look_filter import bands_of, local_curves, range_of, textures_of
 from nlfilter_torch.photo.picture.resizing import resize
 from nlfilter_torch.photo.picture.source import seeded
 from nlfilter_torch.photo.picture.viewing import viewed_size
 
-INSIDE = 0.9  # of a mask, from where on a pixel counts for its region
+INSIDE = 0.9  # value of a mask above which a pixel counts as part of the region
 
 
 @dataclass(frozen=True)
-class SomePixels:
-    """Some pixels of a photograph.
+class PixelSample:
+    """Pixels of a photograph before and after an edit.
 
     Attributes:
-        places: their numbers (P,), along the rows.
+        places: row-major indices (P,) of the pixels.
         before: (3, P).
         after: (3, P).
-        weighed: what parts of a look weigh there, as for :func:`columns_of`.
+        weighed: columns of the parts of a look that depend on the surroundings of a pixel, as for :func:`columns_of`.
         weights: (3, P).
     """
 
@@ -42,14 +42,15 @@ class SomePixels:
     weighed: dict[str, Tensor]
     weights: Tensor
 
-    def sums(self, layout: Layout, parts: list[Tensor]) -> list[Sums]:
-        """Sums over parts (P',) of them."""
-        found = []
-        for some in parts:
-            before = self.before[..., some]
-            columns = columns_of(before, {name: each[..., some] for name, each in self.weighed.items()}, layout)
-            found.append(sums_of(columns, self.after[..., some] - before, self.weights[..., some]))
-        return found
+    def sums(self, layout: Layout, subsets: list[Tensor]) -> list[Sums]:
+        """Sums over subsets of the pixels, given by their indices (P',)."""
+        sums = []
+        for subset in subsets:
+            before = self.before[..., subset]
+            weighed = {name: columns[..., subset] for name, columns in self.weighed.items()}
+            columns = columns_of(before, weighed, layout)
+            sums.append(sums_of(columns, self.after[..., subset] - before, self.weights[..., subset]))
+        return sums
 
 
 class EditedPhotograph:
@@ -94,18 +95,18 @@ class EditedPhotograph:
 
     @cached_property
     def luminance(self) -> Tensor:
-        """Before the edit, (1, 1, H, W)."""
+        """Luminance before the edit, (1, 1, H, W)."""
         return reduce_channels(self.image, "luminance")
 
     @cached_property
     def bands(self) -> list[Tensor]:
-        """What blurs take away and leave before the edit, (3, N) each."""
+        """Bands of blurs before the edit, and the rest, (3, N) each."""
         bands = [band[0].flatten(1) for band in bands_of(self.image)]
         return [*bands[:-1], bands[-1] - self.luminance.mean()]
 
     @cached_property
     def texture(self) -> list[Tensor]:
-        """Of the photograph before the edit, (N,) each."""
+        """Textures before the edit, (N,) each."""
         return [texture.flatten() for texture in textures_of(self.image)]
 
     @cached_property
@@ -115,19 +116,19 @@ class EditedPhotograph:
 
     @cached_property
     def layers(self) -> Tensor:
-        """Of luminance before the edit, (k+1, N)."""
+        """Detail layers of luminance before the edit, (k+1, N)."""
         operator = operator_from_guide(self.luminance, OperatorOptions(**self.options, generator=self.generator))
         return detail_layers(operator, self.luminance, order=self.order)[0, :, 0].flatten(1)
 
-    def regions(self) -> list[SomePixels]:
-        """Pixels of each region that are not clipped; none of a region that the photograph does not show."""
+    def regions(self) -> list[PixelSample]:
+        """Pixels of each region that are not clipped; a region that the photograph does not show has none."""
         return [self._pixels(weights, self.layers) for weights in self._weights()]
 
-    def regions_of_sample(self) -> list[SomePixels] | None:
-        """The same, with layers by a filter whose sums are taken over a sample of the pixels.
+    def regions_of_sample(self) -> list[PixelSample] | None:
+        """A sample of :meth:`regions`, with layers of a filter that is balanced over this sample.
 
-        That takes a fifth of the time, and layers are off by a twentieth. None for small photographs, for those that
-        are mostly clipped, and with masks: the sample has few pixels of a small region.
+        It takes a fifth of the time, and the layers are off by a twentieth. None for small photographs, for those that
+        are mostly clipped, and with masks, as the sample has few pixels of a small region.
         """
         count = self.free.shape[1]
         if count <= MOST or self.masks is not None or float(self.free.amax(0).mean()) < 0.5:
@@ -135,23 +136,23 @@ class EditedPhotograph:
         places = sample(torch.ones_like(self.free[0]))
         generator = self.generator.clone_state()  # the landmarks are those of :attr:`layers`
         operator = sampled_operator(self.luminance, places, **self.options, generator=generator)
-        some = self.luminance.flatten(2)[:, :, None, places]
-        layers = detail_layers(operator, some, order=self.order)[0, :, 0].flatten(1)
+        luminance = self.luminance.flatten(2)[:, :, None, places]
+        layers = detail_layers(operator, luminance, order=self.order)[0, :, 0].flatten(1)
         inside = self.free[:, places].amax(0) > 0
         return [self._at(places[inside], layers[:, inside], self.free)]
 
     def _weights(self) -> list[Tensor]:
-        """Of the pixels, (3, N) for each region."""
+        """Weights of the pixels, (3, N) for each region."""
         if self.masks is None:
             return [self.free]
         inside = ((self.masks.to(self.free).flatten(1) - INSIDE) / (1 - INSIDE)).clamp(0, 1)
         return [self.free * mask for mask in inside]
 
-    def _pixels(self, weights: Tensor, layers: Tensor) -> SomePixels:
+    def _pixels(self, weights: Tensor, layers: Tensor) -> PixelSample:
         places = sample(weights.amax(0))
         return self._at(places, layers[:, places], weights)
 
-    def _at(self, places: Tensor, layers: Tensor, weights: Tensor) -> SomePixels:
+    def _at(self, places: Tensor, layers: Tensor, weights: Tensor) -> PixelSample:
         share = float((weights.amax(0) > 0).sum()) / max(len(places), 1)
         rows, columns = places // self.size[1], places % self.size[1]
         before, after = self.before[:, places], self.after[:, places]
@@ -162,4 +163,4 @@ class EditedPhotograph:
             "local": self.local.at(before[None], rows, columns)[0].transpose(0, 1),
             "alpha": layers,
         }
-        return SomePixels(places, before, after, weighed, weights[:, places] * share)
+        return PixelSample(places, before, after, weighed, weights[:, places] * share)

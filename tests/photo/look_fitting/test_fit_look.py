@@ -108,14 +108,6 @@ def test_one_pair_does_not_bend_curves_where_it_has_no_values() -> None:
     assert float((curves[:, 12:] - torch.linspace(0, 1, 17)[12:]).abs().max()) < 0.08
 
 
-def test_curves_never_fall() -> None:
-    after = in_bytes(0.5 + 0.4 * torch.sin(9 * CAT))  # a curve that rises and falls
-    found = single_look(fit_look([(CAT, after)], parts=("curves",), step=FEW))
-    curves = found.tensors["curves"]
-    assert float(curves.diff(dim=1).min()) >= -1e-5
-    assert float(curves.diff(dim=1).max()) > 0.01
-
-
 def test_pairs_are_read_once_and_not_kept() -> None:
     alive: list[bool] = []
     yielded: list[weakref.ref[Tensor]] = []

@@ -11,7 +11,7 @@ from tests.looks import ALPHA, CAT, FEW, explained, in_bytes, single_look
 
 
 def test_layers_of_a_sample_are_nearly_those_of_all_pixels(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("nlfilter_torch.photo.look_fitting.look_fit.MOST", 2000)
+    monkeypatch.setattr("nlfilter_torch.photo.look_fitting.look_sums.MOST", 2000)
     monkeypatch.setattr("nlfilter_torch.photo.look_fitting.look_pixels.MOST", 2000)
     photograph = EditedPhotograph(CAT[0], (CAT[0] ** 0.7), None, FEW, 3, None)
     found = photograph.regions_of_sample()

@@ -1,0 +1,148 @@
+"""Sums over the pixels of edited photographs: all that fitting a look needs to know of them.
+
+A look is linear in its parameters, so the fit needs only the sums of products of its columns, one for each parameter.
+For every channel these are a tone curve's hat functions, the three colours, the distance from the largest of them at
+each saturation, the bands of blurs, the changes by automatic levels and by local tone curves, and the layers of the
+filter. See :mod:`nlfilter_torch.photo.looks.look_filter`.
+"""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from nlfilter_torch.photo.looks.histogram import KINDS, STRENGTHS
+from nlfilter_torch.photo.looks.look_filter import BLURS, below_largest, saturation_hats
+
+Parts = tuple[str, ...]  # of a look; ``tone`` is one curve for all channels, ``curves`` one for each
+MOST = 1 << 16  # pixels of a pair that sums are taken over
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Layout of the columns of each channel.
+
+    Attributes:
+        knots: K of a tone curve.
+        factors: of saturation.
+        sliders: of the filter.
+    """
+
+    knots: int
+    factors: int
+    sliders: int
+
+    @property
+    def lengths(self) -> dict[str, int]:
+        """Columns of each kind, in their order."""
+        return {
+            "curves": self.knots,
+            "matrix": 3,
+            "saturation": self.factors,
+            "bands": BLURS + 1,
+            "texture": BLURS,
+            "stretch": KINDS,
+            "local": STRENGTHS,
+            "alpha": self.sliders,
+        }
+
+    @property
+    def columns(self) -> int:
+        """Number F of columns of a channel."""
+        return sum(self.lengths.values())
+
+    def place(self, part: str) -> slice:
+        """The columns of a part."""
+        names = list(self.lengths)
+        start = sum(list(self.lengths.values())[: names.index(part)])
+        return slice(start, start + self.lengths[part])
+
+    def parameters(self, parts: Parts) -> Iterator[tuple[str, slice, slice]]:
+        """Yield part, channels and place in the vector of parameters, for each group of parameters of some parts.
+
+        Curves and matrix have a group for each channel, other parts one for all channels.
+        """
+        start = 0
+        for part in parts:
+            length = self.lengths["curves" if part == "tone" else part]
+            groups = [slice(c, c + 1) for c in range(3)] if part in ("curves", "matrix") else [slice(3)]
+            for channels in groups:
+                yield part, channels, slice(start, start + length)
+                start += length
+
+    def spread(self, parts: Parts) -> Tensor:
+        """Matrix (3, F, P) from the parameters of some parts to the coefficients of the columns of every channel."""
+        groups = list(self.parameters(parts))
+        matrix = torch.zeros(3, self.columns, groups[-1][2].stop, dtype=torch.float64)
+        for part, channels, place in groups:
+            columns = self.place("curves" if part == "tone" else part)
+            matrix[channels, columns, place] = torch.eye(place.stop - place.start, dtype=torch.float64)
+        return matrix
+
+
+@dataclass(frozen=True)
+class Sums:
+    """Sums over pixels, for each channel.
+
+    Attributes:
+        gram: of the columns, (3, F, F), in float64.
+        cross: of columns and change, (3, F).
+        power: of the change, (3,).
+    """
+
+    gram: Tensor
+    cross: Tensor
+    power: Tensor
+
+    def __add__(self, other: "Sums") -> "Sums":
+        """Add the sums of two sets of pixels."""
+        return Sums(self.gram + other.gram, self.cross + other.cross, self.power + other.power)
+
+    def left(self, coefficients: Tensor) -> float:
+        """Sum of squares of the change that coefficients (3, F) leave unexplained."""
+        explained = 2 * (coefficients * self.cross).sum()
+        explained = explained - torch.einsum("cf,cfg,cg->", coefficients, self.gram, coefficients)
+        return float(self.power.sum() - explained)
+
+    def explained(self, coefficients: Tensor) -> float:
+        """Share of the change that coefficients (3, F) explain, 1 at best."""
+        return 1.0 - self.left(coefficients) / max(float(self.power.sum()), 1e-30)
+
+
+def sample(weights: Tensor) -> Tensor:
+    """Indices (P,), ascending, of the pixels that sums are taken over, from weights (H, W).
+
+    They are all pixels of positive weight, or :data:`MOST` of them: one at random of each run of equal length.
+    """
+    places = weights.flatten().nonzero().squeeze(1)
+    if len(places) <= MOST:
+        return places
+    random = torch.rand(MOST, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    return places[((torch.arange(MOST) + random) * (len(places) / MOST)).long().to(places.device)]
+
+
+def columns_of(image: Tensor, weighed: Mapping[str, Tensor], layout: Layout) -> Tensor:
+    """Columns (3, F, P), in float64: what a unit of each parameter changes at some pixels.
+
+    Args:
+        image: pixels (3, P) before the edit.
+        weighed: columns of the parts that depend on the surroundings of a pixel: ``bands`` (3, 7, P), ``texture``
+            (6, P), ``stretch`` (3, 3, P), ``local`` (3, 8, P), and ``alpha``, the layers of luminance, (k+1, P).
+        layout: of the columns.
+    """
+    colours = image.double()  # the columns nearly depend on each other
+    knots = torch.arange(layout.knots).to(colours).view(-1, 1)
+    hats = (1 - (colours.clamp(0, 1).unsqueeze(1) * (layout.knots - 1) - knots).abs()).clamp(min=0)
+    steps = saturation_hats(colours[None, :, None], layout.factors)[0, :, 0]
+    below = below_largest(colours[None])[0].unsqueeze(1) * steps
+    columns = {"curves": hats, "matrix": colours, "saturation": below, **weighed}
+    return torch.cat([columns[part].double().expand(3, -1, -1) for part in layout.lengths], dim=1)
+
+
+def sums_of(columns: Tensor, change: Tensor, weights: Tensor) -> Sums:
+    """Sums over pixels with columns (3, F, P), change (3, P) and weights (3, P)."""
+    columns, change, weights = (values.double() for values in (columns, change, weights))
+    weighed = columns * weights.unsqueeze(1)
+    cross = (weighed @ change.unsqueeze(2)).squeeze(2)
+    return Sums(weighed @ columns.mT, cross, (weights * change.square()).sum(1))

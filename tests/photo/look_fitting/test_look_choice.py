@@ -1,0 +1,35 @@
+"""Choosing the parts of a look, and least squares with bounds."""
+
+import torch
+
+from nlfilter_torch import fit_look
+from nlfilter_torch.photo.look_fitting.look_choice import CHOICES, Candidate, nonnegative, simplest
+from tests.looks import CAT, FEW, in_bytes, single_look
+
+
+def test_nonnegative_least_squares_meets_its_conditions() -> None:
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(20):
+        root = torch.rand(12, 8, generator=generator, dtype=torch.float64) - 0.3
+        matrix, vector = root.mT @ root, torch.rand(8, generator=generator, dtype=torch.float64) - 0.5
+        found = nonnegative(matrix, vector)
+        slope = vector - matrix @ found
+        assert float(found.min()) >= 0
+        assert float(slope.max()) < 1e-8
+        assert float((slope * found).abs().max()) < 1e-8
+
+
+def test_curves_never_fall() -> None:
+    after = in_bytes(0.5 + 0.4 * torch.sin(9 * CAT))  # a curve that rises and falls
+    found = single_look(fit_look([(CAT, after)], parts=("curves",), step=FEW))
+    curves = found.tensors["curves"]
+    assert float(curves.diff(dim=1).min()) >= -1e-5
+    assert float(curves.diff(dim=1).max()) > 0.01
+
+
+def test_of_candidates_that_leave_as_little_the_first_is_the_simplest() -> None:
+    nothing = torch.zeros(3, 1)
+    risks = {("matrix",): 0.3, ("tone",): 0.105, ("curves",): 0.1}
+    candidates = {parts: Candidate(parts, nothing, 0.9, 0.9, risk) for parts, risk in risks.items()}
+    assert simplest(candidates).parts == ("tone",)
+    assert len(set(CHOICES)) == len(CHOICES)
