@@ -13,7 +13,7 @@ INSTALL_DEBIAN := $(AS_ROOT) apt-get update && $(AS_ROOT) apt-get install -y --n
 export PYTHONDONTWRITEBYTECODE :=
 
 .DELETE_ON_ERROR:
-.PHONY: demo test lint lint-page types compiler chromium bench bench-quick train pictures figures notebooks wheels docs clean
+.PHONY: demo test test-oldest lint lint-page types compiler chromium bench bench-quick train pictures figures notebooks wheels docs clean
 
 # The stamp files record the last install, which is repeated when a prerequisite changes.
 # torch is installed first, by its exact pin, so that no other package pulls in another build of it.
@@ -48,6 +48,11 @@ demo: $(VENV)/.installed
 test: $(VENV)/.installed-test chromium
 	$(MAKE) --no-print-directory -j2 lint types bench-quick
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist worksteal
+
+# The quick tests with the oldest torch that pyproject.toml allows, in out/oldest; skipped where pip finds no build of it
+# for CPUs.
+test-oldest: $(VENV)/.installed-test
+	OMP_NUM_THREADS=1 $(BIN)/python -m tests.oldest out/oldest
 
 lint: $(VENV)/.installed-test
 	$(BIN)/ruff format --check

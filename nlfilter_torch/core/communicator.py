@@ -14,6 +14,7 @@ these gradients up, and so does that of :meth:`Communicator.copy_to_group`, to w
 from collections.abc import Callable
 from contextlib import suppress
 from datetime import timedelta
+from functools import partial
 from itertools import accumulate
 from typing import Any
 
@@ -21,7 +22,7 @@ import torch
 import torch.distributed as dist
 from torch import Tensor
 
-from nlfilter_torch.core.precision import Gradients, once_differentiable
+from nlfilter_torch.core.torch_internals import default_store
 
 ANSWERING = timedelta(seconds=10)  # for the remaining ranks to say that they are alive
 
@@ -58,7 +59,10 @@ class Communicator:
         return tensor
 
     def copy_to_group(self, value: Any) -> Any:
-        """A parameter that is equal on all ranks: its gradient is the sum over the ranks. May be any value."""
+        """A parameter that is equal on all ranks: its gradient is the sum over the ranks.
+
+        Anything but a tensor is returned unchanged.
+        """
         return value
 
     def columns(self, features: Tensor, indices: Tensor) -> Tensor:
@@ -232,19 +236,29 @@ class _Halo(torch.autograd.Function):
         return extended
 
     @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> Gradients:
-        communicator: RowCommunicator = ctx.communicator
-        wanted, lent = _overlaps(communicator, ctx.margin)
-        base = max(0, communicator.first_row - ctx.margin)
-        own = grad[
-            :, :, communicator.first_row - base : communicator.first_row - base + communicator.rows[communicator.rank]
-        ].clone()
-        sent = {peer: grad[:, :, rows.start - base : rows.stop - base] for peer, rows in wanted.items()}
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:
+        return _HaloAdjoint.apply(grad, ctx.margin, ctx.communicator), None, None  # type: ignore[no-untyped-call]
+
+
+class _HaloAdjoint(torch.autograd.Function):
+    """Every row of this rank and its copies in the halos of other ranks, added up; linear, as :class:`_Halo` is."""
+
+    @staticmethod
+    def forward(ctx: Any, extended: Tensor, margin: int, communicator: RowCommunicator) -> Tensor:
+        ctx.margin, ctx.communicator = margin, communicator
+        wanted, lent = _overlaps(communicator, margin)
+        first = communicator.first_row
+        base = max(0, first - margin)
+        own = extended[:, :, first - base : first - base + communicator.rows[communicator.rank]].clone()
+        sent = {peer: extended[:, :, rows.start - base : rows.stop - base] for peer, rows in wanted.items()}
         shapes = {peer: rows.stop - rows.start for peer, rows in lent.items()}
-        for peer, rows in _swap(sent, shapes, grad, communicator).items():
-            own[:, :, lent[peer].start - communicator.first_row : lent[peer].stop - communicator.first_row] += rows
-        return own, None, None
+        for peer, rows in _swap(sent, shapes, extended, communicator).items():
+            own[:, :, lent[peer].start - first : lent[peer].stop - first] += rows
+        return own
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:
+        return _Halo.apply(grad, ctx.margin, ctx.communicator), None, None  # type: ignore[no-untyped-call]
 
 
 def _overlaps(communicator: RowCommunicator, margin: int) -> tuple[dict[int, slice], dict[int, slice]]:
@@ -252,18 +266,19 @@ def _overlaps(communicator: RowCommunicator, margin: int) -> tuple[dict[int, sli
     ends = list(accumulate(communicator.rows))
     owned = [range(end - rows, end) for end, rows in zip(ends, communicator.rows, strict=True)]
     needed = [range(max(0, rows.start - margin), min(ends[-1], rows.stop + margin)) for rows in owned]
-
-    def common(owned_rows: range, wanted_rows: range) -> slice:
-        return slice(max(owned_rows.start, wanted_rows.start), min(owned_rows.stop, wanted_rows.stop))
-
     here = communicator.rank
-    wanted: dict[int, slice] = {}
-    lent: dict[int, slice] = {}
-    for peer in range(len(owned)):
-        for table, rows in ((wanted, common(needed[here], owned[peer])), (lent, common(owned[here], needed[peer]))):
-            if peer != here and rows.start < rows.stop:
-                table[peer] = rows
-    return wanted, lent
+    peers = [peer for peer in range(len(owned)) if peer != here]
+    wanted = {peer: _intersection(needed[here], owned[peer]) for peer in peers}
+    lent = {peer: _intersection(owned[here], needed[peer]) for peer in peers}
+    return _without_empty(wanted), _without_empty(lent)
+
+
+def _intersection(first: range, second: range) -> slice:
+    return slice(max(first.start, second.start), min(first.stop, second.stop))
+
+
+def _without_empty(rows: dict[int, slice]) -> dict[int, slice]:
+    return {rank: part for rank, part in rows.items() if part.start < part.stop}
 
 
 def _swap(
@@ -280,12 +295,13 @@ def _swap(
         for peer, rows in received.items()
     ]
 
-    def transfer() -> None:
-        for request in dist.batch_isend_irecv(transfers) if transfers else ():
-            request.wait()
-
-    _exchange(transfer, communicator.group)
+    _exchange(partial(_transfer, transfers), communicator.group)
     return received
+
+
+def _transfer(transfers: list[dist.P2POp]) -> None:
+    for request in dist.batch_isend_irecv(transfers) if transfers else ():
+        request.wait()
 
 
 def _exchange(call: Callable[[], object], group: Any) -> None:
@@ -308,7 +324,7 @@ def _name_the_missing(group: Any) -> str:
     ranks = dist.get_process_group_ranks(group)
     keys = {rank: f"nlfilter/{group.group_name}/{rank} is here" for rank in ranks}
     try:
-        store = dist.distributed_c10d._get_default_store()
+        store = default_store()
         store.set(keys[dist.get_rank()], "")
         with suppress(RuntimeError):  # DistStoreError, where some are missing
             store.wait(list(keys.values()), ANSWERING)

@@ -12,10 +12,10 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch._C._functorch import is_functorch_wrapped_tensor
 
 from nlfilter_torch.core.kernels.library import are_derived
 from nlfilter_torch.core.precision import once_differentiable, uncompiled
+from nlfilter_torch.core.torch_internals import is_transformed
 
 # For eigenvalues with a relative distance below MEETING, f' at their midpoint is used: the truncation error, in f''',
 # and the cancellation error are then both near 1e-10. For eigenvalues below FLOOR the distance is relative to FLOOR,
@@ -84,7 +84,7 @@ class SymmetricMatrix:
     @staticmethod
     def _slope(function: Callable[[Tensor], Tensor], points: Tensor) -> Tensor:
         """Derivative of f at ``points`` (B, M, M); f may differ between the images of a batch."""
-        if is_functorch_wrapped_tensor(points):  # in torch.func
+        if is_transformed(points):  # in torch.func
             slope: Tensor = torch.func.grad(lambda flat: function(flat).sum())(points.detach().flatten(1))
             return slope.view_as(points)
         with torch.enable_grad():

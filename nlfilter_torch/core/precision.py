@@ -7,14 +7,14 @@ run in full precision, too, return low-rank gradients as two factors, and raise 
 """
 
 import functools
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from typing import Any, ParamSpec, TypeVar
+from collections.abc import Callable
+from threading import Lock
+from typing import Any, ParamSpec, TypeVar, cast
 
 import torch
 from torch import Tensor
-from torch._C._functorch import is_functorch_wrapped_tensor
-from torch.utils._pytree import tree_map_only
+
+from nlfilter_torch.core.torch_internals import is_transformed, replace_instances, without_memory
 
 Gradients = tuple[Tensor | None, ...]
 P = ParamSpec("P")
@@ -37,20 +37,44 @@ def as_given(result: Tensor, image: Tensor) -> Tensor:
     if image.is_contiguous():
         return result
     # Dynamo cannot trace the question, and has no wrapped tensors.
-    if not torch.compiler.is_compiling() and any(map(is_functorch_wrapped_tensor, (image, result))):
+    if not torch.compiler.is_compiling() and any(map(is_transformed, (image, result))):
         return result
     channels_last = image.is_contiguous(memory_format=torch.channels_last)
     return result.contiguous(memory_format=torch.channels_last) if channels_last else result
 
 
-@contextmanager
-def _no_tf32() -> Iterator[None]:
-    matmul, conv = torch.backends.cuda.matmul.allow_tf32, torch.backends.cudnn.allow_tf32
-    torch.backends.cuda.matmul.allow_tf32 = torch.backends.cudnn.allow_tf32 = False
-    try:
-        yield
-    finally:
-        torch.backends.cuda.matmul.allow_tf32, torch.backends.cudnn.allow_tf32 = matmul, conv
+class _WithoutTF32:
+    """Context without TF32, for all threads of the process, since torch has no such setting for a single thread.
+
+    Threads may enter it at the same time: the first one in saves the settings, and the last one out restores them.
+    While a thread is inside, matrix products of all other threads are computed in full precision, too.
+    """
+
+    def __init__(self) -> None:
+        self._lock = Lock()
+        self._threads = 0
+        self._before = (False, False)
+
+    def __enter__(self) -> None:
+        with self._lock:
+            if self._threads == 0:
+                self._before = (torch.backends.cuda.matmul.allow_tf32, torch.backends.cudnn.allow_tf32)
+                self._set(False, False)
+            self._threads += 1
+
+    def __exit__(self, *_: object) -> None:
+        with self._lock:
+            self._threads -= 1
+            if self._threads == 0:
+                self._set(*self._before)
+
+    @staticmethod
+    def _set(products: bool, convolutions: bool) -> None:
+        torch.backends.cuda.matmul.allow_tf32 = products
+        torch.backends.cudnn.allow_tf32 = convolutions
+
+
+WITHOUT_TF32 = _WithoutTF32()
 
 
 def full_precision(function: Callable[P, R]) -> Callable[P, R]:
@@ -62,7 +86,7 @@ def full_precision(function: Callable[P, R]) -> Callable[P, R]:
         device = devices[0] if devices and devices[0] != "meta" else "cuda"
         with torch.autocast("cpu", enabled=False), torch.autocast(device, enabled=False):
             if torch.cuda.is_available() and not torch.compiler.is_compiling():
-                with _no_tf32():
+                with WITHOUT_TF32:
                     return function(*args, **kwargs)
             return function(*args, **kwargs)
 
@@ -120,7 +144,7 @@ class OuterProduct(Tensor):
     def __new__(cls, left: Tensor, right: Tensor) -> "OuterProduct":
         """Create a tensor that has the shape of the product but owns no memory."""
         shape = (left.shape[0], left.shape[1], right.shape[2])
-        product: OuterProduct = Tensor._make_wrapper_subclass(cls, shape, dtype=left.dtype, device=left.device)
+        product = cast(OuterProduct, without_memory(cls, shape, left))
         product.left, product.right = left, right
         return product
 
@@ -135,7 +159,7 @@ class OuterProduct(Tensor):
         if func is torch.ops.aten.add.Tensor and not kwargs and all(isinstance(a, OuterProduct) for a in args):
             left = torch.cat([a.left for a in args], dim=2)
             return OuterProduct(left, torch.cat([a.right for a in args], dim=1))
-        args, kwargs = tree_map_only(OuterProduct, OuterProduct.formed, (args, kwargs or {}))
+        args, kwargs = replace_instances(OuterProduct, OuterProduct.formed, (args, kwargs or {}))
         return func(*args, **kwargs)
 
 

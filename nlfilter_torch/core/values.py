@@ -11,23 +11,24 @@ from typing import ParamSpec, TypeVar, cast
 
 import torch
 from torch import Tensor
-from torch._C._functorch import is_functorch_wrapped_tensor, peek_interpreter_stack
-from torch._subclasses.fake_tensor import FakeTensor
 from torch.autograd import forward_ad
+
+from nlfilter_torch.core.torch_internals import (
+    in_fake_mode,
+    in_forward_mode,
+    in_transform,
+    is_fake_tensor,
+    is_traced,
+    is_transformed,
+)
 
 P = ParamSpec("P")
 R = TypeVar("R")
-_FAKE = torch._C._TorchDispatchModeKey.FAKE
 
 
 def is_hidden(tensor: Tensor) -> bool:
     """Whether reading values would wait (accelerators) or is impossible (fake, compiling, in ``torch.func``)."""
-    return (
-        tensor.device.type != "cpu"
-        or torch.compiler.is_compiling()
-        or is_functorch_wrapped_tensor(tensor)
-        or is_fake(tensor)
-    )
+    return tensor.device.type != "cpu" or torch.compiler.is_compiling() or is_transformed(tensor) or is_fake(tensor)
 
 
 def cached_constants(function: Callable[P, R]) -> Callable[P, R]:
@@ -41,19 +42,14 @@ def cached_constants(function: Callable[P, R]) -> Callable[P, R]:
     @wraps(function)
     def wrapper(*args: P.args, **kwargs: P.kwargs) -> R:
         with torch.inference_mode(False), torch.device("cpu"):
-            return (function if _fakes() else cached)(*args, **kwargs)
+            return (function if in_fake_mode() else cached)(*args, **kwargs)
 
     return wrapper
 
 
 def is_fake(tensor: Tensor) -> bool:
     """Whether a tensor is fake (has a shape but no data), or fake tensor mode is active."""
-    return isinstance(tensor, FakeTensor) or _fakes()
-
-
-def _fakes() -> bool:
-    """Whether fake tensor mode is active."""
-    return torch._C._get_dispatch_mode(_FAKE) is not None
+    return is_fake_tensor(tensor) or in_fake_mode()
 
 
 def refuse_transforms(name: str, *values: object) -> None:
@@ -61,20 +57,20 @@ def refuse_transforms(name: str, *values: object) -> None:
     if torch.compiler.is_compiling():
         return
     # These three checks take less than a microsecond.
-    if torch._C._is_tracing():
+    if is_traced():
         raise TypeError(
             f"{name} must not be traced by torch.jit.trace while an operator is built, got a traced tensor; "
             "use torch.export.export, or trace only the application of an operator built before"
         )
-    if forward_ad._current_level < 0 and peek_interpreter_stack() is None:
+    if not in_forward_mode() and not in_transform():
         return
-    transformed = any(is_functorch_wrapped_tensor(value) for value in values if isinstance(value, Tensor))
+    transformed = any(is_transformed(value) for value in values if isinstance(value, Tensor))
     if transformed:
         raise TypeError(
             f"{name} must not be transformed by torch.func (vmap, grad, jvp) while an operator is built, got a "
             "transformed tensor; pass a batch, and take derivatives with torch.autograd.grad"
         )
-    if peek_interpreter_stack() is not None:
+    if in_transform():
         raise TypeError(
             f"{name} must not be used to build an operator inside torch.func (vmap, grad, jvp), got a call in it; "
             "build the operator before, and transform a function of its application"

@@ -13,10 +13,10 @@ from typing import Any
 import torch
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
-from torch.utils._python_dispatch import _disable_current_modes
 
 from nlfilter_torch.core.kernels.clusters import chance, pick
 from nlfilter_torch.core.kernels.columns import PLAIN_EXPONENT, SMALLEST_EXPONENT
+from nlfilter_torch.core.torch_internals import outside_modes
 from nlfilter_torch.operator.landmarks import (
     CAPTURED,
     DRAWN_SINGLY,
@@ -46,7 +46,7 @@ class PortableForms(TorchFunctionMode):
 
 def choose(features: Tensor, height: int, width: int, count: int, sampling: Sampling) -> tuple[Tensor, Tensor, Tensor]:
     """As :func:`nlfilter_torch.operator.landmarks.choose`, with the random numbers as constants of the program."""
-    with _disable_current_modes():
+    with outside_modes():
         generator = torch.Generator().manual_seed(0)
         drawn = candidate_pixels((height, width), count, sampling, generator)
         few = draw_few(len(drawn), count, generator)

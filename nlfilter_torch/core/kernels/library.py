@@ -15,6 +15,8 @@ import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
+from nlfilter_torch.core.torch_internals import BELOW_AUTOGRAD, in_forward_mode, is_on_cpu
+
 SMALL = 1 << 15  # elements of a factor below which starting a second thread takes longer than it saves
 OPERATORS = torch.library.Library("nlfilter", "DEF")
 Definition = TypeVar("Definition", bound=Callable[..., Any])
@@ -100,8 +102,8 @@ def register(
         def under_autograd(keys: Any, *arguments: Any) -> Any:
             if are_derived(arguments):
                 return definition(*arguments)
-            keys = keys & below
-            if keys.highestPriorityTypeId() == torch._C.DispatchKey.CPU:  # same as redispatching, but saves 4 us
+            keys = keys & BELOW_AUTOGRAD
+            if is_on_cpu(keys):  # same as redispatching, but saves 4 us
                 return on_processors(*arguments)
             return operator.redispatch(keys, *arguments)
 
@@ -109,7 +111,7 @@ def register(
         OPERATORS.impl(name, definition, "CompositeExplicitAutograd")
         OPERATORS.impl(name, on_processors, "CPU")
         torch.library.register_fake(f"nlfilter::{name}", fake, lib=OPERATORS)
-        operator, below = getattr(torch.ops.nlfilter, name).default, torch._C._after_autograd_keyset
+        operator = getattr(torch.ops.nlfilter, name).default
         if differentiable:
             OPERATORS.impl(name, under_autograd, "Autograd", with_keyset=True)
             OPERATORS.impl(name, definition, "FuncTorchBatched")
@@ -124,7 +126,7 @@ def are_derived(arguments: Sequence[Any]) -> bool:
         for argument in arguments:  # before every product; a loop takes half the time of a generator
             if isinstance(argument, Tensor) and argument.requires_grad:
                 return True
-    if forward_ad._current_level < 0:
+    if not in_forward_mode():
         return False
     return any(isinstance(t, Tensor) and forward_ad.unpack_dual(t).tangent is not None for t in arguments)
 
