@@ -30,38 +30,50 @@ def align(before: Tensor, after: Tensor, name: str, edited: str) -> tuple[Tensor
         ValueError: if the edited picture is not found in the original. ``name`` and ``edited`` are the names of the two
             in the message.
     """
-    size, other = before.shape[-2:], after.shape[-2:]
     edges = frame(before[0], after[0])
     framed = f"{edited} has a frame of one colour, which is left out" if any(edges) else ""
-    inside = _inside(after, edges)
-    if size == other:
-        if min(edges) > 0:
-            enlarged = resize(inside, (size[0], size[1])).clamp(0, 1)
-            kept = _inside(before, edges)
-            if _correlation(_grey(before), _grey(enlarged)) > _correlation(_grey(kept), _grey(inside)):
-                return before, enlarged, f"{framed}; the picture in it is enlarged to {size[1]}x{size[0]}"
-        down, right = (0, 0) if framed else _shift(before, after)
-        if (down, right) == (0, 0):
-            return before, after, framed
-        done = f"{edited} is shifted by {down} pixels down and {right} to the right"
-        return *_overlap(before, after, down, right), done
+    if before.shape[-2:] == after.shape[-2:]:
+        return _aligned_of_same_size(before, after, edges, framed, edited)
     if min(edges) > 0:
-        first, second, done = align(before, inside, name, edited)
+        first, second, done = align(before, _inside(after, edges), name, edited)
         return first, second, f"{framed}; {done}" if done else framed
-    ratio = (other[1] / other[0]) / (size[1] / size[0])
-    resized = resize(after, (size[0], size[1])).clamp(0, 1) if abs(math.log(ratio)) < SAME_SHAPE else None
-    place, likeness = (0, 0), -1.0
-    if other[0] <= size[0] and other[1] <= size[1]:
-        place, likeness = _place(before, after)
+    return _aligned_of_other_size(before, after, name, edited)
+
+
+def _aligned_of_same_size(
+    before: Tensor, after: Tensor, edges: tuple[int, int, int, int], framed: str, edited: str
+) -> tuple[Tensor, Tensor, str]:
+    """:func:`align` for pictures of the same size: cut off a frame, or undo a shift."""
+    height, width = before.shape[-2:]
+    if min(edges) > 0:
+        inside, covered = _inside(after, edges), _inside(before, edges)
+        enlarged = resize(inside, (height, width)).clamp(0, 1)
+        if _correlation(_grey(before), _grey(enlarged)) > _correlation(_grey(covered), _grey(inside)):
+            return before, enlarged, f"{framed}; the picture in it is enlarged to {width}x{height}"
+    down, right = (0, 0) if framed else _shift(before, after)
+    if (down, right) == (0, 0):
+        return before, after, framed
+    done = f"{edited} is shifted by {down} pixels down and {right} to the right"
+    return *_overlap(before, after, down, right), done
+
+
+def _aligned_of_other_size(before: Tensor, after: Tensor, name: str, edited: str) -> tuple[Tensor, Tensor, str]:
+    """:func:`align` for an edited picture of another size: resize it, or find it in the original."""
+    (height, width), other = before.shape[-2:], after.shape[-2:]
+    ratio = (other[1] / other[0]) / (width / height)
+    resized = resize(after, (height, width)).clamp(0, 1) if abs(math.log(ratio)) < SAME_SHAPE else None
+    (row, column), likeness = (0, 0), -1.0
+    if other[0] <= height and other[1] <= width:
+        (row, column), likeness = _place(before, after)
     if resized is not None and _correlation(_grey(before), _grey(resized)) >= likeness:
-        return before, resized, f"{edited} is resized from {other[1]}x{other[0]} to {size[1]}x{size[0]}"
+        return before, resized, f"{edited} is resized from {other[1]}x{other[0]} to {width}x{height}"
     if likeness < MIN_CORRELATION:
         raise ValueError(
-            f"{edited} must have the size of {name}, {size[1]}x{size[0]}, or be a resized copy or a crop of it, "
+            f"{edited} must have the size of {name}, {width}x{height}, or be a resized copy or a crop of it, "
             f"got {other[1]}x{other[0]}; crop both to the same area"
         )
-    part = before[..., place[0] : place[0] + other[0], place[1] : place[1] + other[1]]
-    return part, after, f"{edited} is a crop of {name} from row {place[0]}, column {place[1]}"
+    part = before[..., row : row + other[0], column : column + other[1]]
+    return part, after, f"{edited} is a crop of {name} from row {row}, column {column}"
 
 
 def frame(before: Tensor, after: Tensor) -> tuple[int, int, int, int]:
@@ -77,16 +89,16 @@ def frame(before: Tensor, after: Tensor) -> tuple[int, int, int, int]:
 
 
 def inside_frame(before: Tensor, after: Tensor) -> Tensor:
-    """Which pixels (H, W) of an edited picture (C, H, W) are not in a :func:`frame` around it."""
-    found = torch.ones(after.shape[-2:], dtype=torch.bool, device=after.device)
-    height, width = found.shape
+    """Mask (H, W), bool, of the pixels of an edited picture (C, H, W) that are not in a :func:`frame` around it."""
+    mask = torch.ones(after.shape[-2:], dtype=torch.bool, device=after.device)
+    height, width = mask.shape
     above, below, left, right = frame(before, after)
-    found[:above], found[height - below :], found[:, :left], found[:, width - right :] = False, False, False, False
-    return found
+    mask[:above], mask[height - below :], mask[:, :left], mask[:, width - right :] = False, False, False, False
+    return mask
 
 
 def _plain_edges(image: Tensor) -> tuple[int, int, int, int]:
-    """How many lines along each edge of a picture (C, H, W) have the colour of its first pixel."""
+    """Number of lines along each edge of a picture (C, H, W) that have the colour of its first pixel."""
     plain = ((image - image[:, :1, :1]).abs() <= PLAIN).all(0)
     rows, columns = plain.all(1), plain.all(0)
     lines = (rows, rows.flip(0), columns, columns.flip(0))
@@ -107,8 +119,8 @@ def _grey(image: Tensor) -> Tensor:
 
 def _correlation(first: Tensor, second: Tensor) -> float:
     pair = torch.stack([first.flatten(), second.flatten()])
-    found = float(pair.corrcoef()[0, 1])
-    return found if math.isfinite(found) else 0.0
+    correlation = float(pair.corrcoef()[0, 1])
+    return correlation if math.isfinite(correlation) else 0.0  # it is not for pictures of one brightness
 
 
 def _shift(before: Tensor, after: Tensor) -> tuple[int, int]:
@@ -116,8 +128,8 @@ def _shift(before: Tensor, after: Tensor) -> tuple[int, int]:
     from skimage.registration import phase_cross_correlation
 
     first, second = _grey(before), _grey(after)
-    found = phase_cross_correlation(second.numpy(), first.numpy(), normalization=None)[0]
-    down, right = (round(float(shift)) for shift in found)
+    shifts = phase_cross_correlation(second.numpy(), first.numpy(), normalization=None)[0]
+    down, right = (round(float(shift)) for shift in shifts)
     limit = MAX_SHIFT * min(first.shape)
     if (down, right) == (0, 0) or max(abs(down), abs(right)) > limit:
         return 0, 0
@@ -135,31 +147,39 @@ def _overlap(first: Tensor, second: Tensor, down: int, right: int) -> tuple[Tens
 
 
 def _place(before: Tensor, after: Tensor) -> tuple[tuple[int, int], float]:
-    """Find the position (row, column) of a smaller picture in a larger one, and the correlation there."""
-    from skimage.feature import match_template
+    """Find the position (row, column) of a smaller picture in a larger one, and the correlation there.
 
+    A large picture is reduced for a first search, whose position is accurate to a few pixels; a second search looks
+    around it.
+    """
     whole, part = _grey(before), _grey(after)
     scale = max(1.0, min(whole.shape) / SEARCH_SIDE)
-    small, piece = whole, part
-    if scale > 1:
-        small, piece = (
-            resize(grey[None, None], (max(1, round(grey.shape[0] / scale)), max(1, round(grey.shape[1] / scale))))[0, 0]
-            for grey in (whole, part)
-        )
+    small, piece = (_reduced(grey, scale) for grey in (whole, part))
     if min(piece.shape) < 4 or float(piece.std()) == 0:
         return (0, 0), -1.0
-    found = match_template(small.numpy(), piece.numpy()[: small.shape[0], : small.shape[1]])
-    row, column = (int(i) for i in np.unravel_index(int(found.argmax()), found.shape))
+    (row, column), correlation = _best_match(small, piece[: small.shape[0], : small.shape[1]])
     if scale == 1:
-        return (row, column), float(found.max())
-    margin = math.ceil(2 * scale)  # the position is accurate to a few pixels; search again around it
-    top, left = (
-        min(max(0, round(place * scale) - margin), room)
-        for place, room in zip(
-            (row, column), (whole.shape[0] - part.shape[0], whole.shape[1] - part.shape[1]), strict=True
-        )
-    )
+        return (row, column), correlation
+    margin = math.ceil(2 * scale)
+    top = min(max(0, round(row * scale) - margin), whole.shape[0] - part.shape[0])
+    left = min(max(0, round(column * scale) - margin), whole.shape[1] - part.shape[1])
     near = whole[top : top + part.shape[0] + 2 * margin, left : left + part.shape[1] + 2 * margin]
-    found = match_template(near.numpy(), part.numpy())
-    down, right = (int(i) for i in np.unravel_index(int(found.argmax()), found.shape))
-    return (top + down, left + right), float(found.max())
+    (down, right), correlation = _best_match(near, part)
+    return (top + down, left + right), correlation
+
+
+def _reduced(grey: Tensor, scale: float) -> Tensor:
+    """Reduce luminance (H, W) by a factor."""
+    if scale == 1:
+        return grey
+    size = (max(1, round(grey.shape[0] / scale)), max(1, round(grey.shape[1] / scale)))
+    return resize(grey[None, None], size)[0, 0]
+
+
+def _best_match(whole: Tensor, part: Tensor) -> tuple[tuple[int, int], float]:
+    """Position (row, column) of the part in the whole, (H, W) each, and the correlation there."""
+    from skimage.feature import match_template
+
+    correlations = match_template(whole.numpy(), part.numpy())
+    row, column = np.unravel_index(int(correlations.argmax()), correlations.shape)
+    return (int(row), int(column)), float(correlations.max())

@@ -37,7 +37,7 @@ def brightness(image: Tensor) -> Tensor:
 
 
 def tones(image: Tensor) -> Tensor:
-    """What is stretched: both kinds of :func:`brightness` and the channels, (B, 2 + C, H, W)."""
+    """The planes that levels stretch: both kinds of :func:`brightness` and the channels, (B, 2 + C, H, W)."""
     return torch.cat([brightness(image), image], dim=1)
 
 
@@ -47,7 +47,8 @@ class Stretch:
 
     Attributes:
         darkest: (B, 2 + C, 1, 1).
-        width: distance to the lightest; 1 where it is so small that nothing is stretched, and ``darkest`` is 0 there.
+        width: distance to the lightest tone, (B, 2 + C, 1, 1). Where it is so small that nothing is stretched, it is 1,
+            and ``darkest`` is 0.
     """
 
     darkest: Tensor
@@ -65,10 +66,10 @@ class Stretch:
         return (values - self.darkest[:, 1:2]) / self.width[:, 1:2]
 
     def changes(self, image: Tensor) -> Tensor:
-        """What each kind changes of an image (B, C, H, W): (B, KINDS, C, H, W)."""
-        found = tones(image)
-        moved = (found - self.darkest) / self.width - found
-        scaled = moved[:, 1:2] * image / found[:, 1:2].clamp(min=DARKEST)
+        """Changes (B, KINDS, C, H, W) of an image (B, C, H, W) by each kind of levels."""
+        before = tones(image)
+        moved = (before - self.darkest) / self.width - before
+        scaled = moved[:, 1:2] * image / before[:, 1:2].clamp(min=DARKEST)
         return torch.stack([moved[:, :1].expand_as(image), scaled, moved[:, 2:]], dim=1)
 
     def change(self, image: Tensor, strengths: Tensor) -> Tensor:
@@ -77,7 +78,11 @@ class Stretch:
 
 
 def ramps(image: Tensor, stretch: Stretch) -> Tensor:
-    """How far luminance and the stretched largest channel are from each shade to the next, (B, 2 (K - 1), H, W)."""
+    """Position of luminance and of the stretched largest channel between each shade and the next, in [0, 1].
+
+    Returns:
+        (B, 2 (K - 1), H, W).
+    """
     light = _stretched(brightness(image), stretch) * (SHADES - 1)
     return torch.stack([light.clamp(k, k + 1) - k for k in range(SHADES - 1)], dim=2).flatten(1, 2)
 
@@ -143,11 +148,11 @@ class LocalCurves:
             torch.arange(start, start + length, device=image.device)
             for start, length in zip(corner, (height, width), strict=True)
         )
-        found = self.at(image.flatten(2), rows.repeat_interleave(width), columns.repeat(height))
-        return found.unflatten(3, (height, width))
+        changes = self.at(image.flatten(2), rows.repeat_interleave(width), columns.repeat(height))
+        return changes.unflatten(3, (height, width))
 
     def at(self, image: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
-        """Changes (B, 2 S, C, P) of some pixels (B, C, P), in rows and columns (P,)."""
+        """Changes (B, 2 S, C, P) of pixels (B, C, P) in rows and columns (P,)."""
         light = brightness(image.unsqueeze(2))
         places = _stretched(light, self.stretch).squeeze(2)
         added, scaled = self._changes_of(places, rows, columns).unbind(1)
@@ -164,16 +169,16 @@ class LocalCurves:
         places = [place.clamp(0, length - 1) for place, length in zip(places, shape, strict=True)]
         below = [place.detach().floor().clamp(max=length - 2) for place, length in zip(places, shape, strict=True)]
         changes = self.changes.flatten(3).expand(len(light), -1, -1, -1)
-        found = torch.zeros_like(light).unsqueeze(2)
-        for corner in product((0, 1), repeat=3):
+        total = torch.zeros_like(light).unsqueeze(2)
+        for corner in product((0, 1), repeat=3):  # trilinear interpolation
             index, share = torch.zeros_like(light, dtype=torch.long), torch.ones_like(light)
-            for place, low, one, length in zip(places, below, corner, shape, strict=True):
-                index = index * length + low.long() + one
+            for place, low, step, length in zip(places, below, corner, shape, strict=True):
+                index = index * length + low.long() + step
                 part = place - low
-                share = share * (part if one else 1 - part)
-            taken = changes.gather(3, index.unsqueeze(2).expand(-1, -1, changes.shape[2], -1))
-            found = found + share.unsqueeze(2) * taken
-        return found
+                share = share * (part if step else 1 - part)
+            nearest = changes.gather(3, index.unsqueeze(2).expand(-1, -1, changes.shape[2], -1))
+            total = total + share.unsqueeze(2) * nearest
+        return total
 
 
 def _shares(length: int, step: int) -> Tensor:

@@ -39,7 +39,7 @@ SHAPES: dict[str, tuple[int | str, ...]] = {
     "local": (STRENGTHS,),
 }
 NAMES = tuple(SHAPES)
-#: Numbers with which these parts change nothing; such parts are not computed.
+#: Values at which these parts change nothing; they are not computed then.
 IDLE = {"alpha": 1.0, "bands": 1.0, "texture": 1.0, "stretch": 0.0, "local": 0.0}
 
 
@@ -80,12 +80,12 @@ def check_part(value: Tensor, name: str, batch: int) -> None:
     shape, wanted = tuple(value.shape), SHAPES[name]
     own = shape[-len(wanted) :]
     fits = len(own) == len(wanted) and all(
-        length >= 2 if isinstance(one, str) else length == one for length, one in zip(own, wanted, strict=True)
+        length >= 2 if isinstance(size, str) else length == size for length, size in zip(own, wanted, strict=True)
     )
     if not fits or shape[: -len(wanted)] not in ((), (1,), (batch,)):
-        each = f", or that for each of {batch} images" if batch > 1 else ""
+        batched = f", or that for each of {batch} images" if batch > 1 else ""
         named = f"({wanted[0]},)" if len(wanted) == 1 else f"({wanted[0]}, {wanted[1]})"
-        raise ValueError(f"{name} must have the shape {named}{each}, got {shape}; reshape it, or add values")
+        raise ValueError(f"{name} must have the shape {named}{batched}, got {shape}; reshape it, or add values")
 
 
 def acts(gains: Tensor, idle: float = 1.0) -> bool:
@@ -113,7 +113,7 @@ def pointwise(image: Tensor, curves: Tensor, matrix: Tensor, saturation: Tensor)
 
 
 def below_largest(image: Tensor) -> Tensor:
-    """How far each channel of an image (B, 3, H, W) is from the largest one of its pixel."""
+    """Distance of each channel of an image (B, 3, H, W) from the largest channel of its pixel, at most 0."""
     return image - image.amax(1, keepdim=True)
 
 
@@ -170,7 +170,7 @@ def textures_of(image: Tensor) -> Iterator[Tensor]:
     for number, band in enumerate(bands_of(low)):
         if number == BLURS:
             return
-        low = low - band  # what this blur leaves, and of squares
+        low = low - band  # the blurred luminance, and its blurred square
         variance = (low[:, 1:] - low[:, :1].square()).clamp(min=0)
         yield band[:, :1] * (FLAT**2 / (variance + FLAT**2))
 

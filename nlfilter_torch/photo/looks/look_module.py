@@ -64,8 +64,8 @@ class Look(nn.Module):
     ) -> None:
         super().__init__()
         names = check_learn(learn, NAMES)
-        given = {} if parts is None else dict(parts)
-        check_learn(list(given), NAMES, "parts")
+        initial = {} if parts is None else dict(parts)
+        check_learn(list(initial), NAMES, "parts")
         check_count(knots, "knots", least=2)
         start = {
             "alpha": torch.ones(4),
@@ -76,7 +76,7 @@ class Look(nn.Module):
             "saturation": torch.ones(5),
             "stretch": torch.zeros(KINDS),
             "local": torch.zeros(STRENGTHS),
-        } | given
+        } | initial
         for name, value in start.items():
             check_part(value, name, 1)
             own = value.detach().to(torch.get_default_dtype()).clone()

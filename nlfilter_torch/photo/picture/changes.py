@@ -33,7 +33,7 @@ def activity(image: Tensor) -> Tensor:
 
 
 def sum_of(changes: Tensor) -> Tensor:
-    """Sum of added detail and the rest of the change, given as (B, 2 C, H, W)."""
+    """Sum of added detail and the rest of the change, which are concatenated to (B, 2 C, H, W)."""
     added, rest = changes.chunk(2, dim=1)
     return added + rest
 
@@ -71,6 +71,6 @@ def blend_changes(changes: Tensor, masks: Tensor) -> Tensor:
 
 def blend_edited(image: Tensor, edited: Sequence[Tensor], masks: Tensor) -> Tensor:
     """The image (B, C, H, W), edited in K ways (B, C', H, W) where the masks (B, K, H, W) are 1."""
-    before = image.expand(-1, max(one.shape[1] for one in edited), -1, -1)
-    changes = [one - before for one in edited]
+    before = image.expand(-1, max(version.shape[1] for version in edited), -1, -1)
+    changes = [version - before for version in edited]
     return before + blend_changes(torch.cat([*changes, torch.zeros_like(before)], dim=1), masks)

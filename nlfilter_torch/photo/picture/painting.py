@@ -54,8 +54,8 @@ def mask_of(
     It is 0 where the strokes ``above`` cover them.
     """
     visible, hidden = torch.zeros(2, *_shape(size, rows), dtype=torch.bool)
-    for covered, some in ((visible, strokes), (hidden, above)):
-        for stroke in some:
+    for covered, drawn in ((visible, strokes), (hidden, above)):
+        for stroke in drawn:
             covered |= cover(stroke, size, rows)
     return (visible & ~hidden)[None, None].float()
 

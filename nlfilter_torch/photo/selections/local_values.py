@@ -34,15 +34,16 @@ MIN_INFLUENCE = 1e-8
 
 @dataclass(frozen=True)
 class Links:
-    """A way to relate neighbouring pixels.
+    """A way to weigh the links between neighbouring pixels.
 
     Attributes:
-        weights: function of the differences in luminance of the neighbours from a pixel, and of whether these are in
-            the picture, both (B, 9, h, w) with the pixel itself in the middle, which counts as not in the picture.
-            The result sums to 8 in flat areas.
-        pixels: number to which the picture is reduced.
-        decay_distance: at which the influence of scribbles falls to 1/e in flat areas, relative to the square root of
-            the area.
+        weights: function that returns the weights (B, 9, h, w) of the links of a pixel. Its arguments are the
+            differences in luminance of the neighbours from the pixel, and whether they are in the picture, both
+            (B, 9, h, w); the pixel itself, in the middle, counts as not in the picture. The weights sum to 8 in flat
+            areas.
+        pixels: number of pixels to which the picture is reduced.
+        decay_distance: distance at which the influence of scribbles falls to 1/e in flat areas, relative to the square
+            root of the area.
     """
 
     weights: Callable[[Tensor, Tensor], Tensor]
@@ -126,12 +127,12 @@ class LocalValues:
         alike = links.weights((around - guide.flatten(2)) * inside, inside).double().unflatten(2, (rows, columns))
         own = alike.sum(1, keepdim=True) + anchor
         stencil = torch.cat([-alike[:, :4], own, -alike[:, 5:]], dim=1).unflatten(1, (3, 3))
-        found, *others = solve_stencil(stencil, sums).split([known.shape[1] for known in sets], dim=1)
+        solution, *others = solve_stencil(stencil, sums).split([known.shape[1] for known in sets], dim=1)
         left_out = None
         if groups is not None and others:
             at = blocks_at(places, width, step, (rows, columns))
-            left_out = groups.of_own([one.flatten(2)[:, :, at] for one in others])
-        return LocalValues(links, found.to(guide), guide, step, width, left_out)
+            left_out = groups.of_own([other.flatten(2)[:, :, at] for other in others])
+        return LocalValues(links, solution.to(guide), guide, step, width, left_out)
 
     def __call__(self, own: Tensor, first: int) -> Tensor:
         """Return mean values of scribbles, and their influence in [0, 1], for a rectangle: (B, C+1, h, w).
@@ -139,9 +140,9 @@ class LocalValues:
         The influence is the square root of the interpolated solution for ones. ``own`` is the luminance of the pixels,
         (B, 1, h, w), and ``first`` the row-major index of the first of them.
         """
-        found = self._at(own, *divmod(first, self.width))
-        influence = found[:, -1:].clamp(min=MIN_INFLUENCE)
-        return torch.cat([found[:, :-1] / influence, influence.sqrt()], dim=1)
+        values = self._at(own, *divmod(first, self.width))
+        influence = values[:, -1:].clamp(min=MIN_INFLUENCE)
+        return torch.cat([values[:, :-1] / influence, influence.sqrt()], dim=1)
 
     def _at(self, own: Tensor, top: int, left: int) -> Tensor:
         """Interpolate the solutions (B, C+1, h, w) in a rectangle."""

@@ -54,10 +54,10 @@ def inner_places(size: tuple[int, int]) -> Tensor:
 
 @torch.no_grad()
 def linked_evenly(even: Tensor, scribbles: Tensor) -> Tensor:
-    """How certainly an even area, such as a sky, links each pixel to scribbles on a region, (B, 1, H, W) in [0, 1].
+    """Certainty (B, 1, H, W), in [0, 1], that an even area, such as a sky, links a pixel to scribbles on a region.
 
-    The least evenness along the best path to such a scribble, minus that along the best path to one on the background.
-    It has no gradient, and is 0 or 1 nearly everywhere.
+    It grows with the least evenness along the best path to such a scribble, minus that along the best path to one on
+    the background. It has no gradient, and is 0 or 1 nearly everywhere.
 
     Args:
         even: :func:`evenness`, (B, 1, H, W).
@@ -66,19 +66,28 @@ def linked_evenly(even: Tensor, scribbles: Tensor) -> Tensor:
     height, width = even.shape[-2:]
     steps = [max(min(LINK_STEP, length), math.ceil(length / MOST_LINKED)) for length in (height, width)]
     passable = -F.max_pool2d(-even, steps, ceil_mode=True)
-    found = passable * F.max_pool2d((scribbles > 0).to(even), steps, ceil_mode=True)
-    passable, before = passable.expand_as(found), torch.full_like(found, -1.0)
-    while not torch.equal(found, before):  # as often as the paths turn
-        before.copy_(found)
+    start = passable * F.max_pool2d((scribbles > 0).to(even), steps, ceil_mode=True)
+    front, back = _widest_paths(passable.expand_as(start), start).split(1, dim=1)
+    linked = ((front - back - UNLINKED) / (LINKED - UNLINKED)).clamp(0.0, 1.0)
+    return linked.repeat_interleave(steps[0], 2).repeat_interleave(steps[1], 3)[..., :height, :width]
+
+
+def _widest_paths(passable: Tensor, start: Tensor) -> Tensor:
+    """Least value of ``passable`` along the best path from a start to each pixel, (B, C, h, w).
+
+    ``start`` is 0 where no path starts; it is overwritten. Sweeps along rows and columns are repeated as often as the
+    paths turn.
+    """
+    values, before = start, torch.full_like(start, -1.0)
+    while not torch.equal(values, before):
+        before.copy_(values)
         for axis in (2, 3):
-            lines, limits = found.unbind(axis), passable.unbind(axis)
+            lines, limits = values.unbind(axis), passable.unbind(axis)
             count = len(lines)
             for direction, order in ((-1, range(1, count)), (1, range(count - 2, -1, -1))):
                 for k in order:
                     torch.maximum(lines[k], limits[k].minimum(lines[k + direction]), out=lines[k])
-    front, back = found.split(1, dim=1)
-    linked = ((front - back - UNLINKED) / (LINKED - UNLINKED)).clamp(0.0, 1.0)
-    return linked.repeat_interleave(steps[0], 2).repeat_interleave(steps[1], 3)[..., :height, :width]
+    return values
 
 
 def likeness(scribbled: Tensor, weights: Tensor, others: Tensor, bandwidth: float | Tensor) -> Tensor:
@@ -87,9 +96,9 @@ def likeness(scribbled: Tensor, weights: Tensor, others: Tensor, bandwidth: floa
     Position does not matter: the far end of a sky still counts as the same sky. Pixels whose weight, of (B, 1, n), is 0
     do not count. The bandwidth is that of the regression.
     """
-    some, counted = every_nth(scribbled, (weights.detach() > 0).to(others), NUM_COMPARED)
+    sample, counted = every_nth(scribbled, (weights.detach() > 0).to(others), NUM_COMPARED)
     scale = per_image(bandwidth, others, 3)
-    return (density(colours_in_lab(others), colours_in_lab(some), counted, scale) / SIMILAR_SHARE).clamp(max=1.0)
+    return (density(colours_in_lab(others), colours_in_lab(sample), counted, scale) / SIMILAR_SHARE).clamp(max=1.0)
 
 
 def evenness(image: Tensor) -> Tensor:
@@ -102,7 +111,7 @@ def evenness(image: Tensor) -> Tensor:
 
 def colour_likelihood(
     image: Tensor,
-    marked: Scribbles,
+    scribbles: Scribbles,
     frame: Tensor,
     unlike: Tensor,
     likely: Tensor,
@@ -117,7 +126,7 @@ def colour_likelihood(
 
     Args:
         image: the reduced picture.
-        marked: scribbles on the region and on its background.
+        scribbles: on the region and on its background.
         frame: colours (B, C, n) of the pixels along the borders of the picture.
         unlike: dissimilarity of these pixels to the scribbles on the region, (B, 1, n).
         likely: likelihood of these pixels by the regression, (B, 1, n), times their :func:`evenness`. Where an even
@@ -129,14 +138,14 @@ def colour_likelihood(
     """
     places = hundredths_of_lab(image).flatten(2)
     scale = BANDWIDTH_SHARE * per_image(bandwidth, image, 3)
-    scribbled = (every_nth(marked.image, weights, NUM_COLOURS) for weights in marked.weights.split(1, dim=1))
-    inside, outside = (density(places, colours_in_lab(some), shares, scale) for some, shares in scribbled)
+    samples = (every_nth(scribbles.image, weights, NUM_COLOURS) for weights in scribbles.weights.split(1, dim=1))
+    inside, outside = (density(places, colours_in_lab(sample), shares, scale) for sample, shares in samples)
     shares = unlike * torch.cat([likely.square(), (1 - likely).square()], dim=1)
     shares = shares / unlike.sum(2, keepdim=True).clamp(min=EPSILON)
     within, around = density(places, colours_in_lab(frame), shares, scale).split(1, dim=1)
     shares = linked / linked.sum(2, keepdim=True).clamp(min=1.0)
     inside = inside + within + density(places, colours_in_lab(inner), shares, scale)
-    opposed = (marked.weights[:, 1].detach() > 0).any(1).view(-1, 1, 1)
+    opposed = (scribbles.weights[:, 1].detach() > 0).any(1).view(-1, 1, 1)
     outside = torch.where(opposed, (outside + around) / 2, around)
     return ((inside + MIN_DENSITY) / (inside + outside + 2 * MIN_DENSITY)).unflatten(2, image.shape[-2:])
 
@@ -163,13 +172,13 @@ def density(places: Tensor, points: Tensor, weights: Tensor, bandwidth: Tensor) 
     places, points = (t / (bandwidth * math.sqrt(t.shape[1])) for t in (places, points))
     squares = points.square().sum(1, keepdim=True)
     left = torch.cat([2 * points, -torch.ones_like(squares), -squares], dim=1)  # (B, C+2, m)
-    found = []
+    sums = []
     for block in pixel_blocks(places.shape[2], len(places), places.device):
-        some = places[:, :, block]
-        right = torch.cat([some, some.square().sum(1, keepdim=True), torch.ones_like(some[:, :1])], dim=1)
+        part = places[:, :, block]
+        right = torch.cat([part, part.square().sum(1, keepdim=True), torch.ones_like(part[:, :1])], dim=1)
         exponents = right.mT @ left  # (B, k, m), minus the squared distances
-        found.append(exponents.clamp(SMALLEST_EXPONENT, 0.0).exp() @ weights.mT)
-    return torch.cat(found, dim=1).mT
+        sums.append(exponents.clamp(SMALLEST_EXPONENT, 0.0).exp() @ weights.mT)
+    return torch.cat(sums, dim=1).mT
 
 
 def colours_in_lab(colours: Tensor) -> Tensor:
