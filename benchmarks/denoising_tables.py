@@ -1,8 +1,7 @@
-"""Tables of denoisers: ``python -m benchmarks.denoising_tables FILE [--docs FILE] [--readme FILE]``.
+"""Tables of denoisers: ``python -m benchmarks.denoising_tables FILE [--docs FILE]``.
 
 FILE is the JSON of ``python -m benchmarks.denoising --out FILE``. Prints means over photographs of PSNR in dB, SSIM and
-CPU seconds, and writes them between markers: the table of all methods into ``--docs``, that of a few methods into
-``--readme``.
+CPU seconds, and writes them between the markers of ``--docs``.
 """
 
 import argparse
@@ -16,7 +15,6 @@ from benchmarks.report import between, table
 from nlfilter_torch.photo.io.writing import open_beside
 
 MARKERS = ("<!-- denoising: written by python -m benchmarks.denoising_tables -->", "<!-- end of denoising -->")
-SHOWN = ("ours", "ours, 4 turns", "plain", "BM3D")  # in the README
 Results = dict[str, dict[str, Any]]
 
 
@@ -26,7 +24,7 @@ def mean(results: Results, kind: str, level: str, method: str, figure: str) -> f
     return None if found is None else statistics.mean(each[figure] for each in found.values())
 
 
-def tables(results: Results, methods: Sequence[str] | None, figures: Sequence[tuple[str, str, str]]) -> str:
+def tables(results: Results, figures: Sequence[tuple[str, str, str]]) -> str:
     """A table for each kind of photograph, with one row per method and one column per noise level."""
     parts = []
     for kind in dict.fromkeys(key.split(", ")[0] for key in results):
@@ -35,8 +33,6 @@ def tables(results: Results, methods: Sequence[str] | None, figures: Sequence[tu
         named = dict.fromkeys(name for level in levels for name in results[f"{kind}, {level}"])
         rows = []
         for name in named:
-            if methods is not None and name not in methods:
-                continue
             row = ["CBM3D" if (kind, name) == ("colour", "BM3D") else name]
             for _, figure, form in figures:
                 found = [mean(results, kind, level, name, figure) for level in levels]
@@ -56,20 +52,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Print the tables, and write them to files."""
     parser = argparse.ArgumentParser(description="Tables from the comparison of denoisers.")
     parser.add_argument("file", type=Path, help="JSON of python -m benchmarks.denoising")
-    parser.add_argument("--docs", type=Path, help="file for the table of all methods")
-    parser.add_argument("--readme", type=Path, help="file for the table of a few methods")
+    parser.add_argument("--docs", type=Path, help="file in which the text between the markers becomes the tables")
     options = parser.parse_args(arguments)
     results: Results = json.loads(options.file.read_text())
-    seconds = ("CPU s", "seconds", ".1f")
-    whole = tables(results, None, [("", "psnr", ".2f"), ("SSIM", "ssim", ".3f"), seconds])
-    for path, text in (
-        (options.docs, whole),
-        (options.readme, tables(results, SHOWN, [("", "psnr", ".2f"), seconds])),
-    ):
-        if path is not None:
-            with open_beside(path) as stream:
-                stream.write(between(path.read_text(), text, *MARKERS).encode())
-    print(whole)
+    text = tables(results, [("", "psnr", ".2f"), ("SSIM", "ssim", ".3f"), ("CPU s", "seconds", ".1f")])
+    if options.docs is not None:
+        with open_beside(options.docs) as stream:
+            stream.write(between(options.docs.read_text(), text, *MARKERS).encode())
+    print(text)
 
 
 if __name__ == "__main__":

@@ -1,7 +1,8 @@
 """Tables and plots from the JSON of :mod:`benchmarks.speed`: ``python -m benchmarks.report FILE.json``.
 
-Writes ``speed.md`` and two plots into a folder, and a copy of the JSON if that is a different folder. With ``--readme``
-it writes claims and comparisons between the two marker comments of that file, so that no number is copied by hand.
+Writes ``speed.md`` and two plots into a folder, and a copy of the JSON if that is a different folder. With ``--page``
+the report is written between the two marker comments of that file instead of ``speed.md``, so that no number is copied
+by hand: ``python -m benchmarks.report out/speed.json --folder docs --page docs/speed.md``.
 """
 
 import argparse
@@ -192,16 +193,17 @@ def explanation(results: Results) -> str:
         "minimum cost with "
         "the matrix products of torch: "
         f"N x D x M and twice N x M x M ({seconds(floor['products'])} here) and {READS} reads of the factor "
-        f"({seconds(floor['read'])} each), each part measured alongside in several ways, of which the fastest counts; "
-        "it excludes exponentials, features, landmarks and allocating the factor. The kernels in C skip the zero "
+        f"({seconds(floor['read'])} each). Each of these is timed in several ways beside the other calls, and the "
+        "fastest way counts. The floor excludes exponentials, features, landmarks and allocating the factor. The "
+        "kernels in C skip the zero "
         "triangle of the inverse Cholesky factor, so the operator may be faster than the floor. The other filters are "
         "different operators for the same task."
     )
 
 
 def report(results: Results) -> str:
-    """The whole report in markdown."""
-    parts = ["# Speed", machine_lines(results), explanation(results), "## Claims", claims_table(claims(results))]
+    """The whole report in markdown, without its title."""
+    parts = [machine_lines(results), explanation(results), "## Claims", claims_table(claims(results))]
     missing = [remedy for record in results["results"] for remedy in record.get("missing", {}).values()]
     if any(records_of(results, "main")):
         parts += ["## On one image", *missing, main_table(results)]
@@ -211,14 +213,7 @@ def report(results: Results) -> str:
             parts += [f"## {title}", series_table(records, column, key)]
     parts += other_tables(results)
     parts += [f"Time was up during or before: {', '.join(results['cut'])}."] if results["cut"] else []
-    return "\n\n".join(part for part in parts if part) + "\n"
-
-
-def readme_part(results: Results) -> str:
-    """Claims and comparisons, for the README."""
-    return "\n\n".join(
-        [claims_table(claims(results)), main_table(results), explanation(results), machine_lines(results)]
-    )
+    return "\n\n".join(part for part in parts if part)
 
 
 def between(text: str, part: str, begin: str, end: str) -> str:
@@ -239,22 +234,23 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.report", description=__doc__)
     parser.add_argument("file", type=Path, help="JSON of python -m benchmarks.speed")
     parser.add_argument("--folder", type=Path, help="path of the report (default: beside FILE)")
-    parser.add_argument("--readme", type=Path, help="file whose table between the markers is replaced")
+    parser.add_argument("--page", type=Path, help="file in which the text between the markers becomes the report")
     options = parser.parse_args(arguments)
     results = json.loads(options.file.read_text())
     folder = options.folder or options.file.parent
     if folder.resolve() != options.file.parent.resolve():
         write(folder / "speed.json", options.file.read_bytes())
     text = report(results)
-    write(folder / "speed.md", text.encode())
+    if options.page is None:
+        write(folder / "speed.md", f"# Speed\n\n{text}\n".encode())
+    elif results["quick"] or not records_of(results, "main"):
+        sys.exit("the page takes figures of a full run only; run python -m benchmarks.speed without --quick")
+    else:
+        write(options.page, between(options.page.read_text(), text, BEGIN, END).encode())
     if records_of(results, "sizes") or records_of(results, "landmarks"):
         write(folder / "speed_growth.png", png(plot_growth(results)))
     if records_of(results, "main"):
         write(folder / "speed_peers.png", png(plot_peers(results)))
-    if options.readme:
-        if results["quick"] or not records_of(results, "main"):
-            sys.exit("the README takes figures of a full run only; run python -m benchmarks.speed without --quick")
-        write(options.readme, between(options.readme.read_text(), readme_part(results), BEGIN, END).encode())
     print(text)
 
 

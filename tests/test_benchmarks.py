@@ -80,23 +80,24 @@ def test_report_of_a_run_has_its_tables_and_plots(results, tmp_path):
 
 
 @pytest.mark.slow
-def test_readme_takes_full_runs_only_and_loses_nothing_around_the_markers(results, tmp_path):
-    source, readme = tmp_path / "speed.json", tmp_path / "README.md"
-    readme.write_text(f"before\n\n{report.BEGIN}\nstale\n{report.END}\n\nafter\n")
+def test_a_page_takes_full_runs_only_and_loses_nothing_around_the_markers(results, tmp_path):
+    source, page = tmp_path / "speed.json", tmp_path / "page.md"
+    page.write_text(f"before\n\n{report.BEGIN}\nstale\n{report.END}\n\nafter\n")
     source.write_text(json.dumps(results))
     with pytest.raises(SystemExit, match="full run"):
-        report.main([str(source), "--readme", str(readme)])
-    assert "stale" in readme.read_text()
+        report.main([str(source), "--page", str(page)])
+    assert "stale" in page.read_text()
     source.write_text(json.dumps(copy.deepcopy(results) | {"quick": False}))
-    report.main([str(source), "--readme", str(readme)])
-    text = readme.read_text()
+    report.main([str(source), "--page", str(page)])
+    text = page.read_text()
     assert text.startswith("before\n")
     assert text.endswith("\n\nafter\n")
     assert "stale" not in text
     assert "OpenCV" in text
+    assert not (tmp_path / "speed.md").exists()
 
 
-def test_a_readme_without_markers_is_refused():
+def test_a_page_without_markers_is_refused():
     with pytest.raises(ValueError, match="must hold the lines"):
         report.between("a text", "a table", report.BEGIN, report.END)
 
