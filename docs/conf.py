@@ -1,5 +1,10 @@
 """How ``make docs`` turns these pages and the docstrings into a website, without a look at the network."""
 
+from docutils.nodes import Element, TextElement
+from sphinx.addnodes import pending_xref
+from sphinx.application import Sphinx
+from sphinx.environment import BuildEnvironment
+
 import nlfilter_torch
 
 project = "nlfilter-torch"
@@ -30,3 +35,25 @@ nitpick_ignore_regex = [
     ("py:mod", r"nlfilter_torch(\.\w+)+"),
     ("py:class", r"nlfilter_torch(\.[a-z_]+)+\.\w+"),
 ]
+
+
+def resolve(app: Sphinx, env: BuildEnvironment, node: pending_xref, shown: TextElement) -> Element | None:
+    """Find a public name that a docstring mentions without the package that the reference lists it under."""
+    if node.get("refdomain") != "py":
+        return None
+    name = (
+        node["reftarget"].rpartition(".")[2] if node["reftarget"].startswith("nlfilter_torch.") else node["reftarget"]
+    )
+    domain = env.get_domain("py")
+    for package in ("nlfilter_torch", "nlfilter_torch.photo"):
+        if f"{package}.{name}" in domain.objects:
+            node["reftarget"] = f"{package}.{name}"
+            return domain.resolve_xref(
+                env, node["refdoc"], app.builder, node["reftype"], node["reftarget"], node, shown
+            )
+    return None
+
+
+def setup(app: Sphinx) -> None:
+    """Register the search for names."""
+    app.connect("missing-reference", resolve)

@@ -15,6 +15,7 @@ from PIL import Image
 
 import nlfilter_torch
 from benchmarks import accuracy, guide_pictures, support
+from nlfilter_torch import photo
 from nlfilter_torch.photo.cli import main
 from nlfilter_torch.photo.declared.presets import PRESETS, PURPOSES
 from tests.pages import DOCS, ROOT, Page
@@ -105,10 +106,12 @@ def test_the_reference_has_every_public_name(site: Path) -> None:
     """Each name is on the page of its topic, to which the first page of the reference links."""
     first = (site / "reference.html").read_text(encoding="utf-8")
     pages = {page.stem: page.read_text(encoding="utf-8") for page in (site / "reference").glob("*.html")}
-    for name in nlfilter_torch.__all__:
-        topics = [topic for topic, text in pages.items() if f'id="nlfilter_torch.{name}"' in text]
+    assert set(photo.__all__) - set(nlfilter_torch.__all__)
+    for name in {*nlfilter_torch.__all__, *photo.__all__}:
+        full = f"nlfilter_torch.photo.{name}" if name in photo.__all__ else f"nlfilter_torch.{name}"
+        topics = [topic for topic, text in pages.items() if f'id="{full}"' in text]
         assert len(topics) == 1, name
-        assert f'href="reference/{topics[0]}.html#nlfilter_torch.{name}"' in first, name
+        assert f'href="reference/{topics[0]}.html#{full}"' in first, name
 
 
 def test_the_start_page_leads_to_every_page(site: Path) -> None:
@@ -140,6 +143,18 @@ def test_every_equation_and_figure_of_the_paper_has_a_line() -> None:
 
     for names in re.findall(r"--only ([\w,-]+)`", figures):
         assert set(names.split(",")) <= FIGURES.keys(), names
+
+
+def test_the_tables_of_the_start_page_hold_public_names() -> None:
+    parts = PAGES["index"].text.split("\nIn `")[1:]
+    packages = {"nlfilter_torch": nlfilter_torch, "nlfilter_torch.photo": photo}
+    assert [part.split("`")[0] for part in parts] == list(packages)
+    for part, package in zip(parts, packages.values(), strict=True):
+        rows = [line for line in part.splitlines() if line.startswith("| `")]
+        names = re.findall(r"`(\w+)`", "".join(row.split("|")[1] for row in rows))
+        assert len(names) > 10
+        for name in names:
+            assert name in package.__all__, name
 
 
 def test_names_on_the_page_of_the_paper_exist() -> None:

@@ -182,7 +182,7 @@ def write_photograph(photograph: Photograph, path: str | Path) -> None:
     AVIF at 90, WebP and TIFF without loss. The file appears complete or not at all.
 
     Raises:
-        ValueError: See :func:`check_output`.
+        ValueError: See :func:`~nlfilter_torch.photo.io.check_output`.
         OSError: The file cannot be written.
     """
     path = Path(path)
