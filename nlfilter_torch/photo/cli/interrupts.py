@@ -10,12 +10,15 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from types import FrameType
+from importlib.machinery import SourceFileLoader
+from types import FrameType, ModuleType
 
 INTERRUPTED = 128 + signal.SIGINT  # exit status that shells use for Ctrl-C
 PAUSE = 0.05  # seconds after which an interrupt is sent again, if it could not be raised where it arrived
 SHOW_CURSOR = "\x1b[?25h"
 ENDINGS = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))
+
+Handler = Callable[[int, FrameType | None], object] | int | None
 
 
 class Ended(SystemExit):
@@ -33,6 +36,39 @@ def tell() -> int:
     return INTERRUPTED
 
 
+class _Imports(threading.local):
+    """Number of modules that the calling thread is importing, one within the other."""
+
+    running = 0
+
+
+_imports = _Imports()
+
+
+def _exec_module(loader: SourceFileLoader, module: ModuleType) -> None:
+    """Run the code of a module, and count it among the running imports meanwhile."""
+    _imports.running += 1
+    try:
+        super(SourceFileLoader, loader).exec_module(module)
+    finally:
+        _imports.running -= 1
+
+
+@contextmanager
+def _counting_imports() -> Iterator[None]:
+    """Count the modules that are being imported; those begun earlier do not count, since they may run this program."""
+    before, _imports.running = _imports.running, 0
+    own = "exec_module" in vars(SourceFileLoader)  # counted already: the program runs itself
+    if not own:
+        setattr(SourceFileLoader, "exec_module", _exec_module)  # noqa: B010  # mypy refuses to assign to a method
+    try:
+        yield
+    finally:
+        _imports.running = before
+        if not own:
+            delattr(SourceFileLoader, "exec_module")
+
+
 @contextmanager
 def handled() -> Iterator[None]:
     """Turn signals into exceptions that end the program.
@@ -41,31 +77,82 @@ def handled() -> Iterator[None]:
     raise it there, but would print "Exception ignored in" and continue. An interrupt during an import while a file is
     unfinished is sent again too: the imported code could catch the exception.
     """
-    former = sys.unraisablehook
-    repeats: list[threading.Timer] = []
+    signals = _Signals()
+    with _counting_imports():
+        signals.install()
+        try:
+            yield
+        finally:
+            signals.restore()
 
-    def repeat(number: int) -> None:
-        repeats.append(threading.Timer(PAUSE, _send, [number]))
-        repeats[-1].daemon = True
-        repeats[-1].start()
 
-    def hook(lost: "sys.UnraisableHookArgs") -> None:
+class _Signals:
+    """The handlers of signals, which replace Python's own for a while."""
+
+    def __init__(self) -> None:
+        self._unraisablehook = sys.unraisablehook
+        self._repeats: list[threading.Timer] = []
+        self._handlers: dict[int, Handler] = {}
+
+    def install(self) -> None:
+        """Replace the handlers of signals that still have Python's own.
+
+        Background jobs of a shell ignore SIGINT, jobs under nohup ignore SIGHUP, and a program that runs this one may
+        have its own handlers; those are left unchanged.
+        """
+        if threading.current_thread() is threading.main_thread():
+            usual: dict[int, Handler] = {
+                signal.SIGINT: signal.default_int_handler,
+                **dict.fromkeys(ENDINGS, signal.SIG_DFL),
+            }
+            self._handlers = {
+                number: handler for number, handler in usual.items() if signal.getsignal(number) is handler
+            }
+            for number in self._handlers:
+                signal.signal(number, self._handle)
+        sys.unraisablehook = self._hook
+
+    def restore(self) -> None:
+        """Restore Python's handlers."""
+        sys.unraisablehook = self._unraisablehook
+        for timer in self._repeats:
+            timer.cancel()
+        for number, handler in self._handlers.items():
+            signal.signal(number, handler)
+
+    def _handle(self, number: int, _: FrameType | None) -> None:
+        """Raise an exception.
+
+        During an import, which could catch it, end the process, or send the signal again later if a file is unfinished.
+        """
+        files = sys.modules.get("nlfilter_torch.photo.io.writing")
+        if _imports.running > 0:
+            if getattr(files, "unfinished", None):
+                self._repeat(number)
+                return
+            if sys.stderr.isatty():
+                sys.stderr.write(SHOW_CURSOR)  # a progress bar hides it
+            if number == signal.SIGINT:
+                tell()
+            sys.stderr.flush()
+            os._exit(128 + number)
+        if number == signal.SIGINT:
+            raise KeyboardInterrupt
+        raise Ended(number)
+
+    def _hook(self, lost: "sys.UnraisableHookArgs") -> None:
         if not isinstance(lost.exc_value, KeyboardInterrupt | Ended):
-            former(lost)
+            self._unraisablehook(lost)
             return
         number = lost.exc_value.number if isinstance(lost.exc_value, Ended) else signal.SIGINT
-        repeat(number)  # an exception raised here would be lost again
+        self._repeat(number)  # an exception raised here would be lost again
 
-    handlers = _install(repeat)
-    sys.unraisablehook = hook
-    try:
-        yield
-    finally:
-        sys.unraisablehook = former
-        for timer in repeats:
-            timer.cancel()
-        for number, handler in handlers.items():
-            signal.signal(number, handler)
+    def _repeat(self, number: int) -> None:
+        """Send a signal again later."""
+        timer = threading.Timer(PAUSE, _send, [number])
+        timer.daemon = True
+        self._repeats.append(timer)
+        timer.start()
 
 
 def _send(number: int) -> None:
@@ -75,45 +162,3 @@ def _send(number: int) -> None:
         signal.pthread_kill(main, number)
     else:
         _thread.interrupt_main(signal.Signals(number))
-
-
-def _install(repeat: Callable[[int], None]) -> dict[int, signal.Handlers]:
-    """Replace the handlers of signals that still have Python's own, and return the former handlers.
-
-    Background jobs of a shell ignore SIGINT, jobs under nohup ignore SIGHUP, and a program that runs this one may have
-    its own handlers; those are left unchanged.
-    """
-    if threading.current_thread() is not threading.main_thread():
-        return {}
-    own: dict[int, object] = {signal.SIGINT: signal.default_int_handler, **dict.fromkeys(ENDINGS, signal.SIG_DFL)}
-    replaced = {number: handler for number, handler in own.items() if signal.getsignal(number) is handler}
-    for number in replaced:
-        signal.signal(number, lambda number, frame: _handle(number, frame, repeat))
-    return replaced  # type: ignore[return-value]
-
-
-def _handle(number: int, frame: FrameType | None, repeat: Callable[[int], None]) -> None:
-    """Raise an exception; during an import, which could catch it, end the process or send the signal again later."""
-    files = sys.modules.get("nlfilter_torch.photo.io.writing")
-    if _importing(frame):
-        if getattr(files, "unfinished", None):
-            repeat(number)
-            return
-        if sys.stderr.isatty():
-            sys.stderr.write(SHOW_CURSOR)  # a progress bar hides it
-        if number == signal.SIGINT:
-            tell()
-        sys.stderr.flush()
-        os._exit(128 + number)
-    if number == signal.SIGINT:
-        raise KeyboardInterrupt
-    raise Ended(number)
-
-
-def _importing(frame: FrameType | None) -> bool:
-    """Whether the command line is importing a module; it may itself be run by an import."""
-    while frame is not None and frame.f_globals.get("__name__") != "nlfilter_torch.photo.cli":
-        if frame.f_code.co_filename.startswith("<frozen importlib"):
-            return True
-        frame = frame.f_back
-    return False
