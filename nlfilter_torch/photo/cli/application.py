@@ -34,13 +34,13 @@ class Verb(TyperCommand):
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parse the arguments; raise ValueError if an option is NaN or infinite, BadParameter if it is out of range."""
-        given = list(args)
+        original = list(args)
         try:
             rest = super().parse_args(ctx, args)
         except typer.BadParameter as error:
             if error.param is None or "Input should be" not in error.message:
                 raise
-            value = self.make_parser(ctx).parse_args(given)[0].get(error.param.name or "")
+            value = self.make_parser(ctx).parse_args(original)[0].get(error.param.name or "")
             if isinstance(value, str) and value.strip("+-").lower() in ("nan", "inf", "infinity"):
                 value = float(value)
             _check_finite(error.param.opts[0], value)
@@ -51,7 +51,7 @@ class Verb(TyperCommand):
         return rest
 
 
-def _check_finite(option: str, value: Any) -> None:
+def _check_finite(option: str, value: object) -> None:
     if isinstance(value, float) and not math.isfinite(value):
         raise ValueError(f"{option} must be a finite number, such as 1, got {value}")
 

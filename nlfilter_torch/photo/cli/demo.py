@@ -1,11 +1,17 @@
 """``nlfilter-torch demo``: pictures of each step of the filter on one photograph."""
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import typer
 
 from nlfilter_torch.photo.cli import options
 from nlfilter_torch.photo.cli.inspect import Folder, print_table, summarize
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from torch import Tensor
 
 ALPHA = (3.0, 3.0, 4.0, 1.05)
 SELECTION = (slice(300, 320), slice(60, 80))  # rows and columns of a patch of the astronaut's suit
@@ -33,7 +39,6 @@ def demo(folder: Folder = Path("out")) -> None:
     from nlfilter_torch.photo.picture.colour import edit_luminance
     from nlfilter_torch.photo.plotting import (
         plot_response,
-        save_figure,
         show_eigenvectors,
         show_images,
         show_layers,
@@ -54,22 +59,40 @@ def demo(folder: Folder = Path("out")) -> None:
         figures = summarize(operator, spectrum, luminance)
 
         begin("Selecting a region")
-        region = torch.zeros_like(luminance)
-        region[..., SELECTION[0], SELECTION[1]] = 1
         by_colour = nonlocal_operator(image, photometric_bandwidth=SELECTION_BANDWIDTH, guide_channels="all")
-        mask = diffusion_mask(by_colour.spectrum(), region, time=SELECTION_TIME, width=SELECTION_WIDTH)
+        mask = diffusion_mask(by_colour.spectrum(), select(luminance), time=SELECTION_TIME, width=SELECTION_WIDTH)
 
         begin("Drawing")
         folder.mkdir(exist_ok=True)
         sliders = ", ".join(f"{value:g}" for value in ALPHA)
-        pictures = {
-            "1-before-after": show_images({"Before": image, f"After, alpha = ({sliders})": crisp}),
-            "2-layers": show_layers(detail_layers(operator, luminance)),
-            "3-eigenvectors": show_eigenvectors(spectrum),
-            "4-sliders": plot_response(alpha, spectrum),
-            "5-selection": show_mask(image, region, mask),
-        }
-        for name, figure in pictures.items():
-            save_figure(figure, folder / f"{name}.png")
+        paths = save_figures(
+            folder,
+            {
+                "1-before-after": show_images({"Before": image, f"After, alpha = ({sliders})": crisp}),
+                "2-layers": show_layers(detail_layers(operator, luminance)),
+                "3-eigenvectors": show_eigenvectors(spectrum),
+                "4-sliders": plot_response(alpha, spectrum),
+                "5-selection": show_mask(image, select(luminance), mask),
+            },
+        )
     print_table(figures, "The filter of the astronaut")
-    typer.echo("Pictures: " + ", ".join(str(folder / f"{name}.png") for name in pictures))
+    typer.echo("Pictures: " + ", ".join(map(str, paths)))
+
+
+def select(luminance: "Tensor") -> "Tensor":
+    """The mask of a patch of the astronaut's suit."""
+    import torch
+
+    region = torch.zeros_like(luminance)
+    region[..., SELECTION[0], SELECTION[1]] = 1
+    return region
+
+
+def save_figures(folder: Path, figures: "Mapping[str, Figure]") -> list[Path]:
+    """Save figures in a folder, under their names, and return their paths."""
+    from nlfilter_torch.photo.plotting import save_figure
+
+    paths = [folder / f"{name}.png" for name in figures]
+    for path, figure in zip(paths, figures.values(), strict=True):
+        save_figure(figure, path)
+    return paths

@@ -1,9 +1,11 @@
 """``nlfilter-torch fit``: find the look that turns photographs into edited ones, and save it for others."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from itertools import chain, pairwise
+from operator import itemgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -65,7 +67,7 @@ def fit(
     mask: options.MasksOfPairs = None,
     preview: Preview = None,
     left: Map = None,
-    **given: Any,
+    **values: object,
 ) -> None:
     """Find the look that turns one photograph into another, or a folder of them, whatever program made the edit.
 
@@ -80,18 +82,74 @@ def fit(
 
     `nlfilter-torch fit before.jpg after.jpg look.json --mask sky.png --mask ground.png`
     """
-    step = step_of(EDITS["look"], given)
+    step = step_of(EDITS["look"], values)
 
-    from nlfilter_torch.photo.cli.editing import check_apart, read_masks
     from nlfilter_torch.photo.cli.progress import steps
-    from nlfilter_torch.photo.io.photographs import check_type
-    from nlfilter_torch.photo.io.writing import check_file, open_beside
+    from nlfilter_torch.photo.io.writing import open_beside
     from nlfilter_torch.photo.look_fitting.fit_look import fit_look
 
     paths = _paths(before, after)
     regions = _regions(mask or [], paths, Path(before).is_dir())
     results = [preset.with_stem(f"{preset.stem}-{i + 1}") for i in range(len(mask))] if mask else [preset]
-    inputs = {"photographs": [*chain(*paths)], "mask": [*chain(*regions)]}
+    _check_results(results, preview, left, photographs=[*chain(*paths)], mask=[*chain(*regions)])
+    alone = len(paths) == 1
+    judged = (alone and not mask) or preview is not None or left is not None
+    with steps(len(paths) + 1) as begin:
+        pairs = Pairs(paths, regions, step, begin, keeps_first=judged)
+        fitted = fit_look(iter(pairs), order=layers - 1, step=step)
+        begin("Judging")
+        looks = fitted if isinstance(fitted, tuple) else (fitted,)
+        judgement = None if pairs.first is None else _judged(looks, *pairs.first)
+        if judgement is not None:
+            _draw(*judgement, preview, left)
+        for look, path in zip(looks, results, strict=True):
+            with open_beside(path) as stream:
+                stream.write(look.to_json().encode())
+    whole = judgement if alone and not mask else None
+    for look, path in zip(looks, results, strict=True):
+        _report(look, look.fitted if whole is None else _explained(*whole), path, alone=alone)
+    if whole is not None and pairs.first is not None:
+        _tell_where(*whole, stride=pairs.first[0].shape[-1] / whole[0].shape[-1])
+
+
+@dataclass
+class Pairs:
+    """Pairs of photographs with their masks, read one after the other.
+
+    Attributes:
+        paths: files of the photographs.
+        regions: files of the masks of each pair.
+        step: whose filter looks at them.
+        begin: called with the name of a pair before it is read.
+        keeps_first: whether to keep the first pair.
+        first: the images of the first pair, and their masks if there are any.
+    """
+
+    paths: list[tuple[Path, Path]]
+    regions: list[list[Path]]
+    step: "Step"
+    begin: Callable[[str], None]
+    keeps_first: bool
+    first: "tuple[Tensor, ...] | None" = None
+
+    def __iter__(self) -> "Iterator[tuple[Tensor, ...]]":
+        """Yield the images of each pair, and its masks if there are any."""
+        from nlfilter_torch.photo.cli.editing import read_masks
+
+        for (before, after), masks in zip(self.paths, self.regions, strict=True):
+            self.begin(f"Comparing {after.name}")
+            images = (*_read(before, after, self.step), *([read_masks(masks, before)] if masks else []))
+            if self.keeps_first and self.first is None:
+                self.first = images
+            yield images
+
+
+def _check_results(results: list[Path], preview: Path | None, left: Path | None, **inputs: list[Path]) -> None:
+    """Raise ValueError or OSError unless all files can be written and differ from the inputs."""
+    from nlfilter_torch.photo.cli.editing import check_apart
+    from nlfilter_torch.photo.io.photographs import check_type
+    from nlfilter_torch.photo.io.writing import check_file
+
     for path in results:
         check_file(path)
         if path.suffix.lower() != ".json":
@@ -102,33 +160,6 @@ def fit(
             check_type(picture, "uint8", alpha=False)
             check_apart(option, picture, **inputs)
     check_apart("--map", left, preview=preview)
-    alone = len(paths) == 1
-    judged = (alone and not mask) or preview is not None or left is not None
-    first: list[tuple[Tensor, ...]] = []  # images that are judged, and masks
-    with steps(len(paths) + 1) as begin:
-
-        def pairs() -> "Iterator[tuple[Tensor, ...]]":
-            for pair, masks in zip(paths, regions, strict=True):
-                begin(f"Comparing {pair[1].name}")
-                images = (*_read(*pair, step), *([read_masks(masks, pair[0])] if masks else []))
-                if judged and not first:
-                    first.append(images)
-                yield images
-
-        found = fit_look(pairs(), order=layers - 1, step=step)
-        begin("Judging")
-        looks = found if isinstance(found, tuple) else (found,)
-        seen = [_judged(looks, *images) for images in first]  # of the first pair, if judged
-        for before_and_after in seen:
-            _draw(*before_and_after, preview, left)
-        for look, path in zip(looks, results, strict=True):
-            with open_beside(path) as stream:
-                stream.write(look.to_json().encode())
-    whole = seen[0] if alone and not mask else None
-    for look, path in zip(looks, results, strict=True):
-        _report(look, look.fitted if whole is None else _explained(*whole), path, alone=alone)
-    if whole is not None:
-        _tell_where(*whole, stride=first[0][0].shape[-1] / whole[0].shape[-1])
 
 
 def _paths(before: str, after: str) -> list[tuple[Path, Path]]:
@@ -141,17 +172,17 @@ def _paths(before: str, after: str) -> list[tuple[Path, Path]]:
             f"BEFORE and AFTER must be two photographs or two folders, got {before} and {after}; pass both"
         )
     edited = _pictures(second)
-    found = [(path, pair) for path in _pictures(first) if (pair := _counterpart(path, edited)) is not None]
-    if not found:
+    pairs = [(path, pair) for path in _pictures(first) if (pair := _counterpart(path, edited)) is not None]
+    if not pairs:
         raise ValueError(f"{after} must hold photographs of the names of those in {before}, got none; rename them")
-    for (path, pair), (other, same) in pairwise(sorted(found, key=lambda each: each[1])):
+    for (path, pair), (other, same) in pairwise(sorted(pairs, key=itemgetter(1))):
         if pair == same:
             raise ValueError(
                 f"{before} must hold one photograph for {pair}, got {path.name} and {other.name}; remove one of them"
             )
-    _note_unpaired(first, {path.stem for _, path in found})
-    _note_unpaired(second, {path.stem for path, _ in found})
-    return found
+    _note_unpaired(first, {path.stem for _, path in pairs})
+    _note_unpaired(second, {path.stem for path, _ in pairs})
+    return pairs
 
 
 def _note_unpaired(folder: Path, paired: set[str]) -> None:
@@ -163,8 +194,8 @@ def _note_unpaired(folder: Path, paired: set[str]) -> None:
 
 
 def _regions(masks: list[Path], paths: list[tuple[Path, Path]], folders: bool) -> list[list[Path]]:
-    """The files of the masks of every pair: these, or those in these folders under the names of the photographs."""
-    found: list[list[Path]] = [[] for _ in paths]
+    """The mask files of every pair: the same for all, or those in folders under the names of the photographs."""
+    regions: list[list[Path]] = [[] for _ in paths]
     for mask in masks:
         if mask.is_dir() != folders:
             wanted = (
@@ -173,7 +204,7 @@ def _regions(masks: list[Path], paths: list[tuple[Path, Path]], folders: bool) -
             remedy = "put the masks in a folder under the names of the photographs" if folders else "name a file in it"
             raise ValueError(f"--mask must name {wanted}, got {mask}; {remedy}")
         named = _pictures(mask) if folders else []
-        for files, (photograph, _) in zip(found, paths, strict=True):
+        for files, (photograph, _) in zip(regions, paths, strict=True):
             own = _counterpart(photograph, named) if folders else mask
             if own is None:
                 raise ValueError(
@@ -181,7 +212,7 @@ def _regions(masks: list[Path], paths: list[tuple[Path, Path]], folders: bool) -
                     "over if the region is not in the photograph"
                 )
             files.append(own)
-    return found
+    return regions
 
 
 def _pictures(folder: Path) -> list[Path]:
@@ -191,18 +222,18 @@ def _pictures(folder: Path) -> list[Path]:
 
 
 def _counterpart(path: Path, others: Sequence[Path]) -> Path | None:
-    """The one of these files that has the name of a photograph, or if none has, the name but for its suffix.
+    """The file with the name of a photograph or, if there is none, with that name and another suffix.
 
     Raises:
         ValueError: if several differ from it in the suffix only.
     """
-    found = [other for other in others if other.stem == path.stem]
-    if len(found) > 1 and path.name not in {other.name for other in found}:
-        names = " and ".join(other.name for other in found)
+    matches = [other for other in others if other.stem == path.stem]
+    if len(matches) > 1 and path.name not in {other.name for other in matches}:
+        names = " and ".join(other.name for other in matches)
         raise ValueError(
-            f"{found[0].parent} must hold one photograph of the name of {path.name}, got {names}; remove all but one"
+            f"{matches[0].parent} must hold one photograph of the name of {path.name}, got {names}; remove all but one"
         )
-    return next((other for other in found if other.name == path.name), found[0] if found else None)
+    return next((other for other in matches if other.name == path.name), matches[0] if matches else None)
 
 
 def _read(before: Path, after: Path, step: "Step") -> "tuple[Tensor, Tensor]":
@@ -228,7 +259,7 @@ def _read(before: Path, after: Path, step: "Step") -> "tuple[Tensor, Tensor]":
 def _judged(
     looks: "Sequence[FittedLook]", image: "Tensor", edited: "Tensor", masks: "Tensor | None" = None
 ) -> "tuple[Tensor, Tensor, Tensor]":
-    """A pair at the viewing size, and what the looks make of the photograph, each in its region."""
+    """A pair at the viewing size, and the result of the looks, each in its region."""
     from nlfilter_torch.photo.picture.changes import blend_edited
     from nlfilter_torch.photo.picture.resizing import resize
     from nlfilter_torch.photo.picture.viewing import viewed_size
@@ -238,17 +269,17 @@ def _judged(
     if size != whole:
         image, edited = (resize(planes, size).clamp(0, 1) for planes in (image, edited))
         masks = None if masks is None else resize(masks, size).clamp(0, 1)
-    found = [look.apply(image).clamp(0, 1) for look in looks]
-    return image, edited, found[0] if masks is None else blend_edited(image, found, masks)
+    results = [look.apply(image).clamp(0, 1) for look in looks]
+    return image, edited, results[0] if masks is None else blend_edited(image, results, masks)
 
 
-def _explained(before: "Tensor", after: "Tensor", found: "Tensor") -> float:
-    """Share of the change's energy, 1 at best, without a frame around the picture."""
+def _explained(before: "Tensor", after: "Tensor", result: "Tensor") -> float:
+    """Share of the energy of the change that a result explains, 1 at best, without a frame around the picture."""
     from nlfilter_torch.photo.look_fitting.alignment import inside_frame
 
     shown = inside_frame(before[0], after[0])
-    before, after, found = (image[..., shown] for image in (before, after, found))
-    rest, change = ((after.double() - image.double()).square().sum() for image in (found, before))
+    before, after, result = (image[..., shown] for image in (before, after, result))
+    rest, change = ((after.double() - image.double()).square().sum() for image in (result, before))
     return 1.0 - float(rest / change)
 
 
@@ -269,18 +300,17 @@ def _report(look: "FittedLook", share: float, path: Path, *, alone: bool) -> Non
     typer.echo(f"preset: {path}")
 
 
-def _tell_where(before: "Tensor", after: "Tensor", found: "Tensor", stride: float) -> None:
-    """Say where what is left is, if it is in a few places; ``stride`` is the size of their pixels in the photograph."""
+def _tell_where(before: "Tensor", after: "Tensor", result: "Tensor", stride: float) -> None:
+    """Say where the rest of the change is, if it is in a few places; a pixel is ``stride`` pixels of the photograph."""
     from torch.nn.functional import avg_pool2d
 
     from nlfilter_torch.photo.look_fitting.alignment import inside_frame
 
-    rest = (after - found).square().mean(1, keepdim=True) * inside_frame(before[0], after[0])
+    rest = (after - result).square().mean(1, keepdim=True) * inside_frame(before[0], after[0])
     rest = avg_pool2d(rest, SQUARE, ceil_mode=True)[0, 0]
-    if _explained(before, after, found) > ENOUGH or rest.numel() < 1 / FEW:
+    if _explained(before, after, result) > ENOUGH or rest.numel() < 1 / FEW:
         return
-    some = max(1, int(FEW * rest.numel()))
-    largest = rest.flatten().topk(some)
+    largest = rest.flatten().topk(max(1, int(FEW * rest.numel())))
     if float(largest.values.sum() / rest.sum()) < MOST:
         return
     place = int(largest.indices[0])
@@ -291,15 +321,15 @@ def _tell_where(before: "Tensor", after: "Tensor", found: "Tensor", stride: floa
     )
 
 
-def _draw(before: "Tensor", after: "Tensor", found: "Tensor", preview: Path | None, left: Path | None) -> None:
+def _draw(before: "Tensor", after: "Tensor", result: "Tensor", preview: Path | None, left: Path | None) -> None:
     """Write the preview and the map of what is left."""
     import torch
 
     from nlfilter_torch.photo.io.photographs import Photograph, write_photograph
 
     if preview is not None:
-        rest = (0.5 + AMPLIFIED * (after - found)).clamp(0, 1)
-        write_photograph(Photograph(torch.cat([before, after, found, rest], dim=3)), preview)
+        rest = (0.5 + AMPLIFIED * (after - result)).clamp(0, 1)
+        write_photograph(Photograph(torch.cat([before, after, result, rest], dim=3)), preview)
     if left is not None:
-        rest = (after - found).abs().amax(1, keepdim=True)
+        rest = (after - result).abs().amax(1, keepdim=True)
         write_photograph(Photograph(rest / rest.amax().clamp(min=1e-6)), left)

@@ -12,6 +12,7 @@ import warnings
 from collections import Counter
 from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 from nlfilter_torch.photo.cli.options import NOTE
@@ -24,7 +25,8 @@ FRAMES_RECORD = ".nlfilter-frames.json"  # in that of ``frames``: the names of t
 
 DIED = "the process that worked on it died; use fewer --workers, so that each has more memory, or check the file"
 
-Edit = Callable[[str, str], object]  # from the name of the input to that of the output; can be pickled
+Edit = Callable[[str, str], object]  # edits the file of the first name to that of the second; can be pickled
+Outcome = list[str] | str  # warnings of a file that was edited, or why it could not be edited
 
 
 @dataclass
@@ -168,7 +170,7 @@ def edit_folder(
     with (
         contextlib.ExitStack() as afterwards,
         worker_pool(cluster, min(workers, len(jobs)), threads) as pool,
-        contextlib.closing(_outcomes(jobs, target, edit, pool)) as ended,
+        contextlib.closing(_Work(target, edit, pool).outcomes(jobs)) as ended,
     ):
         afterwards.callback(remove_stale, target, names)  # of workers that were ended by an interrupt
         for path, outcome in ended:
@@ -187,26 +189,44 @@ def edit_folder(
                 return
 
 
-def _outcomes(
-    jobs: Sequence[Path], target: Path, edit: Edit, workers: Workers
-) -> Generator[tuple[Path, list[str] | str]]:
-    """Each job with its warnings or why it failed, as they end.
+@dataclass(frozen=True)
+class _Work:
+    """The same edit of several files by worker processes."""
 
-    When a worker dies, joblib ends the others, too. Files are begun in their order, so that one of the first that have
-    not ended is the cause. Each of these is then worked on alone.
-    """
-    from joblib import delayed
+    target: Path
+    edit: Edit
+    workers: Workers
 
-    def run(paths: Sequence[Path]) -> Generator[tuple[Path, list[str] | str]]:
-        calls = [delayed(_work)(edit, path, target / path.name) for path in paths]
-        return workers.run(calls)
+    def outcomes(self, jobs: Sequence[Path]) -> Generator[tuple[Path, Outcome]]:
+        """Yield each file with its outcome, as they end.
 
-    def alone(path: Path) -> tuple[Path, list[str] | str]:
-        if (target / path.name).exists():  # it had ended
-            return path, []
-        if workers.number > 1:
+        When a worker dies, joblib ends the others, too. Files are begun in their order, so that one of the first that
+        have not ended is the cause. Each of these is then worked on alone.
+        """
+        waiting = dict.fromkeys(jobs)
+        while waiting:
             try:
-                (outcome,) = run([path])
+                with contextlib.closing(self._run(list(waiting))) as ended:
+                    for path, outcome in ended:
+                        del waiting[path]
+                        yield path, outcome
+            except Exception as error:
+                if not is_death(error):
+                    raise
+                for path in list(waiting)[: self.workers.number]:
+                    del waiting[path]
+                    yield self._alone(path)
+
+    def _run(self, paths: Sequence[Path]) -> Generator[tuple[Path, Outcome]]:
+        return self.workers.run([partial(_edit_file, self.edit, path, self.target / path.name) for path in paths])
+
+    def _alone(self, path: Path) -> tuple[Path, Outcome]:
+        """Edit a file while no worker works on another one."""
+        if (self.target / path.name).exists():  # it had ended
+            return path, []
+        if self.workers.number > 1:
+            try:
+                (outcome,) = self._run([path])
             except Exception as error:
                 if not is_death(error):
                     raise
@@ -214,22 +234,8 @@ def _outcomes(
                 return outcome
         return path, DIED
 
-    waiting = dict.fromkeys(jobs)
-    while waiting:
-        try:
-            with contextlib.closing(run(list(waiting))) as ended:
-                for path, outcome in ended:
-                    del waiting[path]
-                    yield path, outcome
-        except Exception as error:
-            if not is_death(error):
-                raise
-            for path in list(waiting)[: workers.number]:
-                del waiting[path]
-                yield alone(path)
 
-
-def _work(edit: Edit, source: Path, target: Path) -> tuple[Path, list[str] | str]:
+def _edit_file(edit: Edit, source: Path, target: Path) -> tuple[Path, Outcome]:
     """Edit one file in a worker; return its name, and its notes and warnings or why it failed."""
     printed = io.StringIO()
     with warnings.catch_warnings(record=True) as caught, contextlib.redirect_stderr(printed):

@@ -1,8 +1,9 @@
 """``nlfilter-torch frames``: one edit for all frames of a film, without flicker."""
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -19,7 +20,8 @@ from nlfilter_torch.photo.declared.parameters import EDITS
 from nlfilter_torch.photo.declared.presets import PRESETS, Recipe
 
 if TYPE_CHECKING:
-    from nlfilter_torch.photo.tiled.film import FilmEdit
+    from nlfilter_torch.photo.io.photographs import Photograph
+    from nlfilter_torch.photo.tiled.film import FilmEdit, FrameArray
 
 #: Edits without scribbles.
 EDITS_WITHOUT_STROKES = tuple(edit for edit in EDITS.values() if not edit.requires_strokes)
@@ -76,7 +78,7 @@ def frames(
     seed: options.Seed = 0,
     preset: Preset = None,
     memory: options.Memory = None,
-    **given: Any,
+    **values: object,
 ) -> None:
     """Edit all frames of a film alike, without flicker.
 
@@ -91,7 +93,7 @@ def frames(
 
     Another edit: `nlfilter-torch frames film.mp4 edited.mp4 --edit denoise --noise-level 8`
     """
-    recipe = chosen_recipe(context, edit, preset, given)
+    recipe = chosen_recipe(context, edit, preset, values)
 
     from nlfilter_torch.photo.cli.editing import allowed_memory
     from nlfilter_torch.photo.cli.showing import note_idle
@@ -104,39 +106,36 @@ def frames(
     note_idle(recipe, preset or f"--edit {edit}")
     passes = Passes("float32", memory=allowed_memory(memory, TILED))
 
-    def fit(samples: list[Any]) -> FilmEdit:
-        return FilmEdit(recipe.steps, samples, passes, seed=seed)
-
     work = edit_film if is_film(source) and not source.is_dir() else edit_folder
-    count = work(source, target, references, fit)
+    count = work(source, target, references, partial(FilmEdit, recipe.steps, passes=passes, seed=seed))
     typer.echo(f"{count} frames in {target}")
 
 
-def chosen_recipe(context: typer.Context, name: str, preset: str | None, given: dict[str, Any]) -> Recipe:
-    """Create the edit from options.
+def chosen_recipe(context: typer.Context, name: str, preset: str | None, values: dict[str, object]) -> Recipe:
+    """Create the edit from the values of options.
 
     Raises:
         ValueError: if an option does not belong to the edit.
     """
-    if preset is not None and (recipe := other_recipe(context, preset, (*given, "edit"))) is not None:
+    if preset is not None and (recipe := other_recipe(context, preset, (*values, "edit"))) is not None:
         return recipe
     if name not in {edit.name for edit in EDITS_WITHOUT_STROKES}:
         names = ", ".join(edit.name for edit in EDITS_WITHOUT_STROKES)
         raise ValueError(f"--edit must be one of {names}, got {name!r}; choose one of these")
     if preset is not None and name != "detail":
         raise ValueError(f"--edit must not be given together with --preset, got {name} and {preset}; drop one of them")
-    own, declared = typed_options(context, given), {parameter.name for parameter in EDITS[name]}
+    own, declared = typed_options(context, values), {parameter.name for parameter in EDITS[name]}
     other = next((option for option in own if option not in declared), None)
     if other is not None:
         edits = " or ".join(edit.name for edit in EDITS_WITHOUT_STROKES if other in {p.name for p in edit})
         raise ValueError(
             f"--{other.replace('_', '-')} must be used with --edit {edits}, got --edit {name}; drop it or change --edit"
         )
-    mine = given if name == "detail" else {option: given[option] for option in own}
-    return Recipe((step_of(EDITS[name], mine),))
+    edit_values = values if name == "detail" else {option: values[option] for option in own}
+    return Recipe((step_of(EDITS[name], edit_values),))
 
 
-def edit_film(source: Path, target: Path, references: int, fit: "Callable[[list[Any]], FilmEdit]") -> int:
+def edit_film(source: Path, target: Path, references: int, fit: "Callable[[list[FrameArray]], FilmEdit]") -> int:
     """Edit a film, and return the number of its frames."""
     from nlfilter_torch.photo.cli.progress import steps
     from nlfilter_torch.photo.io.films import check_film_output, open_film, write_film
@@ -148,14 +147,31 @@ def edit_film(source: Path, target: Path, references: int, fit: "Callable[[list[
         return write_film(film, target, edit, lambda number: begin(f"Frame {number + 1} of {film.count}"))
 
 
-def edit_folder(source: Path, target: Path, references: int, fit: "Callable[[list[Any]], FilmEdit]") -> int:
+def edit_folder(source: Path, target: Path, references: int, fit: "Callable[[list[FrameArray]], FilmEdit]") -> int:
     """Edit the photographs in a folder, and return their number."""
     import torch
 
-    from nlfilter_torch.photo.cli.folders import check_replaced, pictures, record_written
+    from nlfilter_torch.photo.cli.folders import check_replaced
     from nlfilter_torch.photo.cli.progress import steps
+
+    paths = frames_of(source, target)
+    folder, reader = EditedFrames(target, check_replaced(paths, target)), FrameReader()
+    with steps(len(paths) + 1) as begin:
+        begin("Fitting to sample frames")
+        spread = torch.linspace(0, len(paths) - 1, min(references, len(paths))).round().long().tolist()
+        edit = fit([reader(paths[i])[1] for i in spread])
+        for path in paths:
+            begin(path.name)
+            photograph, rows = reader(path)
+            folder.prepare(photograph, path.name, paths)
+            folder.write(photograph, edit(rows), path.name)
+    return len(paths)
+
+
+def frames_of(source: Path, target: Path) -> list[Path]:
+    """The photographs in a folder, of which edited ones can be written to another folder."""
+    from nlfilter_torch.photo.cli.folders import pictures
     from nlfilter_torch.photo.io.films import is_film
-    from nlfilter_torch.photo.io.photographs import check_output, read_photograph, write_photograph
     from nlfilter_torch.photo.io.writing import check_folder
 
     if source.is_file():
@@ -166,39 +182,59 @@ def edit_folder(source: Path, target: Path, references: int, fit: "Callable[[lis
     if is_film(target) and not target.is_dir():
         raise ValueError(f"OUT must be a folder, as FRAMES is one, got {target}; choose the name of a folder")
     check_folder(target)
-    is_new, written = not target.exists(), check_replaced(paths, target)
-    first: tuple[int, ...] = ()
+    return paths
 
-    def read(path: Path) -> tuple[Any, Any]:
-        nonlocal first
+
+class FrameReader:
+    """Reads photographs, which must have the size and channels of the first of them."""
+
+    def __init__(self) -> None:
+        self._shape: tuple[int, ...] = ()
+
+    def __call__(self, path: Path) -> "tuple[Photograph, FrameArray]":
+        """A photograph, and its pixels (H, W, C)."""
+        from nlfilter_torch.photo.io.photographs import read_photograph
+
         photograph = read_photograph(path, bytes_per_pixel=BYTES_PER_PIXEL)
         rows = photograph.pixels[0].permute(1, 2, 0).float().contiguous().numpy()
-        first = first or rows.shape
-        if rows.shape != first:
-            wanted, got = (
-                f"{height}x{width} and {colours} channel(s)" for height, width, colours in (first, rows.shape)
+        self._shape = self._shape or rows.shape
+        if rows.shape != self._shape:
+            expected, actual = (
+                f"{height}x{width} and {colours} channel(s)" for height, width, colours in (self._shape, rows.shape)
             )
             raise ValueError(
-                f"{path} must have the size and channels of the first frame, {wanted}, got {got}; convert it"
+                f"{path} must have the size and channels of the first frame, {expected}, got {actual}; convert it"
             )
         return photograph, rows
 
-    with steps(len(paths) + 1) as begin:
-        begin("Fitting to sample frames")
-        spread = torch.linspace(0, len(paths) - 1, min(references, len(paths))).round().long().tolist()
-        edit = fit([read(paths[i])[1] for i in spread])
-        for number, path in enumerate(paths):
-            begin(path.name)
-            photograph, rows = read(path)
-            target.mkdir(exist_ok=True)
-            try:
-                check_output(target / path.name, photograph)
-            except ValueError:
-                if number == 0 and is_new:
-                    target.rmdir()
-                raise
-            if number == 0:
-                record_written(target, written | {path.name for path in paths})
-            edited = torch.from_numpy(edit(rows)).permute(2, 0, 1)[None]
-            write_photograph(photograph.with_pixels(edited), target / path.name)
-    return len(paths)
+
+class EditedFrames:
+    """The folder of the edited frames; ``written`` are the names of files that an earlier run wrote there."""
+
+    def __init__(self, folder: Path, written: set[str]) -> None:
+        self._folder, self._written = folder, written
+        self._is_new, self._is_begun = not folder.exists(), False
+
+    def prepare(self, photograph: "Photograph", name: str, paths: list[Path]) -> None:
+        """Create the folder, record the names of all frames there, and check that it can hold a photograph."""
+        from nlfilter_torch.photo.cli.folders import record_written
+        from nlfilter_torch.photo.io.photographs import check_output
+
+        self._folder.mkdir(exist_ok=True)
+        try:
+            check_output(self._folder / name, photograph)
+        except ValueError:
+            if self._is_new and not self._is_begun:
+                self._folder.rmdir()
+            raise
+        if not self._is_begun:
+            record_written(self._folder, self._written | {path.name for path in paths})
+        self._is_begun = True
+
+    def write(self, photograph: "Photograph", rows: "FrameArray", name: str) -> None:
+        """Write a photograph with other pixels (H, W, C)."""
+        import torch
+
+        from nlfilter_torch.photo.io.photographs import write_photograph
+
+        write_photograph(photograph.with_pixels(torch.from_numpy(rows).permute(2, 0, 1)[None]), self._folder / name)

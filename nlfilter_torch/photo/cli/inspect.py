@@ -3,7 +3,7 @@
 import json
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -41,7 +41,7 @@ MEANINGS = {
 
 
 @with_options("alpha", "bandwidth", "spatial_bandwidth", "patch_size", "landmarks", "sampling", "viewing_size")
-def inspect(source: options.Source, folder: Folder, seed: options.Seed = 0, **given: Any) -> None:
+def inspect(source: options.Source, folder: Folder, seed: options.Seed = 0, **values: object) -> None:
     """Show the filter of a photograph: the patterns it finds, how strong they are, and how sliders change them.
 
     Writes eigenvectors.png, eigenvalues.png, response.png and diagnostics.json into a folder and prints a table. A
@@ -49,7 +49,7 @@ def inspect(source: options.Source, folder: Folder, seed: options.Seed = 0, **gi
 
     Example: `nlfilter-torch inspect in.jpg looks --alpha 3,3,4,1.05`
     """
-    step = step_of(EDITS["detail"], given)
+    step = step_of(EDITS["detail"], values)
 
     import torch
 
@@ -93,8 +93,8 @@ def build_operator(guide: "Tensor", step: "Step", seed: int = 0) -> "NonlocalOpe
     return operator_from_guide(guide, OperatorOptions(**parameters, generator=seeded(seed)))
 
 
-def summarize(operator: "NonlocalOperator", spectrum: "Spectrum", guide: "Tensor") -> dict[str, Any]:
-    """The diagnostics of one image as plain numbers, bandwidth in grey levels."""
+def summarize(operator: "NonlocalOperator", spectrum: "Spectrum", guide: "Tensor") -> dict[str, float]:
+    """The diagnostics of an operator of a single image as plain numbers, with the bandwidth in grey levels."""
     from nlfilter_torch.filtering.filters import captured_energy
 
     figures = {
@@ -113,7 +113,7 @@ def summarize(operator: "NonlocalOperator", spectrum: "Spectrum", guide: "Tensor
     }
 
 
-def print_table(figures: dict[str, Any], title: str) -> None:
+def print_table(figures: dict[str, float], title: str) -> None:
     """Print diagnostics with the meaning of each."""
     from rich.console import Console
     from rich.table import Table

@@ -6,7 +6,7 @@ at once.
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -149,12 +149,12 @@ Cluster = Annotated[
 ]
 
 
-def _file(name: str, help: str) -> Any:
+def _file(name: str, help: str) -> object:
     """An option for a file."""
     return Annotated[Path | None, typer.Option(name, metavar="FILE", help=help)]
 
 
-def _rectangles(name: str, metavar: str, help: str) -> Any:
+def _rectangles(name: str, metavar: str, help: str) -> object:
     """An option for rectangles, which may be given several times."""
     return Annotated[list[str] | None, typer.Option(name, metavar=metavar, help=help)]
 

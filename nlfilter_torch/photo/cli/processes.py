@@ -2,23 +2,23 @@
 
 The edit is fitted in one process. The result, a :class:`~nlfilter_torch.photo.tiled.tiles.Tiling`, is written to a file
 in the folder of the new array. A worker reads it, opens the picture and the array, computes some rows, and writes the
-chunks that they make up. Rows that a dead worker had begun are computed again by another one. Workers need to see the
-folders under the same names; pixels do not pass through the process that fits.
+chunks that they make up. If a worker dies, another one computes its rows again. Workers need to see the folders under
+the same names; pixels do not pass through the process that fits.
 """
 
 import pickle
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from tempfile import gettempdir
-from typing import Any
 
 from nlfilter_torch.photo.cli.workers import DEATHS, Workers, is_death, worker_pool
 from nlfilter_torch.photo.io.rows import ZarrRows, write_band, zarr_package
 from nlfilter_torch.photo.io.writing import claimed, part_beside
 from nlfilter_torch.photo.tiled.pictures import RowSource
-from nlfilter_torch.photo.tiled.tiles import Tiling
+from nlfilter_torch.photo.tiled.tiles import Comparison, Tiling
 
 TASK_PIXELS = 1 << 20  # that a worker computes before it is given others, if there are enough of them
 TASKS = 4  # per worker at least, so that they end at about the same time
@@ -31,7 +31,7 @@ class ZarrProcesses:
     """Worker processes of joblib.
 
     Attributes:
-        workers: processes that joblib's calls run in.
+        workers: processes of joblib.
         cluster: address of their cluster; None is this machine.
     """
 
@@ -85,13 +85,11 @@ class ZarrProcesses:
                 self.fill(tiling, beside)
                 yield ZarrRows(beside)
 
-    def _outcomes(self, path: Path, parts: list[range]) -> Iterator[tuple[range, list[Any]]]:
-        """Each range of rows as it is finished, with results for :meth:`Tiling.note`."""
-        from joblib import delayed
-
+    def _outcomes(self, path: Path, parts: list[range]) -> Iterator[tuple[range, list[Comparison]]]:
+        """Yield each range of rows as it is finished, with the comparisons for :meth:`Tiling.note`."""
         waiting, deaths = dict.fromkeys(parts), 0
         while waiting:
-            calls = [delayed(compute)(path, part) for part in waiting]
+            calls = [partial(compute, path, part) for part in waiting]
             try:
                 with closing(self.workers.run(calls)) as ended:
                     for part, comparisons in ended:
@@ -109,8 +107,8 @@ class ZarrProcesses:
                     ) from error
 
 
-def compute(path: Path, rows: range) -> tuple[range, list[Any]]:
-    """Compute some rows and write them to the array in a folder, chunk by chunk; runs in a worker."""
+def compute(path: Path, rows: range) -> tuple[range, list[Comparison]]:
+    """Compute a range of rows and write it to the array in a folder, chunk by chunk; runs in a worker."""
     if not (path / JOB).exists():
         raise ValueError(
             f"{path.parent} must be seen by all workers under this name, but one of them finds no file {JOB} there; "
@@ -118,12 +116,12 @@ def compute(path: Path, rows: range) -> tuple[range, list[Any]]:
         )
     with (path / JOB).open("rb") as stream:
         tiling: Tiling = pickle.load(stream)
-    array, found = zarr_package().open_array(path, mode="r+"), []
+    array, comparisons = zarr_package().open_array(path, mode="r+"), list[Comparison]()
     for start in range(rows.start, rows.stop, array.chunks[0]):
-        values, comparisons = tiling.part(start, min(start + array.chunks[0], rows.stop))
+        values, part_comparisons = tiling.part(start, min(start + array.chunks[0], rows.stop))
         write_band(array, start, values)
-        found += comparisons
-    return rows, found
+        comparisons += part_comparisons
+    return rows, comparisons
 
 
 @contextmanager

@@ -4,6 +4,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 
 from rich.console import Console
 from rich.progress import (
@@ -11,6 +12,7 @@ from rich.progress import (
     Progress,
     ProgressColumn,
     SpinnerColumn,
+    TaskID,
     TaskProgressColumn,
     TextColumn,
     TimeElapsedColumn,
@@ -33,14 +35,7 @@ def _bar(*columns: ProgressColumn) -> Progress:
 def _lines(wanted: bool) -> Iterator[progress.Progress]:
     """Print progress every few seconds from a thread, if ``wanted``."""
     current, ended = progress.Progress(), threading.Event()
-
-    def tell() -> None:
-        while not ended.wait(PAUSE):
-            if text := str(current):
-                sys.stderr.write(f"{text}\n")
-                sys.stderr.flush()
-
-    thread = threading.Thread(target=tell, daemon=True)
+    thread = threading.Thread(target=_print_lines, args=(current, ended), daemon=True)
     if wanted:
         thread.start()
     try:
@@ -51,6 +46,40 @@ def _lines(wanted: bool) -> Iterator[progress.Progress]:
             thread.join()
 
 
+def _print_lines(current: progress.Progress, ended: threading.Event) -> None:
+    while not ended.wait(PAUSE):
+        if text := str(current):
+            sys.stderr.write(f"{text}\n")
+            sys.stderr.flush()
+
+
+@dataclass(frozen=True)
+class _Shown:
+    """Progress that is shown by a bar, or printed as lines.
+
+    Attributes:
+        bar: the bar.
+        task: its only task.
+        lines: what the lines say.
+    """
+
+    bar: Progress
+    task: TaskID
+    lines: progress.Progress
+
+    def begin(self, name: str) -> None:
+        """End the current step, and begin the one of that name."""
+        self.bar.update(self.task, description=name, advance=1)
+        self.lines.begin(name)
+
+    def report(self, stage: str, done: int, total: int) -> None:
+        """Show how much of a stage is done."""
+        if stage != self.bar.tasks[0].description:
+            self.bar.reset(self.task, description=stage)
+        self.bar.update(self.task, completed=done, total=total)
+        self.lines(stage, done, total)
+
+
 @contextmanager
 def steps(total: int, *, lines: bool = True) -> Iterator[Callable[[str], None]]:
     """Show a bar of ``total`` steps; yield a function that ends the current step and begins the one of a given name.
@@ -59,13 +88,7 @@ def steps(total: int, *, lines: bool = True) -> Iterator[Callable[[str], None]]:
     """
     columns = (SpinnerColumn(), TextColumn("{task.description}", markup=False), BarColumn(), TimeElapsedColumn())
     with _bar(*columns) as bar, _lines(bar.disable and lines) as current:
-        task = bar.add_task("", total=total, completed=-1)
-
-        def begin(name: str) -> None:
-            bar.update(task, description=name, advance=1)
-            current.begin(name)
-
-        yield begin
+        yield _Shown(bar, bar.add_task("", total=total, completed=-1), current).begin
 
 
 @contextmanager
@@ -73,12 +96,4 @@ def stages() -> Iterator[Callable[[str, int, int], None]]:
     """Show a bar that restarts with every stage; yield a function of the stage, the amount done and the total."""
     columns = (TextColumn("{task.description}", markup=False), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
     with _bar(*columns) as bar, _lines(bar.disable) as lines:
-        task = bar.add_task("")
-
-        def report(stage: str, done: int, total: int) -> None:
-            if stage != bar.tasks[0].description:
-                bar.reset(task, description=stage)
-            bar.update(task, completed=done, total=total)
-            lines(stage, done, total)
-
-        yield report
+        yield _Shown(bar, bar.add_task(""), lines).report

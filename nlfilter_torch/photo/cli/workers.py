@@ -9,10 +9,10 @@ import signal
 import threading
 import time
 import warnings
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
-from typing import Any
+from typing import TypeVar
 
 import psutil
 
@@ -20,18 +20,21 @@ CONNECTING = 30  # seconds for a cluster to answer
 DEATHS = 3  # per worker and in a row: after so many deaths the cause is not in the work
 PAUSE = 0.5  # seconds between two looks at the main process
 
+Result = TypeVar("Result")
+
 
 @dataclass(frozen=True)
 class Workers:
-    """Processes that joblib's calls run in; ``number`` is how many there are."""
+    """Worker processes of joblib; ``number`` is how many there are."""
 
     number: int
 
-    def run(self, calls: Sequence[Any]) -> Generator[Any]:
-        """Results of calls that are made with ``joblib.delayed``, in any order; calls begin in their order."""
-        from joblib import Parallel
+    def run(self, calls: Sequence[Callable[[], Result]]) -> Generator[Result]:
+        """Results of calls in the workers, as they end; calls begin in their order."""
+        from joblib import Parallel, delayed
 
-        yield from Parallel(return_as="generator_unordered", pre_dispatch=self.number, batch_size=1)(calls)
+        parallel = Parallel(return_as="generator_unordered", pre_dispatch=self.number, batch_size=1)
+        yield from parallel([delayed(call)() for call in calls])
 
 
 @contextlib.contextmanager
@@ -56,12 +59,17 @@ def _of_this_machine(workers: int, threads: int) -> Iterator[Workers]:
     import joblib
     from joblib.externals.loky import get_reusable_executor
 
-    # With one, joblib would work in this process, which must outlive the work; a second one stays idle then.
+    # With a single worker, joblib would work in this process, which must outlive the work; a second one stays idle.
     done = False
-    options: dict[str, Any] = {"n_jobs": max(2, workers), "inner_max_num_threads": threads}
     try:
         with (
-            joblib.parallel_config("loky", initializer=be_worker, initargs=(os.getpid(),), **options),
+            joblib.parallel_config(
+                "loky",
+                n_jobs=max(2, workers),
+                inner_max_num_threads=threads,
+                initializer=be_worker,
+                initargs=(os.getpid(),),
+            ),
             warnings.catch_warnings(),
         ):
             warnings.filterwarnings("ignore", "A worker stopped")  # joblib replaces those that grew by 300 MB
@@ -88,7 +96,7 @@ def _of_dask(address: str) -> Iterator[Workers]:
 
 
 def is_death(error: Exception) -> bool:
-    """Whether a worker died; Dask tries a task on several of them before it says so."""
+    """Whether an error means that a worker died; Dask tries a task on several workers before it says so."""
     return isinstance(error, BrokenProcessPool) or type(error).__name__ == "KilledWorker"
 
 
