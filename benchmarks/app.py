@@ -171,7 +171,7 @@ def files(path: Path) -> None:
 
 def in_the_browser(path: Path) -> None:
     """From the pointer's move to the picture in the page."""
-    from tests.app.browser import Editor, Tab, chromium
+    from tests.browser import Editor, Tab, chromium
 
     editor = Editor(path.parent, path.name, threads=torch.get_num_threads())
     try:

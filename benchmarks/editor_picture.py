@@ -14,7 +14,7 @@ import torch
 from playwright.sync_api import Browser
 
 from nlfilter_torch.photo.io.photographs import Photograph, write_photograph
-from tests.app.browser import Editor, Tab, by_finger, chromium
+from tests.browser import Editor, Tab, by_finger, chromium
 
 QUALITY = 85
 QUIET = 5000  # milliseconds until the photograph has been edited at its full size

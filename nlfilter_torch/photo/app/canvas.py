@@ -172,14 +172,16 @@ class Canvas:
 
     def draw_strokes(self) -> None:
         """Show the strokes of the step and the one being drawn, unless strokes are hidden."""
+        if self._session is None:
+            return
         strokes: tuple[Stroke, ...] = ()
-        if self._session is not None and self._show_strokes.value:
+        if self._show_strokes.value:
             strokes = self._session.recipe.last(self._step).strokes
             if self._line:
                 height, width = self._preview_size
                 points = tuple((x / width, y / height) for x, y in self._line)
                 strokes += (Stroke(points, self._brush.radius[self._step], self._brush.paint(self._step)),)
-            self._photo.set_content(drawing.strokes_svg(strokes, self._preview_size))
+        self._photo.set_content(drawing.strokes_svg(strokes, self._preview_size))
 
     def _pointer(self, kind: str, x: float, y: float) -> None:
         """Begin, continue or end a stroke."""

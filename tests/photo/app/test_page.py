@@ -1,16 +1,176 @@
-"""The files of the editor's page: the functions of its script, and that a wheel holds them."""
+"""The editor's page without a browser, and its files: the functions of its script, and that a wheel holds them."""
 
+import asyncio
 import shutil
 import subprocess
 import zipfile
+from collections.abc import Awaitable, Iterator
 from pathlib import Path
 
 import pytest
+from nicegui import Client, background_tasks, ui
 
-from nlfilter_torch.photo.app.page import SCRIPTS, STATIC, STATIC_ADDRESS
+from nlfilter_torch.photo.app import drawing
+from nlfilter_torch.photo.app.library import Library
+from nlfilter_torch.photo.app.page import EDITORS, SCRIPTS, STATIC, STATIC_ADDRESS, Editor
+from nlfilter_torch.photo.declared.presets import Recipe
+from nlfilter_torch.photo.io.photographs import Photograph, write_photograph
 from tests.pages import ROOT
+from tests.problems import cat
 
 NODE = shutil.which("node")
+
+
+class Page:
+    """A page, whose work in the background runs when :meth:`finish` is called."""
+
+    def __init__(self, client: Client, library: Library, works: list[Awaitable[None]]) -> None:
+        self.client, self.works = client, works
+        self.editor = Editor(library)
+        self.editor.build(None)
+
+    def finish(self) -> None:
+        while self.works:
+            asyncio.run(self.works.pop(0))  # type: ignore[arg-type]
+
+    def open(self, path: Path) -> None:
+        self.editor._begin(path, "")
+        self.finish()
+
+    def errors(self) -> list[str]:
+        return [element.message for element in self.client.elements.values() if isinstance(element, ui.notification)]
+
+    def picture(self, kind: str) -> bytes | None:
+        return self.editor.picture(kind, "")
+
+
+@pytest.fixture
+def works(monkeypatch: pytest.MonkeyPatch) -> list[Awaitable[None]]:
+    works: list[Awaitable[None]] = []
+    monkeypatch.setattr(background_tasks, "create", lambda work, **options: works.append(work))
+    monkeypatch.setattr("nlfilter_torch.photo.app.at_rest.QUIET", 0.0)
+    return works
+
+
+@pytest.fixture
+def photo(tmp_path: Path) -> Path:
+    write_photograph(Photograph(cat()), tmp_path / "cat.png")
+    return tmp_path / "cat.png"
+
+
+@pytest.fixture
+def page(client: Client, photo: Path, works: list[Awaitable[None]]) -> Iterator[Page]:
+    yield Page(client, Library(photo.parent), works)
+    EDITORS.clear()
+
+
+@pytest.fixture
+def opened(page: Page, photo: Path) -> Page:
+    page.open(photo)
+    return page
+
+
+ALPHA = (3.0, 1.0, 1.0, 1.0)
+
+
+def test_a_photograph_is_opened(opened: Page, photo: Path, scripts: list[str]) -> None:
+    editor = opened.editor
+    assert editor._title.text == "cat.png"
+    assert editor.session.opened is not None
+    assert opened.picture("before") == opened.picture("after") == drawing.picture(cat())
+    assert not opened.picture("mask")
+    assert opened.picture("piece-1") is None
+    assert "closeup.open(150, 100, '/picture/" in "".join(scripts)
+    assert "page.watchConnection()" in scripts
+    assert scripts[-1] != "page.isUnsaved = true"
+    editor._begin(photo, "")  # a browser that reconnects keeps its edit
+    assert opened.works == []
+
+
+def test_a_file_that_cannot_be_opened(page: Page, photo: Path) -> None:
+    photo.write_text("dear diary")
+    page.open(photo)
+    assert len(page.errors()) == 1
+    assert "is not a PNG" in page.errors()[0]
+    assert page.editor.session.opened is None
+
+
+def test_an_address_that_is_gone(page: Page) -> None:
+    page.editor._begin(None, "gone.png")
+    page.finish()
+    assert page.errors() == ["open the photograph again: this page lost it, but its edit is kept"]
+
+
+def test_a_change_is_shown_while_the_pointer_moves_and_can_then_be_undone(opened: Page, scripts: list[str]) -> None:
+    editor, session = opened.editor, opened.editor.session
+    editor._change("detail", {"alpha": ALPHA}, False)
+    opened.finish()
+    edited = opened.picture("after")
+    assert edited == drawing.picture(session.render())
+    assert edited != opened.picture("before")
+    assert not editor._undo_button.enabled
+    editor._change("detail", {"alpha": ALPHA}, True)
+    opened.finish()
+    assert editor._undo_button.enabled
+    assert editor._reset_button.enabled
+    assert scripts[-1] == "page.isUnsaved = true"
+    editor._undo()
+    opened.finish()
+    assert session.recipe == Recipe()
+    assert opened.picture("after") == opened.picture("before")
+    editor._redo()
+    opened.finish()
+    assert opened.picture("after") == edited
+    editor._reset()
+    opened.finish()
+    assert session.recipe == Recipe()
+    assert editor._undo_button.enabled
+
+
+def test_strokes_are_cleared(opened: Page) -> None:
+    session = opened.editor.session
+    for kind in ("pointerdown", "pointerup"):
+        opened.editor._canvas._pointer(kind, 20, 20)
+    opened.finish()
+    assert len(session.recipe.last("detail").strokes) == 1
+    assert opened.picture("mask")
+    opened.editor._clear_strokes("detail")
+    opened.finish()
+    assert session.recipe.last("detail").strokes == ()
+    assert not opened.picture("mask")
+
+
+def test_a_change_before_a_photograph_is_not_kept(page: Page) -> None:
+    page.editor._change("tone", {"contrast": 1.3}, True)
+    page.editor._clear_strokes("detail")
+    assert page.editor.session.recipe == Recipe()
+    asyncio.run(page.editor._ask_photo_name())
+    assert page.errors() == ["open a photograph first; there is nothing to save"]
+
+
+def test_tabs_that_show_a_photograph_share_its_edit(opened: Page, photo: Path) -> None:
+    library = opened.editor._photographs
+    with Client(ui.page("/")) as client:
+        other = Page(client, library, opened.works)
+        other.open(photo)
+        assert other.editor.session is opened.editor.session
+        opened.editor._change("detail", {"alpha": ALPHA}, True)
+        opened.finish()
+        assert other.picture("after") == opened.picture("after") != other.picture("before")
+    other.editor._leave()
+    assert list(EDITORS.values()) == [opened.editor]
+    client.delete()
+
+
+def test_saving(opened: Page, photo: Path) -> None:
+    editor = opened.editor
+    editor._change("detail", {"alpha": ALPHA}, True)
+    opened.finish()
+    asyncio.run(editor._save(editor.session.save, "out.png"))
+    assert photo.with_name("out.png").is_file()
+    asyncio.run(editor._save(editor.session.save_preset, "edit.json"))
+    assert Recipe.from_json(photo.with_name("edit.json").read_bytes(), "") == editor.session.recipe
+    assert not editor.session.unsaved
 
 
 @pytest.mark.skipif(NODE is None, reason="no node here; install it, in version 20 or later")

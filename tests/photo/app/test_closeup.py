@@ -147,9 +147,9 @@ def test_an_edit_that_changes_takes_its_pieces_with_it(page: Page, large: Sessio
     page.closeup.follow()
     page.finish()
     assert page.told == ["closeup.add('piece-2', 0, 0, 128, 128)"]
-    found = pixels(page.closeup.file("piece-2"))
+    piece = pixels(page.closeup.file("piece-2"))
     wanted = apply_recipe(large.recipe, cat(1)).clamp(0, 1)[..., :128, :128]
-    assert (found - wanted).abs().max() <= 1 / 255
+    assert (piece - wanted).abs().max() <= 1 / 255
     page.told.clear()
     page.closeup.follow()  # nothing has changed
     page.finish()

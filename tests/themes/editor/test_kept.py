@@ -8,7 +8,7 @@ from playwright.sync_api import Browser, Dialog, expect
 
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.io.photographs import Photograph, write_photograph
-from tests.app.browser import Editor, Tab
+from tests.browser import Editor, Tab
 from tests.problems import cat
 
 

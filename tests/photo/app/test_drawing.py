@@ -1,16 +1,12 @@
-"""Drawings of the editor: pictures, masks, strokes and responses, and the ranges of its controls."""
+"""Drawings of the editor: pictures, masks, strokes, histograms and responses."""
 
 import io
 
 import numpy as np
-import pytest
 import torch
 from PIL import Image
 
-from nlfilter_torch.photo.app import controls, drawing
-from nlfilter_torch.photo.app.panel import entries_of
-from nlfilter_torch.photo.declared.presets import PRESETS, Recipe
-from nlfilter_torch.photo.declared.steps import Step
+from nlfilter_torch.photo.app import drawing
 from nlfilter_torch.photo.declared.strokes import Stroke
 from tests.problems import cat
 
@@ -21,8 +17,8 @@ def decoded(content: bytes) -> np.ndarray:
 
 def test_pictures() -> None:
     image = cat()
-    found = torch.from_numpy(decoded(drawing.picture(image)).copy()).permute(2, 0, 1)[None] / 255
-    assert (found - image).square().mean().sqrt() * 255 < 3
+    decoded_picture = torch.from_numpy(decoded(drawing.picture(image)).copy()).permute(2, 0, 1)[None] / 255
+    assert (decoded_picture - image).square().mean().sqrt() * 255 < 3
     assert decoded(drawing.picture(image[:, :1])).shape == (100, 150)
     mask = torch.linspace(0, 1, 15000).view(1, 1, 100, 150)
     layer = decoded(drawing.mask_picture(mask))
@@ -46,21 +42,3 @@ def test_response_has_a_line_for_each_region_and_a_dot_for_each_eigenvalue() -> 
     assert svg.count('class="mark"') == 3
     # Gains from 0 to 3 lie between y = 112 and y = 10; sliders (3, 1) give 3, 2, 1.
     assert [f'cy="{y:.1f}" r="1.6" fill="red"' in svg for y in (10.0, 44.0, 78.0)] == [True] * 3
-
-
-@pytest.mark.parametrize("name", PRESETS)
-def test_presets_are_those_of_the_command(name: str) -> None:
-    assert Recipe((Step("detail", **entries_of(name)),)) == PRESETS[name]
-
-
-@pytest.mark.parametrize(
-    "control", [c for step in controls.OF_EDIT.values() for c in step] + list(controls.detail_sliders("inside", 3))
-)
-def test_controls_stay_within_what_a_step_takes(control: controls.Control) -> None:
-    recipe = Recipe((Step("detail", alpha=(1.0,) * 3, inside=(1.0,) * 3), Step("denoise", noise_level=1.0)))
-    low, high = control.slider.low, control.slider.high
-    assert low <= control.read(recipe) <= high
-    for value in (low, high):
-        changed = control.entries(recipe, value)
-        assert control.parameter.is_valid(changed[control.parameter.name])
-        assert control.read(recipe.with_last(recipe.last(control.edit).changed(**changed))) == value

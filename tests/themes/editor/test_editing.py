@@ -9,7 +9,7 @@ from nlfilter_torch.photo.cli import main
 from nlfilter_torch.photo.declared.presets import Recipe, find_recipe
 from nlfilter_torch.photo.edits.applying import apply_recipe
 from nlfilter_torch.photo.io.photographs import read_photograph
-from tests.app.browser import Tab, difference
+from tests.browser import Tab, difference
 from tests.problems import cat
 
 

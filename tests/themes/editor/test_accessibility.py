@@ -9,7 +9,7 @@ import pytest
 from playwright.sync_api import Browser, Page
 
 from nlfilter_torch.photo.io.photographs import Photograph, write_photograph
-from tests.app.browser import SCREENS, Editor, Tab, running
+from tests.browser import SCREENS, Editor, Tab, running
 from tests.pages import ROOT
 from tests.problems import cat
 
@@ -30,9 +30,9 @@ def defects(page: Page) -> list[tuple[str, str]]:
     """Rules that the page breaks seriously, and the first element that does."""
     # Together, since a page whose connection was lost loads itself again.
     run = "(axe) => { (0, eval)(axe); return window.axe.run(document, {resultTypes: ['violations']}); }"
-    found: dict[str, Any] = page.evaluate(run, AXE.read_text(encoding="utf-8"))
-    assert found["passes"]  # it has looked
-    serious = [rule for rule in found["violations"] if rule["impact"] in ("serious", "critical")]
+    result: dict[str, Any] = page.evaluate(run, AXE.read_text(encoding="utf-8"))
+    assert result["passes"]  # it has looked
+    serious = [rule for rule in result["violations"] if rule["impact"] in ("serious", "critical")]
     return [(rule["id"], rule["nodes"][0]["html"][:200]) for rule in serious]
 
 
@@ -41,12 +41,12 @@ def test_no_serious_defect(browser: Browser, editor: Editor, width: int, height:
     tab = Tab.at(browser, editor.url, width, height, touch=width < 500)
     page = tab.page
     tab.wait_until_ready()
-    found = {"Detail": defects(page)}
+    result = {"Detail": defects(page)}
     page.get_by_role("tab", name="Recolor").click()
     page.get_by_role("button", name="#8a46c8").first.wait_for()
-    found["Recolor"] = defects(page)
+    result["Recolor"] = defects(page)
     page.get_by_role("button", name="Save photo").click()
     page.get_by_label("Name").wait_for()
-    found["saving"] = defects(page)
+    result["saving"] = defects(page)
     tab.close()
-    assert {place: rules for place, rules in found.items() if rules} == {}
+    assert {place: rules for place, rules in result.items() if rules} == {}

@@ -1,8 +1,6 @@
 """Files that the editor opens and saves: they equal those of the command line, and refusals change nothing."""
 
 import io
-import socket
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -147,18 +145,3 @@ def test_an_interrupted_save_leaves_the_old_file(session: Session, monkeypatch: 
         session.save("out.png")
     assert target.read_bytes() == before
     assert sorted(file.name for file in session.folder.iterdir()) == ["cat.png", "out.png"]
-
-
-def test_app_says_what_it_lacks(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["app", "--out", str(tmp_path / "gone"), "--no-open"]) == 2
-    assert "does not exist; create the folder first" in capsys.readouterr().err
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        port = str(taken.getsockname()[1])
-        assert main(["app", "--out", str(tmp_path), "--port", port, "--no-open"]) == 2
-    assert f"cannot listen on --host 127.0.0.1 --port {port}" in capsys.readouterr().err
-    monkeypatch.delitem(sys.modules, "nlfilter_torch.photo.app.server")
-    monkeypatch.setitem(sys.modules, "nicegui", None)
-    assert main(["app", "--out", str(tmp_path), "--no-open"]) == 2
-    assert "the editor needs nicegui, which is not installed" in capsys.readouterr().err

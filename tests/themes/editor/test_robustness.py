@@ -18,7 +18,7 @@ from nlfilter_torch.photo.declared.presets import Recipe, find_recipe
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.edits.applying import apply_recipe
 from nlfilter_torch.photo.io.photographs import Photograph, read_photograph, write_photograph
-from tests.app.browser import TIMEOUT, Editor, Tab, difference
+from tests.browser import TIMEOUT, Editor, Tab, difference
 from tests.problems import cat
 
 

@@ -9,7 +9,7 @@ from playwright.sync_api import Browser, Page, expect
 
 from nlfilter_torch.photo.declared.presets import find_recipe
 from nlfilter_torch.photo.io.photographs import Photograph, read_photograph, write_photograph
-from tests.app.browser import SCREENS, Editor, Fingers, Tab, running
+from tests.browser import SCREENS, Editor, Fingers, Tab, running
 from tests.problems import cat
 
 WIDTH, HEIGHT = 450, 300

@@ -53,11 +53,11 @@ class Editor:
             )
         assert self.process.stdout is not None
         line = self.process.stdout.readline()
-        found = re.search(r"http://\S+/", line)
-        if found is None:
+        address = re.search(r"http://\S+/", line)
+        if address is None:
             self.stop()
             raise RuntimeError(self.log.read_text())
-        self.url = found[0]
+        self.url = address[0]
 
     def stop(self) -> None:
         """Interrupt the process, as Ctrl+C does."""

@@ -7,7 +7,7 @@ import pytest
 from playwright.sync_api import Browser, expect
 
 from nlfilter_torch.photo.io.photographs import Photograph, write_photograph
-from tests.app.browser import CHROMIUM, Editor, Tab, chromium, running
+from tests.browser import CHROMIUM, Editor, Tab, chromium, running
 from tests.problems import cat
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Browser, Locator, expect
 
-from tests.app.browser import SCREENS, Editor, Tab, by_finger
+from tests.browser import SCREENS, Editor, Tab, by_finger
 
 
 def test_keyboard_focus_can_be_seen(opened: Tab) -> None:

@@ -1,19 +1,16 @@
 """The picture of a page at rest: what a file would hold."""
 
 import asyncio
-import time
 from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
-from playwright.sync_api import Browser
 
 from nlfilter_torch.core.progress import Progress
 from nlfilter_torch.photo.app import at_rest
 from nlfilter_torch.photo.app.at_rest import AtRest
-from nlfilter_torch.photo.app.preview import PIXELS
 from nlfilter_torch.photo.app.session import Session
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.declared.steps import Step
@@ -21,7 +18,7 @@ from nlfilter_torch.photo.declared.strokes import Stroke
 from nlfilter_torch.photo.edits.applying import apply_recipe
 from nlfilter_torch.photo.io.photographs import Photograph, read_photograph, write_photograph
 from nlfilter_torch.photo.picture.resizing import resize
-from tests.app.browser import TIMEOUT, Tab, difference, running
+from tests.browser import difference
 from tests.problems import cat
 
 BLUE, IN = Stroke(((0.37, 0.35), (0.4, 0.37)), 0.04, "#2040e0"), Stroke(((0.2, 0.2), (0.3, 0.2)), 0.04, "in")
@@ -116,23 +113,3 @@ def test_a_small_photograph_needs_no_other_picture(page: Page, tmp_path: Path) -
     page.session = session
     page.draw(session)
     assert page.shown == []
-
-
-def test_in_the_browser(browser: Browser, tmp_path: Path) -> None:
-    """The preview appears first and then what a file holds."""
-    photograph = Photograph(resize(cat(1), (1200, 1800)).clamp(0, 1))
-    assert PIXELS < 1200 * 1800
-    write_photograph(photograph, tmp_path / "large.png")
-    photograph = read_photograph(tmp_path / "large.png")  # rounded to 256 levels, on which the tones depend
-    (tmp_path / "lines.json").write_text(LINES.to_json())
-    with running(tmp_path, "large.png") as editor:
-        tab = Tab.at(browser, editor.url)
-        tab.wait_until_ready()
-        tab.load_edit(tmp_path / "lines.json")
-        size = (tab.picture().shape[-2], tab.picture().shape[-1])
-        saved = resize(apply_recipe(LINES, photograph.pixels).clamp(0, 1), size)
-        deadline = time.monotonic() + TIMEOUT / 1000
-        while (left := difference(tab.picture(), saved)) > 1.5:  # pictures of the page are JPEGs
-            assert time.monotonic() < deadline, left
-            tab.page.wait_for_timeout(300)
-        tab.close()

@@ -96,7 +96,7 @@ def test_more_strokes_need_no_other_filter(name: str, session: Session, monkeypa
     wanted = apply_step(second, session.preview.pixels).clamp(0, 1)
     session.load(Recipe((first,)))
     session.render()
-    monkeypatch.setattr("nlfilter_torch.photo.picture.in_memory.nonlocal_operator", None)
+    monkeypatch.setattr("nlfilter_torch.photo.picture.in_memory.operator_from_guide", None)
     session.load(Recipe((second,)))
     assert torch.equal(session.render(), wanted)
 
@@ -211,9 +211,9 @@ def test_sampled_operator_is_a_sample_of_the_whole() -> None:
         height, width = operator.size
         assert operator.size == (300 // stride, 450 // stride)
         points = image[..., first::stride, first::stride][..., :height, :width]
-        found = polynomial_filter(operator, points, alpha)
+        filtered = polynomial_filter(operator, points, alpha)
         wanted = whole[..., first::stride, first::stride][..., :height, :width]
-        assert (found - wanted).square().mean().sqrt() * 255 < 1.0
+        assert (filtered - wanted).square().mean().sqrt() * 255 < 1.0
         assert (wanted - points).square().mean().sqrt() * 255 > 15
 
 
@@ -224,8 +224,8 @@ def test_sampled_operator_in_colour_and_nearby() -> None:
     whole = nonlocal_operator(image, guide_channels="all", **options) @ image  # type: ignore[arg-type]
     detail = Step("detail", landmarks=200, spatial_bandwidth=60.0, patch_size=3)
     operator = sampled_operator(image, 2, detail, bandwidth=0.1, distance=60.0, channels="all", patch_size=3)
-    found, wanted = operator @ image[..., ::2, ::2], whole[..., ::2, ::2]
-    assert (found - wanted).square().mean().sqrt() * 255 < 0.8
+    filtered, wanted = operator @ image[..., ::2, ::2], whole[..., ::2, ::2]
+    assert (filtered - wanted).square().mean().sqrt() * 255 < 0.8
 
 
 LOOKED_AT = {"viewing_size": 0.004, "landmarks": 60}  # megapixels, of previews in these tests
@@ -305,7 +305,7 @@ def test_masks_are_those_of_the_library_and_need_no_other_filter(monkeypatch: py
     inner, outer = mask_of((first,), size), mask_of((second,), size)
     wanted = [region_mask(image, inner, generator=seeded()), region_mask(image, inner, outer, generator=seeded())]
     assert torch.equal(preview.mask(Step("detail", (first,))), wanted[0])
-    monkeypatch.setattr("nlfilter_torch.photo.picture.in_memory.nonlocal_operator", None)
+    monkeypatch.setattr("nlfilter_torch.photo.picture.in_memory.operator_from_guide", None)
     assert torch.equal(preview.mask(Step("detail", (first, second), landmarks=400)), wanted[1])
     assert not torch.equal(preview.mask(Step("detail", (first, second), reach=0.9)), wanted[1])
     with pytest.raises(TypeError):

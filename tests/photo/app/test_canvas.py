@@ -1,0 +1,145 @@
+"""The large picture with its overlays, and the brush that draws on it."""
+
+import pytest
+from nicegui import Client
+
+from nlfilter_torch.photo.app import drawing
+from nlfilter_torch.photo.app.brush import Brush
+from nlfilter_torch.photo.app.canvas import Canvas
+from nlfilter_torch.photo.app.session import Session
+from tests.problems import cat
+
+
+class Page:
+    """A stand-in for the page with a canvas, which records what the canvas calls."""
+
+    def __init__(self) -> None:
+        self.brush = Brush()
+        self.strokes = 0
+        self.errors: list[str] = []
+        self.canvas = Canvas(self.brush, "token", self.drawn, self.errors.append)
+
+    def drawn(self) -> None:
+        self.strokes += 1
+
+    def open(self, session: Session) -> None:
+        assert session.opened is not None
+        self.canvas.open(session, session.preview.pixels, session.opened.photograph.size)
+
+    def paint(self, *points: tuple[float, float]) -> None:
+        for kind, point in zip(("pointerdown", *["pointermove"] * len(points)), points, strict=False):
+            self.canvas._pointer(kind, *point)
+        self.canvas._pointer("pointerup", *points[-1])
+
+
+@pytest.fixture
+def shown(client: Client) -> Page:
+    return Page()
+
+
+@pytest.fixture
+def opened(shown: Page, session: Session) -> Page:
+    shown.open(session)
+    return shown
+
+
+def test_opening(opened: Page, scripts: list[str]) -> None:
+    canvas = opened.canvas
+    assert scripts == ["closeup.open(150, 100, '/picture/token')"]
+    assert canvas._size.text == "150\u00d7100 pixels, shown at 150\u00d7100"
+    assert canvas._photo.visible
+    assert not canvas._welcome.visible
+    assert canvas.pictures == {"before": drawing.picture(cat())}
+    assert canvas.clipped_before == drawing.clipped_shares(cat())
+
+
+def test_drawing_the_edit(opened: Page, session: Session) -> None:
+    canvas = opened.canvas
+    session.set("detail", alpha=(3.0, 1.0, 1.0, 1.0))
+    canvas.draw(None)
+    edited = session.render()
+    assert canvas.pictures["after"] == drawing.picture(edited)
+    assert canvas.pictures["mask"] == b""
+    assert canvas.clipped == drawing.clipped_shares(edited)
+    assert canvas.histogram == drawing.histogram_svg(edited)
+    source = canvas._photo.source
+    canvas.show()
+    assert canvas._photo.source != source
+    assert str(canvas._photo.source).startswith("/picture/token/after?")
+
+
+def test_nothing_is_drawn_before_a_photograph(shown: Page) -> None:
+    shown.canvas.draw(None)
+    shown.paint((10.0, 20.0), (30.0, 20.0))
+    assert shown.canvas.pictures == {}
+    assert shown.strokes == 0
+
+
+def test_a_stroke(opened: Page, session: Session) -> None:
+    canvas = opened.canvas
+    canvas._pointer("pointermove", 10, 20)  # it did not begin here
+    canvas._pointer("pointerdown", 20, 20)
+    canvas._pointer("pointermove", 40, 20)
+    assert canvas._photo.content.count("<path") == 1  # while it is drawn
+    assert session.recipe.last("detail").strokes == ()
+    canvas._pointer("pointerup", 40, 20)
+    (stroke,) = session.recipe.last("detail").strokes
+    assert (stroke.paint, stroke.radius) == ("in", 0.02)
+    assert stroke.points[0] == (round(20 / 150, 4), 0.2)
+    assert opened.strokes == 1
+    canvas._show_strokes.set_value(False)
+    assert canvas._photo.content == ""
+    canvas._show_strokes.set_value(True)
+    assert canvas._photo.content.count("<path") == 1
+
+
+def test_a_stroke_that_is_dropped(opened: Page, session: Session) -> None:
+    opened.canvas._pointer("pointerdown", 20, 20)
+    opened.canvas.drop_stroke()
+    opened.canvas._pointer("pointerup", 40, 20)
+    assert session.recipe.last("detail").strokes == ()
+    assert opened.canvas._photo.content == ""
+
+
+def test_each_step_has_its_strokes(opened: Page, session: Session, scripts: list[str]) -> None:
+    opened.paint((20.0, 20.0), (40.0, 20.0))
+    opened.canvas.switch("recolor")
+    assert opened.canvas._photo.content == ""
+    opened.paint((20.0, 20.0), (40.0, 20.0))
+    assert session.recipe.last("recolor").strokes[0].paint == opened.brush.colour
+    opened.canvas.switch("tone")
+    opened.paint((20.0, 20.0), (40.0, 20.0))  # it takes no strokes
+    assert opened.strokes == 2
+    assert scripts[-2:] == ["closeup.brush(true)", "closeup.brush(false)"]
+
+
+def test_the_mask_is_shown_when_it_is_new_or_kept_in_sight(opened: Page) -> None:
+    canvas = opened.canvas
+    opened.paint((20.0, 20.0), (40.0, 20.0))
+    canvas.draw(None)
+    assert canvas.pictures["mask"]
+    canvas.draw_mask()
+    assert canvas._mask.visible
+    assert "flash-1" in canvas._mask.classes
+    canvas.draw_mask()  # it is not new
+    assert not canvas._mask.visible
+    canvas._show_mask.set_value(True)
+    assert canvas._mask.visible
+    assert not {"flash-0", "flash-1"} & set(canvas._mask.classes)
+    canvas.draw_mask(moving=True)
+    assert not canvas._mask.visible
+    canvas.draw_mask()
+    assert canvas._mask.visible
+    canvas.switch("recolor")
+    assert not canvas._mask.visible
+
+
+def test_what_is_clipped(opened: Page, session: Session) -> None:
+    canvas = opened.canvas
+    assert not canvas._clipped.visible
+    canvas._show_clipped.set_value(True)
+    assert canvas._clipped.visible
+    assert canvas.pictures["clipped"] == drawing.clipped_picture(cat())
+    session.set("tone", contrast=1.4)
+    canvas.draw(None)
+    assert canvas.pictures["clipped"] == drawing.clipped_picture(session.render())

@@ -1,0 +1,42 @@
+"""What the page asks in dialogs."""
+
+from pathlib import Path
+
+import pytest
+from nicegui import Client
+
+from nlfilter_torch.photo.app.dialogs import NameDialog
+
+
+@pytest.fixture
+def answers(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    answers: list[str] = []
+    monkeypatch.setattr("nicegui.ui.dialog.submit", lambda dialog, name: answers.append(name))
+    return answers
+
+
+def test_a_name(client: Client, answers: list[str], tmp_path: Path) -> None:
+    """One that cannot be used, a file that is there already, and that of a new file."""
+    (tmp_path / "old.png").touch()
+
+    def check(name: str) -> Path:
+        if not name.endswith(".png"):
+            raise ValueError(f"{name} must end in .png")
+        return tmp_path / name
+
+    dialog = NameDialog("Save the photograph", "photo.gif", tmp_path, check)
+    assert dialog._note.text == f"In {tmp_path}"
+    dialog._confirm()
+    assert dialog._note.text == "photo.gif must end in .png"
+    dialog._name.set_value("old.png")
+    dialog._confirm()
+    assert (dialog._ok.text, dialog._note.text) == ("Replace", "A file of that name is there already.")
+    assert answers == []
+    dialog._name.set_value("new.png")
+    assert dialog._ok.text == "Save"
+    dialog._name.set_value("old.png")
+    dialog._confirm()
+    dialog._confirm()
+    dialog._name.set_value("new.png")
+    dialog._confirm()
+    assert answers == ["old.png", "new.png"]

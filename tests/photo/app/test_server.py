@@ -1,0 +1,64 @@
+"""The editor's server: its addresses, and what it answers."""
+
+import socket
+import sys
+from pathlib import Path
+
+import pytest
+from nicegui import Client, background_tasks
+
+from nlfilter_torch.__main__ import main
+from nlfilter_torch.photo.app import server
+from nlfilter_torch.photo.app.library import Library
+from nlfilter_torch.photo.app.page import EDITORS
+from nlfilter_torch.photo.app.server import Pages
+
+
+@pytest.fixture
+def pages(client: Client, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Pages:
+    monkeypatch.setattr(background_tasks, "create", lambda work: work.close())
+    return Pages(Library(tmp_path), None)
+
+
+def test_pictures_are_for_those_who_know_their_address(pages: Pages) -> None:
+    pages.page()
+    ((token, editor),) = EDITORS.items()
+    try:
+        assert pages.picture(token, "after").status_code == 404  # there is none
+        assert pages.picture(token, "original", "0,0,10,10").status_code == 404
+        editor._canvas.pictures.update(after=b"JPEG", mask=b"PNG")
+        answer = pages.picture(token, "mask")
+        assert (answer.status_code, answer.body, answer.media_type) == (200, b"PNG", "image/png")
+        answer = pages.picture(token, "after")
+        assert (answer.media_type, answer.headers["Cache-Control"]) == ("image/jpeg", "no-store")
+        assert pages.picture("another", "after").status_code == 404
+    finally:
+        EDITORS.clear()
+
+
+def test_a_free_port() -> None:
+    port = server._check_address("127.0.0.1", 0)
+    assert port > 0
+    assert server._check_address("127.0.0.1", port) == port
+
+
+def test_the_address_is_printed_once_the_server_answers(capsys: pytest.CaptureFixture[str]) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        port = listening.getsockname()[1]
+        server._tell_when_ready("0.0.0.0", port)
+    assert capsys.readouterr().out == f"Editor at http://0.0.0.0:{port}/ - Ctrl+C ends it\n"
+
+
+def test_app_says_what_it_lacks(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["app", "--out", str(tmp_path / "gone"), "--no-open"]) == 2
+    assert "does not exist; create the folder first" in capsys.readouterr().err
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = str(taken.getsockname()[1])
+        assert main(["app", "--out", str(tmp_path), "--port", port, "--no-open"]) == 2
+    assert f"cannot listen on --host 127.0.0.1 --port {port}" in capsys.readouterr().err
+    monkeypatch.delitem(sys.modules, "nlfilter_torch.photo.app.server")
+    monkeypatch.setitem(sys.modules, "nicegui", None)
+    assert main(["app", "--out", str(tmp_path), "--no-open"]) == 2
+    assert "the editor needs nicegui, which is not installed" in capsys.readouterr().err
