@@ -19,7 +19,7 @@ from nlfilter_torch.photo.edits.applying import apply_recipe
 from nlfilter_torch.photo.edits.noise import noise_of
 from nlfilter_torch.photo.io.photographs import Photograph, read_photograph, write_photograph
 from nlfilter_torch.photo.picture.painting import cover, mask_of, paint
-from nlfilter_torch.photo.selections.matting import pyramid_levels
+from nlfilter_torch.photo.selections.pyramid import pyramid_levels
 from nlfilter_torch.photo.tiled import recipe as whole_edit
 from nlfilter_torch.photo.tiled import stream_detail
 from nlfilter_torch.photo.tiled.pictures import Picture

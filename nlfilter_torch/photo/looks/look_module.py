@@ -1,21 +1,23 @@
 """A layer for looks with learned parts."""
 
-import inspect
 from collections.abc import Collection, Mapping
+from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
 
-from nlfilter_torch.core.checks import check_count, check_image
+from nlfilter_torch.core.checks import check_choice, check_count, check_image
 from nlfilter_torch.core.precision import as_given, working_dtype
 from nlfilter_torch.filtering.filters import polynomial_filter
 from nlfilter_torch.nn.parameters import check_learn
-from nlfilter_torch.operator.build import nonlocal_operator, operator_from_guide
-from nlfilter_torch.operator.features import reduce_channels
+from nlfilter_torch.operator.build import operator_from_guide
+from nlfilter_torch.operator.features import GuideChannels, SpatialBandwidth, reduce_channels
+from nlfilter_torch.operator.landmarks import Sampling
+from nlfilter_torch.operator.nystrom import Completion
 from nlfilter_torch.operator.operator import NonlocalOperator
-from nlfilter_torch.operator.options import OperatorOptions
+from nlfilter_torch.operator.options import AUTO, OperatorOptions
 from nlfilter_torch.photo.declared.shading import LANDMARKS, LEVELS, NEAR
 from nlfilter_torch.photo.looks.histogram import KINDS, STRENGTHS
 from nlfilter_torch.photo.looks.look_filter import BLURS, NAMES, acts, check_part, filter_look
@@ -32,8 +34,18 @@ class Look(nn.Module):
             :meth:`FittedLook.tensors`. Omitted parts start from the identity.
         learn: names of the parts to learn; the others are buffers.
         knots: K, for curves that start from the identity.
-        **options: of :func:`nonlocal_operator`, for the filter of ``alpha``; the spatial bandwidth is a twelfth of the
-            short side by default.
+        patch_size: option of :func:`nonlocal_operator`, for the filter of ``alpha``, like the following ones.
+        photometric_bandwidth: h_y in units of the luminance, or ``"auto"``.
+        spatial_bandwidth: h_x in pixels; ``"auto"`` is a twelfth of the short side, None compares pixels regardless of
+            their distance.
+        num_landmarks: M.
+        landmarks: as for :func:`nonlocal_operator`.
+        completion: as for :func:`nonlocal_operator`.
+        guide_channels: as for :func:`nonlocal_operator`.
+        patch_weights: as for :func:`nonlocal_operator`.
+        tolerance: as for :func:`nonlocal_operator`.
+        generator: as for :func:`nonlocal_operator`.
+        group: as for :func:`nonlocal_operator`.
 
     Raises:
         TypeError, ValueError: if a part has the wrong shape or an unknown name.
@@ -60,7 +72,17 @@ class Look(nn.Module):
         *,
         learn: Collection[str] = NAMES,
         knots: int = 17,
-        **options: Any,
+        patch_size: int = OperatorOptions.patch_size,
+        photometric_bandwidth: float | Tensor | Literal["auto"] = LEVELS / 255,
+        spatial_bandwidth: SpatialBandwidth | Literal["auto"] | None = AUTO,
+        num_landmarks: int = LANDMARKS,
+        landmarks: Sampling = OperatorOptions.landmarks,
+        completion: Completion = OperatorOptions.completion,
+        guide_channels: GuideChannels = OperatorOptions.guide_channels,
+        patch_weights: Tensor | None = OperatorOptions.patch_weights,
+        tolerance: float | None = OperatorOptions.tolerance,
+        generator: torch.Generator | None = OperatorOptions.generator,
+        group: object = OperatorOptions.group,
     ) -> None:
         super().__init__()
         names = check_learn(learn, NAMES)
@@ -84,24 +106,65 @@ class Look(nn.Module):
                 self.register_parameter(name, nn.Parameter(own))
             else:
                 self.register_buffer(name, own)
-        inspect.signature(nonlocal_operator).bind(None, **options)  # raises TypeError for an unknown option
-        self.options = {"photometric_bandwidth": LEVELS / 255, "num_landmarks": LANDMARKS, **options}
+        if isinstance(spatial_bandwidth, str):
+            check_choice(spatial_bandwidth, "spatial_bandwidth", (AUTO,), "pass it, a number of pixels or None")
+        self.spatial_bandwidth = spatial_bandwidth
+        self.options = OperatorOptions(
+            patch_size=patch_size,
+            photometric_bandwidth=photometric_bandwidth,
+            num_landmarks=num_landmarks,
+            landmarks=landmarks,
+            completion=completion,
+            guide_channels=guide_channels,
+            patch_weights=patch_weights,
+            tolerance=tolerance,
+            generator=generator,
+            group=group,
+        )
 
-    def forward(self, image: Tensor, operator: NonlocalOperator | None = None, **parts: Tensor) -> Tensor:
+    def forward(
+        self,
+        image: Tensor,
+        operator: NonlocalOperator | None = None,
+        *,
+        alpha: Tensor | None = None,
+        bands: Tensor | None = None,
+        texture: Tensor | None = None,
+        curves: Tensor | None = None,
+        matrix: Tensor | None = None,
+        saturation: Tensor | None = None,
+        stretch: Tensor | None = None,
+        local: Tensor | None = None,
+    ) -> Tensor:
         """Apply the look to an image: (B, 3, H, W), with values possibly outside [0, 1].
+
+        A part that is passed replaces the layer's own in this call, for example if a network computes it; it may have a
+        first dimension of B. None uses the layer's own.
 
         Args:
             image: (B, 3, H, W) in [0, 1].
             operator: W of the image's luminance, if available; None builds it unless the sliders are all 1.
-            **parts: values that replace the layer's own in this call, for example computed by a network, with a first
-                dimension of B if they differ between images.
+            alpha: (k+1,) or (B, k+1).
+            bands: (7,) or (B, 7).
+            texture: (6,) or (B, 6).
+            curves: (3, K) or (B, 3, K).
+            matrix: (3, 3) or (B, 3, 3).
+            saturation: (K,) or (B, K).
+            stretch: (3,) or (B, 3).
+            local: (8,) or (B, 8).
         """
         check_image(image, "image", channels=3)
-        check_learn(list(parts), NAMES, "parts")
-        used = {name: parts.get(name, getattr(self, name)) for name in NAMES}
+        passed = (alpha, bands, texture, curves, matrix, saturation, stretch, local)
+        parts = {name: getattr(self, name) if part is None else part for name, part in zip(NAMES, passed, strict=True)}
         exact = image.to(working_dtype(image))
-        if operator is None and acts(used["alpha"]):
-            near = {"spatial_bandwidth": NEAR * min(image.shape[-2:])}
-            operator = operator_from_guide(reduce_channels(exact, "luminance"), OperatorOptions(**near | self.options))
+        if operator is None and acts(parts["alpha"]):
+            operator = operator_from_guide(reduce_channels(exact, "luminance"), self._options(image))
         detail = None if operator is None else partial(polynomial_filter, operator)
-        return as_given(filter_look(exact, used, detail), image)
+        return as_given(filter_look(exact, parts, detail), image)
+
+    def _options(self, image: Tensor) -> OperatorOptions:
+        """Options of the filter for an image (B, 3, H, W)."""
+        bandwidth = self.spatial_bandwidth
+        if isinstance(bandwidth, str):
+            bandwidth = NEAR * min(image.shape[-2:])
+        return replace(self.options, spatial_bandwidth=bandwidth)

@@ -3,8 +3,9 @@
 A regression with the filter's covariance (:mod:`nlfilter_torch.filtering.scribbles`) on colour, surrounding colour and
 texture separates foreground from background, together with the colours of single pixels
 (:mod:`nlfilter_torch.photo.selections.scribbled_colours`). Points that an even area, such as a sky, links to a scribble
-count as scribbled, too. Two local solves (:mod:`nlfilter_torch.photo.selections.matting`) then align the borders of the
-mask with those of the picture. Both run on a copy reduced to about :data:`SOLVED` pixels, so the cost hardly grows with
+count as scribbled, too. Two local solves (:mod:`nlfilter_torch.photo.selections.random_walker` and
+:mod:`nlfilter_torch.photo.selections.closed_form`) then align the borders of the mask with those of the picture. All
+run on a copy reduced to about :data:`SOLVED` pixels, so the cost hardly grows with
 the size of the picture. The result is a linear function of the colour for each place, which gives the mask of any pixel
 from its own colour; results in tiles are therefore exact.
 """
@@ -26,7 +27,8 @@ from nlfilter_torch.photo.picture.resizing import enlarged
 from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles
 from nlfilter_torch.photo.picture.source import Fitted, Pixels, Reduced, Source
 from nlfilter_torch.photo.picture.viewing import viewed_size
-from nlfilter_torch.photo.selections.matting import LinearMasks, linear_mask, linear_models, solve_linear, solve_mask
+from nlfilter_torch.photo.selections.closed_form import LinearMasks, linear_mask, linear_models, solve_linear
+from nlfilter_torch.photo.selections.random_walker import solve_mask
 from nlfilter_torch.photo.selections.rough_mask import RoughMasks
 
 SOLVED = 1 << 17  # pixels
@@ -300,7 +302,9 @@ def calibrated(mask: Tensor) -> Tensor:
 
 
 def fit_borders(image: Tensor, models: list[LinearMasks], rough: Tensor, front: Tensor, back: Tensor) -> Tensor:
-    """Linear functions (B, K, C+1, H, W) from colours to masks, see :func:`solve_linear`.
+    """Linear functions (B, K, C+1, H, W) from colours to masks that follow the borders of an image.
+
+    A random walker aligns the rough masks with the borders; closed-form matting starts from the result.
 
     Args:
         image: (B, C, H, W).

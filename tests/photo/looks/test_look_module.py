@@ -47,6 +47,17 @@ def test_half_precision_pictures_are_computed_in_float32(part: str, dtype: torch
         assert torch.equal(look(exact), expected)
 
 
+def test_pixels_far_apart_do_not_count_unless_the_spatial_bandwidth_is_none() -> None:
+    sliders = {"alpha": torch.tensor([2.0, 1.5, 1.0, 1.0])}
+    usual, near, far = (
+        Look(sliders, num_landmarks=30, spatial_bandwidth=bandwidth)(CAT) for bandwidth in ("auto", 80 / 12, None)
+    )
+    assert torch.equal(usual, near)
+    assert (far - near).abs().max() > 0.02
+    with pytest.raises(ValueError, match="spatial_bandwidth must be"):
+        Look(sliders, spatial_bandwidth="far")  # type: ignore[arg-type]
+
+
 @pytest.mark.parametrize(("name", "value"), [("bands", torch.nan), ("curves", torch.inf)])
 def test_parts_that_are_not_finite_are_refused(name: str, value: float) -> None:
     part = torch.full((7,) if name == "bands" else (3, 17), value)

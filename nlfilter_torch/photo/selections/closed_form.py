@@ -1,0 +1,148 @@
+"""Closed-form matting (Levin, Lischinski and Weiss, 2008), from an initial mask.
+
+In every small window the mask is a linear function of the colour, which models hair and soft borders. These functions
+also give the mask of any pixel of a larger picture (:class:`LinearMasks`).
+"""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from nlfilter_torch.photo.picture.colour import dot
+from nlfilter_torch.photo.selections.pyramid import doubled, halved, pyramid_levels
+
+WINDOW_RADIUS, NOISE = 2, 1e-6  # radius of the windows in which masks are linear in colour; variance of noise
+LINEAR_LEVELS, LINEAR_STEPS = 2, 24  # levels of the pyramid, steps on each
+END_MARGIN = 0.1  # mask values closer than this to 0 or 1 are set to 0 or 1
+SLOWEST = 0.005  # smallest eigenvalue that the steps damp
+# Confidence in a rough mask of 0 or 1, and in scribbles.
+LINEAR_ROUGH_CONFIDENCE, LINEAR_SCRIBBLE_CONFIDENCE = 3e-3, 10.0
+
+
+@dataclass(frozen=True, eq=False)
+class LinearMasks:
+    """Masks that are a linear function of colour in every window of a picture; windows overlap.
+
+    In flat windows the functions are steep, so that float32 would not be exact: small rounding errors of the sums over
+    a window are divided by the variance of its colours.
+
+    Attributes:
+        image: the image minus 0.5, (B, C, H, W).
+        share: 1 divided by the number of pixels of the window around each pixel, (1, 1, H, W).
+        mean: mean colour of that window, (B, C, H, W).
+        inverse: inverse covariance of the colours in it, (B, C, C, H, W).
+    """
+
+    image: Tensor
+    share: Tensor
+    mean: Tensor
+    inverse: Tensor
+
+    @staticmethod
+    def of(image: Tensor) -> "LinearMasks":
+        """The model of an image (B, C, H, W), in float64."""
+        image = image.double() - 0.5
+        count = image.shape[1]
+        share = 1 / window_sums(torch.ones_like(image[:1, :1]))
+        mean = share * window_sums(image)
+        products = (image.unsqueeze(1) * image.unsqueeze(2)).flatten(1, 2)
+        product = (share * window_sums(products)).unflatten(1, (count, count))
+        covariance = (product - mean.unsqueeze(1) * mean.unsqueeze(2)).permute(0, 3, 4, 1, 2)
+        inverse = torch.linalg.inv(covariance + NOISE * torch.eye(count).to(covariance))
+        return LinearMasks(image, share, mean, inverse.permute(0, 3, 4, 1, 2).contiguous())
+
+    def to(self, like: Tensor) -> "LinearMasks":
+        """The model in the dtype of a tensor."""
+        return LinearMasks(self.image.to(like), self.share.to(like), self.mean.to(like), self.inverse.to(like))
+
+    def fit(self, mask: Tensor) -> Tensor:
+        """Fit the linear functions (B, C+1, H, W) of a mask (B, 1, H, W), averaged over all windows around a pixel.
+
+        The last channel is the constant; the others multiply the colour minus 0.5.
+        """
+        mean, product = (self.share * window_sums(torch.cat([mask, mask * self.image], dim=1))).tensor_split([1], dim=1)
+        covariance = torch.addcmul(product, mean, self.mean, value=-1)
+        slopes = dot(self.inverse, covariance.unsqueeze(1), dim=2).squeeze(2)
+        return self.share * window_sums(torch.cat([slopes, mean - dot(slopes, self.mean)], dim=1))
+
+    def smoothed(self, mask: Tensor) -> Tensor:
+        """The mask that the fitted functions give."""
+        return linear_mask(self.image, self.fit(mask))
+
+
+def linear_mask(image: Tensor, functions: Tensor) -> Tensor:
+    """Mask (B, 1, H, W) that functions of :meth:`LinearMasks.fit` give for an image minus 0.5."""
+    return dot(functions[:, :-1], image) + functions[:, -1:]
+
+
+def window_sums(planes: Tensor) -> Tensor:
+    """Sums over the window around each pixel, cut off at the borders of the picture."""
+    for axis in (2, 3):
+        total, length = planes.clone(), planes.shape[axis]
+        for shift in range(1, min(WINDOW_RADIUS + 1, length)):  # F.avg_pool2d takes several times as long
+            total.narrow(axis, shift, length - shift).add_(planes.narrow(axis, 0, length - shift))
+            total.narrow(axis, 0, length - shift).add_(planes.narrow(axis, shift, length - shift))
+        planes = total
+    return planes
+
+
+def linear_models(image: Tensor) -> list[LinearMasks]:
+    """Models of an image (B, C, H, W) on the levels of the pyramid, finest first."""
+    levels = min(LINEAR_LEVELS - 1, pyramid_levels(min(image.shape[-2:])))
+    return [LinearMasks.of(colours) for colours in halved(image, levels)]
+
+
+def solve_linear(models: list[LinearMasks], start: Tensor, rough: Tensor, front: Tensor, back: Tensor) -> Tensor:
+    """Solve for the functions (B, K, C+1, H, W) of :meth:`LinearMasks.fit`.
+
+    Args:
+        models: :func:`linear_models` of the image.
+        start: initial masks, (B, K, H, W).
+        rough: rough masks, (B, K, H, W); values near 0 or 1 have a higher confidence.
+        front: weights of foreground scribbles, (B, K, H, W).
+        back: weights of background scribbles, (B, K, H, W).
+    """
+    trust = LINEAR_ROUGH_CONFIDENCE * ((2 * rough - 1).square() + 0.01)
+    certain = LINEAR_SCRIBBLE_CONFIDENCE * (front + back)
+    planes = torch.cat([trust * rough + LINEAR_SCRIBBLE_CONFIDENCE * front, trust + certain, start], dim=1)
+    coarser: Tensor | None = None
+    levels = zip(models, halved(planes, len(models) - 1), strict=True)
+    for level, (model, planes_of_level) in reversed(list(enumerate(levels))):
+        target, trust, first = planes_of_level.chunk(3, dim=1)
+        masks = first if coarser is None else doubled(coarser, planes_of_level)
+        solved = [
+            damped(model, a, 4**level * t, 4**level * c)
+            for a, t, c in zip(masks.split(1, 1), target.split(1, 1), trust.split(1, 1), strict=True)
+        ]
+        coarser = torch.cat(solved, dim=1)
+    assert coarser is not None  # for mypy
+    functions = torch.stack([models[0].fit(mask.clamp(0.0, 1.0).double()) for mask in coarser.split(1, 1)], dim=1)
+    slopes, constant = functions.tensor_split([-1], dim=2)
+    return (torch.cat([slopes, constant - END_MARGIN], dim=2) / (1 - 2 * END_MARGIN)).to(coarser)
+
+
+def damped(model: LinearMasks, mask: Tensor, target: Tensor, trust: Tensor) -> Tensor:
+    """Chebyshev steps from a mask (B, 1, H, W) towards ``(1 + c) a = S a + c t``, S being :meth:`LinearMasks.smoothed`.
+
+    The eigenvalues of the preconditioned system lie in [0, 1]; error components with an eigenvalue below
+    :data:`SLOWEST` are left to coarser levels. Only the first residual is computed in float64: the others follow from
+    it by steps that get smaller, and so do their rounding errors.
+
+    Args:
+        model: the linear model of the picture.
+        mask: initial mask.
+        target: c t, confidence times rough mask.
+        trust: c, the confidence.
+    """
+    middle, half = (1 + SLOWEST) / 2, (1 - SLOWEST) / 2
+    residual = ((model.smoothed(mask.double()) + target) / (1 + trust) - mask).to(mask)
+    model, damping = model.to(mask), 1 / (1 + trust)
+    ratio, step = half / middle, residual / middle
+    mask = mask + step
+    for _ in range(LINEAR_STEPS - 1):
+        residual = residual + damping * model.smoothed(step) - step
+        following = 1 / (2 * middle / half - ratio)
+        step = following * ratio * step + 2 * following / half * residual
+        ratio, mask = following, mask + step
+    return mask

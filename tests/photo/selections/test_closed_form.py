@@ -1,0 +1,53 @@
+"""Closed-form matting: the solution of a dense linear system, and its precision."""
+
+import numpy as np
+import pytest
+import torch
+
+from nlfilter_torch import region_mask
+from nlfilter_torch.photo.selections import closed_form
+from tests.problems import box, colour, noise
+
+
+def test_the_solve_is_that_of_the_linear_system(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(closed_form, "LINEAR_LEVELS", 1)
+    monkeypatch.setattr(closed_form, "LINEAR_STEPS", 3000)
+    monkeypatch.setattr(closed_form, "SLOWEST", 1e-5)
+    height, width, count = 6, 7, 42
+    image, rough = noise(1, 3, height, width), noise(1, 1, height, width, seed=1)
+    front, back = box(1, 1, 2, 2, size=(height, width)).double(), box(4, 4, 1, 2, size=(height, width)).double()
+    functions = closed_form.solve_linear(
+        closed_form.linear_models(image), torch.full_like(rough, 0.5), rough, front, back
+    )
+    pixels = image[0].flatten(1).T.numpy()
+    rows, columns = np.divmod(np.arange(count), width)
+    near = np.maximum(abs(rows[:, None] - rows), abs(columns[:, None] - columns)) <= closed_form.WINDOW_RADIUS
+    share = near / near.sum(1, keepdims=True)  # weights of pixels in windows, and of windows around a pixel
+    smooth = np.zeros((count, count))
+    for middle in range(count):
+        inside = near[middle].nonzero()[0]
+        some = pixels[inside] - pixels[inside].mean(0)
+        slopes = np.linalg.inv(some.T @ some / len(inside) + closed_form.NOISE * np.eye(3)) @ some.T / len(inside)
+        values = (pixels - pixels[inside].mean(0)) @ slopes + 1 / len(inside)  # values of every pixel from those inside
+        smooth[:, inside] += share[:, [middle]] * values
+    trust = closed_form.LINEAR_ROUGH_CONFIDENCE * (np.square(2 * rough.numpy().ravel() - 1) + 0.01)
+    certain = closed_form.LINEAR_SCRIBBLE_CONFIDENCE * (front + back).numpy().ravel()
+    target = trust * rough.numpy().ravel() + closed_form.LINEAR_SCRIBBLE_CONFIDENCE * front.numpy().ravel()
+    expected = np.linalg.solve(np.diag(1 + trust + certain) - smooth, target)
+    found = closed_form.linear_mask(image - 0.5, functions[:, 0])
+    stretched = (smooth @ expected.clip(0, 1) - closed_form.END_MARGIN) / (1 - 2 * closed_form.END_MARGIN)
+    np.testing.assert_allclose(found.flatten(), stretched, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["coffee", "chelsea", "astronaut"])
+def test_the_solve_is_the_same_in_float32(name: str) -> None:
+    image = (255 * colour(name, 110, 130)).round() / 255
+    front, back = box(50, 50, 8, 12, size=(110, 130)), box(4, 8, 8, 12, size=(110, 130))
+    rough = region_mask(image, front, back, num_landmarks=40)
+    found = []
+    for dtype in (torch.float32, torch.float64):
+        some, *masks = (planes.to(dtype) for planes in (image, rough, rough, front, back))
+        functions = closed_form.solve_linear(closed_form.linear_models(some), *masks)
+        assert functions.dtype == dtype
+        found.append(closed_form.linear_mask(some - 0.5, functions[:, 0]))
+    torch.testing.assert_close(found[0].double(), found[1], atol=2e-3, rtol=0)
