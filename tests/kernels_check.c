@@ -7,24 +7,9 @@
 #include <stdlib.h>
 #include <string.h>
 
-enum { B = 2, N = 1237, D = 5, M = 29, J = 3, R = 3, S = 400 }; /* sizes: none is a multiple of another */
+#include "../nlfilter_torch/core/kernels/interface.h"
 
-int nlfilter_level(void);
-int nlfilter_columns(int, int, long, long, long, long, const float *, long, long, const float *, const float *,
-                     const float *, float, int, float *, long, long, float *);
-int nlfilter_backward(int, int, long, long, long, long, const float *, long, long, const float *, const float *,
-                      const float *, float, int, float *, long, long, const float *, long, const float *,
-                      const float *, long, long, const float *, const float *, float *, double *);
-int nlfilter_spread(int, int, long, long, long, const float *, long, long, long, const float *, const float *, float *);
-int nlfilter_gather(int, int, long, long, long, const float *, long, long, long, const float *, long, long, double *);
-int nlfilter_sweep(int, int, long, long, long, const float *, long, long, const float *, const float *, const float *,
-                   float, float *, double *);
-int nlfilter_grams(int, int, long, long, long, const float *, long, long, long, const float *, const float *, double *);
-int nlfilter_lloyd(int, int, long, long, long, long, long, float, const float *, const float *, int *);
-int nlfilter_pivots(int, int, long, long, long, long, float, const float *, const float *, long *);
-int nlfilter_convolution(int, int, long, long, long, long, long, long, long, float, const float *, const float *,
-                         const float *, const float *, float *);
-int nlfilter_stencil(int, int, long, long, long, long, const double *, const double *, double *);
+enum { B = 2, N = 1237, D = 5, M = 29, J = 3, R = 3, S = 400 }; /* sizes: none is a multiple of another */
 
 static float x[B][D][N], z[B][D][M], centre[B][D], rows[B][M][D + 2], inverse[B][M][M], factor[B][M][N], norms[B][N];
 static float right[B][M][N], left[B][M][R], scale[B][N], diagonal[B][N], points[B][D + 1][M], moved[B][D][N];
@@ -47,9 +32,9 @@ static void fill(float *array, size_t bytes, float least, float most)
 
 static double worst, largest;
 
-static void compare(double found, double wanted)
+static void compare(double actual, double wanted)
 {
-    const double error = fabs(found - wanted);
+    const double error = fabs(actual - wanted);
     worst = isnan(worst) || error <= worst ? worst : error; /* NaN stays */
     largest = fabs(wanted) > largest ? fabs(wanted) : largest;
 }
@@ -190,29 +175,29 @@ static void check_products(int level, int threads)
 
 static void check_landmarks(int level, int threads)
 {
-    static float some[B][D][S], start[B][D][M], draws[M];
+    static float samples[B][D][S], start[B][D][M], draws[M];
     static int nearest[B][S];
     static long pivots[B][M];
-    fill(some[0][0], sizeof some, -1, 1);
+    fill(samples[0][0], sizeof samples, -1, 1);
     fill(draws, sizeof draws, 0, 1);
     for (int b = 0; b < B; b++)
         for (int k = 0; k < D; k++)
-            memcpy(start[b][k], some[b][k], M * sizeof(float));
-    int status = nlfilter_lloyd(level, threads, B, D, S, M, 0, 1e-6f, some[0][0], start[0][0], nearest[0]);
+            memcpy(start[b][k], samples[b][k], M * sizeof(float));
+    int status = nlfilter_lloyd(level, threads, B, D, S, M, 0, 1e-6f, samples[0][0], start[0][0], nearest[0]);
     for (int b = 0; b < B; b++)
         for (int i = 0; i < S; i++) {
             double least = INFINITY, chosen = 0;
             for (int m = 0; m < M; m++) {
                 double distance = 0;
                 for (int k = 0; k < D; k++)
-                    distance += pow(some[b][k][i] - start[b][k][m], 2);
+                    distance += pow(samples[b][k][i] - start[b][k][m], 2);
                 least = distance < least ? distance : least;
                 chosen = nearest[b][i] == m ? distance : chosen;
             }
             compare(chosen, least);
         }
     judge("lloyd", status, 1e-5);
-    status = nlfilter_pivots(level, threads, B, D, S, M, 1e-6f, some[0][0], draws, pivots[0]);
+    status = nlfilter_pivots(level, threads, B, D, S, M, 1e-6f, samples[0][0], draws, pivots[0]);
     for (int b = 0; b < B; b++) {
         static double column[M][S], residual[S];
         for (int i = 0; i < S; i++)
@@ -230,7 +215,7 @@ static void check_landmarks(int level, int threads)
             for (int i = 0; i < S; i++) {
                 double distance = 0;
                 for (int k = 0; k < D; k++)
-                    distance += pow(some[b][k][i] - some[b][k][pivot], 2);
+                    distance += pow(samples[b][k][i] - samples[b][k][pivot], 2);
                 column[m][i] = exp(-distance);
                 for (int j = 0; j < m; j++)
                     column[m][i] -= column[j][i] * column[j][pivot];

@@ -7,6 +7,7 @@ import math
 import sys
 import warnings
 from collections.abc import Callable, Sequence
+from functools import partial
 from itertools import takewhile
 from traceback import walk_stack
 from typing import Any
@@ -285,27 +286,28 @@ def checked_response(response: Response, support: Tensor) -> Response:
             f"response must be a function of the eigenvalues, got {type(response).__name__}; "
             "pass a function such as torch.sqrt"
         )
+    return partial(_gains, response, support)
+
+
+def _gains(response: Response, support: Tensor, eigenvalues: Tensor) -> Tensor:
+    """Compute and check the gains of eigenvalues (B, M)."""
     remedy = "return one gain for every eigenvalue"
-
-    def checked(eigenvalues: Tensor) -> Tensor:
-        gains = response(eigenvalues)
-        check_tensor(gains, "response", remedy)
-        if gains.dtype.is_complex:
-            raise TypeError(f"response must be real, got {gains.dtype}; {remedy}")
-        try:
-            fits = torch.broadcast_shapes(gains.shape, eigenvalues.shape) == eigenvalues.shape
-        except RuntimeError:
-            fits = False
-        if not fits:
-            raise ValueError(
-                f"response must return a tensor with the shape of its argument, {tuple(eigenvalues.shape)}, "
-                f"got {tuple(gains.shape)}; {remedy}"
-            )
-        if eigenvalues.shape == support.shape:
-            check_finite(torch.where(support, gains.detach(), 0), "response")
-        return gains if gains.is_floating_point() else gains.to(eigenvalues)
-
-    return checked
+    gains = response(eigenvalues)
+    check_tensor(gains, "response", remedy)
+    if gains.dtype.is_complex:
+        raise TypeError(f"response must be real, got {gains.dtype}; {remedy}")
+    try:
+        fits = torch.broadcast_shapes(gains.shape, eigenvalues.shape) == eigenvalues.shape
+    except RuntimeError:
+        fits = False
+    if not fits:
+        raise ValueError(
+            f"response must return a tensor with the shape of its argument, {tuple(eigenvalues.shape)}, "
+            f"got {tuple(gains.shape)}; {remedy}"
+        )
+    if eigenvalues.shape == support.shape:
+        check_finite(torch.where(support, gains.detach(), 0), "response")
+    return gains if gains.is_floating_point() else gains.to(eigenvalues)
 
 
 def check_alpha(alpha: Tensor, *, dimensions: Sequence[int] = (1, 2, 4)) -> None:

@@ -36,16 +36,19 @@ def moved(container: Container, target: Target, dtype: torch.dtype | None = None
             f"dtype must be torch.float32 or torch.float64, got {dtype}; filters convert images of other dtypes"
         )
 
-    def move(value: Any, exact: bool) -> Any:
-        if isinstance(value, Tensor):
-            kept = exact or dtype is None or not value.is_floating_point()
-            return value.to(device=device, dtype=value.dtype if kept else dtype)
-        if isinstance(value, tuple):
-            return tuple(move(item, exact) for item in value)
-        if not is_dataclass(value) or isinstance(value, type):
-            return value
-        entries = {field.name: getattr(value, field.name) for field in fields(value)}
-        return replace(value, **{name: move(item, exact or name in EXACT) for name, item in entries.items()})
-
-    result: Container = move(container, exact=False)
+    result: Container = _move(container, device, dtype, exact=False)
     return result
+
+
+def _move(value: Any, device: torch.device | None, dtype: torch.dtype | None, *, exact: bool) -> Any:
+    """Move the tensors of a value of any type; keep the precision of all of them if ``exact``."""
+    if isinstance(value, Tensor):
+        kept = exact or dtype is None or not value.is_floating_point()
+        return value.to(device=device, dtype=value.dtype if kept else dtype)
+    if isinstance(value, tuple):
+        return tuple(_move(item, device, dtype, exact=exact) for item in value)
+    if not is_dataclass(value) or isinstance(value, type):
+        return value
+    entries = {field.name: getattr(value, field.name) for field in fields(value)}
+    moved_entries = {name: _move(item, device, dtype, exact=exact or name in EXACT) for name, item in entries.items()}
+    return replace(value, **moved_entries)

@@ -8,7 +8,7 @@ close to 1, the identity, as the target allows.
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import torch
 from torch import Tensor
@@ -307,8 +307,16 @@ class _Problem:
         basis = scale.unsqueeze(2) * SymmetricMatrix.of(inverse).apply(torch.sqrt, torch.ones_like(scale).bool())
         filtered_shape = (self.layers.shape[0], *target.shape[1:])
         target = target.expand(filtered_shape)
-        image = target - self.edit.view(filtered_shape)
-        shares = None if mask is None else mask.to(target) / mask.amax((1, 2, 3), keepdim=True)
+        descent = _Descent(
+            start=start,
+            basis=basis,
+            layers=self.layers,
+            image=target - self.edit.view(filtered_shape),
+            target=target,
+            shares=None if mask is None else mask.to(target) / mask.amax((1, 2, 3), keepdim=True),
+            ridge=self.ridge,
+            loss=loss,
+        )
         coefficients = torch.zeros_like(start).requires_grad_()
         optimizer = torch.optim.LBFGS(
             [coefficients],
@@ -317,30 +325,56 @@ class _Problem:
             tolerance_change=1e-12,
             line_search_fn="strong_wolfe",
         )
+        optimizer.step(partial(descent.differentiate, optimizer, coefficients))
+        return descent.change(coefficients.detach())
 
-        def change_of(c: Tensor) -> Tensor:
-            return start + (basis @ c.unsqueeze(2)).squeeze(2)
 
-        @torch.enable_grad()
-        def closure() -> Tensor:
-            optimizer.zero_grad()
-            change = change_of(coefficients)
-            filtered = image + (change.unsqueeze(1) @ self.layers).view(filtered_shape)
-            if shares is not None:
-                filtered = torch.lerp(target, filtered, shares)
-            value = loss(filtered, target)
-            check_tensor(value, "loss", "return a number that depends on the first image")
-            if value.numel() != 1 or not value.requires_grad:
-                raise ValueError(
-                    f"loss must return a single number with a gradient, got a tensor of shape {tuple(value.shape)}; "
-                    "compute it from the first image in torch"
-                )
-            objective = value.sum() + self.ridge * change.square().sum()
-            objective.backward()
-            return objective
+@dataclass(frozen=True)
+class _Descent:
+    """Minimisation of a loss over coefficients (B, k+1) of a change of the sliders.
 
-        optimizer.step(closure)
-        return change_of(coefficients.detach())
+    Attributes:
+        start: change (B, k+1) for coefficients of 0.
+        basis: (B, k+1, k+1), from coefficients to changes.
+        layers: (B, k+1, P).
+        image: (B, C, H, W), before the edit.
+        target: (B, C, H, W).
+        shares: (B, 1, H, W), the share of the filtered image where it is blended with the target; None means 1.
+        ridge: see :func:`fit_alpha`.
+        loss: see :func:`fit_alpha`.
+    """
+
+    start: Tensor
+    basis: Tensor
+    layers: Tensor
+    image: Tensor
+    target: Tensor
+    shares: Tensor | None
+    ridge: float
+    loss: Loss
+
+    def change(self, coefficients: Tensor) -> Tensor:
+        """Change (B, k+1) of the sliders."""
+        return self.start + (self.basis @ coefficients.unsqueeze(2)).squeeze(2)
+
+    @torch.enable_grad()
+    def differentiate(self, optimizer: torch.optim.Optimizer, coefficients: Tensor) -> Tensor:
+        """Compute what is minimised, and its gradient with respect to the coefficients."""
+        optimizer.zero_grad()
+        change = self.change(coefficients)
+        filtered = self.image + (change.unsqueeze(1) @ self.layers).view(self.target.shape)
+        if self.shares is not None:
+            filtered = torch.lerp(self.target, filtered, self.shares)
+        value = self.loss(filtered, self.target)
+        check_tensor(value, "loss", "return a number that depends on the first image")
+        if value.numel() != 1 or not value.requires_grad:
+            raise ValueError(
+                f"loss must return a single number with a gradient, got a tensor of shape {tuple(value.shape)}; "
+                "compute it from the first image in torch"
+            )
+        objective = value.sum() + self.ridge * change.square().sum()
+        objective.backward()
+        return objective
 
 
 def _pixel_weights(mask: Tensor | None, operator: NonlocalOperator, layers: Tensor) -> Tensor:

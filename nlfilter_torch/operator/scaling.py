@@ -15,6 +15,7 @@ factor of 10 to 100; Chebyshev iteration reduces it by 5.8.
 """
 
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -353,11 +354,8 @@ def damped(matrix: KernelMatrix, start: Solution, goal: float) -> Solution:
 
 def _line_search(step: Tensor, deficit: Tensor, communicator: Communicator, weights: Tensor | None) -> Tensor:
     """Find s (B, 1) that minimises ``(1 + s x)^T W (1 + s x) / 2 - sum log(1 + s x)``, given x and 1 - W 1 (B, N)."""
-    # W 1 = 1 - lacking and W x = lacking - x determine the quadratic.
-
-    def total(values: Tensor) -> Tensor:
-        return communicator.sum(weighted(values, weights).sum(1, keepdim=True))
-
+    total = partial(_total, weights=weights, communicator=communicator)
+    # W 1 = 1 - deficit and W x = deficit - x determine the quadratic.
     linear, square = total(step * (1 - deficit)), total(step * (deficit - step))
     longest = (
         communicator.max((-step).amax(1, keepdim=True)).clamp(min=1e-12).reciprocal()
@@ -373,6 +371,11 @@ def _line_search(step: Tensor, deficit: Tensor, communicator: Communicator, weig
         inside = (following > low) & (following < high)
         length = torch.where(inside, following, (low + high) / 2)
     return length
+
+
+def _total(values: Tensor, *, weights: Tensor | None, communicator: Communicator) -> Tensor:
+    """Sum (B, 1) of values (B, N) over the pixels that the points represent."""
+    return communicator.sum(weighted(values, weights).sum(1, keepdim=True))
 
 
 def weighted_moment(factor: Tensor, weight: Tensor, communicator: Communicator, total: Tensor) -> Tensor:

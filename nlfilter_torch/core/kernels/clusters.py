@@ -1,6 +1,7 @@
 """Parts of k-means: initial centroids, from randomly pivoted Cholesky decomposition, and Lloyd's iteration."""
 
 from collections.abc import Callable
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -49,6 +50,11 @@ def affinities_between(points: Tensor, norms: Tensor, others: Tensor, lengths: T
     return torch.baddbmm(norms + lengths.mT, others.mT, points, beta=-1, alpha=2).clamp_(-60.0, 0.0).exp_()
 
 
+def _affinities_to(points: Tensor, norms: Tensor, pivot: Tensor) -> Tensor:
+    """Affinities (B, 1, S) of points (B, D, S) with squared norms (B, 1, S) to those with index ``pivot`` (B, 1, 1)."""
+    return affinities_between(points, norms, pick(points, pivot), pick(norms, pivot))
+
+
 def pick(planes: Tensor, at: Tensor) -> Tensor:
     """Columns (B, R, M) of planes (B, R, S) with indices (B, 1, M)."""
     return planes.gather(2, at.expand(-1, planes.shape[1], -1))
@@ -75,11 +81,7 @@ def pivots(points: Tensor, draws: Tensor, captured: float) -> Tensor:
     """
     norms = points.square().sum(1, keepdim=True)  # (B, 1, S)
     ones = torch.ones_like(norms)
-
-    def affinities(pivot: Tensor) -> Tensor:
-        return affinities_between(points, norms, pick(points, pivot), pick(norms, pivot))
-
-    return draw_pivots(affinities, ones, ones, draws, captured)[0].squeeze(1)
+    return draw_pivots(partial(_affinities_to, points, norms), ones, ones, draws, captured)[0].squeeze(1)
 
 
 def _compiled_lloyd(points: Tensor, start: Tensor, iterations: int, margin: float) -> Tensor:

@@ -93,21 +93,21 @@ INLINE void NAME(transform_tile)(const struct convolution *task, long top, long 
     for (long c = 0; c < channels; c += LANES) {
         FLOATS rows[6][6];
         for (int j = 0; j < 6; j++) {
-            FLOATS column[6], found[6];
+            FLOATS column[6], values[6];
 #pragma GCC unroll 6
             for (int i = 0; i < 6; i++)
                 column[i] = NAME(leaky)(*(const FLOATS *)(sources[i][j] + c), task->slope);
-            NAME(transform)(column, found);
+            NAME(transform)(column, values);
 #pragma GCC unroll 6
             for (int i = 0; i < 6; i++)
-                rows[i][j] = found[i];
+                rows[i][j] = values[i];
         }
         for (int i = 0; i < 6; i++) {
-            FLOATS found[6];
-            NAME(transform)(rows[i], found);
+            FLOATS values[6];
+            NAME(transform)(rows[i], values);
 #pragma GCC unroll 6
             for (int j = 0; j < 6; j++)
-                *(FLOATS *)(out + (i * 6 + j) * TILES * channels + c) = found[j];
+                *(FLOATS *)(out + (i * 6 + j) * TILES * channels + c) = values[j];
         }
     }
 }
@@ -121,21 +121,21 @@ INLINE void NAME(restore_tile)(const struct convolution *task, long top, long le
         const FLOATS bias = *(const FLOATS *)(task->bias + o);
         FLOATS rows[4][6];
         for (int j = 0; j < 6; j++) {
-            FLOATS column[6], found[4];
+            FLOATS column[6], values[4];
 #pragma GCC unroll 6
             for (int i = 0; i < 6; i++)
                 column[i] = *(const FLOATS *)(products + (i * 6 + j) * TILES * task->padded_outputs + o);
-            NAME(restore)(column, found);
+            NAME(restore)(column, values);
 #pragma GCC unroll 4
             for (int i = 0; i < 4; i++)
-                rows[i][j] = found[i];
+                rows[i][j] = values[i];
         }
         for (int i = 0; i < 4 && top + i * apart < task->height; i++) {
-            FLOATS found[4];
-            NAME(restore)(rows[i], found);
+            FLOATS values[4];
+            NAME(restore)(rows[i], values);
             for (int j = 0; j < 4 && left + j * apart < task->width; j++) {
                 const long place = ((top + i * apart) * task->width + left + j * apart) * outputs + o;
-                FLOATS sum = found[j] + bias;
+                FLOATS sum = values[j] + bias;
                 if (width == LANES) {
                     if (task->added)
                         sum += *(const FLOATS *)(task->added + place);
@@ -153,14 +153,14 @@ INLINE void NAME(restore_tile)(const struct convolution *task, long top, long le
 static TARGET void NAME(convolution)(const struct convolution *task, long first, long last, float *scratch)
 {
     const long channels = task->channels, apart = task->dilation, across = task->tiles_across;
-    const long each = task->tiles_down * across; /* tiles of a phase */
+    const long per_phase = task->tiles_down * across; /* tiles of a phase */
     float *zeros = scratch, *pixels = zeros + channels, *products = pixels + 36 * TILES * channels;
     memset(zeros, 0, channels * sizeof(float));
     for (long start = first; start < last; start += TILES) {
         const long count = last - start < TILES ? last - start : TILES;
         long top[TILES], left[TILES];
         for (long t = 0; t < count; t++) {
-            const long phase = (start + t) / each, tile = (start + t) % each;
+            const long phase = (start + t) / per_phase, tile = (start + t) % per_phase;
             top[t] = phase / apart + 4 * apart * (tile / across);
             left[t] = phase % apart + 4 * apart * (tile % across);
             NAME(transform_tile)(task, top[t], left[t], zeros, pixels + t * channels);

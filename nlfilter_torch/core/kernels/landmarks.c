@@ -41,7 +41,7 @@ int nlfilter_lloyd(int level, int threads, long images, long size, long count, l
 {
     struct lloyd task = {points, start, nearest, size, count, num_landmarks, iterations, margin};
     struct work work = {.run = run_lloyd, .task = &task, .level = level, .images = images, .pixels = 1, .length = 1,
-                        .each = 1, .floats = (size + 1) * (2 * padded(num_landmarks, MOST_ROWS) + MOST_PIXELS)};
+                        .pieces = 1, .floats = (size + 1) * (2 * padded(num_landmarks, MOST_ROWS) + MOST_PIXELS)};
     return run_pieces(&work, threads);
 }
 
@@ -64,6 +64,6 @@ int nlfilter_pivots(int level, int threads, long images, long size, long count, 
     const long whole = padded(count, LINE);
     struct pivots task = {points, draws, pivots, size, count, whole, num_landmarks, captured};
     struct work work = {.run = run_pivots, .task = &task, .level = level, .images = images, .pixels = 1, .length = 1,
-                        .each = 1, .floats = (num_landmarks + 2 + size) * whole};
+                        .pieces = 1, .floats = (num_landmarks + 2 + size) * whole};
     return run_pieces(&work, threads);
 }

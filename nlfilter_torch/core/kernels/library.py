@@ -7,8 +7,9 @@ torch computes the same in all other cases: on other devices, in other dtypes, u
 
 import ctypes
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from pathlib import Path
+from threading import Lock
 from typing import Any, TypeVar, cast
 
 import torch
@@ -23,11 +24,41 @@ Definition = TypeVar("Definition", bound=Callable[..., Any])
 
 _POINTER, _LONG, _INT, _FLOAT = ctypes.c_void_p, ctypes.c_long, ctypes.c_int, ctypes.c_float
 _library: ctypes.CDLL | None = None
-level = 0  # index of instruction_sets.NAMES; 0 without a library
+level = 0  # index of instruction_sets.NAMES, set once: 0 without a library
+
+
+class _Definitions:
+    """Whether definitions in torch are used instead of kernels: while any thread is inside this context.
+
+    Attributes:
+        used: read without a lock before every operator.
+    """
+
+    def __init__(self) -> None:
+        self.used = False
+        self._lock = Lock()
+        self._contexts = 0
+
+    def __enter__(self) -> None:
+        self._count(1)
+
+    def __exit__(self, *_: object) -> None:
+        self._count(-1)
+
+    def _count(self, change: int) -> None:
+        with self._lock:
+            self._contexts += change
+            self.used = self._contexts > 0
+
+
+_definitions = _Definitions()
 
 
 def use(library: ctypes.CDLL, best: int) -> None:
-    """Run the kernels of a compiled library, with instruction sets up to ``best``."""
+    """Run the kernels of a compiled library, with instruction sets up to ``best``.
+
+    ``interface.h`` declares the types of the arguments; a test compares them with these.
+    """
     global _library, level
     _library, level = library, best
     shared: list[Any] = [_INT, _INT, _LONG]  # instruction set, threads, pixels
@@ -62,15 +93,9 @@ def share_threads(library: ctypes.CDLL, openmp: Any) -> None:
     library.nlfilter_share_threads(ctypes.cast(openmp, _POINTER) if openmp is not None else None)
 
 
-@contextmanager
-def definitions_only() -> Iterator[None]:
+def definitions_only() -> AbstractContextManager[None]:
     """Use the definitions in torch instead of the kernels in C, in all threads; for tests and comparisons."""
-    global level
-    before, level = level, 0
-    try:
-        yield
-    finally:
-        level = before
+    return _definitions
 
 
 def register(
@@ -96,7 +121,9 @@ def register(
 
     def decorate(definition: Definition) -> Definition:
         def on_processors(*arguments: Any) -> Any:
-            result = compiled(*arguments) if compiled is not None and level and _suit(arguments, dtype) else None
+            result = None
+            if compiled is not None and level and not _definitions.used and _suit(arguments, dtype):
+                result = compiled(*arguments)
             return definition(*arguments) if result is None else result
 
         def under_autograd(keys: Any, *arguments: Any) -> Any:

@@ -39,17 +39,17 @@ static int is_halved_by_row(const struct level *level) { return level->height > 
 /* A rectangle. The bits of its index tell which half it is, the highest that of the whole image. */
 static struct rectangle find(const struct dissection *task, long level, long number)
 {
-    struct rectangle found = {0, 0, task->height, task->width, -1};
+    struct rectangle rectangle = {0, 0, task->height, task->width, -1};
     for (long k = 0;; k++) {
-        long *start = &found.left, *length = &found.width;
+        long *start = &rectangle.left, *length = &rectangle.width;
         if (is_halved_by_row(task->levels + k))
-            start = &found.top, length = &found.height;
-        found.line = k < task->last ? (*length - 1) / 2 : -1;
+            start = &rectangle.top, length = &rectangle.height;
+        rectangle.line = k < task->last ? (*length - 1) / 2 : -1;
         if (k == level)
-            return found;
+            return rectangle;
         const int second = number >> (level - 1 - k) & 1;
-        *start += second ? found.line + 1 : 0;
-        *length = second ? *length - 1 - found.line : found.line;
+        *start += second ? rectangle.line + 1 : 0;
+        *length = second ? *length - 1 - rectangle.line : rectangle.line;
     }
 }
 
@@ -228,7 +228,7 @@ static int run_level(struct dissection *task, long index, int threads, int instr
     const long below = index < task->last ? level[1].own + level[1].around : 0, listed = below > pixels ? below : pixels;
     task->level = index;
     struct work work = {.run = substitute ? run_substitute : run_eliminate, .task = task, .level = instructions,
-                        .images = 1, .pixels = pieces, .length = length, .each = (pieces + length - 1) / length,
+                        .images = 1, .pixels = pieces, .length = length, .pieces = (pieces + length - 1) / length,
                         .floats = (values * sizeof(double) + listed * sizeof(long)) / sizeof(float)};
     return run_pieces(&work, threads);
 }

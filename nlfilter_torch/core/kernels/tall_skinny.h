@@ -4,11 +4,11 @@
 
 /* Pointers to the next `count` rows of the factor, with the last row repeated past the end. Reading several rows at
  * once makes better use of the memory bandwidth. */
-INLINE void NAME(row_pointers)(const struct tall_skinny *task, long row, long start, int count, const float **found)
+INLINE void NAME(row_pointers)(const struct tall_skinny *task, long row, long start, int count, const float **rows)
 {
     const long last = task->num_landmarks - 1;
     for (long k = 0; k < count; k++)
-        found[k] = task->factor + (row + k < last ? row + k : last) * task->factor_stride + start;
+        rows[k] = task->factor + (row + k < last ? row + k : last) * task->factor_stride + start;
 }
 
 /* out = rows (R, M) times the columns first to last of the factor, at most CHUNK of them, times scaling. */

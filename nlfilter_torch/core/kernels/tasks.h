@@ -11,6 +11,8 @@
 #include <stdlib.h>
 #include <string.h>
 
+#include "interface.h"
+
 #define CHUNK 33024  /* maximum pixels per piece; reading long parts of each row uses memory bandwidth better */
 #define LINE 64      /* pieces are multiples of this: the largest tile, and more than a cache line */
 #define NEAR 196608  /* number of floats of the factor that fit the second-level cache */
@@ -118,7 +120,7 @@ struct work {
     size_t floats; /* size of the scratch memory of each thread */
     int level;
     long images, pixels; /* pixels of each image */
-    long length, each;   /* pixels of a piece, and pieces per image */
+    long length, pieces; /* pixels of a piece, and pieces per image */
     double *totals;      /* sums of each piece, or NULL */
     atomic_long next;
     atomic_int failed;

@@ -47,8 +47,8 @@ static void run_worker(void *argument)
     if (!scratch)
         work->failed = 1;
     while (scratch) {
-        const long piece = atomic_fetch_add(&work->next, 1), image = piece / work->each;
-        const long first = piece % work->each * work->length, last = first + work->length;
+        const long piece = atomic_fetch_add(&work->next, 1), image = piece / work->pieces;
+        const long first = piece % work->pieces * work->length, last = first + work->length;
         if (image >= work->images)
             break;
         work->run(work, image, piece, first, last < work->pixels ? last : work->pixels, scratch);
@@ -66,8 +66,8 @@ void nlfilter_share_threads(void *gomp_parallel) { parallel = gomp_parallel; }
 /* The pool. Its threads sleep until there is work that wants more threads. The thread that submits work takes part in
  * it, and then waits only for pool threads that have started: a thread without a core yet delays nothing. */
 static pthread_mutex_t lock = PTHREAD_MUTEX_INITIALIZER;
-static pthread_cond_t brought = PTHREAD_COND_INITIALIZER, finished = PTHREAD_COND_INITIALIZER;
-static struct work *brought_first; /* head of the list of submitted work */
+static pthread_cond_t submitted = PTHREAD_COND_INITIALIZER, finished = PTHREAD_COND_INITIALIZER;
+static struct work *first_work; /* head of the list of submitted work */
 static int pool_size;
 
 static void *help(void *unused)
@@ -75,11 +75,11 @@ static void *help(void *unused)
     (void)unused;
     pthread_mutex_lock(&lock);
     for (;;) {
-        struct work *work = brought_first;
+        struct work *work = first_work;
         while (work && !work->places)
             work = work->following;
         if (!work) {
-            pthread_cond_wait(&brought, &lock);
+            pthread_cond_wait(&submitted, &lock);
             continue;
         }
         work->places--;
@@ -97,8 +97,8 @@ static void *help(void *unused)
 static void forget_pool(void)
 {
     lock = (pthread_mutex_t)PTHREAD_MUTEX_INITIALIZER;
-    brought = finished = (pthread_cond_t)PTHREAD_COND_INITIALIZER;
-    brought_first = NULL;
+    submitted = finished = (pthread_cond_t)PTHREAD_COND_INITIALIZER;
+    first_work = NULL;
     pool_size = 0;
 }
 
@@ -124,14 +124,14 @@ static void run_with_pool(struct work *work, int helpers)
     if (pool_size < helpers)
         grow_pool(helpers);
     work->places = helpers;
-    work->following = brought_first;
-    brought_first = work;
+    work->following = first_work;
+    first_work = work;
     pthread_mutex_unlock(&lock);
     for (int i = 0; i < helpers; i++)
-        pthread_cond_signal(&brought);
+        pthread_cond_signal(&submitted);
     run_worker(work);
     pthread_mutex_lock(&lock);
-    struct work **link = &brought_first;
+    struct work **link = &first_work;
     while (*link != work)
         link = &(*link)->following;
     *link = work->following;
@@ -148,7 +148,7 @@ static void run_with_pool(struct work *work, int helpers)
 
 int run_pieces(struct work *work, int threads)
 {
-    const long pieces = work->images * work->each;
+    const long pieces = work->images * work->pieces;
     const int wanted = threads < pieces ? threads : pieces;
     if (wanted < 2)
         run_worker(work);
@@ -165,7 +165,7 @@ static void cut(struct work *work, int threads, long most)
     const long wanted = (4 * threads + work->images - 1) / work->images;
     const long length = padded((work->pixels + wanted - 1) / wanted, LINE);
     work->length = length < most ? length : most;
-    work->each = (work->pixels + work->length - 1) / work->length;
+    work->pieces = (work->pixels + work->length - 1) / work->length;
 }
 
 int divide(struct work *work, int threads, long most)
@@ -178,12 +178,12 @@ int divide(struct work *work, int threads, long most)
 int add_up(struct work *work, int threads, long sums, double *out)
 {
     cut(work, threads, work->pixels);
-    work->totals = calloc(work->images * work->each * sums, sizeof(double));
+    work->totals = calloc(work->images * work->pieces * sums, sizeof(double));
     int status = work->totals ? run_pieces(work, threads) : -1;
     memset(out, 0, work->images * sums * sizeof(double));
-    for (long piece = 0; !status && piece < work->images * work->each; piece++)
+    for (long piece = 0; !status && piece < work->images * work->pieces; piece++)
         for (long k = 0; k < sums; k++)
-            out[piece / work->each * sums + k] += work->totals[piece * sums + k];
+            out[piece / work->pieces * sums + k] += work->totals[piece * sums + k];
     free(work->totals);
     return status;
 }

@@ -1,6 +1,7 @@
 """A denoiser: in each of two passes, a small network computes guide and sliders for a filter of similar pixels."""
 
 import math
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -146,16 +147,15 @@ class NonlocalDenoiser(nn.Module):
         check_count(turns, "turns")
         if turns not in (1, 2, 4):
             raise ValueError(f"turns must be 1, 2 or 4, got {described(turns)}; 1 is fastest")
-        quarters = range(0, 4, 4 // turns)
+        return in_tiles(image, noise, partial(self._mean_estimate, range(0, 4, 4 // turns)), inner)
 
-        def mean(tile: Tensor, levels: Tensor) -> Tensor:
-            estimates = [
-                self.estimate_noise(*(planes.rot90(n, (2, 3)) for planes in (tile, levels))).rot90(-n, (2, 3))
-                for n in quarters
-            ]
-            return torch.stack(estimates).mean(0)
-
-        return in_tiles(image, noise, mean, inner)
+    def _mean_estimate(self, quarters: range, tile: Tensor, levels: Tensor) -> Tensor:
+        """Mean of the estimates of a tile's noise, each from the tile rotated by so many quarters of a turn."""
+        estimates = [
+            self.estimate_noise(*(planes.rot90(n, (2, 3)) for planes in (tile, levels))).rot90(-n, (2, 3))
+            for n in quarters
+        ]
+        return torch.stack(estimates).mean(0)
 
     def estimate_noise(self, noisy: Tensor, noise: Tensor) -> Tensor:
         """Estimate the noise without dividing the image: called with crops in training, with tiles otherwise.

@@ -1,0 +1,66 @@
+/* Functions that Python calls, declared here alone: C checks the definitions against this file, and
+ * tests/core/kernels/test_library.py the argument types that ctypes converts to.
+ *
+ * `level` is the instruction set, an index of SETS; `threads` the number of threads; B images have N = `pixels` pixels.
+ * The functions that take these return 0 on success and -1 if memory cannot be allocated. */
+
+#pragma once
+
+/* The best instruction set that this processor supports, as an index of SETS; 0 for none. */
+int nlfilter_level(void);
+
+/* Run on the threads of an OpenMP library from now on, by its function GOMP_parallel; NULL: on a pool of its own. */
+void nlfilter_share_threads(void *gomp_parallel);
+
+/* Columns (B, M, N) of the Nystrom factor; norms (B, N) are written if `limited`. */
+int nlfilter_columns(int level, int threads, long pixels, long images, long size, long num_landmarks,
+                     const float *features, long features_step, long features_stride, const float *centre,
+                     const float *landmarks, const float *inverse_cholesky, float floor, int limited, float *factor,
+                     long factor_step, long factor_stride, float *norms);
+
+/* Gradients of the columns' inputs. The gradient of the columns is left right; if `left` is NULL, it is `right`, and
+ * `rank` is the number of landmarks. */
+int nlfilter_backward(int level, int threads, long pixels, long images, long size, long num_landmarks,
+                      const float *features, long features_step, long features_stride, const float *centre,
+                      const float *landmarks, const float *inverse_cholesky, float floor, int limited, float *factor,
+                      long factor_step, long factor_stride, const float *scale, long rank, const float *left,
+                      const float *right, long right_step, long right_stride, const float *diagonal,
+                      const float *points, float *moved, double *totals);
+
+/* rows (B, R, M) times the factor and, unless it is NULL, a diagonal scaling (B, N). */
+int nlfilter_spread(int level, int threads, long pixels, long images, long num_landmarks, const float *factor,
+                    long factor_step, long factor_stride, long count, const float *rows, const float *scaling,
+                    float *out);
+
+/* planes (B, R, N) times the transposed factor. */
+int nlfilter_gather(int level, int threads, long pixels, long images, long num_landmarks, const float *factor,
+                    long factor_step, long factor_stride, long count, const float *planes, long planes_step,
+                    long planes_stride, double *out);
+
+/* A vector over all pixels and its moment: with `diagonal` the scaling that belongs to `row`, half an estimate of the
+ * moment; with `scaling` its product with the row times the factor. */
+int nlfilter_sweep(int level, int threads, long pixels, long images, long num_landmarks, const float *factor,
+                   long factor_step, long factor_stride, const float *row, const float *scaling, const float *diagonal,
+                   float most, float *out, double *moment);
+
+/* Gram matrices (B, R, M, M) of the scaled factor, weighted by powers of the remainder. */
+int nlfilter_grams(int level, int threads, long pixels, long images, long num_landmarks, const float *factor,
+                   long factor_step, long factor_stride, long count, const float *scaling, const float *remainder,
+                   double *out);
+
+/* Lloyd's iteration of k-means: the nearest centre (B, S) of each point. */
+int nlfilter_lloyd(int level, int threads, long images, long size, long count, long num_landmarks, long iterations,
+                   float margin, const float *points, const float *start, int *nearest);
+
+/* Pivots (B, M) of randomly pivoted Cholesky decompositions. */
+int nlfilter_pivots(int level, int threads, long images, long size, long count, long num_landmarks, float captured,
+                    const float *points, const float *draws, long *pivots);
+
+/* Convolution with 3x3 weights of features that pass through a leaky rectifier. */
+int nlfilter_convolution(int level, int threads, long images, long height, long width, long channels, long outputs,
+                         long padded_outputs, long dilation, float slope, const float *features, const float *weights,
+                         const float *bias, const float *added, float *out);
+
+/* Solutions (B, C, H, W) of linear systems of pixels and their eight neighbours. */
+int nlfilter_stencil(int level, int threads, long images, long height, long width, long sides, const double *stencil,
+                     const double *right, double *out);
