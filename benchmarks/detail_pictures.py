@@ -26,7 +26,7 @@ from skimage.filters import unsharp_mask
 from torch import Tensor
 
 from benchmarks.photographs import LETTERS
-from nlfilter_torch.photo.declared.presets import PRESETS
+from nlfilter_torch.photo import PRESETS, apply_recipe
 from nlfilter_torch.photo.picture.colour import edit_luminance
 from nlfilter_torch.photo.plotting import save_figure, show_images
 
@@ -101,7 +101,7 @@ def main() -> None:
     for name, (top, left) in CROPS.items():
         image = torch.from_numpy(getattr(skimage.data, name)()).permute(2, 0, 1)[None].float() / 255
         luminance = rgb_to_grayscale(image)
-        crisp = PRESETS["crisp"].apply(image)
+        crisp = apply_recipe(PRESETS["crisp"], image)
         gain = detail_gain(luminance, rgb_to_grayscale(crisp.clamp(0, 1)))
         amount = matching_amount(luminance, gain)
         masked = edit_luminance(image, unsharp(amount))

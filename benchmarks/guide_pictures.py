@@ -29,7 +29,7 @@ from nlfilter_torch import (
     recolor,
     sharpen,
 )
-from nlfilter_torch.photo.declared.presets import PRESETS
+from nlfilter_torch.photo import PRESETS, apply_recipe
 from nlfilter_torch.photo.io.writing import open_beside
 from nlfilter_torch.photo.picture.colour import edit_luminance
 from nlfilter_torch.photo.plotting import plot_response, show_eigenvectors, show_images, show_layers
@@ -56,7 +56,7 @@ def filtered(image: Tensor, alpha: Tensor = ALPHA, **options: object) -> Tensor:
 def presets(name: str, window: tuple[int, int, int]) -> Figure:
     """Every preset on one photograph."""
     image = photograph(name)
-    panels = {"before": image} | {title: preset.apply(image) for title, preset in PRESETS.items()}
+    panels = {"before": image} | {title: apply_recipe(preset, image) for title, preset in PRESETS.items()}
     return show_images(
         {title: crop(panel, window) for title, panel in panels.items()}, columns=3, side=250, letters=LETTERS
     )

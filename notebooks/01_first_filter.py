@@ -27,8 +27,8 @@ from kornia.color import rgb_to_grayscale
 from skimage.transform import resize
 
 from nlfilter_torch import captured_energy, detail_layers, nonlocal_operator, polynomial_filter
+from nlfilter_torch.photo import plot_response, show_eigenvectors, show_images, show_layers
 from nlfilter_torch.photo.picture.colour import edit_luminance
-from nlfilter_torch.photo.plotting import plot_response, show_eigenvectors, show_images, show_layers
 
 # %% [markdown]
 # ## 1. A photograph
@@ -45,7 +45,7 @@ show_images({"The photograph": image, "Its luminance": luminance}, side=280)
 # ## 2. Its filter
 #
 # The operator W links each of the 38,400 pixels to all others, by the similarity of the 5x5 patches around them. A hundred
-# typical patches, the landmarks, represent all of them, so the matrix of more than a thousand million entries is never formed.
+# typical patches, the landmarks, represent all of them, so the matrix of more than a billion entries is never formed.
 # The diagnostics measure the quality of this approximation: `row_sum_residual` (W averages, so its rows should sum to 1), and
 # beta, the share of the picture that the filter's eigenvectors capture.
 

@@ -24,8 +24,8 @@ import torch
 from kornia.color import rgb_to_grayscale
 from skimage.transform import resize
 
-from nlfilter_torch import colorize, diffusion_mask, enhance, nonlocal_operator, recolor
-from nlfilter_torch.photo.plotting import show_images, show_mask
+from nlfilter_torch import diffusion_mask, nonlocal_operator
+from nlfilter_torch.photo import colorize, enhance, recolor, show_images, show_mask
 
 pixels = resize(skimage.data.astronaut(), (200, 200), anti_aliasing=True)
 image = torch.from_numpy(pixels).float().permute(2, 0, 1)[None]
@@ -84,7 +84,7 @@ keep = spot(72, 17, 8, 5) + spot(165, 2, 8, 6) + spot(62, 84)
 alone = recolor(image, strokes, painted)
 green = recolor(image, strokes, painted, keep=keep)
 shown = torch.lerp(image, strokes, painted) * (1 - keep)
-show_images({"strokes, and what stays": shown, "without what stays": alone, "recoloured": green}, side=300)
+show_images({"scribbles, and the background": shown, "without the background": alone, "recoloured": green}, side=300)
 
 # %% [markdown]
 # ## 5. Colours for a grey photograph

@@ -26,10 +26,8 @@ from skimage.filters import unsharp_mask
 from skimage.transform import resize
 
 from nlfilter_torch import estimate_bandwidth, fit_alpha, nonlocal_operator, polynomial_filter
-from nlfilter_torch.photo.declared.presets import PRESETS, Recipe
-from nlfilter_torch.photo.declared.steps import Step
+from nlfilter_torch.photo import PRESETS, Recipe, Step, apply_recipe, plot_response, show_images
 from nlfilter_torch.photo.picture.colour import edit_luminance
-from nlfilter_torch.photo.plotting import plot_response, show_images
 
 
 def load(name: str, height: int, width: int) -> torch.Tensor:
@@ -62,11 +60,11 @@ show_images({"before": image, "the edit": edited}, side=380)
 # %%
 operator = nonlocal_operator(luminance)
 alpha = fit_alpha(operator, luminance, target)[0]
-found = polynomial_filter(operator, luminance, alpha)
-left, change = ((target - x).square().sum() for x in (found, luminance))
+by_sliders = polynomial_filter(operator, luminance, alpha)
+left, change = ((target - x).square().sum() for x in (by_sliders, luminance))
 print("alpha:", [round(a, 2) for a in alpha.tolist()])
 print(f"explained: {100 * (1 - left / change):.1f} % of the change")
-show_images({"the edit": edited, "by the sliders": edit_luminance(image, lambda _: found)}, side=380)
+show_images({"the edit": edited, "by the sliders": edit_luminance(image, lambda _: by_sliders)}, side=380)
 
 # %%
 plot_response(alpha, operator.spectrum())
@@ -80,14 +78,14 @@ plot_response(alpha, operator.spectrum())
 # %%
 look = Recipe((Step("detail", alpha=tuple(round(a, 3) for a in alpha.tolist())),))
 print(look.to_json(complete=True))
-show_images({"another photograph": other, "with the same look": look.apply(other)}, side=380)
+show_images({"another photograph": other, "with the same look": apply_recipe(look, other)}, side=380)
 
 # %% [markdown]
 # Named presets take one line of code, or `--preset NAME` on the command line.
 
 # %%
 names = ("crisp", "dramatic", "glow", "soft skin", "calm", "smooth")
-show_images({name: PRESETS[name].apply(other) for name in names}, columns=3, side=260)
+show_images({name: apply_recipe(PRESETS[name], other) for name in names}, columns=3, side=260)
 
 # %% [markdown]
 # ## 4. The filter itself, by gradient descent

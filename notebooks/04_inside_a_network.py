@@ -26,7 +26,7 @@ from skimage.color import rgb2gray
 from torch import nn
 
 from nlfilter_torch import NonlocalFilter
-from nlfilter_torch.photo.plotting import show_images
+from nlfilter_torch.photo import show_images
 
 NOISE = 25 / 255
 
@@ -82,14 +82,14 @@ def crops(count: int = 4, side: int = 48) -> torch.Tensor:
     return torch.stack(chosen)[:, None]
 
 
-def psnr(clean: torch.Tensor, found: torch.Tensor) -> float:
-    return -10 * float((clean - found).square().mean().log10())
+def psnr(clean: torch.Tensor, denoised: torch.Tensor) -> float:
+    return -10 * float((clean - denoised).square().mean().log10())
 
 
 # %% [markdown]
 # ## 3. Training
 #
-# An ordinary loop. Gradients of the balancing are implicit and do not divide by differences of eigenvalues, so clipping and
+# An ordinary loop. Gradients of the Sinkhorn balancing are implicit and do not divide by differences of eigenvalues, so clipping and
 # warm-up are not needed.
 
 # %%
@@ -102,13 +102,13 @@ optimizer = torch.optim.Adam(network.parameters(), lr=0.01)
 gains = []
 for _ in range(100):
     clean = crops()
-    given = noisy(clean)
-    found = network(given)
-    loss = (found - clean).square().mean()
+    degraded = noisy(clean)
+    denoised = network(degraded)
+    loss = (denoised - clean).square().mean()
     optimizer.zero_grad()
     loss.backward()
     optimizer.step()
-    gains.append(psnr(clean, found.detach()) - psnr(clean, given))
+    gains.append(psnr(clean, denoised.detach()) - psnr(clean, degraded))
 
 figure = Figure(figsize=(7, 3), layout="constrained")
 axis = figure.subplots()
