@@ -1,0 +1,79 @@
+"""Colours: luminance at constant chroma, chroma within gamut, and groups of colours."""
+
+import pytest
+import skimage.color
+import torch
+
+from nlfilter_torch.photo.picture.colour import (
+    colour_guide,
+    dot,
+    edit_luminance,
+    group_colours,
+    hundredths_of_lab,
+    merge_luminance,
+    split_luminance,
+    with_green,
+)
+from tests.problems import colour, luminance, noise
+
+
+def test_an_edit_of_luminance_keeps_the_differences_of_the_channels() -> None:
+    image = colour("coffee", 20, 30).double()
+    edited = edit_luminance(image, lambda y: y.sqrt())
+    torch.testing.assert_close(luminance(edited), luminance(image).sqrt())
+    torch.testing.assert_close(edited - luminance(edited), image - luminance(image))
+    two = image[:, :2]
+    assert torch.equal(edit_luminance(two, lambda planes: 2 * planes), 2 * two)  # not RGB: all channels are edited
+
+
+def test_luminance_and_chroma_are_the_image() -> None:
+    image = colour("coffee", 20, 30).double()
+    grey, chroma = split_luminance(image)
+    torch.testing.assert_close(merge_luminance(grey, chroma), image)
+    torch.testing.assert_close(luminance(chroma), torch.zeros_like(grey), atol=1e-7, rtol=0)
+    torch.testing.assert_close(with_green(chroma[:, ::2]), chroma, atol=1e-6, rtol=0)
+
+
+def test_chroma_beyond_the_gamut_is_scaled_down_and_luminance_kept() -> None:
+    grey, chroma = noise(1, 1, 9, 9), with_green(noise(1, 2, 9, 9, seed=1) - 0.5)
+    merged = merge_luminance(grey, 4 * chroma)
+    assert merged.min() > -1e-9
+    assert merged.max() < 1 + 1e-9
+    torch.testing.assert_close(luminance(merged), grey, atol=1e-6, rtol=0)
+    hues = torch.linalg.cross(merged - luminance(merged), chroma, dim=1)
+    torch.testing.assert_close(hues, torch.zeros_like(hues), atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+def test_lab_is_that_of_scikit_image(channels: int) -> None:
+    image = colour("coffee", 20, 30)[:, :channels]
+    wanted = skimage.color.rgb2lab(image[0].expand(3, -1, -1).permute(1, 2, 0).double().numpy()) / 100
+    torch.testing.assert_close(
+        hundredths_of_lab(image)[0].permute(1, 2, 0).double(), torch.from_numpy(wanted), atol=2e-4, rtol=0
+    )
+
+
+def test_lightness_counts_less_than_colour() -> None:
+    image = colour("coffee", 20, 30)
+    torch.testing.assert_close(
+        colour_guide(image), hundredths_of_lab(image) * torch.tensor([0.3, 1.0, 1.0]).view(1, 3, 1, 1)
+    )
+
+
+def test_products_are_summed_along_any_dimension() -> None:
+    a, b = noise(2, 3, 4, 5), noise(2, 3, 4, 5, seed=1)
+    for dim in (1, 2):
+        torch.testing.assert_close(dot(a, b, dim), (a * b).sum(dim, keepdim=True))
+
+
+def test_strokes_of_more_than_sixteen_colours_join_the_nearest_group() -> None:
+    reds = torch.linspace(-0.5, 0.5, 20).view(1, 1, 1, 20)
+    chroma = torch.cat([reds, torch.zeros(1, 2, 1, 20)], dim=1)
+    weights = torch.ones(1, 1, 1, 20)
+    weights[..., 19] = 0
+    regions, means, valid = group_colours(chroma, weights)
+    assert regions.shape == (1, 16, 1, 20)
+    assert valid.all()
+    assert torch.equal(regions.sum(1), weights[:, 0])  # each painted pixel is in one of them
+    assert float(regions[0, 15, 0, 15:19].sum()) == 4  # the last colours are nearest to the sixteenth
+    torch.testing.assert_close(means[0, 15, 0], reds[..., 15:19].mean())

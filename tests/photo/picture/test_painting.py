@@ -1,0 +1,59 @@
+"""Brush strokes as masks and colours."""
+
+import math
+from itertools import pairwise
+
+import pytest
+import torch
+
+from nlfilter_torch.photo.declared.strokes import Stroke
+from nlfilter_torch.photo.picture.painting import colour_of, cover, mask_of, paint
+
+SIZE = (40, 60)
+LINE = Stroke(((0.2, 0.3), (0.8, 0.3), (0.8, 0.9)), 0.05, "in")
+
+
+def test_a_stroke_covers_the_pixels_near_its_line() -> None:
+    covered = cover(LINE, SIZE)
+    points = [(x * 60 - 0.5, y * 40 - 0.5) for x, y in LINE.points]
+    for row in range(40):
+        for column in range(60):
+            distances = []
+            for (x0, y0), (x1, y1) in pairwise(points):
+                squared = (x1 - x0) ** 2 + (y1 - y0) ** 2
+                along = min(max(((column - x0) * (x1 - x0) + (row - y0) * (y1 - y0)) / squared, 0), 1)
+                distances.append(math.hypot(column - x0 - along * (x1 - x0), row - y0 - along * (y1 - y0)))
+            if abs(min(distances) - 2) > 1e-3:  # a radius of 0.05 of the short side
+                assert bool(covered[row, column]) == (min(distances) < 2)
+
+
+def test_a_dot_of_any_size_covers_a_pixel() -> None:
+    for x, y in ((0.0, 0.0), (0.5, 0.5), (1.0, 1.0), (0.333, 0.777)):
+        assert cover(Stroke(((x, y),), 1e-6, "in"), SIZE).any()
+
+
+@pytest.mark.parametrize("rows", [slice(0, 40), slice(5, 13), slice(38, 40)])
+def test_rows_are_those_of_the_whole(rows: slice) -> None:
+    assert torch.equal(cover(LINE, SIZE, rows), cover(LINE, SIZE)[rows])
+    blue = Stroke(((0.5, 0.5),), 0.2, "#0000ff")
+    for part, whole in zip(paint([blue], SIZE, rows), paint([blue], SIZE), strict=True):
+        assert torch.equal(part, whole[..., rows, :])
+
+
+def test_strokes_above_hide_those_below() -> None:
+    dot = Stroke(((0.5, 0.3),), 0.2, "out")
+    mask, hidden = mask_of([LINE], SIZE), cover(dot, SIZE)
+    visible = mask_of([LINE], SIZE, above=[dot])
+    assert mask.dtype == torch.float32
+    assert not visible[0, 0][hidden].any()
+    assert torch.equal(visible[0, 0][~hidden], mask[0, 0][~hidden])
+    assert mask[0, 0][hidden].any()
+
+
+def test_later_strokes_cover_earlier_ones() -> None:
+    red, blue = Stroke(((0.5, 0.5),), 0.3, "#ff0000"), Stroke(((0.5, 0.5),), 0.1, "#0000ff")
+    colours, painted = paint([red, blue], SIZE)
+    assert torch.equal(colours[0, :, 20, 30], colour_of("#0000ff"))
+    assert torch.equal(colours[0, :, 20, 22], colour_of("#ff0000"))
+    assert torch.equal(painted, mask_of([red], SIZE))
+    assert not colours[:, :, painted[0, 0] == 0].any()
