@@ -232,8 +232,8 @@ class Editor:
 
     def _is_preview(self, session: object) -> bool:
         """Whether the page shows the preview of a session, and nothing is being drawn or moved."""
-        gone, drawing = self._client.is_deleted, self._drawing or bool(self._wanted)
-        return self.session is session and not (gone or drawing or self._closeup.is_busy)
+        is_drawing = self._drawing or bool(self._wanted)
+        return self.session is session and not (self._client.is_deleted or is_drawing or self._closeup.is_busy)
 
     def _draw_response(self) -> None:
         detail = self.session.recipe.last("detail")
