@@ -1,4 +1,4 @@
-"""Who may talk to the editor: its own pages, under an address of this machine, with files of a stated size."""
+"""Access to the editor: its own pages, at an address of this machine, with files of a limited and stated size."""
 
 import ipaddress
 import socket
@@ -11,7 +11,7 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 
 LOCAL = ("127.0.0.1", "localhost", "::1")
 LARGEST = 1_000_000_000  # bytes of an uploaded file
-AROUND = 100_000  # bytes that a form adds to a file
+FORM = 100_000  # bytes that a form adds to a file, at most
 
 
 def names_of(host: str) -> frozenset[str]:
@@ -29,8 +29,8 @@ def names_of(host: str) -> frozenset[str]:
 def refusal(headers: Headers, *, websocket: bool, host: str, names: Iterable[str]) -> tuple[int, str] | None:
     """Status and sentence for a request that is refused, or None.
 
-    A page of another site can reach the editor in two ways: by a name of its own that leads to this machine (DNS
-    rebinding), which ``Host`` shows, or by the editor's address, which ``Origin`` shows.
+    A page of another site can reach the editor in two ways: through its own domain name pointed at this machine (DNS
+    rebinding), which the ``Host`` header reveals, or at the editor's address, which the ``Origin`` header reveals.
     """
     address = _split(f"//{headers.get('host', '')}")
     if address is None or not (address[0] in names or (host not in LOCAL and _is_numeric(address[0]))):
@@ -39,13 +39,13 @@ def refusal(headers: Headers, *, websocket: bool, host: str, names: Iterable[str
     if origin is not None and _split(origin) != address:
         return 403, "requests must come from the page of the editor itself"
     foreign = not websocket and headers.get("sec-fetch-site") in ("cross-site", "same-site")
-    # Sent without an origin by links, which are harmless, and by scripts and pictures of other sites.
+    # Links, which are harmless, send no origin, and neither do scripts and pictures of other sites.
     if origin is None and foreign and headers.get("sec-fetch-mode") != "navigate":
         return 403, "requests must come from the page of the editor itself"
     length = headers.get("content-length", "0")
     if "chunked" in headers.get("transfer-encoding", ""):
         return 411, "the size of a file must be given in Content-Length"
-    if not length.isdecimal() or int(length) > LARGEST + AROUND:
+    if not length.isdecimal() or int(length) > LARGEST + FORM:
         return 413, f"a file must be at most {LARGEST / 1e9:g} GB; make the picture smaller, or use the command line"
     return None
 

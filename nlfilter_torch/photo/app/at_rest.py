@@ -1,4 +1,4 @@
-"""The picture of a page at rest: what a file would hold, in place of the preview."""
+"""The picture of a page at rest: what a saved file would show, in place of the preview."""
 
 import asyncio
 from collections.abc import Callable
@@ -44,7 +44,7 @@ class AtRest:
         self._again: Reduced | None = None
 
     def drawn(self, session: Reduced) -> None:
-        """Begin anew: the preview of a session has been drawn."""
+        """Start over, since the preview of a session has been drawn."""
         if session.is_reduced and session.recipe.acting:
             self._again = session
             if not self._working:

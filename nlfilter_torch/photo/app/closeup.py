@@ -1,4 +1,4 @@
-"""The part of a photograph that is seen at full size, in pieces that the page lays over the preview."""
+"""The visible part of a photograph at full size, in pieces that the page lays over the preview."""
 
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -16,7 +16,7 @@ from nlfilter_torch.photo.tiled.sampling import Report
 
 CELL = 64  # pixels; pieces consist of squares of that size
 PIECE = 1 << 19  # pixels of a piece, at most
-KEPT = 24_000_000  # pixels of all pieces; those that are not seen go first
+KEPT = 24_000_000  # pixels of all pieces, at most; invisible pieces are dropped first
 LARGEST = 40_000_000  # pixels that a page may ask for at once
 
 
@@ -37,7 +37,7 @@ class Enlarged(Protocol):
 
 
 class Closeup:
-    """What of a photograph a page shows at full size.
+    """The pieces of a photograph that a page shows at full size.
 
     ``tell`` runs JavaScript in the page.
     """
@@ -66,7 +66,7 @@ class Closeup:
         return self._held or self._view is not None
 
     def look(self, view: Sequence[float] | None) -> None:
-        """Show a part: left, top, right and bottom in pixels of the photograph, or None for no part."""
+        """Show a part, (left, top, right, bottom) in pixels of the photograph, or None for the whole photograph."""
         self._view = None if view is None else self._part(view)
         self._wake()
 
@@ -76,11 +76,11 @@ class Closeup:
         self._forget()
 
     def stop(self) -> None:
-        """Work no more: the page is gone."""
+        """Stop working, since the page is gone."""
         self._held = True
 
     def follow(self) -> None:
-        """Show the edit of the session, after a change or not."""
+        """Show the current edit of the session."""
         self._held = False
         if self.session is not None and self.session.recipe.acting != self._recipe.acting:
             self._forget()
@@ -91,7 +91,7 @@ class Closeup:
         return self._pieces[name][1] if name in self._pieces else None
 
     def original(self, place: str) -> bytes | None:
-        """A part of the photograph before the edit as a PNG file; ``place`` as of :meth:`look`, with commas."""
+        """A part of the photograph before the edit as a PNG file; ``place`` is that of :meth:`look`, with commas."""
         try:
             part = self._part([int(number) for number in place.split(",")])
         except ValueError:
@@ -99,7 +99,7 @@ class Closeup:
         return None if self.session is None or part is None else drawing.lossless(self.session.original(part))
 
     def _part(self, view: Sequence[float]) -> Rectangle | None:
-        """What a page asks for, as far as the photograph has it."""
+        """The part that a page asks for, within the photograph; None if it is empty, too large or not a part."""
         if self.session is None or len(view) != 4:
             return None
         height, width = self.session.size
@@ -108,7 +108,7 @@ class Closeup:
         return part if 0 < len(part.rows) * len(part.columns) <= LARGEST else None
 
     def _forget(self) -> None:
-        """Forget all pieces: they are of another edit."""
+        """Forget all pieces, which show another edit."""
         self._covered.zero_()
         if self._pieces:
             self._pieces = {}
@@ -119,7 +119,7 @@ class Closeup:
             self._start(self._work())
 
     async def _work(self) -> None:
-        """Make pieces until all that is seen is there."""
+        """Make pieces until the visible part is covered."""
         self._working = True
         try:
             while (piece := self._next()) is not None:
@@ -143,7 +143,7 @@ class Closeup:
         return self._held or self.session is not session or session.recipe.acting != recipe.acting
 
     def _work_out(self, session: Enlarged, recipe: Recipe, part: Rectangle, progress: Progress) -> bytes:
-        """A piece; runs in a thread."""
+        """Compute a piece, as a PNG file; runs in a thread."""
         report = Interruptible(progress, partial(self._is_outdated, session, recipe))
         return drawing.lossless(session.part(part, recipe, report))
 
@@ -165,12 +165,12 @@ class Closeup:
                 total -= len(other.rows) * len(other.columns)
 
     def _cells(self, part: Rectangle) -> Tensor:
-        """Which cells that a part touches are covered."""
+        """A view of the cells that a part touches: whether each is covered."""
         rows, columns = (slice(axis.start // CELL, -(-axis.stop // CELL)) for axis in (part.rows, part.columns))
         return self._covered[rows, columns]
 
     def _next(self) -> tuple[Enlarged, Rectangle] | None:
-        """A piece that is seen but not there, and the session that it is of, or None."""
+        """The next piece that is visible but missing, with its session, or None."""
         if self.session is None or self._view is None or self._held:
             return None
         height, width = self.session.size

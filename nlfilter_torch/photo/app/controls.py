@@ -23,7 +23,7 @@ class Control:
         parameter: what it sets.
         slider: its range and label.
         help: a sentence.
-        index: which number the slider sets, if the parameter is a list of them.
+        index: which number the slider sets, if the parameter is a tuple of numbers.
     """
 
     edit: str
@@ -99,7 +99,7 @@ OF_EDIT: dict[str, tuple[Control, ...]] = {
 
 
 class SteadySlider(ui.slider):
-    """A slider to which the server does not send values back: a late one would move it away from the pointer."""
+    """A slider to which the server does not send values back, since a late one would move it away from the pointer."""
 
     LOOPBACK = False
 

@@ -14,7 +14,7 @@ from nlfilter_torch.photo.declared.strokes import Stroke
 
 QUALITY = 95
 TINT, OPACITY = (255, 40, 80), 120  # of the mask
-WORDS = {"in": "#22c55e", "out": "#ef4444", "keep": "#9ca3af"}  # colours of strokes that have a meaning instead
+WORDS = {"in": "#22c55e", "out": "#ef4444", "keep": "#9ca3af"}  # colours of strokes with a meaning
 WHITE_TINT, BLACK_TINT = (255, 60, 60, 255), (60, 120, 255, 255)  # where a picture is clipped
 BINS = 64  # of a histogram
 
@@ -46,7 +46,7 @@ def mask_picture(mask: Tensor) -> bytes:
 
 
 def clipped_picture(image: Tensor) -> bytes:
-    """Where an image (1, C, H, W) has lost light or shade, as a transparent PNG: red and blue."""
+    """Where an image (1, C, H, W) is white (red) or black (blue) in a channel, as a transparent PNG."""
     values = _bytes(image)
     layer = np.zeros((*values.shape[1:], 4), np.uint8)
     layer[(values == 0).any(0).numpy()] = BLACK_TINT
@@ -55,7 +55,7 @@ def clipped_picture(image: Tensor) -> bytes:
 
 
 def clipped_shares(image: Tensor) -> tuple[float, float]:
-    """Shares of the pixels of which a channel is white, and of those of which one is black.
+    """The shares of pixels with a white channel, and of those with a black channel.
 
     >>> clipped_shares(torch.tensor([1.0, 0.999, 0.5, 0.0]).view(1, 1, 2, 2))
     (0.5, 0.25)
@@ -150,7 +150,7 @@ class Axes:
 
 
 def response_svg(eigenvalues: Tensor, curves: Sequence[tuple[str, Sequence[float]]]) -> str:
-    """SVG of the sliders' gain f(lambda), with the eigenvalues (R,) of the filter marked; curves: (colour, sliders)."""
+    """SVG of the gain f(lambda) of the sliders, with the eigenvalues (R,) marked; curves are (colour, sliders)."""
     steps = torch.linspace(0, 1, 101)
     gains = [polynomial_response(steps, torch.tensor(tuple(alpha))).tolist() for _, alpha in curves]
     axes = Axes(min(0.0, *(min(gain) for gain in gains)), max(2.0, *(max(gain) for gain in gains)))

@@ -12,7 +12,7 @@ GONE = "open the photograph again: this page lost it, but its edit is kept"
 
 
 class Library:
-    """Sessions by the address that a page has in its location, which survives a reload.
+    """Sessions by the address in the location of their page, which survives a reload.
 
     Files are saved in ``folder``; edits are kept beside the photographs in ``photographs``, by default the same folder.
     """
@@ -21,7 +21,7 @@ class Library:
         self.folder = folder
         self.photographs = folder if photographs is None else photographs
         self._sessions: WeakValueDictionary[tuple[str, float], Session] = WeakValueDictionary()
-        self._latest: Session | None = None  # a page that is loaded again leaves its photograph for a moment
+        self._latest: Session | None = None  # kept alive while a page is reloaded and nobody shows its photograph
         self._lock = Lock()
 
     def new(self) -> Session:
@@ -35,7 +35,7 @@ class Library:
         return self._session(path, path.name, path, path.name if inside else str(path.resolve()), version)
 
     def open_upload(self, copy: Path, name: str) -> Session:
-        """The session of a file that the browser sent; of the file of that name, if it is the same.
+        """The session of a file that the browser sent, or of the file of that name in the folder if it is the same.
 
         Raises:
             ValueError, OSError, MemoryError: as :meth:`Session.open`.
@@ -47,13 +47,13 @@ class Library:
         return self._session(copy, name, None, _digest(copy)[:16], 0.0)
 
     def reopen(self, address: str) -> Session:
-        """The session of an address that a page had; raises ValueError if its photograph is gone."""
+        """The session of the address of an earlier page; raises ValueError if its photograph is gone."""
         with self._lock:
             known = [session for (other, _), session in self._sessions.items() if other == address]
         if known:
             return known[-1]
         path = self.photographs / Path(address).name
-        # No others: an address must not open what nobody has edited here.
+        # Only a photograph that was edited here: an address must not open other files.
         if Path(address).name == address and path.is_file() and path.with_name(path.name + ENDING).exists():
             return self.open(path)
         raise ValueError(GONE)
@@ -67,7 +67,7 @@ class Library:
             session.address = address
             session.keep_in(Sidecar.of(original, name, _digest(path)))
         else:
-            session.restore()  # someone may have changed the file, or removed it to begin anew
+            session.restore()  # another program may have changed the file, or a person removed it to begin anew
         with self._lock:
             session = self._sessions.setdefault((address, version), session)
             self._latest = session

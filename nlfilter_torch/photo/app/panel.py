@@ -169,7 +169,7 @@ class Panel:
         self._change("detail", {**entries_of(name), "inside": inside if fits else None}, True)
 
     def _name_preset(self, detail: Step) -> None:
-        """Show the preset that the sliders are; or the one that they began with, which can then be chosen again."""
+        """Show the preset that the sliders equal, or else the one they started from, which can be chosen again."""
         same = [name for name in PRESETS if all(detail[k] == v for k, v in entries_of(name).items())]
         if same and self._started not in same:
             self._started = same[0]

@@ -1,11 +1,11 @@
 """A reduced picture under an edit, fast enough to follow a slider.
 
-A photograph is reduced to the size at which edits of brightness look at it, so that the preview holds the very picture
-that these work on. What depends on the pixels of the photograph itself comes from there. Edits of single pixels differ
-a little from what a file will hold, which :meth:`~nlfilter_torch.photo.app.session.Session.at_rest` computes.
+A photograph is reduced to the viewing size, so that edits of brightness work on exactly the picture that the preview
+holds. Only what depends on the full resolution is computed from the photograph itself. Edits that depend on single
+pixels differ a little from the saved file, which :meth:`~nlfilter_torch.photo.app.session.Session.at_rest` computes.
 
-Slow results are cached with the settings they depend on: the layers that the sliders weigh, the filter for masks, the
-filter of the step that is being changed, and the picture after each step.
+Slow results are cached together with the settings they depend on: the layers that the sliders weigh, the filter for
+masks, the filter of the step that is being changed, and the picture after each step.
 """
 
 import math
@@ -61,7 +61,7 @@ def sampled_operator(
     channels: GuideChannels,
     patch_size: int,
 ) -> NonlocalOperator:
-    """The operator of every ``stride``-th pixel of a guide, from the patches around them at full resolution."""
+    """The operator for every ``stride``-th pixel of a guide; patches around these are taken at full resolution."""
     features = GuideFeatures(unit_window(patch_size, None).to(guide), bandwidth, distance, channels)
     size = (guide.shape[-2] // stride, guide.shape[-1] // stride)
     return operator_from_features(
@@ -151,11 +151,11 @@ class Preview:
 
     Args:
         photograph: (1, C, H, W), in [0, 1] except for files of floats.
-        pixels: largest number of pixels of the preview, about.
+        pixels: the largest number of pixels in the preview, approximately.
 
     Attributes:
         size: (height, width) of the preview.
-        stride: every how many pixels of the photograph it has one.
+        stride: sampling step of the preview relative to the photograph.
     """
 
     def __init__(self, photograph: Tensor, pixels: int = PIXELS) -> None:
@@ -194,7 +194,7 @@ class Preview:
         return self._layers
 
     def _compared(self, detail: Step) -> tuple[int, Tensor]:
-        """What the filter of a step compares: every so many patches of a picture, of about the viewing size."""
+        """The stride of the patches that the filter of a step compares, and their picture, near the viewing size."""
         viewed = self._viewed(detail)
         stride = max(1, round(viewed[0] / self.size[0]))
         if stride == 1:
@@ -202,11 +202,11 @@ class Preview:
         return stride, resize(self.photograph.float(), (self.size[0] * stride, self.size[1] * stride))
 
     def _viewed(self, step: Step) -> tuple[int, int]:
-        """(H, W) at which a step looks at the photograph."""
+        """(H, W) of the photograph at the viewing size of a step."""
         return viewed_size((self.photograph.shape[-2], self.photograph.shape[-1]), step["viewing_size"])
 
     def _activity(self, detail: Step) -> Tensor:
-        """The activity of what the filter of a step compares, in the size of the preview."""
+        """The activity of the picture that the filter of a step compares, at the size of the preview."""
         viewed = self._viewed(detail)
         if self._active is None or self._active[0] != viewed:
             stride, shown = self._compared(detail)
@@ -220,7 +220,7 @@ class Preview:
         return DETAIL["spatial_bandwidth"].distance(detail.arguments(size, scale)["spatial_bandwidth"], size)
 
     def mask(self, detail: Step) -> Tensor | None:
-        """The mask (1, 1, h, w) of the sliders inside, or None without strokes; slow the first time only."""
+        """The mask (1, 1, h, w) of the region, or None without strokes; only the first one is slow."""
         if not detail.has_region():
             return None
         key = (detail.strokes, detail["reach"], detail["tolerance"], detail["landmarks"])
@@ -245,7 +245,7 @@ class Preview:
         return self._mask[1]
 
     def render(self, recipe: Recipe, upto: str | None = None) -> Tensor:
-        """The preview under an edit, or under its steps up to the one named ``upto``: (1, 1 or 3, h, w) in [0, 1]."""
+        """The preview after all steps, or after the last one named ``upto``: (1, 1 or 3, h, w) in [0, 1]."""
         result, drawn = self.pixels, False
         key: Key = ()
         places = [i for i, step in enumerate(recipe.steps) if step.edit == upto]
@@ -258,7 +258,7 @@ class Preview:
                 continue
             cached = self._pictures.get(i)
             if cached is None or cached[0] != key:
-                # The first picture to be computed again is that of the step being changed: its filter is cached.
+                # The first picture that is computed again is that of the step being changed, so its filter is cached.
                 edit = self._filter_of(step, result, before, keep=not drawn)
                 cached = self._pictures[i] = (key, edit(step))
                 drawn = True
@@ -266,7 +266,7 @@ class Preview:
         return result.clamp(0, 1)
 
     def _is_of_layers(self, step: Step) -> bool:
-        """Whether a step weighs layers of luminance, which are cached."""
+        """Whether a step only weighs layers of luminance, which are cached."""
         if step.edit != "detail" or step["residual"] is not None or step["channels"] != "luminance":
             return False
         return self._viewed(step) >= self.size
@@ -286,13 +286,13 @@ class Preview:
         return self._source.all(within_limits(self._source, Fitted(change), detail["limits"], brighter))
 
     def _filter_of(self, step: Step, image: Tensor, before: Key, *, keep: bool) -> Callable[[Step], Tensor]:
-        """The edit of a step on the picture before it; slow unless its filter is cached."""
+        """A function that applies a step to the picture before it; slow unless its filter is cached."""
         key = (*before, step.edit, *filter_key(step))
         if self._filter is not None and self._filter[0] == key:
             return self._filter[1]
         if keep:
-            self._filter = None  # first, since two of them would take twice the memory
-        # A reduced photograph goes a little beyond its range, also where saving reduces it.
+            self._filter = None  # released first, since two filters would take twice the memory
+        # A reduced photograph goes a little beyond its range, here as in saving.
         image = image.clamp(0, 1) if before else image
         edit = between_knots(step.declared, prepare(step, image, stride=self.stride), image)
         if keep:

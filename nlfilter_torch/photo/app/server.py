@@ -1,7 +1,7 @@
 """The editor's server: one page, one session per photograph, pictures at an address that only that tab knows.
 
 Why NiceGUI and not Gradio: Gradio 6.31 excludes Pillow 13, its ImageEditor sends whole bitmaps, and in a trial with
-headless Chromium its change event had not arrived three seconds after a stroke. NiceGUI reports the pointer in pixels
+headless Chromium its change event took more than three seconds after a stroke. NiceGUI reports the pointer in pixels
 of the picture, keeps the moves of a slider in order, and includes every script and font that it uses.
 """
 
@@ -45,7 +45,7 @@ class Pages:
 
 
 def serve(image: Path | None, folder: Path, *, host: str, port: int, open_page: bool) -> None:
-    """Run the editor until it is interrupted; it begins with an image, if there is one, and saves in the folder.
+    """Run the editor until it is interrupted; it opens an image, if there is one, and saves into the folder.
 
     Raises:
         ValueError: if it cannot listen on that address; port 0 is a free one.
@@ -76,7 +76,7 @@ def serve(image: Path | None, folder: Path, *, host: str, port: int, open_page: 
 
 def _tell_when_ready(host: str, port: int) -> None:
     """Print the address once the server accepts connections, which is a little after the start."""
-    reachable = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)  # not on every system as they are
+    reachable = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)  # some systems cannot connect to these
     for _ in range(round(STARTING / PAUSE)):
         try:
             socket.create_connection((reachable, port), timeout=STARTING).close()

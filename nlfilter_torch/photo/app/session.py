@@ -1,4 +1,4 @@
-"""The editing of one photograph: what is open, the edit, and what can be undone. Independent of the page."""
+"""A session: an open photograph, its edit, and the history of undo. It does not depend on the page."""
 
 import threading
 from dataclasses import dataclass
@@ -35,7 +35,7 @@ from nlfilter_torch.photo.tiled.recipe import edit_rows
 from nlfilter_torch.photo.tiled.sampling import Report, in_silence
 from nlfilter_torch.photo.tiled.tiles import Passes, Statistics
 
-SPACING = 0.2  # of the points of a stroke, as a share of its radius
+SPACING = 0.2  # distance of the points of a stroke, as a share of its radius
 UNDOS = 100
 SMALL = 1 << 18  # pixels, up to which statistics are those of all pixels; a sample is nearly as exact, and fast
 OPEN_BYTES = 40  # per pixel, for a photograph before and after the edit and the files of both; edits work in tiles
@@ -63,17 +63,17 @@ class Opened:
 
 
 class Session:
-    """The state of the pages that show a photograph.
+    """The editing of a photograph, shared by all pages that show it.
 
     Args:
         folder: where files are saved.
-        pixels: largest number of pixels of the preview.
+        pixels: the largest number of pixels in the preview.
 
     Attributes:
         recipe: the edit.
         opened: the photograph, or None.
-        address: by which a page finds the session again.
-        saved: the edit of the file that was written last.
+        address: the address by which a page finds the session again.
+        saved: the edit as of the last file that was written.
     """
 
     def __init__(self, folder: Path, pixels: int = PIXELS) -> None:
@@ -84,8 +84,8 @@ class Session:
         self.saved = Recipe()
         self._sidecar: Sidecar | None = None
         self._kept = Recipe()  # what the sidecar holds
-        self._drawing = threading.Lock()  # previews keep what was computed, one picture at a time
-        self._fitting = threading.Lock()  # and so do parts at full size
+        self._drawing = threading.Lock()  # previews cache what they compute, so they draw one picture at a time
+        self._fitting = threading.Lock()  # the same holds for parts at full size
         self._at_rest: tuple[tuple[Step, ...], Tensor] | None = None  # the last result, for other tabs
         self._pixels = pixels
         self._past: list[Recipe] = []
@@ -96,8 +96,8 @@ class Session:
         """Read a photograph and begin a new edit; a failure changes nothing.
 
         Raises:
-            ValueError, OSError, MemoryError: see :func:`read_photograph`; the message names the file as ``name``, of
-                which ``path`` may be a copy.
+            ValueError, OSError, MemoryError: see :func:`read_photograph`. The message calls the file ``name``; ``path``
+                may be a copy of it.
         """
         try:
             photograph = read_photograph(path, bytes_per_pixel=OPEN_BYTES)
@@ -114,12 +114,12 @@ class Session:
         self._past, self._future = [], []
 
     def keep_in(self, sidecar: Sidecar) -> None:
-        """Keep the edit in a file from now on, beginning with the edit that is there."""
+        """Load the edit that is kept in a file, and keep the edit there from now on."""
         self._sidecar = sidecar
         self.recipe = self._shown = self.saved = self._kept = sidecar.read() or Recipe()
 
     def restore(self) -> None:
-        """Load what is kept if another program has changed it."""
+        """Load the edit from its file again if another program has changed the file."""
         if self._sidecar is not None:
             recipe = self._sidecar.read() or Recipe()
             if recipe != self._kept:
@@ -164,11 +164,11 @@ class Session:
         return self.preview.stride > 1
 
     def set(self, edit: str, *, strokes: tuple[Stroke, ...] | None = None, **values: object) -> None:
-        """Change the last step of an edit, or add one; :meth:`commit` completes the change."""
+        """Change the last step with that edit, or add such a step; :meth:`commit` completes the change."""
         self.recipe = self.recipe.with_last(self.recipe.last(edit).changed(strokes=strokes, **values))
 
     def commit(self) -> None:
-        """Complete a change, which can then be undone."""
+        """Complete a change, so that it can be undone."""
         if self.recipe != self._shown:
             self._past = [*self._past[-UNDOS + 1 :], self._shown]
             self._future = []
@@ -207,7 +207,7 @@ class Session:
         """Add a stroke to a step: points (x, y) in pixels of the preview, and a radius as a share of its short side.
 
         Raises:
-            ValueError: if no photograph is open, or the step takes no stroke of that meaning or colour.
+            ValueError: if no photograph is open, or the step does not take strokes of that meaning or colour.
         """
         height, width = self.preview.size
         shares = thin(((x / width, y / height) for x, y in points), SPACING * radius)
@@ -230,7 +230,7 @@ class Session:
             return self.preview.render(self.recipe, upto)
 
     def mask(self) -> Tensor | None:
-        """The mask of the sliders inside; see :meth:`Preview.mask`."""
+        """The mask of the region that has its own sliders; see :meth:`Preview.mask`."""
         with self._drawing:
             return self.preview.mask(self.recipe.last("detail"))
 
@@ -241,8 +241,8 @@ class Session:
     def part(self, place: Rectangle, recipe: Recipe, report: Report = in_silence) -> Tensor:
         """A part of the photograph under an edit as :meth:`save` makes it, (1, C, h, w) in [0, 1].
 
-        The first of an edit takes nearly as long as saving: its statistics are those of the whole photograph. The
-        report of the progress may raise an error to interrupt.
+        The first part of an edit takes nearly as long as saving, since its statistics are those of the whole
+        photograph. ``report`` may raise an error to interrupt.
 
         Raises:
             ValueError, OSError, MemoryError: if nothing is open, or the photograph cannot be edited.
@@ -253,8 +253,8 @@ class Session:
     def at_rest(self, recipe: Recipe, report: Report = in_silence) -> Tensor:
         """The photograph under an edit as :meth:`save` makes it, reduced to the size of the preview.
 
-        :meth:`render` is fast, and approximate for edits that depend on single pixels; this takes as long as saving.
-        The report of the progress may raise an error to interrupt.
+        This takes as long as saving; :meth:`render` is fast, but approximate for edits that depend on single pixels.
+        ``report`` may raise an error to interrupt.
 
         Raises:
             ValueError, OSError, MemoryError: as :meth:`part`.
@@ -270,13 +270,13 @@ class Session:
             return self._at_rest[1]
 
     def _fitted(self, recipe: Recipe, report: Report) -> Parts:
-        """The parts of the photograph, with an edit fitted to the whole."""
+        """The parts of the photograph, with the edit fitted to the whole photograph."""
         opened = self._opened_to("show")
         opened.parts.fit(recipe.steps, self._passes(opened.photograph, report))
         return opened.parts
 
     def _edited_at_once(self, recipe: Recipe, report: Report) -> Tensor | None:
-        """The edited pixels (1, C, H, W), as the command line computes them; None if that takes much memory."""
+        """The edited pixels (1, C, H, W), as the command line computes them; None if that needs too much memory."""
         opened = self._opened_to("edit")
         height, width = opened.photograph.size
         if width * height * recipe.bytes_per_pixel > WHOLE:
@@ -285,20 +285,20 @@ class Session:
         return apply_recipe(recipe, opened.photograph.pixels, partial(report, "Editing"))
 
     def _opened_to(self, purpose: str) -> Opened:
-        """The open photograph; raises ValueError, with what it was needed for, if there is none."""
+        """The open photograph; if there is none, raises a ValueError that names the purpose."""
         if self.opened is None:
             raise ValueError(f"open a photograph first; there is nothing to {purpose}")
         return self.opened
 
     def _passes(self, photograph: Photograph, report: Report) -> Passes:
-        """Of an edit in parts at full size."""
+        """How an edit passes over the photograph in tiles."""
         height, width = photograph.size
         statistics: Statistics = "full" if width * height <= SMALL else "sample"
         kind = str(photograph.pixels.numpy().dtype)
         return Passes(kind, statistics, memory=usual_memory(TILED), report=report, folder=self.folder)
 
     def target(self, name: str) -> Path:
-        """The file of that name in the folder; raises ValueError if ``name`` leads out of it or is no name."""
+        """The file of that name in the folder; raises ValueError if ``name`` is invalid or leads out of the folder."""
         path = Path(name.strip())
         if not path.name or path.name != name.strip() or path.name.startswith(".") or "\0" in name:
             raise ValueError(
@@ -325,7 +325,7 @@ class Session:
         return target
 
     def suggested_name(self) -> str:
-        """The name of the photograph with ``-edited``, and an extension of a file type that can hold it."""
+        """The name of the photograph with ``-edited`` appended, and the extension of a file type that can store it."""
         if self.opened is None:
             return ""
         path, photograph = Path(self.opened.name), self.opened.photograph
@@ -359,7 +359,7 @@ class Session:
     def save_preset(self, name: str, report: Report = in_silence) -> Path:
         """Write the edit as a file for :meth:`load_preset` and the command line.
 
-        This is quick, so that ``report`` is not called.
+        This is quick; ``report`` is not called.
 
         Raises:
             ValueError, OSError: if it cannot be written.
@@ -371,6 +371,6 @@ class Session:
         return target
 
     def load_preset(self, content: bytes, name: str) -> None:
-        """Load the edit in the content of a file; raises ValueError if there is none, or no photograph is open."""
+        """Load an edit from the content of a file; raises ValueError if it has none, or if no photograph is open."""
         self._opened_to("edit")
         self.load(Recipe.from_json(content, name))

@@ -1,7 +1,7 @@
-"""Where the edit of an open photograph is kept: a file beside it, in the form that ``apply`` takes.
+"""The file that keeps the edit of an open photograph, in the format that ``apply`` reads.
 
-In ``photo.jpg.edit.json`` beside ``photo.jpg``; in a folder of this user's if that one is read-only, if the name would
-be too long, or if the browser sent the photograph and no file in the editor's folder is the same.
+It is ``photo.jpg.edit.json`` beside ``photo.jpg``, or a file in the user's state folder if the folder of the photograph
+is read-only, if the name would be too long, or if the browser sent a photograph that is not in the editor's folder.
 """
 
 import os
@@ -19,7 +19,7 @@ LONGEST_NAME = 255 - len(UNREADABLE)  # bytes; file systems allow 255
 
 
 def state_folder() -> Path:
-    """The folder for edits that cannot be kept beside their photographs."""
+    """The user's folder for edits that cannot be kept beside their photographs."""
     if sys.platform == "win32":
         base = os.environ.get("LOCALAPPDATA") or Path.home() / "AppData" / "Local"
     else:
@@ -29,11 +29,11 @@ def state_folder() -> Path:
 
 @dataclass
 class Sidecar:
-    """The file that an edit is kept in.
+    """The file that keeps an edit.
 
     Attributes:
         path: path of the file.
-        trouble: what went wrong when it was read or written last, as a sentence, or None.
+        trouble: what went wrong in the last read or write, as a sentence, or None.
     """
 
     path: Path
@@ -41,7 +41,7 @@ class Sidecar:
 
     @staticmethod
     def of(photograph: Path | None, name: str, digest: str) -> "Sidecar":
-        """That of a photograph: a file, or None for one whose content alone is known, by its digest."""
+        """The sidecar of a photograph file, or, if that is None, of the content with a digest."""
         if photograph is not None:
             beside = photograph.with_name(photograph.name + ENDING)
             short = len(os.fsencode(beside.name)) <= LONGEST_NAME
@@ -50,7 +50,7 @@ class Sidecar:
         return Sidecar(state_folder() / f"{digest[:16]}-{os.fsencode(name)[-80:].decode(errors='ignore')}{ENDING}")
 
     def read(self) -> Recipe | None:
-        """The edit that is kept, or None; a file that cannot be read is renamed, so that nothing in it is lost."""
+        """The edit in the file, or None; an unreadable file is renamed, so that nothing in it is lost."""
         self.trouble = None
         try:
             return Recipe.from_json(self.path.read_bytes(), str(self.path))
@@ -66,7 +66,7 @@ class Sidecar:
         return None
 
     def write(self, recipe: Recipe) -> None:
-        """Keep an edit, completely or not at all; an edit without effect removes the file."""
+        """Write an edit, completely or not at all; an edit that changes nothing removes the file."""
         self.trouble = None
         try:
             if recipe.drawn == Recipe():
