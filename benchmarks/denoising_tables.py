@@ -20,8 +20,8 @@ Results = dict[str, dict[str, Any]]
 
 def mean(results: Results, kind: str, level: str, method: str, figure: str) -> float | None:
     """The mean of a measurement over the photographs, or None if there is none."""
-    found = results.get(f"{kind}, {level}", {}).get(method)
-    return None if found is None else statistics.mean(each[figure] for each in found.values())
+    photographs = results.get(f"{kind}, {level}", {}).get(method)
+    return None if photographs is None else statistics.mean(figures[figure] for figures in photographs.values())
 
 
 def tables(results: Results, figures: Sequence[tuple[str, str, str]]) -> str:
@@ -35,11 +35,11 @@ def tables(results: Results, figures: Sequence[tuple[str, str, str]]) -> str:
         for name in named:
             row = ["CBM3D" if (kind, name) == ("colour", "BM3D") else name]
             for _, figure, form in figures:
-                found = [mean(results, kind, level, name, figure) for level in levels]
+                means = [mean(results, kind, level, name, figure) for level in levels]
                 if figure == "seconds":  # nearly the same at all noise levels
-                    known = [value for value in found if value is not None]
-                    found = [statistics.mean(known)] if known else [None]
-                row += ["" if value is None else format(value, form) for value in found]
+                    known = [value for value in means if value is not None]
+                    means = [statistics.mean(known)] if known else [None]
+                row += ["" if value is None else format(value, form) for value in means]
             rows.append(row)
         header = [f"{kind}, noise of"]
         for title, figure, _ in figures:

@@ -63,7 +63,7 @@ def cells(edit: Edit, parameter: Parameter) -> tuple[str, ...]:
 def places(edit: Edit, parameter: Parameter) -> list[str]:
     """Find the declarations of a parameter of an edit that have literal values: ``file:line`` of each."""
     names = {parameter.name, parameter.keyword}
-    found = []
+    lines = []
     for path in sorted(PACKAGE.rglob("*.py")):
         file = path.relative_to(PACKAGE).as_posix()
         own = file in FILES or path.stem == edit.name or path.parent.name in INTERFACES
@@ -71,11 +71,11 @@ def places(edit: Edit, parameter: Parameter) -> list[str]:
             scopes = [
                 n for n in parsed(path).body if isinstance(n, ast.Assign) and named(n.targets[0]) in used(edit.name)
             ]
-            nodes = [node for one in scopes for node in ast.walk(one)]
-            found += [f"{file}:{n.lineno}" for n in nodes if declares(n, parameter.name)]
+            nodes = [node for scope in scopes for node in ast.walk(scope)]
+            lines += [f"{file}:{n.lineno}" for n in nodes if declares(n, parameter.name)]
         elif own:
-            found += [f"{file}:{line}" for line, name in written_in(path) if name in names]
-    return found
+            lines += [f"{file}:{line}" for line, name in written_in(path) if name in names]
+    return lines
 
 
 @cache
@@ -116,16 +116,16 @@ def declares(node: ast.AST, name: str) -> bool:
 
 def literals(tree: ast.Module) -> list[tuple[int, str]]:
     """Lines and names of arguments and fields whose default is a literal other than None."""
-    found = []
+    fields = []
     for node in ast.walk(tree):
         if isinstance(node, ast.FunctionDef):
             positional = node.args.args[len(node.args.args) - len(node.args.defaults) :]
             pairs = [*zip(positional, node.args.defaults, strict=True)]
             pairs += [(a, d) for a, d in zip(node.args.kwonlyargs, node.args.kw_defaults, strict=True) if d is not None]
-            found += [(default.lineno, argument.arg) for argument, default in pairs if written_out(default)]
+            fields += [(default.lineno, argument.arg) for argument, default in pairs if written_out(default)]
         elif isinstance(node, ast.AnnAssign) and node.value is not None and written_out(node.value):
-            found.append((node.lineno, named(node.target)))
-    return found
+            fields.append((node.lineno, named(node.target)))
+    return fields
 
 
 def written_out(node: ast.expr) -> bool:

@@ -57,11 +57,11 @@ def tags(block: bytes | None) -> tuple[dict[int, object], dict[int, object], dic
     return main, dict(exif.get_ifd(folders[0])), dict(exif.get_ifd(folders[1]))
 
 
-def same(found: Photograph, wanted: Photograph) -> None:
-    assert found.depth == wanted.depth
-    assert found.pixels.dtype == wanted.pixels.dtype
-    assert torch.equal(found.pixels, wanted.pixels)
-    assert (found.alpha is None) == (wanted.alpha is None)
-    assert found.alpha is None or torch.equal(found.alpha, wanted.alpha)
-    assert found.icc == wanted.icc
-    assert tags(found.exif) == tags(wanted.exif)
+def same(opened: Photograph, wanted: Photograph) -> None:
+    assert opened.depth == wanted.depth
+    assert opened.pixels.dtype == wanted.pixels.dtype
+    assert torch.equal(opened.pixels, wanted.pixels)
+    assert (opened.alpha is None) == (wanted.alpha is None)
+    assert opened.alpha is None or torch.equal(opened.alpha, wanted.alpha)
+    assert opened.icc == wanted.icc
+    assert tags(opened.exif) == tags(wanted.exif)

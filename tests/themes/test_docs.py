@@ -198,8 +198,8 @@ def test_the_table_of_errors_is_what_the_benchmark_prints() -> None:
     assert [(name, int(h)) for name, h, *_ in rows] == [(p, h) for p in accuracy.PICTURES for h in accuracy.LIMITS]
     for name, bandwidth, *printed in rows:
         if (name, bandwidth) == ("chelsea", "20"):
-            found = accuracy.measure(name, int(bandwidth))
-            for text, value in zip(printed, (found.paper, found.uniform, found.default), strict=True):
+            measured = accuracy.measure(name, int(bandwidth))
+            for text, value in zip(printed, (measured.paper, measured.uniform, measured.default), strict=True):
                 assert abs(float(text) - value) <= 0.02, (name, bandwidth)
 
 

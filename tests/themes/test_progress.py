@@ -17,10 +17,10 @@ def test_the_command_line_goes_to_tiles(tmp_path: Path, monkeypatch: pytest.Monk
     used: list[bool] = []
     read = editing.read_if_it_fits
 
-    def watched(*given: object) -> Photograph | None:
-        found = read(*given)  # type: ignore[arg-type]
-        used.append(found is None)
-        return found
+    def watched(*arguments: object) -> Photograph | None:
+        photograph = read(*arguments)  # type: ignore[arg-type]
+        used.append(photograph is None)
+        return photograph
 
     monkeypatch.setattr(editing, "read_if_it_fits", watched)
     assert main(arguments) == 0
@@ -35,12 +35,12 @@ def test_saving_in_the_editor_reports_its_progress(session: Session, monkeypatch
     """In memory and, for a large photograph, in tiles."""
     session.set("detail", alpha=(2.0, 1.5, 1.0, 1.0))
     session.add_stroke("recolor", LINE, 0.03, "#2040e0")
-    found = []
+    saved = []
     for name, memory, in_tiles in (("small.png", 10**9, False), ("large.png", 0, True)):
         monkeypatch.setattr("nlfilter_torch.photo.app.session.WHOLE", memory)
         stages: list[str] = []
-        found.append(read_photograph(session.save(name, lambda stage, *_, told=stages: told.append(stage))).pixels)
+        saved.append(read_photograph(session.save(name, lambda stage, *_, told=stages: told.append(stage))).pixels)
         assert stages[-1] == "Writing"
         assert len(set(stages)) > 2 if in_tiles else set(stages) == {"Editing", "Writing"}
-    assert float((found[0] - found[1]).square().mean().sqrt()) * 255 < 1
+    assert float((saved[0] - saved[1]).square().mean().sqrt()) * 255 < 1
     assert sorted(path.name for path in session.folder.iterdir()) == ["cat.png", "large.png", "small.png"]

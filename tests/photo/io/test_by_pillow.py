@@ -18,13 +18,13 @@ def test_avif_keeps_metadata_and_looks(tmp_path: Path, channels: int) -> None:
     ramp = np.linspace(0, 255, 64 * 64).reshape(64, 64, 1).repeat(channels, -1).round().astype(np.uint8)
     wanted = photograph(ramp, icc=PROFILE, exif=exif_block())
     write_photograph(wanted, tmp_path / "out.avif")
-    found = read_photograph(tmp_path / "out.avif")
-    assert found.depth == "uint8"
-    assert (found.pixels - wanted.pixels).abs().max() < 6 / 255
-    assert (found.alpha is None) == (channels < 4)
-    assert found.alpha is None or (found.alpha - wanted.alpha).abs().max() < 6 / 255
-    assert found.icc == PROFILE
-    assert tags(found.exif) == tags(wanted.exif)
+    opened = read_photograph(tmp_path / "out.avif")
+    assert opened.depth == "uint8"
+    assert (opened.pixels - wanted.pixels).abs().max() < 6 / 255
+    assert (opened.alpha is None) == (channels < 4)
+    assert opened.alpha is None or (opened.alpha - wanted.alpha).abs().max() < 6 / 255
+    assert opened.icc == PROFILE
+    assert tags(opened.exif) == tags(wanted.exif)
 
 
 @pytest.mark.parametrize("bits", [8, 10, 12])
@@ -32,10 +32,10 @@ def test_deep_avif_is_read_at_sixteen_bits(tmp_path: Path, bits: int) -> None:
     values = (np.linspace(0, 1, 64 * 48 * 3).reshape(48, 64, 3) * (2**bits - 1)).round()
     stored = imagecodecs.avif_encode(values.astype(np.uint8 if bits == 8 else np.uint16), level=100, bitspersample=bits)
     (tmp_path / "in.avif").write_bytes(stored)
-    found = read_photograph(tmp_path / "in.avif")
-    assert found.depth == ("uint8" if bits == 8 else "uint16")
+    opened = read_photograph(tmp_path / "in.avif")
+    assert opened.depth == ("uint8" if bits == 8 else "uint16")
     wanted = torch.from_numpy(values / (2**bits - 1)).permute(2, 0, 1)[None].float()
-    assert (found.pixels - wanted).abs().max() < 3 / 2**bits
+    assert (opened.pixels - wanted).abs().max() < 3 / 2**bits
 
 
 def test_avif_is_turned_upright(tmp_path: Path) -> None:
@@ -44,9 +44,9 @@ def test_avif_is_turned_upright(tmp_path: Path) -> None:
     exif = Image.Exif()
     exif[ExifTags.Base.Orientation] = 6
     Image.fromarray(values).save(tmp_path / "in.avif", exif=exif)
-    found = read_photograph(tmp_path / "in.avif").pixels
-    assert found.shape == (1, 3, 48, 32)
-    assert found[0, 0, 12, 24] > 0.9 > 0.1 > found[0, 0, 12, 8]
+    opened = read_photograph(tmp_path / "in.avif").pixels
+    assert opened.shape == (1, 3, 48, 32)
+    assert opened[0, 0, 12, 24] > 0.9 > 0.1 > opened[0, 0, 12, 8]
 
 
 def test_palettes_and_bits_are_made_plain(tmp_path: Path) -> None:

@@ -44,9 +44,9 @@ def write_dng(path: Path, scene: np.ndarray, orientation: int = 1) -> None:
 def test_raw_is_developed_at_sixteen_bits(tmp_path: Path) -> None:
     pytest.importorskip("rawpy")
     write_dng(tmp_path / "in.dng", SCENE)
-    found = read_photograph(tmp_path / "in.dng")
-    assert found.depth == "uint16"
-    pixels = found.pixels[0].permute(1, 2, 0).numpy()
+    opened = read_photograph(tmp_path / "in.dng")
+    assert opened.depth == "uint16"
+    pixels = opened.pixels[0].permute(1, 2, 0).numpy()
     assert pixels.shape == SCENE.shape
     # LibRaw develops with the curve of BT.709, whose middle tones are darker than those of sRGB.
     assert np.corrcoef(pixels.ravel(), SCENE.ravel())[0, 1] > 0.98
@@ -79,12 +79,12 @@ def test_heic_is_read_upright_with_its_notes(tmp_path: Path) -> None:
     exif = Image.Exif()
     exif[ExifTags.Base.Orientation], exif[ExifTags.Base.Make] = 6, "A camera"
     heif.from_pillow(Image.fromarray(SCENE)).save(tmp_path / "in.heic", quality=95, exif=exif.tobytes())
-    found = read_photograph(tmp_path / "in.heic")
-    assert found.depth == "uint8"
-    pixels = found.pixels[0].permute(1, 2, 0).numpy()
+    opened = read_photograph(tmp_path / "in.heic")
+    assert opened.depth == "uint8"
+    pixels = opened.pixels[0].permute(1, 2, 0).numpy()
     assert np.abs(pixels - np.rot90(SCENE, -1) / 255).mean() < 4 / 255
     kept = Image.Exif()
-    kept.load(found.exif or b"")
+    kept.load(opened.exif or b"")
     assert kept[ExifTags.Base.Make] == "A camera"
     assert kept.get(ExifTags.Base.Orientation, 1) == 1
     with pytest.raises(TooLarge, match="64x80 pixels"):
@@ -100,10 +100,10 @@ def test_deep_heic_is_read_at_sixteen_bits(tmp_path: Path, monkeypatch: pytest.M
     monkeypatch.setattr(heif.options, "SAVE_HDR_TO_12_BIT", False)
     grey = np.linspace(0, 65535, 64 * 80).reshape(64, 80, 1).repeat(3, 2).astype(np.uint16)
     heif.encode("RGB;16", (80, 64), grey.tobytes(), tmp_path / "in.heic", quality=-1)
-    found = read_photograph(tmp_path / "in.heic")
-    assert found.depth == "uint16"
-    assert np.abs(found.pixels[0].permute(1, 2, 0).numpy() - grey / 65535).max() < 4 / 1023
-    assert float(found.pixels.max()) == 1
+    opened = read_photograph(tmp_path / "in.heic")
+    assert opened.depth == "uint16"
+    assert np.abs(opened.pixels[0].permute(1, 2, 0).numpy() - grey / 65535).max() < 4 / 1023
+    assert float(opened.pixels.max()) == 1
 
 
 def test_colours_that_heic_describes_by_numbers(tmp_path: Path) -> None:

@@ -36,8 +36,8 @@ def test_colours_that_png_describes_by_numbers(tmp_path: Path, name: bytes, cont
     path = tmp_path / "in.png"
     with_chunk(path, name, content)
     with pytest.warns(UserWarning, match=sentence):
-        found = read_photograph(path)
-    assert torch.equal(found.pixels, photograph(stored_values(3, "uint8")).pixels)
+        opened = read_photograph(path)
+    assert torch.equal(opened.pixels, photograph(stored_values(3, "uint8")).pixels)
 
 
 @pytest.mark.parametrize(

@@ -22,16 +22,16 @@ def test_exif_orientation_is_applied_and_reset(tmp_path: Path, orientation: int,
     image.save(tmp_path / "with_tag.png", exif=exif)
     with Image.open(tmp_path / "with_tag.png") as stored:
         upright = np.asarray(ImageOps.exif_transpose(stored))
-    found = read_photograph(tmp_path / f"in{suffix}")
-    assert torch.equal(found.pixels, photograph(upright).pixels)
-    main, details, gps = tags(found.exif)
+    opened = read_photograph(tmp_path / f"in{suffix}")
+    assert torch.equal(opened.pixels, photograph(upright).pixels)
+    main, details, gps = tags(opened.exif)
     assert main == {ExifTags.Base.Make: "Maker", ExifTags.Base.Orientation: 1}
-    height, width = found.pixels.shape[-2:]
+    height, width = opened.pixels.shape[-2:]
     assert (details[ExifTags.Base.ExifImageWidth], details[ExifTags.Base.ExifImageHeight]) == (width, height)
     assert details[ExifTags.Base.LensModel] == "a lens with a long name"
     assert gps == {ExifTags.GPS.GPSLatitudeRef: "N"}
-    write_photograph(found, tmp_path / f"again{suffix}")
-    same(read_photograph(tmp_path / f"again{suffix}"), found)
+    write_photograph(opened, tmp_path / f"again{suffix}")
+    same(read_photograph(tmp_path / f"again{suffix}"), opened)
 
 
 def odd_exif(kind: str) -> bytes:
@@ -66,11 +66,11 @@ def odd_exif(kind: str) -> bytes:
 )
 def test_fields_of_exif_without_sense_are_ignored(tmp_path: Path, kind: str, suffix: str) -> None:
     Image.fromarray(stored_values(3, "uint8")).save(tmp_path / f"in{suffix}", exif=odd_exif(kind))
-    found = read_photograph(tmp_path / f"in{suffix}")
-    assert found.pixels.shape[-2:] == stored_values(3, "uint8").shape[:2]
-    assert tags(found.exif)[0][ExifTags.Base.Make] == "Maker"
+    opened = read_photograph(tmp_path / f"in{suffix}")
+    assert opened.pixels.shape[-2:] == stored_values(3, "uint8").shape[:2]
+    assert tags(opened.exif)[0][ExifTags.Base.Make] == "Maker"
     for other in (".png", ".tif", ".jpg"):
-        write_photograph(found, tmp_path / f"out{other}")
+        write_photograph(opened, tmp_path / f"out{other}")
         assert tags(read_photograph(tmp_path / f"out{other}").exif)[0][ExifTags.Base.Make] == "Maker"
 
 
@@ -95,8 +95,8 @@ def test_text_beyond_ascii_is_kept(tmp_path: Path, suffix: str, depth: str) -> N
     write_photograph(photograph(stored_values(3, depth), exif=exif.tobytes()), tmp_path / "in.png")
     write_photograph(read_photograph(tmp_path / "in.png"), tmp_path / f"between{suffix}")
     write_photograph(read_photograph(tmp_path / f"between{suffix}"), tmp_path / f"out{suffix}")
-    found = read_photograph(tmp_path / f"out{suffix}").exif
-    texts = [table[place] for table, place in zip(tags(found), places, strict=True)]
+    opened = read_photograph(tmp_path / f"out{suffix}").exif
+    texts = [table[place] for table, place in zip(tags(opened), places, strict=True)]
     # Pillow reads latin-1.
     assert [str(text).encode("latin-1") for text in texts] == ["Jörg".encode(), b"G\xf6rlitz", "Süd".encode()]
 

@@ -24,10 +24,10 @@ KINDS += [("a.avif", "uint8")]
 
 
 def check(path: Path) -> None:
-    found = read_extras(path)
-    assert found.xmp == UPRIGHT
+    extras = read_extras(path)
+    assert extras.xmp == UPRIGHT
     if path.suffix not in (".webp", ".avif"):  # have no such field
-        assert found.dpi == pytest.approx((240, 300), abs=0.02)
+        assert extras.dpi == pytest.approx((240, 300), abs=0.02)
 
 
 @pytest.mark.parametrize(("name", "depth"), KINDS)

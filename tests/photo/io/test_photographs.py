@@ -62,11 +62,11 @@ def test_jpeg_keeps_metadata_and_looks(tmp_path: Path, channels: int) -> None:
     ramp = np.linspace(0, 255, 64 * 64).reshape(64, 64, 1).repeat(channels, -1).round().astype(np.uint8)
     wanted = photograph(ramp, icc=PROFILE, exif=exif_block())
     write_photograph(wanted, tmp_path / "out.JPG")
-    found = read_photograph(tmp_path / "out.JPG")
-    assert found.depth == "uint8"
-    assert (found.pixels - wanted.pixels).abs().max() < 6 / 255
-    assert found.icc == PROFILE
-    assert tags(found.exif) == tags(wanted.exif)
+    opened = read_photograph(tmp_path / "out.JPG")
+    assert opened.depth == "uint8"
+    assert (opened.pixels - wanted.pixels).abs().max() < 6 / 255
+    assert opened.icc == PROFILE
+    assert tags(opened.exif) == tags(wanted.exif)
 
 
 def test_integers_are_clipped_and_rounded_floats_are_not(tmp_path: Path) -> None:

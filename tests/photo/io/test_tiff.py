@@ -15,9 +15,9 @@ from tests.files import photograph, same, stored_values
 @pytest.mark.parametrize("tag", [(274, 2, 4, "top"), (274, 5, 1, (1, 0)), (274, 3, 2, (6, 1)), (34675, 3, 1, 5)])
 def test_tags_of_tiff_without_sense_are_ignored(tmp_path: Path, tag: tuple[object, ...]) -> None:
     tifffile.imwrite(tmp_path / "in.tif", stored_values(3, "uint8"), extratags=[(*tag, True)], metadata=None)
-    found = read_photograph(tmp_path / "in.tif")
-    assert torch.equal(found.pixels, photograph(stored_values(3, "uint8")).pixels)
-    assert found.icc is None
+    opened = read_photograph(tmp_path / "in.tif")
+    assert torch.equal(opened.pixels, photograph(stored_values(3, "uint8")).pixels)
+    assert opened.icc is None
 
 
 def test_stored_kinds_are_made_plain(tmp_path: Path) -> None:
