@@ -16,9 +16,9 @@ from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.declared.strokes import Stroke
 from nlfilter_torch.photo.edits.applying import apply_recipe, apply_step, prepare
 from nlfilter_torch.photo.picture.painting import mask_of
-from nlfilter_torch.photo.picture.resizing import block_means, enlarged, resize
+from nlfilter_torch.photo.picture.resizing import resize
 from nlfilter_torch.photo.picture.source import seeded
-from nlfilter_torch.photo.picture.viewing import enlarged_and_reduced, viewed_size
+from nlfilter_torch.photo.picture.viewing import viewed_size
 from tests.problems import cat, difference
 
 FEW = {"landmarks": 60}
@@ -276,26 +276,6 @@ def test_preview_of_a_soft_photograph_shows_what_saving_gives(step: Step, monkey
     saved = resize(apply_recipe(recipe, image), preview.size)
     assert rms(preview.pixels, saved) > 1.5
     assert rms(preview.render(recipe), saved) < 0.1
-
-
-def test_blocks_of_a_fractional_step() -> None:
-    """Pixels are weighted by their overlap; blocks equal those of the picture with each pixel repeated four times."""
-    row = torch.tensor([0.0, 3.0, 6.0, 9.0, 12.0, 15.0]).expand(1, 1, 6, 6)
-    torch.testing.assert_close(block_means(row, 1.5)[0, 0, 0], torch.tensor([1.0, 5.0, 10.0, 14.0]))
-    twice = row.repeat_interleave(2, dim=2).repeat_interleave(2, dim=3)
-    torch.testing.assert_close(block_means(row, 1.5), block_means(twice, 3))
-    blocks = block_means(cat(), 5)
-    torch.testing.assert_close(
-        enlarged(blocks, (5 + 1e-9,) * 2, (7, 12), (20, 30)), enlarged(blocks, (5, 5), (7, 12), (20, 30))
-    )
-
-
-@pytest.mark.parametrize("stride", [2, 2.7])
-def test_enlarged_and_reduced(stride: float) -> None:
-    planes = cat()
-    large = resize(planes, (round(100 * stride), round(150 * stride)))
-    back = resize(large, (100, 150))
-    assert rms(enlarged_and_reduced(planes, stride), back) < 0.1 * rms(planes, back)
 
 
 def test_masks_are_those_of_the_library_and_need_no_other_filter(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -6,11 +6,11 @@ import torch
 import torch.nn.functional as F
 
 from nlfilter_torch.photo.picture.in_memory import InMemory
-from nlfilter_torch.photo.picture.resizing import enlarged, resize, resized
+from nlfilter_torch.photo.picture.resizing import block_means, enlarged, resize, resized
 from nlfilter_torch.photo.tiled.pictures import Picture
 from nlfilter_torch.photo.tiled.source import Tiled
 from nlfilter_torch.photo.tiled.tiles import Passes
-from tests.problems import colour, noise
+from tests.problems import cat, colour, noise
 
 
 @pytest.mark.parametrize("wanted", [(10, 15), (40, 60), (17, 33), (80, 61)])
@@ -57,3 +57,15 @@ def test_enlarged_blocks_are_interpolated_bilinearly(step: int) -> None:
     whole = enlarged(blocks, (step, step), (0, 0), (7 * step, 5 * step))
     expected = torch.nn.functional.interpolate(blocks, scale_factor=step, mode="bilinear", align_corners=False)
     torch.testing.assert_close(whole, expected)
+
+
+def test_blocks_of_a_fractional_step() -> None:
+    """Pixels are weighted by their overlap; blocks equal those of the picture with each pixel repeated four times."""
+    row = torch.tensor([0.0, 3.0, 6.0, 9.0, 12.0, 15.0]).expand(1, 1, 6, 6)
+    torch.testing.assert_close(block_means(row, 1.5)[0, 0, 0], torch.tensor([1.0, 5.0, 10.0, 14.0]))
+    twice = row.repeat_interleave(2, dim=2).repeat_interleave(2, dim=3)
+    torch.testing.assert_close(block_means(row, 1.5), block_means(twice, 3))
+    blocks = block_means(cat(), 5)
+    torch.testing.assert_close(
+        enlarged(blocks, (5 + 1e-9,) * 2, (7, 12), (20, 30)), enlarged(blocks, (5, 5), (7, 12), (20, 30))
+    )

@@ -10,10 +10,10 @@ from nlfilter_torch import enhance
 from nlfilter_torch.photo.cli import main
 from nlfilter_torch.photo.io.photographs import Photograph, read_photograph, write_photograph
 from nlfilter_torch.photo.picture.resizing import resize
-from nlfilter_torch.photo.picture.viewing import viewed_size
+from nlfilter_torch.photo.picture.viewing import enlarged_and_reduced, viewed_size
 from nlfilter_torch.photo.tiled import stream_detail
 from tests.brightness import ALPHA, EDITS
-from tests.problems import colour, luminance
+from tests.problems import cat, colour, luminance
 
 
 @pytest.mark.parametrize("residual", [None, 1.0])
@@ -122,3 +122,12 @@ def test_distance_counts_unless_told_otherwise(tmp_path: Any, capsys: pytest.Cap
     assert (read_photograph(tmp_path / "out.png").pixels - wanted.clamp(0, 1)).abs().max() < 0.6 / 255
     assert main([*arguments, "--spatial-bandwidth", "far"]) == 2
     assert "--spatial-bandwidth must be a positive number of pixels, such as 20, or none" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("stride", [2, 2.7])
+def test_enlarged_and_reduced(stride: float) -> None:
+    planes = cat()
+    large = resize(planes, (round(100 * stride), round(150 * stride)))
+    back = resize(large, (100, 150))
+    error, reduction = enlarged_and_reduced(planes, stride) - back, planes - back
+    assert error.square().mean().sqrt() < 0.1 * reduction.square().mean().sqrt()

@@ -26,7 +26,7 @@ function consume(event) {
 class Closeup {
   #size = null; // of the photograph, once there is one
   #address = ""; // of its pictures
-  #view = views.whole();
+  #view = views.WHOLE;
   #wipe = 0;
   #hasBrush = true;
   #gestures = new Gestures();
@@ -90,7 +90,7 @@ class Closeup {
 
   /** Show the whole photograph. */
   fit() {
-    this.#view = views.whole();
+    this.#view = views.WHOLE;
     this.#draw();
   }
 

@@ -7,19 +7,14 @@
  * canvas on the page (`{ left, top, width, height }`), and `density`, pixels of the screen per pixel of the page.
  */
 
-/** The scale from which on a part is shown at full size. */
-export const LEAST = 0.5;
+/** The view of the whole photograph. */
+export const WHOLE = { scale: null, x: 0, y: 0 };
 
+const CLOSE = 0.5; // the scale from which on a part is shown at full size
 const MOST = 16;
 const LADDER = [1 / 64, 1 / 32, 1 / 16, 1 / 8, 1 / 4, 1 / 2, 1, 2, 4, 8, 16];
-const WHOLE = { scale: null, x: 0, y: 0 };
 
 const clamp = (value, low, high) => Math.min(Math.max(value, low), high);
-
-/** The view of the whole photograph. */
-export function whole() {
-  return WHOLE;
-}
 
 /** The scale at which the whole photograph fits the canvas. */
 export function fittingScale({ size, room, density }) {
@@ -33,7 +28,7 @@ export function scaleOf(view, frame) {
 
 /** Whether a view shows its part at full size. */
 export function isCloseup(view) {
-  return view.scale !== null && view.scale >= LEAST;
+  return view.scale !== null && view.scale >= CLOSE;
 }
 
 /** Left, top, right and bottom of the visible part, in pixels of the photograph. */

@@ -13,7 +13,7 @@ const FRAME = {
   density: 1,
 };
 const SMALL = { ...FRAME, size: { width: 200, height: 100 } };
-const WHOLE = views.whole();
+const { WHOLE } = views;
 
 /** The box of the photograph on the page, for a view. */
 function photoBox(view, frame) {
