@@ -31,10 +31,10 @@ def in_bytes(image: Tensor) -> Tensor:
     return (image.clamp(0, 1) * 255).round() / 255
 
 
-def single_look(found: FittedLook | tuple[FittedLook, ...]) -> FittedLook:
-    assert isinstance(found, FittedLook)
-    return found
+def single_look(look: FittedLook | tuple[FittedLook, ...]) -> FittedLook:
+    assert isinstance(look, FittedLook)
+    return look
 
 
-def explained(before: Tensor, after: Tensor, found: Tensor) -> float:
-    return 1 - float((after - found.clamp(0, 1)).square().sum() / (after - before).square().sum())
+def explained(before: Tensor, after: Tensor, result: Tensor) -> float:
+    return 1 - float((after - result.clamp(0, 1)).square().sum() / (after - before).square().sum())

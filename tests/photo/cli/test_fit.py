@@ -37,8 +37,8 @@ def test_fit_finds_the_sliders_and_how_much_they_explain(before: Path, capsys: p
     preset = before.with_name("look.json")
     assert fit(before, edit(before), preset) == 0
     printed = capsys.readouterr().out
-    found = Recipe.from_json(preset.read_text(), "look.json").steps[0]
-    assert found["alpha"] == pytest.approx(ALPHA, rel=0.02)
+    step = Recipe.from_json(preset.read_text(), "look.json").steps[0]
+    assert step["alpha"] == pytest.approx(ALPHA, rel=0.02)
     assert "alpha: 2.2" in printed
     explained = float(printed.split("explained: ")[1].split(" %")[0])
     assert explained > 99.0
@@ -230,26 +230,26 @@ def test_it_warns_of_a_local_edit_and_fits_regions(tmp_path: Path, capsys: pytes
 
 
 def test_looks_of_regions_are_put_where_their_masks_are(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    before, after, out, rows, look, one, other, odd = (
+    before, after, out, rows, look, on_left, on_right, odd = (
         str(tmp_path / f"{name}.png") for name in ("a", "b", "out", "rows", "look", "left", "right", "odd")
     )
     left = (torch.arange(100) < 50).float().expand(1, 1, 80, 100)
     edited = torch.where(left > 0, CAT**0.6, apply_look(CAT, matrix=SEPIA))
-    for path, image in ((before, CAT), (after, edited), (one, left), (other, 1 - left), (odd, left[..., :70])):
+    for path, image in ((before, CAT), (after, edited), (on_left, left), (on_right, 1 - left), (odd, left[..., :70])):
         write_photograph(Photograph(image), Path(path))
     look = look.replace(".png", ".json")
-    assert main(["fit", before, after, look, "--landmarks", "40", "--mask", one, "--mask", other]) == 0
+    assert main(["fit", before, after, look, "--landmarks", "40", "--mask", on_left, "--mask", on_right]) == 0
     first, second = (look.replace(".json", f"-{i}.json") for i in (1, 2))
-    regions = ["--preset", first, "--mask", one, "--preset", second, "--mask", other]
+    regions = ["--preset", first, "--mask", on_left, "--preset", second, "--mask", on_right]
     assert main(["apply", before, out, *regions]) == 0
-    found, target = read_photograph(Path(out)).pixels, read_photograph(Path(after)).pixels
-    assert explained(CAT, target, found) > 0.98
+    pixels, target = read_photograph(Path(out)).pixels, read_photograph(Path(after)).pixels
+    assert explained(CAT, target, pixels) > 0.98
     assert main(["apply", before, rows, *regions, "--memory", "0.001"]) == 0
-    assert (read_photograph(Path(rows)).pixels - found).abs().max() <= 1.01 / 255
-    assert main(["apply", before, out, "--preset", first, "--mask", one]) == 0
-    found = read_photograph(Path(out)).pixels
-    assert torch.equal(found[..., 50:], read_photograph(Path(before)).pixels[..., 50:])
-    assert main(["apply", before, out, "--preset", first, "--preset", second, "--mask", one]) == 2
+    assert (read_photograph(Path(rows)).pixels - pixels).abs().max() <= 1.01 / 255
+    assert main(["apply", before, out, "--preset", first, "--mask", on_left]) == 0
+    pixels = read_photograph(Path(out)).pixels
+    assert torch.equal(pixels[..., 50:], read_photograph(Path(before)).pixels[..., 50:])
+    assert main(["apply", before, out, "--preset", first, "--preset", second, "--mask", on_left]) == 2
     assert "--mask must come once for each --preset, got 1 for 2" in capsys.readouterr().err
     for memory in ([], ["--memory", "0.001"]):
         assert main(["apply", before, out, "--preset", first, "--mask", odd, *memory]) == 2
@@ -264,9 +264,9 @@ def test_folders_of_masks_belong_to_folders_of_photographs(tmp_path: Path, capsy
         for folder, picture in zip(folders.values(), (image, edited, left, 1 - left), strict=True):
             folder.mkdir(exist_ok=True)
             write_photograph(Photograph(picture), folder / f"{name}.png")
-    before, after, one, other = map(str, folders.values())
+    before, after, first, other = map(str, folders.values())
     look, out = tmp_path / "look.json", tmp_path / "out.png"
-    assert main(["fit", before, after, str(look), "--landmarks", "40", "--mask", one, "--mask", other]) == 0
+    assert main(["fit", before, after, str(look), "--landmarks", "40", "--mask", first, "--mask", other]) == 0
     assert "in other photographs" in capsys.readouterr().out
     for number, part, curve in ((1, slice(50), True), (2, slice(50, 100), False)):
         preset = str(tmp_path / f"look-{number}.json")
@@ -275,15 +275,15 @@ def test_folders_of_masks_belong_to_folders_of_photographs(tmp_path: Path, capsy
         assert explained(CUP[..., part], wanted, read_photograph(out).pixels[..., part]) > 0.98
     (folders["right"] / "cat.png").unlink()
     for masks, message in {
-        (one, other): "right must hold a mask for every photograph, got none for cat.png; add one",
-        (f"{one}/cat.png",): "--mask must name folders of masks, as BEFORE and AFTER are folders, got",
+        (first, other): "right must hold a mask for every photograph, got none for cat.png; add one",
+        (f"{first}/cat.png",): "--mask must name folders of masks, as BEFORE and AFTER are folders, got",
     }.items():
         named = [word for mask in masks for word in ("--mask", mask)]
         assert main(["fit", before, after, str(look), *named]) == 2
         complaint = capsys.readouterr().err
         assert message in complaint
         assert complaint.count("\n") == 1
-    assert main(["fit", f"{before}/cat.png", f"{after}/cat.png", str(look), "--mask", one]) == 2
+    assert main(["fit", f"{before}/cat.png", f"{after}/cat.png", str(look), "--mask", first]) == 2
     assert "--mask must name pictures, as BEFORE and AFTER are, got" in capsys.readouterr().err
 
 

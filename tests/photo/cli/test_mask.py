@@ -92,11 +92,11 @@ def test_a_rough_mask_becomes_a_soft_one(photograph: Path, tmp_path: Path) -> No
 def test_tiles(photograph: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("nlfilter_torch.photo.cli.editing.read_if_it_fits", lambda *_: None)
     assert run(photograph, tmp_path / "out.tif") == 0
-    found = tifffile.imread(tmp_path / "out.tif")
-    assert found.shape == SIZE
-    np.testing.assert_allclose(found / 65535, expected(photograph), atol=0.02)
+    mask = tifffile.imread(tmp_path / "out.tif")
+    assert mask.shape == SIZE
+    np.testing.assert_allclose(mask / 65535, expected(photograph), atol=0.02)
     assert run(photograph, tmp_path / "out.pfm") == 0
-    np.testing.assert_allclose(floats(tmp_path / "out.pfm"), found / 65535, atol=1e-4)
+    np.testing.assert_allclose(floats(tmp_path / "out.pfm"), mask / 65535, atol=1e-4)
 
 
 @pytest.mark.parametrize(

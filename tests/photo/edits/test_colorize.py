@@ -30,8 +30,8 @@ def test_strokes_of_a_narrow_picture_stay_where_they_are() -> None:
     grey = 0.5 + 0.01 * noise(1, 1, 3000, 31, dtype=torch.float32)
     above, below = box(2800, 8, 20, 16, size=(3000, 31)), box(2900, 8, 20, 16, size=(3000, 31))
     strokes, painted = paint(0.8, 0.2, 0.2, above) + paint(0.2, 0.2, 0.8, below), above + below
-    found = colorize(grey, strokes, painted, viewing_size=0.01, num_landmarks=40)
-    redness = (found[:, 0] - found[:, 2])[..., 8:24].mean((0, 2))
+    coloured = colorize(grey, strokes, painted, viewing_size=0.01, num_landmarks=40)
+    redness = (coloured[:, 0] - coloured[:, 2])[..., 8:24].mean((0, 2))
     assert redness[2800:2820].mean() > 0.1
     assert redness[2900:2920].mean() < -0.1
 
@@ -41,12 +41,12 @@ def test_colours_come_back_from_strokes() -> None:
     mask = torch.zeros(1, 1, 60, 90)
     for row, column in np.random.default_rng(0).integers(0, (56, 86), (12, 2)):
         mask[..., row : row + 4, column : column + 4] = 1
-    found = colorize(luminance(image), image * mask, mask)
-    assert (luminance(found) - luminance(image)).abs().max() < 1e-4
-    assert (found - image).square().mean() < 0.3 * (luminance(image) - image).square().mean()
+    coloured = colorize(luminance(image), image * mask, mask)
+    assert (luminance(coloured) - luminance(image)).abs().max() < 1e-4
+    assert (coloured - image).square().mean() < 0.3 * (luminance(image) - image).square().mean()
     pieces = colorize(luminance(image), image * mask, mask, method="kmeans")
     assert (luminance(pieces) - luminance(image)).abs().max() < 1e-4
-    assert not torch.equal(pieces, found)
+    assert not torch.equal(pieces, coloured)
 
 
 def test_strength_decides_what_becomes_of_the_rest() -> None:
@@ -55,8 +55,8 @@ def test_strength_decides_what_becomes_of_the_rest() -> None:
     stroke = box(10, 4, size=(40, 40))
 
     def chroma(strength: float) -> torch.Tensor:
-        found = colorize(grey, paint(0.4, 0.1, 0.1, stroke), stroke, strength=strength, num_landmarks=40)
-        return split_luminance(found)[1][..., 26:].abs().mean()
+        coloured = colorize(grey, paint(0.4, 0.1, 0.1, stroke), stroke, strength=strength, num_landmarks=40)
+        return split_luminance(coloured)[1][..., 26:].abs().mean()
 
     assert chroma(0.0) < 0.01 < chroma(0.5) < chroma(1.0)
 
@@ -65,8 +65,8 @@ def test_a_line_between_equal_greys_keeps_their_colours_apart() -> None:
     grey = torch.full((1, 1, 40, 60), 0.5)
     grey[..., 29:31] = 0.1
     left, right = box(10, 24, size=(40, 60)), box(26, 33, size=(40, 60))
-    found = colorize(grey, paint(0.8, 0.2, 0.2, left) + paint(0.2, 0.2, 0.8, right), left + right, num_landmarks=40)
-    redder = (found[:, 0] - found[:, 2])[0]
+    coloured = colorize(grey, paint(0.8, 0.2, 0.2, left) + paint(0.2, 0.2, 0.8, right), left + right, num_landmarks=40)
+    redder = (coloured[:, 0] - coloured[:, 2])[0]
     # With similarity alone, a quarter of the right half would be red.
     assert (redder[:, :28] > 0).float().mean() > 0.97
     assert (redder[:, 32:] < 0).float().mean() > 0.97
@@ -85,9 +85,9 @@ def test_the_mean_of_estimates_leaves_out_what_differs_and_what_nothing_supports
     def pixel(*chroma: float) -> torch.Tensor:
         return torch.tensor(chroma).view(1, 2, 1, 1)
 
-    red, blue, one, none = pixel(0.3, -0.1), pixel(-0.1, 0.3), torch.ones(1, 1, 1, 1), torch.zeros(1, 1, 1, 1)
-    torch.testing.assert_close(weighted_mean((red, red, red), (one, one, 1.0)), red)
-    assert (weighted_mean((blue, red, red), (one, one, 1.0)) - red).norm() < 0.3 * (blue - red).norm()
+    red, blue, certain, none = pixel(0.3, -0.1), pixel(-0.1, 0.3), torch.ones(1, 1, 1, 1), torch.zeros(1, 1, 1, 1)
+    torch.testing.assert_close(weighted_mean((red, red, red), (certain, certain, 1.0)), red)
+    assert (weighted_mean((blue, red, red), (certain, certain, 1.0)) - red).norm() < 0.3 * (blue - red).norm()
     torch.testing.assert_close(weighted_mean((blue, blue, red), (none, none, 1.0)), red)
 
 
@@ -105,13 +105,13 @@ def test_chroma_is_proportional_to_that_of_the_strokes() -> None:
     for row, column in np.random.default_rng(1).integers(0, (56, 86), (8, 2)):
         mask[..., row : row + 4, column : column + 4] = 1
 
-    def found(saturation: float) -> torch.Tensor:
+    def coloured(saturation: float) -> torch.Tensor:
         return colorize(grey, (grey + saturation * chroma) * mask, mask) - grey
 
-    strong, faint = found(0.2), found(0.01)
+    strong, faint = coloured(0.2), coloured(0.01)
     assert strong.abs().max() > 0.02
     torch.testing.assert_close(20 * faint, strong, atol=1e-5, rtol=0)
-    assert found(0.0).abs().max() < 1e-6
+    assert coloured(0.0).abs().max() < 1e-6
 
 
 def test_colours_spread_farther_where_brightness_changes_less() -> None:
@@ -120,9 +120,9 @@ def test_colours_spread_farther_where_brightness_changes_less() -> None:
     strokes, painted = paint(0.8, 0.2, 0.2, beside) + paint(0.2, 0.2, 0.8, above), beside + above
 
     def redness(turned: bool) -> torch.Tensor:
-        given = (x.mT if turned else x for x in (bands, strokes, painted))
-        found = colorize(*given, num_landmarks=100)
-        red, _, blue = (found.mT if turned else found)[0, :, 40:44, 38:42].mean((1, 2))
+        arguments = (x.mT if turned else x for x in (bands, strokes, painted))
+        coloured = colorize(*arguments, num_landmarks=100)
+        red, _, blue = (coloured.mT if turned else coloured)[0, :, 40:44, 38:42].mean((1, 2))
         return red - blue
 
     assert redness(turned=False) > 0.02
@@ -169,18 +169,18 @@ def test_one_pixel_and_all_pixels_may_be_painted() -> None:
     image = colour("chelsea", 40, 60)
     dot = box(20, 30, 1, 1, size=(40, 60))
     wanted = split_luminance(image)[1][..., 20:21, 30:31]
-    found = split_luminance(colorize(luminance(image), image * dot, dot))[1]
-    torch.testing.assert_close(found[..., 20:21, 30:31], wanted, atol=0.02, rtol=0)
+    coloured = split_luminance(colorize(luminance(image), image * dot, dot))[1]
+    torch.testing.assert_close(coloured[..., 20:21, 30:31], wanted, atol=0.02, rtol=0)
     full = colorize(luminance(image), image, torch.ones(1, 1, 40, 60))
     assert (full - image).abs().mean() < 0.01
 
 
 def test_a_colour_too_strong_for_its_luminance_is_weakened() -> None:
     grey, chroma = torch.tensor([0.05, 0.5, 0.98]).view(1, 1, 1, 3), paint(1, 0, 0, torch.ones(1, 1, 1, 3))
-    found = merge_luminance(grey, split_luminance(chroma)[1])
-    assert found.min() >= 0
-    assert found.max() <= 1
-    torch.testing.assert_close(luminance(found), grey)
+    coloured = merge_luminance(grey, split_luminance(chroma)[1])
+    assert coloured.min() >= 0
+    assert coloured.max() <= 1
+    torch.testing.assert_close(luminance(coloured), grey)
 
 
 def test_segments_of_an_image_do_not_depend_on_the_colours_of_others() -> None:

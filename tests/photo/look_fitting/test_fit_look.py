@@ -23,8 +23,8 @@ from tests.looks import ALPHA, CAT, CUP, FEW, SEPIA, SUIT, explained, in_bytes, 
 
 
 def equalized(image: Tensor) -> Tensor:
-    found = skimage.exposure.equalize_adapthist(image[0].permute(1, 2, 0).numpy(), clip_limit=0.1)
-    return in_bytes(torch.from_numpy(found).permute(2, 0, 1)[None].float())
+    values = skimage.exposure.equalize_adapthist(image[0].permute(1, 2, 0).numpy(), clip_limit=0.1)
+    return in_bytes(torch.from_numpy(values).permute(2, 0, 1)[None].float())
 
 
 def detailed(image: Tensor) -> Tensor:
@@ -48,9 +48,9 @@ def test_parts_that_depend_on_the_picture_explain_another_photograph(
 ) -> None:
     pairs = [(image, edit(image)) for image in (CAT, CUP, SUIT)]
     shares = []
-    for some in (parts, parts[:2]):
-        found = single_look(fit_look(pairs[:2], parts=some, step=FEW))
-        shares.append(explained(*pairs[2], found.apply(SUIT)))
+    for chosen in (parts, parts[:2]):
+        look = single_look(fit_look(pairs[:2], parts=chosen, step=FEW))
+        shares.append(explained(*pairs[2], look.apply(SUIT)))
     assert shares[0] > least > most > shares[1], shares
 
 
@@ -59,12 +59,12 @@ def test_sliders_are_found_through_eight_bits(count: int) -> None:
     images = (rgb("chelsea", slice(0, 300, 2), slice(0, 450, 2)), rgb("coffee", slice(0, 300, 2), slice(0, 450, 2)))
     step = Step("detail", alpha=ALPHA, limits="none", threshold=0.0, landmarks=150)
     pairs = [(image, in_bytes(apply_step(step, image))) for image in images[:count]]
-    found = single_look(fit_look(iter(pairs), step=Step("look", landmarks=150)))
-    assert found.parts == ("alpha",)
-    assert found.step.edit == "detail"
-    assert found.step["alpha"] == pytest.approx(ALPHA, abs=1e-3)
-    assert found.fitted > 0.99
-    assert torch.allclose(found.apply(images[0]).clamp(0, 1), pairs[0][1], atol=1.01 / 255)
+    look = single_look(fit_look(iter(pairs), step=Step("look", landmarks=150)))
+    assert look.parts == ("alpha",)
+    assert look.step.edit == "detail"
+    assert look.step["alpha"] == pytest.approx(ALPHA, abs=1e-3)
+    assert look.fitted > 0.99
+    assert torch.allclose(look.apply(images[0]).clamp(0, 1), pairs[0][1], atol=1.01 / 255)
 
 
 @pytest.mark.parametrize(
@@ -81,8 +81,8 @@ def test_sliders_are_found_through_eight_bits(count: int) -> None:
 def test_edits_of_others_are_explained_on_other_photographs(edit: object) -> None:
     assert callable(edit)
     pairs = [(image, in_bytes(edit(image))) for image in (CAT, CUP, SUIT)]
-    found = single_look(fit_look(pairs[:2], step=FEW))
-    assert all(explained(*pair, found.apply(pair[0])) > 0.95 for pair in pairs)
+    look = single_look(fit_look(pairs[:2], step=FEW))
+    assert all(explained(*pair, look.apply(pair[0])) > 0.95 for pair in pairs)
 
 
 def test_saturation_in_hsv_is_explained_on_other_photographs() -> None:
@@ -95,16 +95,16 @@ def test_saturation_in_hsv_is_explained_on_other_photographs() -> None:
     pairs = [
         (image, saturated(image)) for image in (rgb(name, every, every) for name in ("astronaut", "coffee", "chelsea"))
     ]
-    found = single_look(fit_look(pairs[:2], step=FEW))
-    assert found.parts == ("saturation",)
-    assert all(explained(*pair, found.apply(pair[0])) > 0.99 for pair in pairs)
+    look = single_look(fit_look(pairs[:2], step=FEW))
+    assert look.parts == ("saturation",)
+    assert all(explained(*pair, look.apply(pair[0])) > 0.99 for pair in pairs)
 
 
 def test_one_pair_does_not_bend_curves_where_it_has_no_values() -> None:
     dark = in_bytes(0.1 + 0.25 * CAT)
-    found = single_look(fit_look([(dark, in_bytes(dark + 0.8 * dark * (0.5 - dark)))], parts=("curves",), step=FEW))
-    curves = found.tensors["curves"]
-    assert found.fitted > 0.9
+    look = single_look(fit_look([(dark, in_bytes(dark + 0.8 * dark * (0.5 - dark)))], parts=("curves",), step=FEW))
+    curves = look.tensors["curves"]
+    assert look.fitted > 0.9
     assert float((curves[:, 12:] - torch.linspace(0, 1, 17)[12:]).abs().max()) < 0.08
 
 
@@ -121,20 +121,20 @@ def test_pairs_are_read_once_and_not_kept() -> None:
             gc.collect()
             alive.extend(reference() is not None for reference in yielded[:-1])
 
-    found = single_look(fit_look(pairs(), step=FEW))
+    look = single_look(fit_look(pairs(), step=FEW))
     assert len(yielded) == 6
     assert len(alive) == 15
     assert not any(alive)
-    assert found.left_out > 0.95
+    assert look.left_out > 0.95
 
 
 def test_regions_have_looks_of_their_own() -> None:
     masks = torch.zeros(1, 2, *CAT.shape[-2:])
     masks[:, 0, :, :50], masks[:, 1, :, 50:] = 1, 1
     bright, sepia = in_bytes(CAT**0.6), in_bytes(apply_look(CAT, matrix=SEPIA))
-    found = fit_look([(CAT, torch.where(masks[:, :1] > 0, bright, sepia), masks)], step=FEW)
-    assert isinstance(found, tuple)
-    left, right = (look.apply(CAT) for look in found)
+    looks = fit_look([(CAT, torch.where(masks[:, :1] > 0, bright, sepia), masks)], step=FEW)
+    assert isinstance(looks, tuple)
+    left, right = (look.apply(CAT) for look in looks)
     assert explained(CAT[..., :50], bright[..., :50], left[..., :50]) > 0.98
     assert explained(CAT[..., 50:], sepia[..., 50:], right[..., 50:]) > 0.98
 
@@ -148,9 +148,9 @@ def test_a_region_may_be_missing_in_some_pairs() -> None:
         (CUP, in_bytes(apply_look(CUP, matrix=SEPIA)), ground),
         (CAT, torch.where(sky[:, :1] > 0, bright, sepia), sky),
     ]
-    found = fit_look(pairs, step=FEW)
-    assert isinstance(found, tuple)
-    upper, lower = (look.apply(CAT) for look in found)
+    looks = fit_look(pairs, step=FEW)
+    assert isinstance(looks, tuple)
+    upper, lower = (look.apply(CAT) for look in looks)
     assert explained(CAT[..., :40, :], bright[..., :40, :], upper[..., :40, :]) > 0.98
     assert explained(CAT[..., 40:, :], sepia[..., 40:, :], lower[..., 40:, :]) > 0.98
     with pytest.raises(
@@ -164,24 +164,24 @@ def test_a_frame_around_the_edited_picture_is_left_out(colour: float, width: int
     inside = (..., slice(width, -width), slice(width, -width))
     after = torch.full_like(CAT, colour)
     after[inside] = in_bytes(CAT**0.6)[inside]
-    found = single_look(fit_look([(CAT, after)], step=FEW))
-    assert found.fitted > 0.98
-    assert explained(CAT[inside], after[inside], found.apply(CAT)[inside]) > 0.98
+    look = single_look(fit_look([(CAT, after)], step=FEW))
+    assert look.fitted > 0.98
+    assert explained(CAT[inside], after[inside], look.apply(CAT)[inside]) > 0.98
 
 
 def test_a_watermark_lowers_what_is_explained_and_little_else() -> None:
     after = in_bytes(CAT**0.6)
     after[..., 60:75, 60:95] = 0.9
-    found = single_look(fit_look([(CAT, after)], step=FEW))
-    assert 0 < found.fitted < 0.95
-    assert explained(CAT[..., :55, :], after[..., :55, :], found.apply(CAT)[..., :55, :]) > 0.8
+    look = single_look(fit_look([(CAT, after)], step=FEW))
+    assert 0 < look.fitted < 0.95
+    assert explained(CAT[..., :55, :], after[..., :55, :], look.apply(CAT)[..., :55, :]) > 0.8
 
 
 def test_more_parameters_than_pixels_are_told_by_what_is_left_out() -> None:
     noise = torch.rand(1, 3, 5, 5, generator=torch.Generator().manual_seed(0))
-    found = single_look(fit_look([(CAT[..., :5, :5], noise)], step=Step("look", landmarks=20)))
-    assert found.left_out < 0.5
-    assert all(abs(value) < 1e3 for value in found.tensors["alpha"].tolist())
+    look = single_look(fit_look([(CAT[..., :5, :5], noise)], step=Step("look", landmarks=20)))
+    assert look.left_out < 0.5
+    assert all(abs(value) < 1e3 for value in look.tensors["alpha"].tolist())
 
 
 @pytest.mark.parametrize(
@@ -203,10 +203,10 @@ def test_bad_pairs_are_refused_in_a_sentence(pairs: list[object], message: str) 
 
 
 def test_files_keep_looks(tmp_path: Path) -> None:
-    found = single_look(fit_look([(CAT, in_bytes(CAT**0.6))], step=FEW))
-    text = found.to_json()
+    look = single_look(fit_look([(CAT, in_bytes(CAT**0.6))], step=FEW))
+    text = look.to_json()
     assert json.loads(text)["steps"][0]["edit"] == "look"
-    assert Recipe.from_json(text, "it").steps == (found.step,)
+    assert Recipe.from_json(text, "it").steps == (look.step,)
     with pytest.raises(ValueError, match="matrix of look, step 1 in it must be a list of 9 numbers"):
         Recipe.from_json('{"version": 1, "steps": [{"edit": "look", "matrix": [1, 2]}]}', "it")
 

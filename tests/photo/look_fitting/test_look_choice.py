@@ -12,17 +12,17 @@ def test_nonnegative_least_squares_meets_its_conditions() -> None:
     for _ in range(20):
         root = torch.rand(12, 8, generator=generator, dtype=torch.float64) - 0.3
         matrix, vector = root.mT @ root, torch.rand(8, generator=generator, dtype=torch.float64) - 0.5
-        found = nonnegative(matrix, vector)
-        slope = vector - matrix @ found
-        assert float(found.min()) >= 0
+        solution = nonnegative(matrix, vector)
+        slope = vector - matrix @ solution
+        assert float(solution.min()) >= 0
         assert float(slope.max()) < 1e-8
-        assert float((slope * found).abs().max()) < 1e-8
+        assert float((slope * solution).abs().max()) < 1e-8
 
 
 def test_curves_never_fall() -> None:
     after = in_bytes(0.5 + 0.4 * torch.sin(9 * CAT))  # a curve that rises and falls
-    found = single_look(fit_look([(CAT, after)], parts=("curves",), step=FEW))
-    curves = found.tensors["curves"]
+    look = single_look(fit_look([(CAT, after)], parts=("curves",), step=FEW))
+    curves = look.tensors["curves"]
     assert float(curves.diff(dim=1).min()) >= -1e-5
     assert float(curves.diff(dim=1).max()) > 0.01
 

@@ -14,14 +14,14 @@ def test_layers_of_a_sample_are_nearly_those_of_all_pixels(monkeypatch: pytest.M
     monkeypatch.setattr("nlfilter_torch.photo.look_fitting.look_sums.MOST", 2000)
     monkeypatch.setattr("nlfilter_torch.photo.look_fitting.look_pixels.MOST", 2000)
     photograph = EditedPhotograph(CAT[0], (CAT[0] ** 0.7), None, FEW, 3, None)
-    found = photograph.regions_of_sample()
-    assert found is not None
-    (some,) = found
-    assert some.weighed["alpha"].shape == (4, 2000)
-    assert float(some.weights[0].sum()) == pytest.approx(float(photograph.free[0].sum()), rel=0.02)
-    exact = photograph.layers[:, some.places]
-    assert torch.allclose(some.weighed["alpha"].sum(0), exact.sum(0), atol=1e-5)
-    assert bool(((some.weighed["alpha"] - exact).square().mean(1) < 0.04 * exact.square().mean(1)).all())
+    regions = photograph.regions_of_sample()
+    assert regions is not None
+    (sample,) = regions
+    assert sample.weighed["alpha"].shape == (4, 2000)
+    assert float(sample.weights[0].sum()) == pytest.approx(float(photograph.free[0].sum()), rel=0.02)
+    exact = photograph.layers[:, sample.places]
+    assert torch.allclose(sample.weighed["alpha"].sum(0), exact.sum(0), atol=1e-5)
+    assert bool(((sample.weighed["alpha"] - exact).square().mean(1) < 0.04 * exact.square().mean(1)).all())
     masks = torch.ones(1, *CAT.shape[-2:])
     assert EditedPhotograph(CAT[0], CAT[0] ** 0.7, masks, FEW, 3, None).regions_of_sample() is None
 

@@ -13,7 +13,7 @@ def test_local_contrast_is_the_clipped_histogram_of_the_tiles_around(scaled: boo
     image = CAT[:, :, :77, :90].double()  # tiles of 9.6 by 11.3 pixels
     strengths = [0.0] * 8
     strengths[4 * scaled + 1] = 1.0  # a limit of 2
-    found = apply_look(image, local=strengths) - image
+    changes = apply_look(image, local=strengths) - image
     weights = torch.tensor([0.299, 0.587, 0.114], dtype=torch.float64).view(3, 1, 1)
     light = (image[0].amax(0) if scaled else (image[0] * weights).sum(0)).numpy()
     value = light
@@ -42,7 +42,7 @@ def test_local_contrast_is_the_clipped_histogram_of_the_tiles_around(scaled: boo
                 blended += (1 - abs(place[0] - i)) * (1 - abs(place[1] - j)) * curve(i, j)
         change = np.interp(light[row, column], np.linspace(0, 1, 33), blended)
         colours = image[0, :, row, column] / value[row, column] if scaled else torch.ones(3)
-        assert found[0, :, row, column].tolist() == pytest.approx((change * colours).tolist(), abs=1e-6)
+        assert changes[0, :, row, column].tolist() == pytest.approx((change * colours).tolist(), abs=1e-6)
     even = torch.full((1, 3, 5, 40), 0.5)  # tiles of less than a pixel
     assert torch.isfinite(apply_look(even, local=LOCAL)).all()
 
@@ -53,11 +53,11 @@ def test_automatic_levels_reach_from_black_to_white() -> None:
     for kind, tone in enumerate((lambda x: (x * weights).sum(1), lambda x: x.amax(1), lambda x: x)):
         strengths = [0.0] * 3
         strengths[kind] = 1.0
-        found = tone(apply_look(dull, stretch=strengths))
+        stretched = tone(apply_look(dull, stretch=strengths))
         low, high = tone(dull).min(), tone(dull).max()
         if kind == 2:
             low, high = (torch.stack([of(x) for x in dull[0]]).view(3, 1, 1) for of in (torch.min, torch.max))
-        assert torch.allclose(found, (tone(dull) - low) / (high - low), atol=1e-5)
+        assert torch.allclose(stretched, (tone(dull) - low) / (high - low), atol=1e-5)
     value = apply_look(dull, stretch=(0.0, 1.0, 0.0))
     assert torch.allclose(value * dull.amax(1, True), dull * value.amax(1, True), atol=1e-5)  # hue and saturation stay
     grey = apply_look(dull[:, :1], stretch=(0.0, 0.0, 1.0))

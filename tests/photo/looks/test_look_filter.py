@@ -48,9 +48,9 @@ def test_texture_is_the_fine_band_where_luminance_varies_little() -> None:
     def blurred(row: int, column: int, values: np.ndarray) -> float:
         return float((values[row - 2 : row + 3, column - 2 : column + 3] * weights).sum())
 
-    found = apply_look(image, texture=(2.0, 1.0, 1.0, 1.0, 1.0, 1.0)) - image
+    added = apply_look(image, texture=(2.0, 1.0, 1.0, 1.0, 1.0, 1.0)) - image
     for row, column in ((2, 2), (30, 41), (60, 80)):
         mean = blurred(row, column, light)
         variance = blurred(row, column, light**2) - mean**2
         change = (light[row, column] - mean) * 0.15**2 / (0.15**2 + variance)
-        assert found[0, :, row, column].tolist() == pytest.approx([change] * 3, abs=1e-9)
+        assert added[0, :, row, column].tolist() == pytest.approx([change] * 3, abs=1e-9)

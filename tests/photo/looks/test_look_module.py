@@ -26,8 +26,8 @@ def test_the_layer_learns_what_it_is_told_to() -> None:
 
 def test_the_layer_takes_what_was_found() -> None:
     after = in_bytes(apply_look(CAT, matrix=SEPIA))
-    found = single_look(fit_look([(CAT, after)], step=FEW))
-    assert torch.allclose(Look(found.tensors, learn=())(CAT), found.apply(CAT), atol=1e-5)
+    look = single_look(fit_look([(CAT, after)], step=FEW))
+    assert torch.allclose(Look(look.tensors, learn=())(CAT), look.apply(CAT), atol=1e-5)
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
@@ -40,9 +40,9 @@ def test_half_precision_pictures_are_computed_in_float32(part: str, dtype: torch
         "texture": torch.full((6,), 1.3),
     }
     look = Look({part: parts[part]}, num_landmarks=20)
-    expected, found = look(exact), look(exact.to(dtype))
-    assert found.dtype == dtype
-    torch.testing.assert_close(found, expected.to(dtype), atol=0, rtol=0)
+    expected, result = look(exact), look(exact.to(dtype))
+    assert result.dtype == dtype
+    torch.testing.assert_close(result, expected.to(dtype), atol=0, rtol=0)
     with torch.autocast("cpu", torch.bfloat16):
         assert torch.equal(look(exact), expected)
 

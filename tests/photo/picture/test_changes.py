@@ -11,8 +11,8 @@ from tests.brightness import ALPHA
 def test_calm_areas_are_strengthened_less_and_smoothed_alike() -> None:
     changes = torch.tensor([0.4, 0.1]).view(1, 2, 1, 1).expand(1, 2, 1, 3)
     variance = torch.tensor([0.0, 1e-4, 1.0]).view(1, 1, 1, 3)
-    found = limit_by_activity(changes, variance, 0.01).flatten()
-    torch.testing.assert_close(found, torch.tensor([0.1, 0.3, 0.5]), atol=1e-4, rtol=0)
+    limited = limit_by_activity(changes, variance, 0.01).flatten()
+    torch.testing.assert_close(limited, torch.tensor([0.1, 0.3, 0.5]), atol=1e-4, rtol=0)
     assert torch.equal(limit_by_activity(changes, variance, 0.0), torch.full((1, 1, 1, 3), 0.5))
     added, rest = split_sliders(torch.tensor([0.5, -0.5, 2.0, 0.3]))
     assert added.tolist() == [0.5, 0.0, 2.0, 0.0]

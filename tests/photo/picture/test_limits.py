@@ -10,17 +10,17 @@ from tests.problems import colour, luminance
 
 def test_changes_keep_within_their_room_and_small_ones_are_kept() -> None:
     image, change = drawn()
-    for found in (changed(image, change), changed(image, change, brighter=0.0)):
-        levels = (255 * found).round()
+    for edited in (changed(image, change), changed(image, change, brighter=0.0)):
+        levels = (255 * edited).round()
         assert not bool(((levels <= 0) & (image > 0)).any())  # no channel clips that did not before
         assert not bool(((levels >= 255) & (image < 1)).any())
-        assert found.min() >= -1e-12
-        assert found.max() <= 1 + 1e-12
-    found = changed(image, change)
-    moved = luminance(found) - luminance(image)
+        assert edited.min() >= -1e-12
+        assert edited.max() <= 1 + 1e-12
+    edited = changed(image, change)
+    moved = luminance(edited) - luminance(image)
     assert bool((moved * change >= -1e-12).all())
     assert bool((moved.abs() <= change.abs() + 1e-12).all())
-    before, after = (x - luminance(x) for x in (image, found))
+    before, after = (x - luminance(x) for x in (image, edited))
     assert bool((torch.linalg.cross(before, after, dim=1).abs() < 1e-7).all())  # hues are kept
     assert bool((after.norm(dim=1) <= before.norm(dim=1) + 1e-6).all())
     middle = torch.full((1, 3, 4, 4), 0.5, dtype=torch.float64)
@@ -52,23 +52,23 @@ def test_balance_keeps_mean_brightness_and_chroma(channels: int) -> None:
     alone = means(changed(image, change))
     assert (alone[0] - means(image)[0]).abs().min() > 0.004
     for brighter in (0.0, 0.05):
-        found = means(changed(image, change, brighter=brighter))
-        torch.testing.assert_close(found[0], (1 + brighter) * means(image)[0], atol=2e-6, rtol=0)
-        torch.testing.assert_close(found[1], means(image)[1], atol=2e-6, rtol=0)
+        edited = means(changed(image, change, brighter=brighter))
+        torch.testing.assert_close(edited[0], (1 + brighter) * means(image)[0], atol=2e-6, rtol=0)
+        torch.testing.assert_close(edited[1], means(image)[1], atol=2e-6, rtol=0)
 
 
 def test_saturated_colours_keep_their_chroma_and_muted_ones_their_detail() -> None:
     image, change = saturated()
     before = image - luminance(image)
 
-    def lost(found: torch.Tensor) -> float:
-        return 1 - float((found - luminance(found)).norm(dim=1).mean() / before.norm(dim=1).mean())
+    def lost(edited: torch.Tensor) -> float:
+        return 1 - float((edited - luminance(edited)).norm(dim=1).mean() / before.norm(dim=1).mean())
 
     assert lost(changed(image, change)) > 0.1
-    found = changed(image, change, brighter=0.0)
-    assert abs(lost(found)) < 0.015
-    assert abs((luminance(found) - luminance(image)).mean()) < 2e-6
-    assert bool((torch.linalg.cross(before, found - luminance(found), dim=1).abs() < 1e-7).all())  # hues are kept
+    edited = changed(image, change, brighter=0.0)
+    assert abs(lost(edited)) < 0.015
+    assert abs((luminance(edited) - luminance(image)).mean()) < 2e-6
+    assert bool((torch.linalg.cross(before, edited - luminance(edited), dim=1).abs() < 1e-7).all())  # hues are kept
     free, full = (changed(image, change, brighter=Balance(torch.tensor(r).double())) for r in (0.0, 1.0))
     assert abs(lost(full)) < 1e-6
     torch.testing.assert_close(full[..., 27:], free[..., 27:], atol=0, rtol=0)
@@ -95,10 +95,10 @@ def test_a_restrained_change_causes_no_edge(rest: tuple[int, int], change: float
 def test_edits_keep_mean_brightness_and_chroma(name: str) -> None:
     image = colour("astronaut", 60, 80)
     for size in (0.0025, 0):
-        found = EDITS[name](image, viewing_size=size)
-        assert (luminance(found) - luminance(image)).mean().abs() < (1 / 255 if size else 2e-5)
+        edited = EDITS[name](image, viewing_size=size)
+        assert (luminance(edited) - luminance(image)).mean().abs() < (1 / 255 if size else 2e-5)
         assert (
-            (found - luminance(found)).norm(dim=1).mean() / (image - luminance(image)).norm(dim=1).mean() - 1
+            (edited - luminance(edited)).norm(dim=1).mean() / (image - luminance(image)).norm(dim=1).mean() - 1
         ) < 0.02
 
 

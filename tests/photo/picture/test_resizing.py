@@ -16,15 +16,15 @@ from tests.problems import cat, colour, noise
 @pytest.mark.parametrize("wanted", [(10, 15), (40, 60), (17, 33), (80, 61)])
 def test_resizing_is_antialiased_bicubic_and_can_go_by_rows(wanted: tuple[int, int]) -> None:
     image = colour("coffee", 40, 60).double()
-    found = resize(image, wanted)
+    small = resize(image, wanted)
     expected = F.interpolate(image, wanted, mode="bicubic", antialias=True)
-    torch.testing.assert_close(found, expected, atol=1e-6 if wanted[0] <= 40 else 1e-4, rtol=0)
+    torch.testing.assert_close(small, expected, atol=1e-6 if wanted[0] <= 40 else 1e-4, rtol=0)
     rows = range(3, min(wanted[0], 9))
     part = resized(lambda start, stop: image[:, :, start:stop], (40, 60), wanted, rows)
-    torch.testing.assert_close(part, found[:, :, 3:9])
+    torch.testing.assert_close(part, small[:, :, 3:9])
     columns = range(2, min(wanted[1], 13))
     part = resized(lambda start, stop: image[:, :, start:stop], (40, 60), wanted, rows, columns)
-    torch.testing.assert_close(part, found[:, :, 3:9, 2:13])
+    torch.testing.assert_close(part, small[:, :, 3:9, 2:13])
 
 
 def test_weights_are_resized_by_themselves() -> None:
@@ -37,8 +37,8 @@ def test_weights_are_resized_by_themselves() -> None:
     assert both[0].max() == pytest.approx(0.6)
     rows = mask[:, 0].permute(1, 2, 0).numpy()  # the two as planes of one picture
     tiled = Tiled(Picture(np.zeros((40, 56, 3), np.float32)), Passes("float32"), "mask")
-    found = torch.from_numpy(np.asarray(tiled.resized_weights(rows, (20, 28), "mask"))).permute(2, 0, 1)
-    torch.testing.assert_close(found, both[:, 0], rtol=0, atol=1e-6)
+    small = torch.from_numpy(np.asarray(tiled.resized_weights(rows, (20, 28), "mask"))).permute(2, 0, 1)
+    torch.testing.assert_close(small, both[:, 0], rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize("step", [1, 3, 2.5])

@@ -21,10 +21,10 @@ def test_sliders_at_1_change_no_bit(residual: float | None) -> None:
     image, region = colour("coffee", 40, 60), torch.zeros(1, 1, 40, 60)
     region[..., 10:20, 10:20] = 1
     for options in ({}, {"viewing_size": 0.001}, {"limits": "none"}, {"threshold": 0.0}):
-        found = enhance(image, torch.ones(4), residual=residual, num_landmarks=40, **options)
-        assert torch.equal(found, image)
-        found = enhance(image, torch.ones(4), region, outside=torch.ones(4), num_landmarks=40, **options)
-        assert torch.equal(found, image)
+        edited = enhance(image, torch.ones(4), residual=residual, num_landmarks=40, **options)
+        assert torch.equal(edited, image)
+        edited = enhance(image, torch.ones(4), region, outside=torch.ones(4), num_landmarks=40, **options)
+        assert torch.equal(edited, image)
 
 
 def test_the_viewing_size_of_a_picture() -> None:
@@ -43,8 +43,8 @@ def test_a_larger_picture_looks_alike_at_the_viewing_size(name: str) -> None:
     viewed = resize(EDITS[name](large, viewing_size=megapixels), (60, 90))
     per_pixel = resize(EDITS[name](large, viewing_size=0), (60, 90))
 
-    def error(found: torch.Tensor) -> float:
-        return float((found - wanted).square().mean().sqrt())
+    def error(edited: torch.Tensor) -> float:
+        return float((edited - wanted).square().mean().sqrt())
 
     change = float((wanted - small).square().mean().sqrt())
     assert error(viewed) < 0.4 * change
@@ -82,8 +82,8 @@ def test_tiles_are_those_of_the_edit_in_memory(saturation: float) -> None:
         planes = None if regions is None else torch.from_numpy(regions).permute(2, 0, 1)[None]
         for size in (0.005, 1.5):
             wanted = enhance(image, ALPHA, planes, num_landmarks=40, viewing_size=size)
-            found = [np.empty_like(rows) for _ in range(2)]
-            for target, height in zip(found, (7, 50), strict=True):
+            edited = [np.empty_like(rows) for _ in range(2)]
+            for target, height in zip(edited, (7, 50), strict=True):
                 stream_detail(
                     rows,
                     target,
@@ -94,8 +94,8 @@ def test_tiles_are_those_of_the_edit_in_memory(saturation: float) -> None:
                     statistics="full",
                     tile_rows=height,
                 )
-            assert np.abs(found[0] - wanted[0].permute(1, 2, 0).numpy()).max() < 2e-3
-            assert np.abs(found[0] - found[1]).max() < 1e-6
+            assert np.abs(edited[0] - wanted[0].permute(1, 2, 0).numpy()).max() < 2e-3
+            assert np.abs(edited[0] - edited[1]).max() < 1e-6
 
 
 def test_regions_of_another_size_are_told_at_the_viewing_size_too() -> None:
@@ -109,8 +109,8 @@ def test_regions_of_another_size_are_told_at_the_viewing_size_too() -> None:
 
 def test_distance_counts_unless_told_otherwise(tmp_path: Any, capsys: pytest.CaptureFixture[str]) -> None:
     image = colour("coffee", 48, 72)
-    near, given, far = (enhance(image, ALPHA, num_landmarks=60, spatial_bandwidth=h) for h in (None, 4.0, "none"))
-    assert torch.equal(near, given)  # a twelfth of 48
+    near, explicit, far = (enhance(image, ALPHA, num_landmarks=60, spatial_bandwidth=h) for h in (None, 4.0, "none"))
+    assert torch.equal(near, explicit)  # a twelfth of 48
     assert (far - near).abs().max() > 0.02
     with pytest.raises(ValueError, match="spatial_bandwidth must be one of 'none', got 'far'"):
         enhance(image, ALPHA, spatial_bandwidth="far")

@@ -26,17 +26,19 @@ def test_the_solve_is_that_of_the_linear_system(monkeypatch: pytest.MonkeyPatch)
     smooth = np.zeros((count, count))
     for middle in range(count):
         inside = near[middle].nonzero()[0]
-        some = pixels[inside] - pixels[inside].mean(0)
-        slopes = np.linalg.inv(some.T @ some / len(inside) + closed_form.NOISE * np.eye(3)) @ some.T / len(inside)
+        centred = pixels[inside] - pixels[inside].mean(0)
+        slopes = (
+            np.linalg.inv(centred.T @ centred / len(inside) + closed_form.NOISE * np.eye(3)) @ centred.T / len(inside)
+        )
         values = (pixels - pixels[inside].mean(0)) @ slopes + 1 / len(inside)  # values of every pixel from those inside
         smooth[:, inside] += share[:, [middle]] * values
     trust = closed_form.LINEAR_ROUGH_CONFIDENCE * (np.square(2 * rough.numpy().ravel() - 1) + 0.01)
     certain = closed_form.LINEAR_SCRIBBLE_CONFIDENCE * (front + back).numpy().ravel()
     target = trust * rough.numpy().ravel() + closed_form.LINEAR_SCRIBBLE_CONFIDENCE * front.numpy().ravel()
     expected = np.linalg.solve(np.diag(1 + trust + certain) - smooth, target)
-    found = closed_form.linear_mask(image - 0.5, functions[:, 0])
+    solved = closed_form.linear_mask(image - 0.5, functions[:, 0])
     stretched = (smooth @ expected.clip(0, 1) - closed_form.END_MARGIN) / (1 - 2 * closed_form.END_MARGIN)
-    np.testing.assert_allclose(found.flatten(), stretched, atol=1e-5)
+    np.testing.assert_allclose(solved.flatten(), stretched, atol=1e-5)
 
 
 @pytest.mark.parametrize("name", ["coffee", "chelsea", "astronaut"])
@@ -44,10 +46,10 @@ def test_the_solve_is_the_same_in_float32(name: str) -> None:
     image = (255 * colour(name, 110, 130)).round() / 255
     front, back = box(50, 50, 8, 12, size=(110, 130)), box(4, 8, 8, 12, size=(110, 130))
     rough = region_mask(image, front, back, num_landmarks=40)
-    found = []
+    solved = []
     for dtype in (torch.float32, torch.float64):
-        some, *masks = (planes.to(dtype) for planes in (image, rough, rough, front, back))
-        functions = closed_form.solve_linear(closed_form.linear_models(some), *masks)
+        colours, *masks = (planes.to(dtype) for planes in (image, rough, rough, front, back))
+        functions = closed_form.solve_linear(closed_form.linear_models(colours), *masks)
         assert functions.dtype == dtype
-        found.append(closed_form.linear_mask(some - 0.5, functions[:, 0]))
-    torch.testing.assert_close(found[0].double(), found[1], atol=2e-3, rtol=0)
+        solved.append(closed_form.linear_mask(colours - 0.5, functions[:, 0]))
+    torch.testing.assert_close(solved[0].double(), solved[1], atol=2e-3, rtol=0)

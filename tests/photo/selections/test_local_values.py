@@ -43,8 +43,8 @@ def local(links: Links, image: Tensor, places: Tensor, weights: Tensor, values: 
     """Return mean values and influence of scribbled pixels."""
     size = (image.shape[2], image.shape[3])
     guide = InMemory(image).reduced(luminance, links.step(size))
-    found = LocalValues.of(links, guide, size, places, weights, values)(image, 0)
-    return found[:, :-1], found[:, -1:]
+    solution = LocalValues.of(links, guide, size, places, weights, values)(image, 0)
+    return solution[:, :-1], solution[:, -1:]
 
 
 @LINKS
@@ -77,9 +77,9 @@ def test_relative_links_are_those_of_levin_lischinski_and_weiss() -> None:
     image = colour("chelsea", 24, 30).mean(1, keepdim=True)
     mask = box(4, 6, 3, 3, size=(24, 30)) + box(15, 20, 3, 3, size=(24, 30))
     values = torch.rand(1, 2, 24, 30, generator=torch.Generator().manual_seed(0)) * mask
-    found, _ = spread(RELATIVE, image, mask, values)
+    solution, _ = spread(RELATIVE, image, mask, values)
     wanted = propagate(image[0, 0].double().numpy(), values[0].double().numpy(), mask[0, 0].numpy() > 0)
-    inner = found[0, :, 1:-1, 1:-1].double().numpy() - wanted[:, 1:-1, 1:-1]
+    inner = solution[0, :, 1:-1, 1:-1].double().numpy() - wanted[:, 1:-1, 1:-1]
     assert np.abs(inner).max() < 0.008
 
 
@@ -93,11 +93,11 @@ def test_gradients(links: Links, pixels: int, monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(local_values, "SCRIBBLE_WEIGHT", 2.0)
     reduced = replace(links, pixels=pixels)
 
-    def found(image: Tensor, values: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
+    def solution(image: Tensor, values: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
         return local(reduced, 0.1 * image, places, weights, values)
 
-    given = (image, values.flatten(2)[..., :4], weights.flatten(2)[..., :4])
-    assert torch.autograd.gradcheck(found, tuple(tensor.clone().requires_grad_() for tensor in given), atol=1e-6)
+    inputs = (image, values.flatten(2)[..., :4], weights.flatten(2)[..., :4])
+    assert torch.autograd.gradcheck(solution, tuple(tensor.clone().requires_grad_() for tensor in inputs), atol=1e-6)
 
 
 @LINKS
@@ -154,9 +154,9 @@ def test_neighbours_predict_a_dot_as_if_it_were_not_painted(links: Links) -> Non
     values = torch.rand(1, 2, *SIZE, generator=torch.Generator().manual_seed(2))
     groups, places = groups_of(mask)
     weights, known = torch.ones(1, 1, 4), values.flatten(2)[:, :, places]
-    found = LocalValues.of(links, image, SIZE, places, weights, known, groups, known)
-    assert found.left_out is not None
-    ratio = found.left_out[:, :-1] / found.left_out[:, -1:]
+    solution = LocalValues.of(links, image, SIZE, places, weights, known, groups, known)
+    assert solution.left_out is not None
+    ratio = solution.left_out[:, :-1] / solution.left_out[:, -1:]
     for k in range(4):
         rest = torch.arange(4) != k
         without = LocalValues.of(links, image, SIZE, places[rest], weights[..., rest], known[..., rest])

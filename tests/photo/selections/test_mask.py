@@ -32,24 +32,24 @@ def test_one_scribble_is_enough_and_the_background_may_be_painted() -> None:
     image, inside = square()
     scribble, ground = box(18, 20, 3, 6, size=SIZE), box(3, 3, 3, 6, size=SIZE)
     for background in (None, ground):
-        found = region_mask(image, scribble, background)
-        assert found.shape == inside.shape
-        assert (found - inside).abs().mean() < 0.03
-        assert ((found > 0.5) == (inside > 0.5)).float().mean() > 0.99
+        mask = region_mask(image, scribble, background)
+        assert mask.shape == inside.shape
+        assert (mask - inside).abs().mean() < 0.03
+        assert ((mask > 0.5) == (inside > 0.5)).float().mean() > 0.99
 
 
 def test_regions_are_background_to_each_other_and_batches_are_their_images() -> None:
     image, inside = square()
     ground = box(3, 3, 3, 6, size=SIZE)
     both = torch.cat([box(18, 20, 3, 6, size=SIZE), ground], dim=1)
-    found = region_mask(image, both, spatial_bandwidth=math.inf)
-    assert ((found[:, :1] > 0.5) == (inside > 0.5)).float().mean() > 0.99
-    assert ((found[:, 1:] > 0.5) == (inside < 0.5)).float().mean() > 0.95
+    mask = region_mask(image, both, spatial_bandwidth=math.inf)
+    assert ((mask[:, :1] > 0.5) == (inside > 0.5)).float().mean() > 0.99
+    assert ((mask[:, 1:] > 0.5) == (inside < 0.5)).float().mean() > 0.95
     alone = region_mask(image, both[:, :1], ground, spatial_bandwidth=math.inf)
-    torch.testing.assert_close(found[:, :1], alone)
+    torch.testing.assert_close(mask[:, :1], alone)
     images = torch.cat([image, image.flip(3)])
     together = region_mask(images, torch.cat([both, both.flip(3)]), spatial_bandwidth=math.inf)
-    torch.testing.assert_close(together[:1], found, atol=2e-3, rtol=0)
+    torch.testing.assert_close(together[:1], mask, atol=2e-3, rtol=0)
 
 
 def test_a_dot_counts_beside_pixels_that_are_not_painted_or_painted_in_another_image() -> None:
@@ -67,8 +67,8 @@ def test_what_is_scribbled_over_stays() -> None:
     assert (region_mask(image, inside)[inside > 0] > 0.95).all()  # the whole subject
     assert (region_mask(image, torch.ones_like(inside)) > 0.95).all()  # the whole picture
     over = box(18, 20, 6, 6, size=SIZE)
-    found = region_mask(image, over, over + box(3, 3, size=SIZE))  # background below the scribble does not count
-    torch.testing.assert_close(found, region_mask(image, over, box(3, 3, size=SIZE)))
+    mask = region_mask(image, over, over + box(3, 3, size=SIZE))  # background below the scribble does not count
+    torch.testing.assert_close(mask, region_mask(image, over, box(3, 3, size=SIZE)))
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 9), (3, 2), (30, 5)])
@@ -77,11 +77,11 @@ def test_small_and_flat_pictures(size: tuple[int, int], dtype: torch.dtype) -> N
     for image in (torch.full((1, 3, *size), 0.4, dtype=dtype), noise(1, 1, *size, dtype=dtype)):
         scribble = torch.zeros(1, 1, *size, dtype=dtype)
         scribble[..., 0, 0] = 1
-        found = region_mask(image, scribble)
-        assert found.shape == scribble.shape
-        assert found.dtype == dtype
-        assert torch.isfinite(found).all()
-        assert found[..., 0, 0] > 0.9
+        mask = region_mask(image, scribble)
+        assert mask.shape == scribble.shape
+        assert mask.dtype == dtype
+        assert torch.isfinite(mask).all()
+        assert mask[..., 0, 0] > 0.9
 
 
 def test_it_is_the_same_again_and_leaves_the_generator_alone() -> None:
@@ -101,8 +101,8 @@ def test_gradients() -> None:
     direction = noise(1, 1, 10, 12, seed=3)
 
     def loss(image: torch.Tensor, front: torch.Tensor, reach: torch.Tensor) -> torch.Tensor:
-        found = region_mask(image, front, back, reach=reach, num_landmarks=20, landmarks="uniform")
-        return (found * direction).sum()
+        mask = region_mask(image, front, back, reach=reach, num_landmarks=20, landmarks="uniform")
+        return (mask * direction).sum()
 
     at = [image, 0.8 * front, torch.tensor(0.5, dtype=torch.float64)]
     inputs = [t.clone().requires_grad_() for t in at]
@@ -126,8 +126,8 @@ def test_tiles_are_as_in_memory(tile_rows: int, monkeypatch: pytest.MonkeyPatch)
     rows: list[Any] = [t[0].permute(1, 2, 0).numpy() for t in (image, front, back)]
     tiled = Tiled(Picture(rows[0]), Passes("float32", "full", tile_rows=tile_rows))
     fitted = region_mask.fit(tiled, rows[1], rows[2], num_landmarks=40)
-    found = np.concatenate([values for _, values in tiled.rows(fitted)])
-    np.testing.assert_allclose(found[..., 0], wanted[0, 0].numpy(), atol=1e-5)
+    mask = np.concatenate([values for _, values in tiled.rows(fitted)])
+    np.testing.assert_allclose(mask[..., 0], wanted[0, 0].numpy(), atol=1e-5)
 
 
 def test_masks_of_a_reduced_picture_follow_the_borders_of_the_large_one(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -135,11 +135,11 @@ def test_masks_of_a_reduced_picture_follow_the_borders_of_the_large_one(monkeypa
     scribble, ground = box(44, 50, 6, 10, size=(96, 112)), box(6, 6, 6, 10, size=(96, 112))
     whole = region_mask(image, scribble, ground)
     monkeypatch.setattr(masks, "SOLVED", 96 * 112 // 4)
-    found = region_mask(image, scribble, ground)
-    assert (found - inside).abs().mean() < 0.02
-    assert ((found > 0.5) == (inside > 0.5)).float().mean() > 0.99
-    assert (found - whole).abs().mean() < 0.02
-    assert not torch.equal(found, whole)
+    mask = region_mask(image, scribble, ground)
+    assert (mask - inside).abs().mean() < 0.02
+    assert ((mask > 0.5) == (inside > 0.5)).float().mean() > 0.99
+    assert (mask - whole).abs().mean() < 0.02
+    assert not torch.equal(mask, whole)
 
 
 @pytest.mark.parametrize(
@@ -195,12 +195,12 @@ def test_one_scribble_selects_a_sky_whose_colour_changes(building: bool) -> None
     image[..., 90:, :] = torch.rand(1, 3, 30, 160, generator=torch.Generator().manual_seed(0)) * 0.3
     if building:
         image[..., 30:90, 60:90] = torch.tensor([0.5, 0.35, 0.3]).view(1, 3, 1, 1)
-    found = region_mask(image, box(10, 20, 6, 40, size=(120, 160)).float())
-    assert found[..., 80:86, :50].min() > 0.8
-    assert found[..., 80:86, 100:].min() > 0.8
-    assert found[..., 96:, :].mean() < 0.1
+    mask = region_mask(image, box(10, 20, 6, 40, size=(120, 160)).float())
+    assert mask[..., 80:86, :50].min() > 0.8
+    assert mask[..., 80:86, 100:].min() > 0.8
+    assert mask[..., 96:, :].mean() < 0.1
     if building:
-        assert found[..., 36:84, 66:84].mean() < 0.5
+        assert mask[..., 36:84, 66:84].mean() < 0.5
 
 
 @pytest.mark.parametrize("step", [4, 2.5])
@@ -209,10 +209,10 @@ def test_weights_of_blocks_are_the_means_of_their_pixels(step: float) -> None:
     small = source.blocks(step, 1)
     painted = torch.zeros(1, 1, 41, 57)
     painted[..., 37:, :], painted[..., 54:] = 1, 0.5
-    found = masks.blocks_of(source.scribbles(painted, None, "mask"), small, source.size, (step, step)).planes(small)
-    assert found[0, 0, -1, :10].min() == 1
-    assert found[0, 0, :5, -1].min() == 0.5
-    assert found.max() == 1
+    mask = masks.blocks_of(source.scribbles(painted, None, "mask"), small, source.size, (step, step)).planes(small)
+    assert mask[0, 0, -1, :10].min() == 1
+    assert mask[0, 0, :5, -1].min() == 0.5
+    assert mask.max() == 1
 
 
 def test_options_of_the_guide_are_refused() -> None:
@@ -254,7 +254,7 @@ def test_masks_do_not_depend_on_the_default_dtype() -> None:
     usual = region_mask(image, scribble, num_landmarks=50)
     try:
         torch.set_default_dtype(torch.bfloat16)
-        found = region_mask(image, scribble, num_landmarks=50)
+        mask = region_mask(image, scribble, num_landmarks=50)
     finally:
         torch.set_default_dtype(torch.float32)
-    torch.testing.assert_close(found, usual, atol=2e-3, rtol=0)
+    torch.testing.assert_close(mask, usual, atol=2e-3, rtol=0)

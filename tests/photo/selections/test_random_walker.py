@@ -13,7 +13,7 @@ def test_the_local_solve_is_that_of_the_linear_system(monkeypatch: pytest.Monkey
     height, width = 7, 9
     image, rough = noise(1, channels, height, width), noise(1, 2, height, width, seed=1)
     trust = 0.05 + noise(1, 2, height, width, seed=2)
-    found = random_walker.solve_mask(image, rough, trust)
+    solved = random_walker.solve_mask(image, rough, trust)
     pixels = image[0].flatten(1).T.numpy()
     rows, columns = np.divmod(np.arange(height * width), width)
     near = np.maximum(abs(rows[:, None] - rows), abs(columns[:, None] - columns)) == 1
@@ -23,4 +23,4 @@ def test_the_local_solve_is_that_of_the_linear_system(monkeypatch: pytest.Monkey
     for k in range(2):
         c = trust[0, k].flatten().numpy()
         expected = np.linalg.solve(laplacian + np.diag(c), c * rough[0, k].flatten().numpy())
-        np.testing.assert_allclose(found[0, k].flatten(), expected, atol=1e-6)
+        np.testing.assert_allclose(solved[0, k].flatten(), expected, atol=1e-6)

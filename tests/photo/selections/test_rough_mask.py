@@ -30,7 +30,7 @@ def test_the_regression_is_the_best_estimate_from_scribbles_frame_and_grid(
     unlike, linked, within = (noise(1, 1, n, seed=k) for k, n in ((4, len(places)), (5, len(places)), (6, len(grid))))
     points = [Points.of(source, held, at) for at in (places, grid)]
     rough = RoughMasks(source, held, *points, torch.tensor(0.2), reach=0.6)
-    found = rough.regression(scribbles, unlike, linked, within)(source)
+    estimated = rough.regression(scribbles, unlike, linked, within)(source)
 
     def estimate(values: torch.Tensor, weights: torch.Tensor) -> np.ndarray:
         flat = (values.flatten().numpy(), weights.flatten().numpy())
@@ -43,4 +43,4 @@ def test_the_regression_is_the_best_estimate_from_scribbles_frame_and_grid(
     weights[places] = enlarged * torch.from_numpy((1 - first).clip(0, 1) ** 2)[places] * unlike[0, 0]
     values[places], weights[grid], values[grid] = linked[0, 0], within[0, 0], 1.0
     expected = estimate(values, weights)
-    np.testing.assert_allclose(found.flatten(), expected, atol=2e-5)
+    np.testing.assert_allclose(estimated.flatten(), expected, atol=2e-5)

@@ -20,11 +20,11 @@ from tests.problems import noise
 def test_densities_are_sums_of_gaussians() -> None:
     places, points = noise(2, 3, 1, 700).squeeze(2), noise(2, 3, 1, 5, seed=1).squeeze(2)
     weights = torch.tensor([[[1.0, 0.0, 0.5, 2.0, 0.0]], [[0.0] * 5]], dtype=torch.float64)
-    found = density(places, points, weights, torch.full((1, 1, 1), 0.3, dtype=torch.float64))
+    sums = density(places, points, weights, torch.full((1, 1, 1), 0.3, dtype=torch.float64))
     squares = (places[:, :, :, None] - points[:, :, None]).square().mean(1)
     wanted = (torch.exp(-squares[0] / 0.09) * weights[0]).sum(1)
-    torch.testing.assert_close(found[0, 0], wanted, atol=1e-12, rtol=0)
-    assert (found[1] == 0).all()  # without weights there is nothing
+    torch.testing.assert_close(sums[0, 0], wanted, atol=1e-12, rtol=0)
+    assert (sums[1] == 0).all()  # without weights there is nothing
 
 
 def test_evenness() -> None:
@@ -58,26 +58,26 @@ def test_points_inside_are_few_and_spread_evenly(size: tuple[int, int]) -> None:
     assert 1 <= len(places) <= 64 * 16
     assert torch.equal(places, places.unique())
     rows, columns = places // size[1], places % size[1]
-    for found, length in ((rows, size[0]), (columns, size[1])):
-        lines = found.unique()
+    for numbers, length in ((rows, size[0]), (columns, size[1])):
+        lines = numbers.unique()
         gaps = torch.cat([lines[:1], lines.diff(), length - lines[-1:]])
         assert gaps.max() <= max(1, min(size) // 16, -(-max(size) // 64))
 
 
 def best_path(even: torch.Tensor, starts: torch.Tensor) -> torch.Tensor:
     """Least evenness along the best path from the starts to every pixel, (H, W), by Dijkstra's algorithm."""
-    found = torch.zeros_like(even)
+    widest = torch.zeros_like(even)
     queue = [(-float(even[tuple(place)]), *place) for place in starts.nonzero().tolist()]
     heapq.heapify(queue)
     while queue:
         value, row, column = heapq.heappop(queue)
-        if -value <= float(found[row, column]):
+        if -value <= float(widest[row, column]):
             continue
-        found[row, column] = -value
+        widest[row, column] = -value
         for y, x in ((row - 1, column), (row + 1, column), (row, column - 1), (row, column + 1)):
             if 0 <= y < even.shape[0] and 0 <= x < even.shape[1]:
                 heapq.heappush(queue, (max(value, -float(even[y, x])), y, x))
-    return found
+    return widest
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 9), (12, 1), (17, 23)])
@@ -85,11 +85,11 @@ def test_links_follow_the_best_path(monkeypatch: pytest.MonkeyPatch, size: tuple
     monkeypatch.setattr(scribbled_colours, "LINK_STEP", 1)
     even = noise(2, 1, *size)
     scribbles = (noise(2, 2, *size, seed=1) > 0.9).double() * 0.3
-    found = linked_evenly(even, scribbles)
+    linked = linked_evenly(even, scribbles)
     for k in range(2):
         front, back = (best_path(even[k, 0], scribbles[k, side] > 0) for side in (0, 1))
         expected = ((front - back - 0.25) / 0.25).clamp(0, 1)
-        torch.testing.assert_close(found[k, 0], expected)
+        torch.testing.assert_close(linked[k, 0], expected)
 
 
 def test_links_pass_no_border_narrower_than_the_search() -> None:
@@ -97,9 +97,9 @@ def test_links_pass_no_border_narrower_than_the_search() -> None:
     image[..., 40] = 0.2  # a line of one pixel, such as a mast
     scribble = torch.zeros(1, 2, 60, 90).double()
     scribble[:, 0, 20:30, 5:15] = 1
-    found = linked_evenly(evenness(image), scribble)
-    assert found[..., :30].min() == 1
-    assert found[..., 50:].max() == 0
+    linked = linked_evenly(evenness(image), scribble)
+    assert linked[..., :30].min() == 1
+    assert linked[..., 50:].max() == 0
 
 
 def test_pixels_to_compare_do_not_depend_on_other_images() -> None:
