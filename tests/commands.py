@@ -23,3 +23,14 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
     assert not captured.out
     assert len(captured.err.splitlines()) == 1
     return captured.err
+
+
+def refusal(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
+    """Return the sentence of a refusal, without the name of the program."""
+    capsys.readouterr()
+    assert main([str(argument) for argument in arguments]) == 2
+    captured = capsys.readouterr()
+    assert not captured.out
+    lines = captured.err.splitlines()
+    assert len(lines) == 1
+    return lines[0].removeprefix("nlfilter-torch: ")

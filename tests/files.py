@@ -1,17 +1,19 @@
 """Pixels, metadata and comparisons for tests of image files."""
 
+from pathlib import Path
+from typing import Any
+
 import numpy as np
+import skimage.data
 import torch
+from numpy.typing import NDArray
 from PIL import ExifTags, Image, ImageCms
 
 from nlfilter_torch.photo.io.photographs import Photograph
+from nlfilter_torch.photo.io.rows import open_picture
 
 PROFILE = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
-
-
 INTEGERS = ("uint8", "uint16")
-
-
 CHANNELS = (1, 2, 3, 4)  # grey, grey + alpha, RGB, RGBA
 
 
@@ -65,3 +67,21 @@ def same(opened: Photograph, wanted: Photograph) -> None:
     assert opened.alpha is None or torch.equal(opened.alpha, wanted.alpha)
     assert opened.icc == wanted.icc
     assert tags(opened.exif) == tags(wanted.exif)
+
+
+Array = NDArray[Any]
+PLENTY = 1 << 30
+
+
+def cat(height: int = 200, width: int = 150, channels: int = 3) -> Array:
+    """(height, width, channels) of 8 bits; the fourth channel is a ramp."""
+    picture = skimage.data.chelsea()[20 : 20 + height, 90 : 90 + width]
+    ramp = np.broadcast_to(np.arange(width, dtype=np.uint8)[:, None], (height, width, 1))
+    return np.ascontiguousarray(np.concatenate([picture, ramp], axis=2)[..., :channels])
+
+
+def rows_of(path: Path, step: int = 37) -> Array:
+    with open_picture(path, PLENTY) as picture:
+        height = picture.shape[0]
+        parts = [picture.rows[slice(top, min(top + step, height))] for top in range(0, height, step)]
+        return np.concatenate(parts)

@@ -1,9 +1,11 @@
 """Progress on the terminal, and as lines elsewhere."""
 
+import os
 import time
 from pathlib import Path
 
 import pytest
+from rich.console import Console
 
 from nlfilter_torch.photo.cli import progress
 
@@ -29,3 +31,15 @@ def test_quick_work_says_nothing(tmp_path: Path, capfd: pytest.CaptureFixture[st
     with progress.steps(1) as begin:
         begin("Reading")
     assert capfd.readouterr() == ("", "")
+
+
+def test_report_of_progress_is_drawn_on_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+    shown = Console(force_terminal=True, width=80, record=True, file=open(os.devnull, "w"))  # noqa: SIM115
+    monkeypatch.setattr(progress, "Console", lambda stderr: shown)
+    with progress.stages() as report:
+        report("Looking", 1, 4)
+        report("Filtering", 3, 4)
+    text = shown.export_text()
+    shown.file.close()
+    assert "Filtering" in text
+    assert "75%" in text

@@ -1,6 +1,7 @@
 """TIFF files of every kind become plain channels; invalid tags are ignored."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -8,8 +9,11 @@ import tifffile
 import torch
 from PIL import Image
 
+from nlfilter_torch.photo.io.exif import upright
 from nlfilter_torch.photo.io.photographs import read_photograph
-from tests.files import photograph, same, stored_values
+from nlfilter_torch.photo.io.rows import open_picture
+from nlfilter_torch.photo.io.tiff import TiffRows
+from tests.files import cat, photograph, rows_of, same, stored_values
 
 
 @pytest.mark.parametrize("tag", [(274, 2, 4, "top"), (274, 5, 1, (1, 0)), (274, 3, 2, (6, 1)), (34675, 3, 1, 5)])
@@ -51,3 +55,79 @@ def test_stored_kinds_are_made_plain(tmp_path: Path) -> None:
     rgb = Image.fromarray(np.full((16, 16, 3), 90, np.uint8))
     rgb.save(tmp_path / "jpeg.tif", compression="jpeg")
     torch.testing.assert_close(read_photograph(tmp_path / "jpeg.tif").pixels, torch.full((1, 3, 16, 16), 90 / 255))
+
+
+@pytest.mark.parametrize(
+    "layout",
+    [
+        {},
+        {"compression": "zlib", "predictor": True, "rowsperstrip": 7},
+        {"compression": "lzw", "tile": (32, 48)},
+        {"tile": (64, 64)},
+        {"rowsperstrip": 16},
+        {"planarconfig": "separate"},
+        {"planarconfig": "separate", "tile": (32, 32), "compression": "zlib"},
+        {"bigtiff": True, "byteorder": ">", "compression": "zlib", "tile": (128, 128)},
+        {"byteorder": ">"},
+        {"compression": "jpeg", "tile": (64, 64)},
+    ],
+)
+def test_rows_of_every_layout_of_tiff(tmp_path: Path, layout: dict[str, Any]) -> None:
+    picture = cat() if layout.get("compression") == "jpeg" else cat().astype(np.uint16) * 250
+    tifffile.imwrite(
+        tmp_path / "in.tif",
+        np.moveaxis(picture, 2, 0) if "planarconfig" in layout else picture,
+        photometric="rgb",
+        **layout,
+    )
+    whole = read_photograph(tmp_path / "in.tif").pixels[0].permute(1, 2, 0).numpy()
+    white = 255 if picture.dtype == np.uint8 else 65535
+    np.testing.assert_array_equal(rows_of(tmp_path / "in.tif"), np.rint(whole * white).astype(picture.dtype))
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_rows_are_upright(tmp_path: Path, orientation: int) -> None:
+    picture = cat(90, 60)
+    tags = [(274, "H", 1, orientation, True)]
+    tifffile.imwrite(tmp_path / "in.tif", picture, photometric="rgb", extratags=tags, rowsperstrip=10)
+    np.testing.assert_array_equal(rows_of(tmp_path / "in.tif"), upright(picture, orientation))
+
+
+def test_grey_floats_white_at_zero_and_multiplied_alpha(tmp_path: Path) -> None:
+    grey = cat(channels=1)[..., 0]
+    tifffile.imwrite(tmp_path / "float.tif", grey / np.float32(255), photometric="minisblack")
+    np.testing.assert_allclose(rows_of(tmp_path / "float.tif")[..., 0] * 255, grey, rtol=1e-6)
+    tifffile.imwrite(tmp_path / "white.tif", grey, photometric="miniswhite", tile=(32, 32))
+    np.testing.assert_array_equal(rows_of(tmp_path / "white.tif")[..., 0], 255 - grey)
+    tifffile.imwrite(tmp_path / "alpha.tif", cat(channels=4), photometric="rgb", extrasamples=["assocalpha"])
+    whole = read_photograph(tmp_path / "alpha.tif")
+    assert whole.alpha is not None
+    wanted = torch.cat([whole.pixels, whole.alpha], 1)[0].permute(1, 2, 0).numpy()
+    np.testing.assert_array_equal(rows_of(tmp_path / "alpha.tif"), np.rint(wanted * 255))
+
+
+def test_tiles_that_a_sparse_file_leaves_out_are_black(tmp_path: Path) -> None:
+    tile = cat(64, 64)
+    tiles = iter([tile, None, None, tile])
+    tifffile.imwrite(tmp_path / "in.tif", tiles, shape=(128, 128, 3), dtype=np.uint8, tile=(64, 64), photometric="rgb")
+    rows = rows_of(tmp_path / "in.tif")
+    np.testing.assert_array_equal(rows[:64, :64], tile)
+    np.testing.assert_array_equal(rows[64:, 64:], tile)
+    assert not rows[:64, 64:].any()
+    assert not rows[64:, :64].any()
+
+
+def test_a_part_of_a_tiff_is_read_without_the_rest(tmp_path: Path) -> None:
+    tifffile.imwrite(tmp_path / "in.tif", cat(), photometric="rgb", tile=(32, 32), compression="zlib")
+    with TiffRows(tmp_path / "in.tif") as rows:
+        rows[slice(70, 80)]
+        assert list(rows.bands) == [2]
+        rows[slice(60, 130)]
+        assert list(rows.bands) == [3, 4]
+        assert rows.cached == 3 * 32 * 150 * 3
+
+
+def test_a_tiff_in_one_piece_needs_memory_for_it(tmp_path: Path) -> None:
+    tifffile.imwrite(tmp_path / "in.tif", cat(), photometric="rgb", rowsperstrip=200, compression="zlib")
+    with pytest.raises(MemoryError, match=r"can only be read in pieces of 0 MB, .* save it in smaller tiles"):
+        open_picture(tmp_path / "in.tif", 100_000).__enter__()

@@ -14,7 +14,7 @@ from nlfilter_torch.photo.picture.colour import (
     split_luminance,
     with_green,
 )
-from tests.problems import colour, luminance, noise
+from tests.problems import cat, colour, luminance, noise
 
 
 def test_an_edit_of_luminance_keeps_the_differences_of_the_channels() -> None:
@@ -77,3 +77,11 @@ def test_strokes_of_more_than_sixteen_colours_join_the_nearest_group() -> None:
     assert torch.equal(regions.sum(1), weights[:, 0])  # each painted pixel is in one of them
     assert float(regions[0, 15, 0, 15:19].sum()) == 4  # the last colours are nearest to the sixteenth
     torch.testing.assert_close(means[0, 15, 0], reds[..., 15:19].mean())
+
+
+def test_edit_luminance_keeps_colour() -> None:
+    image = cat()
+    torch.testing.assert_close(edit_luminance(image, lambda y: y), image, atol=0, rtol=0)
+    torch.testing.assert_close(edit_luminance(image, lambda y: y + 0.1), image + 0.1)
+    grey = image[:, :1]
+    assert torch.equal(edit_luminance(grey, lambda y: 2 * y), 2 * grey)

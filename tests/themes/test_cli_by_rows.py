@@ -1,4 +1,4 @@
-"""`detail` by rows on the command line: the result equals that in memory, and failures are handled."""
+"""Commands that edit a photograph by rows."""
 
 import os
 import resource
@@ -21,7 +21,7 @@ from PIL import Image
 from nlfilter_torch.photo.cli import main
 from nlfilter_torch.photo.io.photographs import Photograph, read_photograph, write_photograph
 from nlfilter_torch.photo.io.tiff import TiffRows
-from tests.test_streaming_files import PROFILE, Array, cat
+from tests.files import PROFILE, Array, cat
 
 LITTLE = "0.03"  # gigabytes: less than the whole picture needs, more than small blocks of rows need
 
@@ -144,22 +144,6 @@ def test_zarr_is_needed_for_zarr(
     monkeypatch.setitem(sys.modules, "zarr", None)
     assert detail(tmp_path / "in.zarr", tmp_path / "out.zarr") == 2
     assert "install nlfilter-torch[zarr]" in capsys.readouterr().err
-
-
-def test_report_of_progress_is_drawn_on_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
-    from rich.console import Console
-
-    from nlfilter_torch.photo.cli import progress
-
-    shown = Console(force_terminal=True, width=80, record=True, file=open(os.devnull, "w"))  # noqa: SIM115
-    monkeypatch.setattr(progress, "Console", lambda stderr: shown)
-    with progress.stages() as report:
-        report("Looking", 1, 4)
-        report("Filtering", 3, 4)
-    text = shown.export_text()
-    shown.file.close()
-    assert "Filtering" in text
-    assert "75%" in text
 
 
 def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:

@@ -1,28 +1,39 @@
-"""The command line with bad numbers, presets and errors of the system: one sentence each; and what it imports."""
+"""Options with values that make no sense: one sentence each."""
 
-import ast
-import errno
-import subprocess
-import sys
 from pathlib import Path
-from types import ModuleType
 
 import pytest
 
-import nlfilter_torch
-import nlfilter_torch.photo
-from nlfilter_torch.photo.declared.declaration import shown
-from nlfilter_torch.photo.declared.presets import Recipe
-from nlfilter_torch.photo.declared.steps import Step
-from tests.commands import refused, small_photo
+from tests.commands import refusal, refused
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        (["--alpha", "3"], "--alpha must have at least two numbers, such as 3,3,4,1.05, got '3'"),
+        (["--alpha", "3,x"], "--alpha must be numbers separated by commas, such as 3,3,4,1.05, got '3,x'"),
+        (["--alpha", "3,nan"], "--alpha must be finite numbers, such as 3,3,4,1.05, got '3,nan'"),
+        (["--bandwidth", "0"], "--bandwidth must be a positive number of grey levels, such as 20, or auto, got '0'"),
+        (["--bandwidth", "wide"], "--bandwidth must be a positive number of grey levels"),
+        (["--bandwidth", "inf"], "--bandwidth must be a positive number of grey levels"),
+        (["--spatial-bandwidth", "-2"], "--spatial-bandwidth must be a positive number of pixels, such as 20, or none"),
+        (["--patch-size", "4"], "--patch-size must be odd and at least 1, got 4; try 5"),
+        (["--landmarks", "0"], "Invalid value for '--landmarks': "),
+        (["--sampling", "best"], "Invalid value for '--sampling': 'best' is not one of"),
+        (["--channels", "red"], "Invalid value for '--channels': 'red' is not one of"),
+        (["--residual", "nan"], "--residual must be a finite number, such as 1, got nan"),
+        (["--depth", "12"], "Invalid value for '--depth': '12' is not one of"),
+        (["--sharpen"], "No such option: --sharpen"),
+    ],
+)
+def test_wrong_options(
+    photo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str], sentence: str
+) -> None:
+    assert refusal(capsys, "detail", photo, tmp_path / "out.png", *options).startswith(sentence)
+    assert [file.name for file in tmp_path.iterdir()] == ["in.png"]
+
 
 LONG = "9" * 400
-HEAVY = ("torch", "kornia", "skimage", "numpy", "PIL")
-
-
-@pytest.fixture
-def photo(tmp_path: Path) -> Path:
-    return small_photo(tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -121,85 +132,3 @@ def test_presets_without_sense(
     if "defocus" not in text and "abstract" not in text and "recolor" not in text:
         assert sentence in refused(capsys, "detail", photo, tmp_path / "out.png", "--preset", preset)
     assert not (tmp_path / "out.png").exists()
-
-
-def test_memory_of_large_patches_is_asked_for(
-    photo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    preset = tmp_path / "look.json"
-    preset.write_text(Recipe((Step("detail", alpha=(2.0, 1.0), patch_size=99),)).to_json())
-    asked: list[int] = []
-
-    def read(*_: object, bytes_per_pixel: int, **__: object) -> None:
-        asked.append(bytes_per_pixel)
-        raise ValueError("enough")
-
-    monkeypatch.setattr("nlfilter_torch.photo.cli.editing.read_photograph", read)
-    refused(capsys, "apply", photo, tmp_path / "out.png", "--preset", preset)
-    assert asked[0] > 4 * 2 * 99**2
-
-
-def test_values_in_messages_are_short() -> None:
-    nested: list[object] = []
-    for _ in range(100_000):
-        nested = [nested]
-    assert len(shown(nested)) < 80
-    assert len(shown(["x" * 1000] * 1000)) < 300
-
-
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        ["presets"],
-        ["presets", "crisp"],
-        ["--version"],
-        ["--help"],
-        ["detail", "--help"],
-        ["batch", "--help"],
-        ["demo", "--help"],
-        ["detail", "in.png", "out.png", "--alpha", "3"],
-        ["recolor", "in.png"],
-    ],
-)
-def test_commands_that_need_no_filter_import_none(arguments: list[str]) -> None:
-    program = (
-        "import sys\n"
-        "from nlfilter_torch.__main__ import main\n"
-        "main(sys.argv[1:])\n"
-        f"print('imported:', *sorted(set(sys.modules) & set({HEAVY})))\n"
-    )
-    finished = subprocess.run([sys.executable, "-c", program, *arguments], capture_output=True, text=True, check=True)
-    assert finished.stdout.splitlines()[-1].split() == ["imported:"]
-
-
-@pytest.mark.parametrize("package", [nlfilter_torch, nlfilter_torch.photo], ids=lambda package: package.__name__)
-def test_public_names_are_those_of_the_stub(package: ModuleType) -> None:
-    stub = ast.parse(Path(package.__file__ or "").with_suffix(".pyi").read_text())
-    names = {
-        alias.name for statement in stub.body if isinstance(statement, ast.ImportFrom) for alias in statement.names
-    }
-    assert set(package.__all__) == names <= set(dir(package))
-    for name in names:
-        assert name == "PRESETS" or getattr(package, name).__name__ == name
-    with pytest.raises(AttributeError, match="sharpenn"):
-        _ = package.sharpenn
-
-
-def test_errors_of_the_system(photo: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    for error, sentence in (
-        (OSError(errno.ENOSPC, "Full", "out"), "out cannot be written: Full; free some space there"),
-        (OSError(errno.EIO, "Damaged"), "reading or writing failed: Damaged; check the disk, and try again"),
-        (OSError(errno.EACCES, "Closed", "out"), "out: Closed; check the name and the permissions"),
-        (OSError("Said already"), "Said already"),
-    ):
-
-        def fail(*_: object, error: OSError = error, **__: object) -> None:
-            raise error
-
-        monkeypatch.setattr("nlfilter_torch.photo.cli.editing.edit_file", fail)
-        assert refused(capsys, "tone", photo, photo.with_name("out.png")) == f"nlfilter-torch: {sentence}\n"
-
-
-def test_a_command_without_presets_says_where_they_are(photo: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    told = refused(capsys, "look", photo, photo.with_name("out.png"), "--preset", "crisp")
-    assert told == "nlfilter-torch: No such option: --preset; use nlfilter-torch detail or apply, which have it\n"

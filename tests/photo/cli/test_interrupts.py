@@ -6,11 +6,13 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from nlfilter_torch.photo.cli import main
+from nlfilter_torch.photo.io.photographs import read_photograph
 from tests.commands import small_photo
 
 
@@ -82,3 +84,56 @@ def test_signals_while_a_file_is_written(
         for name, handler in before.items():
             signal.signal(name, handler)
     assert [path.name for path in tmp_path.iterdir()] == ["in.png"]
+
+
+def test_interrupted_work_says_so(
+    photo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupt(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("nlfilter_torch.photo.cli.editing.read_photograph", interrupt)
+    assert main(["tone", str(photo), str(tmp_path / "out.png")]) == 130
+    assert capsys.readouterr().err.strip() == "nlfilter-torch: interrupted; no file is half written"
+
+
+@pytest.fixture
+def interruptible() -> Iterator[None]:
+    """Ctrl-C interrupts, as it does not in background jobs of a shell."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("interruptible")
+def test_an_interrupt_that_python_loses_comes_again(
+    photo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Busy:
+        def __del__(self) -> None:
+            raise KeyboardInterrupt  # as if Ctrl-C were pressed at this moment
+
+    def work(*_: object, **__: object) -> None:
+        Busy()
+        for _ in range(1000):
+            time.sleep(0.01)
+
+    monkeypatch.setattr("nlfilter_torch.photo.cli.editing.read_photograph", work)
+    assert main(["tone", str(photo), str(tmp_path / "out.png")]) == 130
+    assert capsys.readouterr().err.strip() == "nlfilter-torch: interrupted; no file is half written"
+
+
+def test_other_errors_of_destructors_are_told_as_ever(
+    photo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Faulty:
+        def __del__(self) -> None:
+            raise RuntimeError("of its own")
+
+    told: list[BaseException | None] = []
+    monkeypatch.setattr("sys.unraisablehook", lambda lost: told.append(lost.exc_value))
+    monkeypatch.setattr(
+        "nlfilter_torch.photo.cli.editing.read_photograph", lambda *_, **__: Faulty() and read_photograph(photo)
+    )
+    assert main(["tone", str(photo), str(tmp_path / "out.png")]) == 0
+    assert [str(error) for error in told] == ["of its own"]

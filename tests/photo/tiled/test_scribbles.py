@@ -1,37 +1,50 @@
-"""Strokes on pictures read by rows: the result in memory, for any tiles, and errors that name their cause."""
+"""Scribbles over pictures that are read by rows."""
 
-from pathlib import Path
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
-import skimage.data
-import tifffile
 import torch
 from numpy.typing import NDArray
-from PIL import Image
 
 from nlfilter_torch import colorize, recolor
-from nlfilter_torch.photo.cli import main
-from nlfilter_torch.photo.io.photographs import read_photograph
 from nlfilter_torch.photo.picture.colour import split_luminance
-from nlfilter_torch.photo.tiled import sampling, stream_colorize, stream_recolor, tiles
+from nlfilter_torch.photo.picture.painting import cover, mask_of, paint
+from nlfilter_torch.photo.tiled import sampling, stream_colorize, stream_detail, stream_recolor, tiles
 from nlfilter_torch.photo.tiled.pictures import Picture
 from nlfilter_torch.photo.tiled.scribbles import read_scribbles
-from tests.test_streaming import FEW, LEVEL, Rows, Shrinking, cat
+from tests import problems
+from tests.recipes import BLUE, rows_of
+from tests.tiles import FEW, LEVEL, Rows, Shrinking, cat
+
+
+@pytest.mark.parametrize("rows", [slice(0, 1), slice(3, 11), slice(7, 48), slice(0, 48)])
+def test_strokes_cover_the_same_by_rows(rows: slice) -> None:
+    strokes, size = (BLUE, replace(BLUE, points=((-0.1, 0.9), (1.2, 0.1)), paint="#ff0000")), (48, 64)
+    assert torch.equal(cover(BLUE, size, rows), cover(BLUE, size)[rows])
+    assert torch.equal(mask_of(strokes, size, rows), mask_of(strokes, size)[..., rows, :])
+    for some, whole in zip(paint(strokes, size, rows), paint(strokes, size), strict=True):
+        assert torch.equal(some, whole[..., rows, :])
+
+
+def test_negative_regions_come_with_regions_of_their_number() -> None:
+    source = rows_of(problems.cat())
+    edited, two, three = np.empty_like(source), np.ones((100, 150, 2), np.float32), np.ones((100, 150, 3), np.float32)
+    with pytest.raises(ValueError, match="negative must be given together with regions, got no regions"):
+        stream_detail(source, edited, torch.tensor([2.0, 1.0]), negative=two)
+    with pytest.raises(ValueError, match="negative must have 1 channel or one for each of the 2 regions, got 3"):
+        stream_detail(source, edited, torch.tensor([2.0, 1.0]), two, negative=three)
+    with pytest.raises(ValueError, match="negative must have the height and width of source, 100x150, got 99x150"):
+        stream_detail(source, edited, torch.tensor([2.0, 1.0]), two, negative=two[1:])
+    with pytest.raises(ValueError, match="negative must hold a painted pixel, got none"):
+        stream_detail(source, edited, torch.tensor([2.0, 1.0]), two, negative=0 * two)
+
 
 Array = NDArray[Any]
 
 
-@pytest.fixture
-def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Reduce samples and blocks in proportion to a small picture."""
-    monkeypatch.setattr(sampling, "PILOT", 2000)
-    monkeypatch.setattr(sampling, "CHUNK", 300)
-    monkeypatch.setattr("nlfilter_torch.photo.tiled.pictures.STATISTICS_PIXELS", 2500)
-
-
-def paint(height: int, width: int) -> tuple[Array, Array, Array]:
+def paint_rows(height: int, width: int) -> tuple[Array, Array, Array]:
     """Strokes (H, W, 3) of three colours, two spots of one of them, their mask (H, W, 1), and what is kept (H, W)."""
     strokes, mask = np.zeros((height, width, 3), np.float32), np.zeros((height, width, 1), np.float32)
     for top, left, colour, weight in (
@@ -50,10 +63,6 @@ def paint(height: int, width: int) -> tuple[Array, Array, Array]:
 def planes(rows: Array) -> torch.Tensor:
     """(1, C, H, W)."""
     return torch.from_numpy(np.atleast_3d(rows)).permute(2, 0, 1)[None]
-
-
-def rows_of(image: torch.Tensor) -> Array:
-    return image[0].permute(1, 2, 0).numpy()
 
 
 def grey(picture: Array) -> Array:
@@ -86,7 +95,7 @@ def coloured(picture: Array, *painted: Array, kind: Any = None, **options: Any) 
 )
 def test_full_passes_recolour_as_in_memory(options: dict[str, Any], kept: bool, dtype: Any) -> None:
     picture = cat(83, 121).astype(dtype)
-    strokes, mask, keep = paint(83, 121)
+    strokes, mask, keep = paint_rows(83, 121)
     held = {"keep": planes(keep.astype(dtype))} if kept else {}
     whole = recolor(
         planes(picture),
@@ -110,7 +119,7 @@ def test_full_passes_recolour_as_in_memory(options: dict[str, Any], kept: bool, 
 )
 def test_full_passes_colourise_as_in_memory(options: dict[str, Any], dtype: Any) -> None:
     picture = grey(cat(83, 121)).astype(dtype)
-    strokes, mask, _ = paint(83, 121)
+    strokes, mask, _ = paint_rows(83, 121)
 
     def seeded() -> torch.Generator:
         return torch.Generator().manual_seed(3)
@@ -125,7 +134,7 @@ def test_full_passes_colourise_as_in_memory(options: dict[str, Any], dtype: Any)
 def test_a_sample_is_within_a_grey_level(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sampling, "PILOT", 1 << 12)
     picture = cat(270, 350)
-    strokes, mask, keep = paint(270, 350)
+    strokes, mask, keep = paint_rows(270, 350)
     whole = recolor(planes(picture), planes(strokes), planes(mask), keep=planes(keep), num_landmarks=50)
     edited = recoloured(picture, strokes, mask, keep=keep, sample=1 << 12)
     assert np.abs(edited - rows_of(whole)).max() < 1e-5  # takes sums over all pixels of a reduced picture
@@ -138,7 +147,7 @@ def test_a_sample_is_within_a_grey_level(monkeypatch: pytest.MonkeyPatch) -> Non
 @pytest.mark.parametrize("statistics", ["sample", "full"])
 def test_tiles_of_any_size_give_the_same(statistics: Any) -> None:
     picture = cat(150, 67)
-    strokes, mask, keep = paint(150, 67)
+    strokes, mask, keep = paint_rows(150, 67)
     settings = {"statistics": statistics, "sample": 4000}
     first, *others = (
         (
@@ -152,7 +161,7 @@ def test_tiles_of_any_size_give_the_same(statistics: Any) -> None:
 
 
 def test_a_guide_that_is_kept_changes_nothing() -> None:
-    picture, (strokes, mask, _) = cat(90, 60), paint(90, 60)
+    picture, (strokes, mask, _) = cat(90, 60), paint_rows(90, 60)
     kept, made_again = (
         recoloured(picture, strokes, mask, num_landmarks=20, tile_rows=16),
         recoloured(picture, strokes, mask, num_landmarks=20, tile_rows=16, memory=tiles.LARGE_MEMORY - 1),
@@ -163,7 +172,7 @@ def test_a_guide_that_is_kept_changes_nothing() -> None:
 def test_everything_is_read_a_few_rows_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("nlfilter_torch.photo.tiled.pictures.STATISTICS_PIXELS", 600)
     picture = cat(240, 60)
-    painted = paint(240, 60)
+    painted = paint_rows(240, 60)
     settings = {"tile_rows": 10, "sample": 2000, "num_landmarks": 30, "memory": FEW}
     source, *paints = (Rows(rows, most=10 + 2 * 40) for rows in (picture, *painted))  # with surroundings
     edited = np.empty_like(picture)
@@ -176,7 +185,7 @@ def test_everything_is_read_a_few_rows_at_a_time(monkeypatch: pytest.MonkeyPatch
 
 
 def test_strokes_may_be_integers_with_transparency() -> None:
-    picture, (strokes, mask, keep) = cat(50, 60), paint(50, 60)
+    picture, (strokes, mask, keep) = cat(50, 60), paint_rows(50, 60)
     layer = np.concatenate([np.rint(strokes * 255), np.rint(mask * 255)], axis=2).astype(np.uint8)
     opaque = layer[..., 3:] / np.float32(255)
     for edit in (recoloured, coloured):
@@ -189,7 +198,7 @@ def test_strokes_may_be_integers_with_transparency() -> None:
 
 
 def test_nothing_is_kept_by_an_empty_mask() -> None:
-    picture, (strokes, mask, keep) = cat(50, 60), paint(50, 60)
+    picture, (strokes, mask, keep) = cat(50, 60), paint_rows(50, 60)
     none = recoloured(picture, strokes, mask, keep=0 * keep)
     np.testing.assert_allclose(none, recoloured(picture, strokes, mask), atol=1e-5)
 
@@ -197,7 +206,7 @@ def test_nothing_is_kept_by_an_empty_mask() -> None:
 @pytest.mark.parametrize("channels", [1, 2, 3, 4])
 def test_transparency_and_depth_are_kept(channels: int) -> None:
     picture = np.random.default_rng(0).integers(0, 256, (40, 50, channels), np.uint8)
-    strokes, mask, _ = paint(40, 50)
+    strokes, mask, _ = paint_rows(40, 50)
     edited = np.empty((40, 50, 3 + (channels in (2, 4))), np.uint16)
     stream_colorize(picture, edited, strokes, mask, num_landmarks=20)
     if channels in (2, 4):
@@ -210,7 +219,7 @@ def test_transparency_and_depth_are_kept(channels: int) -> None:
 
 def test_report_tells_every_stage() -> None:
     seen: list[str] = []
-    picture, (strokes, mask, _) = cat(40, 60), paint(40, 60)
+    picture, (strokes, mask, _) = cat(40, 60), paint_rows(40, 60)
     recoloured(picture, strokes, mask, sample=1000, num_landmarks=20, report=lambda *step: seen.append(step[0]))
     assert list(dict.fromkeys(seen)) == ["Reading strokes", "Reducing", "Filtering"]
     seen.clear()
@@ -220,7 +229,7 @@ def test_report_tells_every_stage() -> None:
 
 
 def test_painted_pixels_need_memory() -> None:
-    picture, (strokes, mask, _) = cat(180, 240), paint(180, 240)
+    picture, (strokes, mask, _) = cat(180, 240), paint_rows(180, 240)
     with pytest.raises(MemoryError, match=r"the strokes on source cover at least \d+ pixels .* paint less"):
         read_scribbles(
             Picture(picture),
@@ -268,13 +277,13 @@ def test_painted_pixels_need_memory() -> None:
     ],
 )
 def test_what_cannot_be_used_is_named(edit: Any, change: Any, options: dict[str, Any], message: str) -> None:
-    strokes, mask, _ = paint(40, 50)
+    strokes, mask, _ = paint_rows(40, 50)
     with pytest.raises(ValueError, match=message):
         edit(cat(40, 50), *change(strokes, mask), **options)
 
 
 def test_what_only_one_of_them_takes_is_named() -> None:
-    picture, (strokes, mask, keep) = cat(40, 50), paint(40, 50)
+    picture, (strokes, mask, keep) = cat(40, 50), paint_rows(40, 50)
     with pytest.raises(ValueError, match="source must have 3 or 4 channels to be recoloured, got 1"):
         recoloured(grey(picture), strokes, mask)
     with pytest.raises(ValueError, match="keep must have the height and width of source"):
@@ -294,91 +303,8 @@ def test_what_only_one_of_them_takes_is_named() -> None:
 
 
 def test_a_source_that_changes_its_size_is_named() -> None:
-    strokes, mask, _ = paint(40, 30)
+    strokes, mask, _ = paint_rows(40, 30)
     for edit in (stream_recolor, stream_colorize):
         source = Shrinking(cat(40, 30), most=100)
         with pytest.raises(ValueError, match="source must keep its size while it is read, 40 rows of 30"):
             edit(source, np.empty_like(source.picture), strokes, mask, num_landmarks=20, tile_rows=10)
-
-
-# --- the command line
-
-LITTLE = "0.014"  # gigabytes: less than the whole picture needs, more than small blocks of rows need
-
-
-@pytest.fixture
-def photo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A file of 16 bits, 180x150, beside strokes over it in two files, and a copy in grey."""
-    monkeypatch.setattr(sampling, "PILOT", 8000)
-    monkeypatch.setattr("nlfilter_torch.photo.tiled.pictures.STATISTICS_PIXELS", 6000)
-    picture = skimage.data.chelsea()[20:170, 90:270].astype(np.uint16) * 257
-    tifffile.imwrite(tmp_path / "in.tif", picture, photometric="rgb", tile=(64, 64), compression="zlib")
-    tifffile.imwrite(tmp_path / "grey.tif", picture[..., 1], photometric="minisblack")
-    layer = np.zeros((150, 180, 4), np.uint8)
-    layer[60:70, 40:50], layer[110:120, 100:120] = (0, 0, 255, 255), (255, 0, 0, 255)
-    Image.fromarray(layer).save(tmp_path / "paint.png")
-    tifffile.imwrite(tmp_path / "paint.tif", layer, photometric="rgb", extrasamples=["unassalpha"], tile=(64, 64))
-    tifffile.imwrite(tmp_path / "mask.tif", layer[..., 2], photometric="minisblack", tile=(64, 64))
-    return tmp_path / "in.tif"
-
-
-def run(verb: str, *arguments: object) -> int:
-    return main([verb, *map(str, arguments), "--landmarks", "40"])
-
-
-@pytest.mark.parametrize(
-    ("verb", "source", "options"),
-    [
-        ("recolor", "in.tif", ("--strokes", "paint.tif", "--keep", "5,5,20,20", "--reach", "0.6")),
-        ("recolor", "in.tif", ("--strokes", "paint.png", "--region", "100,20,9,9:#14a028", "--depth", "8")),
-        ("colorize", "grey.tif", ("--strokes", "paint.tif", "--strength", "0.8")),
-        ("colorize", "in.tif", ("--region", "40,60,10,10:blue", "--region", "100,110,20,10:red", "--seed", "3")),
-        ("sharpen", "in.tif", ()),
-        ("sharpen", "grey.tif", ("--guide-blur", "0")),
-        ("tone", "in.tif", ("--clarity", "1.5")),
-        ("denoise", "in.tif", ("--method", "rule", "--patch-size", "3", "--noise-level", "6")),
-        ("denoise", "grey.tif", ("--method", "rule", "--noise-level", "5")),
-        ("abstract", "in.tif", ("--edges", "1", "--tones", "8")),
-        ("abstract", "grey.tif", ()),
-        ("defocus", "in.tif", ("--region", "80,60,20,20", "--region", "100,90,9,9")),
-        ("defocus", "in.tif", ("--mask", "mask.tif", "--aperture", "gaussian")),
-        ("defocus", "in.tif", ("--region", "80,60,20,20", "--background", "5,5,20,20")),
-    ],
-)
-def test_by_rows_as_whole(photo: Path, verb: str, source: str, options: tuple[str, ...]) -> None:
-    folder = photo.parent
-    options = tuple(str(folder / word) if word.startswith(("paint", "mask")) else word for word in options)
-    for name, more in (("whole.tif", ()), ("rows.tif", ("--memory", LITTLE, "--full"))):
-        assert run(verb, folder / source, folder / name, *options, *more) == 0
-    with tifffile.TiffFile(folder / "rows.tif") as file:
-        assert file.pages.first.is_tiled  # what is written by rows is
-    one, other = (read_photograph(folder / name) for name in ("whole.tif", "rows.tif"))
-    assert one.depth == other.depth
-    assert (one.pixels - read_photograph(folder / source).pixels).abs().max() > 0.01
-    assert (one.pixels - other.pixels).abs().max() < (
-        1.1 / 255 if "8" in options else 1e-3 if verb == "recolor" else 1e-4
-    )
-
-
-def test_what_cannot_be_done_by_rows_leaves_nothing(photo: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    folder = photo.parent
-    layer = Image.open(folder / "paint.png")
-    layer.crop((0, 0, 180, 149)).save(folder / "small.png")
-    layer.convert("RGB").save(folder / "opaque.png")
-    Image.new("RGBA", layer.size).save(folder / "clear.png")
-    files = set(folder.iterdir())
-    for verb, source, options, sentence in (
-        ("colorize", "in.tif", ("--strokes", folder / "paint.png", "--method", "kmeans"), "method must be regression"),
-        ("recolor", "grey.tif", ("--strokes", folder / "paint.png"), "recolor needs a colour photograph, got a grey"),
-        ("recolor", "in.tif", (), "give --strokes FILE or --region"),
-        ("recolor", "in.tif", ("--strokes", folder / "small.png"), "small.png must be as large as the photograph"),
-        ("recolor", "in.tif", ("--strokes", folder / "opaque.png"), "opaque.png has no transparency"),
-        ("colorize", "in.tif", ("--strokes", folder / "clear.png"), "clear.png is transparent everywhere"),
-        ("recolor", "in.tif", ("--region", "1,2,5,4:red", "--keep", "9,9,9,9:red"), "--keep must be X,Y,W,H only"),
-        ("colorize", "in.tif", ("--region", "1,2,5,4"), "--region must end in a colour"),
-    ):
-        assert run(verb, folder / source, folder / "out.tif", *options, "--memory", LITTLE) == 2
-        assert sentence in capsys.readouterr().err
-    assert run("recolor", photo, folder / "out.tif", "--region", "1,2,5,4:red", "--memory", "0") == 2
-    assert "--memory must be a positive number" in capsys.readouterr().err
-    assert set(folder.iterdir()) == files

@@ -24,7 +24,7 @@ from nlfilter_torch.photo.declared.strokes import Stroke
 from nlfilter_torch.photo.io.rows import open_picture, write_picture
 from nlfilter_torch.photo.tiled.pictures import Picture, Tile
 from nlfilter_torch.photo.tiled.tiles import Passes, Tiling
-from tests.test_streaming_files import cat
+from tests.files import cat
 
 FEW = ("--landmarks", "20")
 FOCUS = Stroke(((0.3, 0.3), (0.5, 0.4)), 0.1, "in")

@@ -17,7 +17,7 @@ from nlfilter_torch.photo.tiled import recipe as whole_edit
 from nlfilter_torch.photo.tiled.parts import Parts, Rectangle
 from nlfilter_torch.photo.tiled.tiles import Passes
 from tests.problems import cat
-from tests.test_whole_edit import COLORIZE, DETAIL, IN, RECOLOR, rows_of
+from tests.recipes import COLORIZE, DETAIL, IN, RECOLOR, rows_of
 
 SMALL = 0.002  # megapixels, fewer than the cat has
 PLACES = [

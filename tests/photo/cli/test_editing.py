@@ -1,0 +1,178 @@
+"""Files that commands read, edit and write: pixels, metadata, depth, and errors of one sentence."""
+
+from pathlib import Path
+
+import psutil
+import pytest
+import torch
+from PIL import ExifTags, Image, ImageCms
+
+from nlfilter_torch import NonlocalFilter, nonlocal_operator, polynomial_filter
+from nlfilter_torch.photo.cli import main
+from nlfilter_torch.photo.declared.presets import Recipe
+from nlfilter_torch.photo.declared.steps import Step
+from nlfilter_torch.photo.io.photographs import Depth, Photograph, read_photograph, write_photograph
+from tests.commands import refusal, refused
+
+PROFILE = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+PLAIN = ("--limits", "none", "--threshold", 0, "--spatial-bandwidth", "none")  # the filter as it is
+
+
+def detail(*arguments: object) -> int:
+    return main(["detail", *map(str, arguments), "--landmarks", "40"])
+
+
+def test_detail_is_the_filter_on_luminance(photo: Path, tmp_path: Path, cat: torch.Tensor) -> None:
+    out = tmp_path / "out.png"
+    assert detail(photo, out, "--alpha", "3,3,4,1.05", "--bandwidth", 20, "--seed", 7, *PLAIN) == 0
+    luminance = (cat * torch.tensor([0.299, 0.587, 0.114]).view(3, 1, 1)).sum(1, keepdim=True)
+    operator = nonlocal_operator(
+        luminance, photometric_bandwidth=20 / 255, num_landmarks=40, generator=torch.Generator().manual_seed(7)
+    )
+    filtered = polynomial_filter(operator, luminance, torch.tensor([3, 3, 4, 1.05]))
+    wanted = (cat + filtered - luminance).clamp(0, 1)
+    assert (read_photograph(out).pixels - wanted).abs().max() < 0.6 / 255
+
+
+def test_all_channels_are_edited_on_request(photo: Path, tmp_path: Path, cat: torch.Tensor) -> None:
+    assert detail(photo, tmp_path / "out.png", "--alpha", "2,1", "--channels", "all", "--bandwidth", 20, *PLAIN) == 0
+    layer = NonlocalFilter(alpha=(2, 1), photometric_bandwidth=20 / 255, num_landmarks=40)
+    layer.affinity.generator = torch.Generator().manual_seed(0)
+    wanted = layer(cat).detach().clamp(0, 1)
+    assert (read_photograph(tmp_path / "out.png").pixels - wanted).abs().max() < 0.6 / 255
+
+
+@pytest.mark.parametrize(
+    ("suffix", "depth", "channels"),
+    [
+        (".png", "uint8", 1),
+        (".png", "uint8", 4),
+        (".png", "uint16", 3),
+        (".tif", "uint16", 4),
+        (".tif", "float32", 3),
+        (".webp", "uint8", 4),
+    ],
+)
+def test_alpha_of_ones_gives_the_file_back(
+    tmp_path: Path, cat: torch.Tensor, suffix: str, depth: Depth, channels: int
+) -> None:
+    """Depth, alpha, profile and EXIF are kept; integer pixels are exact, floats equal to rounding."""
+    exif = Image.Exif()
+    exif[ExifTags.Base.Make] = "Maker"
+    exif[ExifTags.Base.Orientation] = 1
+    pixels = cat[:, : 1 if channels == 1 else 3]
+    transparency = cat[:, :1].flip(-1) if channels in (2, 4) else None
+    original = Photograph(pixels, depth, transparency, PROFILE, exif.tobytes())
+    write_photograph(original, tmp_path / f"in{suffix}")
+    assert detail(tmp_path / f"in{suffix}", tmp_path / f"out{suffix}", "--alpha", "1,1,1,1") == 0
+    stored, found = read_photograph(tmp_path / f"in{suffix}"), read_photograph(tmp_path / f"out{suffix}")
+    assert (found.pixels - stored.pixels).abs().max() <= (1e-5 if depth == "float32" else 0)
+    assert (found.alpha is None) == (stored.alpha is None)
+    assert found.alpha is None or torch.equal(found.alpha, stored.alpha)
+    assert (found.depth, found.icc, found.exif) == (depth, PROFILE, stored.exif)
+
+
+def test_options_change_the_picture(photo: Path, tmp_path: Path) -> None:
+    def result(*arguments: object) -> bytes:
+        assert detail(photo, tmp_path / "out.png", *arguments) == 0
+        return (tmp_path / "out.png").read_bytes()
+
+    usual = result()
+    assert usual == result("--alpha", "2.2,2.2,2.2,1", "--patch-size", 5, "--sampling", "kmeans", "--seed", 0)
+    variations = [
+        ("--alpha", "2,1"),
+        ("--patch-size", 3),
+        ("--bandwidth", 40),
+        ("--spatial-bandwidth", 8),
+        ("--sampling", "uniform"),
+        ("--sampling", "random"),
+        ("--residual", 1),
+        ("--seed", 1),
+        ("--channels", "all"),
+        ("--depth", "16"),
+    ]
+    assert len({usual, *(result(*variation) for variation in variations)}) == 1 + len(variations)
+
+
+def test_depth_can_be_chosen(photo: Path, tmp_path: Path) -> None:
+    for name, choice, depth in (("a.png", "16", "uint16"), ("b.tif", "float", "float32"), ("c.tif", "8", "uint8")):
+        assert detail(photo, tmp_path / name, "--depth", choice) == 0
+        assert read_photograph(tmp_path / name).depth == depth
+
+
+def test_a_file_can_replace_itself(photo: Path) -> None:
+    before = photo.read_bytes()
+    assert detail(photo, photo) == 0
+    assert photo.read_bytes() != before
+    assert list(photo.parent.iterdir()) == [photo]
+
+
+def test_wrong_inputs(photo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "out.png"
+    (tmp_path / "empty.png").touch()
+    (tmp_path / "text.jpg").write_text("this is no picture at all, whatever its name may say")
+    (tmp_path / "half.png").write_bytes(photo.read_bytes()[:3000])
+    sentences = {
+        "none.png": "none.png does not exist; check the name and the folder",
+        "empty.png": "empty.png is empty; copy it again from its source",
+        "text.jpg": "text.jpg is not a PNG, JPEG, TIFF, WebP or AVIF image; convert it to one of these",
+        "half.png": "half.png is damaged or cut short (",
+    }
+    for name, sentence in sentences.items():
+        assert sentence in refusal(capsys, "detail", tmp_path / name, out)
+        assert sentence in refusal(capsys, "inspect", tmp_path / name, tmp_path / "looks")
+    assert not out.exists()
+    assert not (tmp_path / "looks").exists()
+
+
+def test_outputs_that_cannot_be(photo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_photograph(Photograph(torch.zeros(1, 3, 4, 4), alpha=torch.ones(1, 1, 4, 4)), tmp_path / "rgba.png")
+    write_photograph(Photograph(torch.zeros(1, 3, 4, 4), "uint16"), tmp_path / "deep.png")
+    write_photograph(Photograph(torch.zeros(1, 3, 4, 4), "float32"), tmp_path / "float.tif")
+    before = set(tmp_path.iterdir())
+    for source, target, sentence in (
+        ("in.png", "nowhere/out.png", "does not exist; make it first"),
+        ("in.png", "out.gif", "out.gif must end in .png, .jpg, .webp, .avif or .tif, got '.gif'"),
+        ("rgba.png", "out.jpg", "JPEG has no alpha channel; write a PNG, TIFF, WebP or AVIF file"),
+        (
+            "deep.png",
+            "out.jpg",
+            "JPEG has no 16 bits per channel; write a PNG or TIFF file or choose a depth of 8 bits",
+        ),
+        ("float.tif", "out.png", "PNG has no floats per channel; write a TIFF file or choose a depth of 16 bits"),
+    ):
+        assert sentence in refusal(capsys, "detail", tmp_path / source, tmp_path / target)
+    assert "does not exist; make it first" in refusal(capsys, "inspect", photo, tmp_path / "no" / "where")
+    assert "is a file, not a folder" in refusal(capsys, "inspect", photo, photo)
+    assert "does not exist; make it first" in refusal(capsys, "demo", tmp_path / "no" / "where")
+    assert set(tmp_path.iterdir()) == before
+
+
+def test_too_large_for_memory(
+    photo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    free = psutil.virtual_memory()._replace(available=1_000_000)
+    monkeypatch.setattr(psutil, "virtual_memory", lambda: free)
+    sentence = refusal(capsys, "tone", photo, tmp_path / "out.png")  # not even in tiles
+    assert (
+        "in.png needs at least 21 MB of memory, but only 1 MB may be used; allow more, or use fewer landmarks"
+        in sentence
+    )
+    sentence = refusal(capsys, "inspect", photo, tmp_path)  # needs all pixels at once
+    assert "has 90x60 pixels and needs about 34 MB of memory, but only 1 MB is free; use fewer landmarks" in sentence
+
+
+def test_memory_of_large_patches_is_asked_for(
+    photo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    preset = tmp_path / "look.json"
+    preset.write_text(Recipe((Step("detail", alpha=(2.0, 1.0), patch_size=99),)).to_json())
+    asked: list[int] = []
+
+    def read(*_: object, bytes_per_pixel: int, **__: object) -> None:
+        asked.append(bytes_per_pixel)
+        raise ValueError("enough")
+
+    monkeypatch.setattr("nlfilter_torch.photo.cli.editing.read_photograph", read)
+    refused(capsys, "apply", photo, tmp_path / "out.png", "--preset", preset)
+    assert asked[0] > 4 * 2 * 99**2

@@ -1,0 +1,23 @@
+"""Public names of both packages are those of their stubs."""
+
+import ast
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+import nlfilter_torch
+import nlfilter_torch.photo
+
+
+@pytest.mark.parametrize("package", [nlfilter_torch, nlfilter_torch.photo], ids=lambda package: package.__name__)
+def test_public_names_are_those_of_the_stub(package: ModuleType) -> None:
+    stub = ast.parse(Path(package.__file__ or "").with_suffix(".pyi").read_text())
+    names = {
+        alias.name for statement in stub.body if isinstance(statement, ast.ImportFrom) for alias in statement.names
+    }
+    assert set(package.__all__) == names <= set(dir(package))
+    for name in names:
+        assert name == "PRESETS" or getattr(package, name).__name__ == name
+    with pytest.raises(AttributeError, match="sharpenn"):
+        _ = package.sharpenn
