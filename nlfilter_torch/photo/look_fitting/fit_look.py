@@ -185,7 +185,7 @@ class _Region:
         self._add_sliders(pixels, whole, rounding)
 
     def _add_sliders(self, pixels: PixelSample, sums: Sums, rounding: float) -> None:
-        """Add the least-squares sliders of a pair; what rounding of the edited picture explains is no error."""
+        """Add the least-squares sliders of a pair, for which differences within rounding are no error."""
         if self.sliders is None:
             return
         if not _are_sliders(sums, self.layout, SLIDERS_ONLY):
@@ -344,7 +344,7 @@ def _pixels_and_sums(photograph: EditedPhotograph, layout: Layout) -> tuple[list
 
 
 def _sums_of_squares(pixels: PixelSample, layout: Layout, width: int) -> list[Sums]:
-    """Sums over parts of a picture of that width, one after the other, which takes less memory than all at once."""
+    """Sums over the squares of a picture of that width, one after the other to save memory."""
     square = _squares(pixels.places, width)
     return pixels.sums(layout, [(square == i).nonzero().squeeze(1) for i in square.unique()])
 

@@ -105,7 +105,7 @@ def local_curves(image: Tensor, stretch: Stretch) -> LocalCurves:
 
 @full_precision
 def pointwise(image: Tensor, curves: Tensor, matrix: Tensor, saturation: Tensor) -> Tensor:
-    """The image (B, 3, H, W) plus what tone curves, matrix and saturation change."""
+    """An image (B, 3, H, W) under tone curves, matrix and saturation, whose changes are added up."""
     change = matrix - torch.eye(3).to(matrix)
     result = tone_curve(image, curves) + (change.to(image) @ image.flatten(2)).view_as(image)
     factors = (saturation.to(image) - 1).reshape(-1, saturation.shape[-1], 1, 1)

@@ -27,7 +27,7 @@ from nlfilter_torch.photo.selections.stroke_groups import StrokeGroups
 SAME = 0.007  # difference in luminance at which an absolute weight falls to a quarter
 SHARE_OF_VARIANCE, MIN_VARIANCE = 0.6, 2e-6  # squared differences at which a relative weight falls to 1/e
 MIN_RELATIVE = 1e-6  # relative weight of the least similar neighbour
-SAME_BLOCK, MIN_WEIGHT = 0.042, 1e-5  # difference of a pixel from a block, and least weight of a block
+SAME_BLOCK, MIN_WEIGHT = 0.042, 1e-5  # difference from a block at which its weight falls to 1/e, and least weight
 SCRIBBLE_WEIGHT = 1e3  # weight of the value of a scribbled pixel
 MIN_INFLUENCE = 1e-8
 
@@ -119,9 +119,9 @@ class LocalValues:
         if groups is not None and predicted is not None:
             sets += groups.without_each(torch.cat([predicted * weights, weights], dim=1))
         sums = sums_in_blocks(torch.cat(sets, dim=1), places, width, step, (rows, columns)).double()
-        sums, ones = sums * (SCRIBBLE_WEIGHT / step**2), values.shape[1]
+        sums, count = sums * (SCRIBBLE_WEIGHT / step**2), values.shape[1]
         # In flat areas the system is a u = 3 u'', as there are three neighbours on each side.
-        anchor = sums[:, ones : ones + 1] + 3 / (links.decay_distance**2 * rows * columns)
+        anchor = sums[:, count : count + 1] + 3 / (links.decay_distance**2 * rows * columns)
         around, inside = (F.unfold(planes, 3, padding=1) for planes in (guide, torch.ones_like(guide[:1])))
         inside[:, 4] = 0.0  # the pixel itself
         alike = links.weights((around - guide.flatten(2)) * inside, inside).double().unflatten(2, (rows, columns))

@@ -1,4 +1,4 @@
-"""Colours on both sides of the borders of a mask, and what they say of the pixels in between."""
+"""Colours on both sides of the borders of a mask, and the mixing ratios of pixels on soft borders."""
 
 from dataclasses import dataclass
 

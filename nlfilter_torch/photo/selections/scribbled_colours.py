@@ -23,7 +23,7 @@ NUM_COLOURS = 32  # approximate number of scribbled pixels on each side that the
 BANDWIDTH_SHARE = 0.4  # bandwidth of that comparison as a share of the photometric bandwidth
 EVEN_SIGMA = 2.0  # pixels; standard deviation of the surroundings whose evenness is judged
 HALF_EVEN_DEVIATION = 0.007  # standard deviation of colours, in hundredths of Lab, that counts as half even
-UNLINKED, LINKED = 0.25, 0.5  # least evenness along a path from scribbles: up to which it links nothing, and fully
+UNLINKED, LINKED = 0.25, 0.5  # least evenness along a path up to which it links nothing, and from which on it does
 # Step of the search for paths in pixels; EVEN_SIGMA makes borders wider than that. It is larger along an axis of more
 # steps than MOST_LINKED, in long, narrow pictures.
 LINK_STEP, MOST_LINKED = 3, 1000
@@ -151,10 +151,16 @@ def colour_likelihood(
 
 
 def every_nth(colours: Tensor, weights: Tensor, number: int) -> tuple[Tensor, Tensor]:
-    """Every n-th pixel of positive weight, about ``number`` for each image, whatever the others in the batch have.
+    """Choose every n-th pixel of positive weight, about ``number`` in each image, independently of the other images.
 
-    Takes colours (B, C, n) and weights (B, 1, n). Returns colours (B, C, m) of the pixels chosen for any image, and
-    their weights (B, 1, m), divided by their sum, and 0 for those of other images.
+    Args:
+        colours: (B, C, n).
+        weights: (B, 1, n).
+        number: of pixels.
+
+    Returns:
+        Colours (B, C, m) of the pixels that are chosen in any image; and their weights (B, 1, m), divided by their sum,
+        0 where the pixel is not chosen in this image.
     """
     counted = weights.detach() > 0
     place = counted.cumsum(2) - 1

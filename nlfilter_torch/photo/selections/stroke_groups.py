@@ -1,4 +1,4 @@
-"""Groups of strokes, each of which is predicted from the others, to compare methods on the scribbles themselves."""
+"""Groups of strokes for cross-validation: methods are compared by how well they predict a group from the others."""
 
 import math
 from collections.abc import Sequence
@@ -11,7 +11,7 @@ from torch import Tensor
 from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles, blocks_at, sums_in_blocks
 
 GROUPS = 5
-CELLS = 64  # along the short side, in which painted areas are connected
+CELLS = 64  # number of cells along the short side; painted areas in the same or in adjacent cells are connected
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,12 +52,12 @@ class StrokeGroups:
         return [weighted * (self.groups != number) for number in range(min(GROUPS, self.count))]
 
     def weights_without_each(self, weights: Tensor) -> list[Tensor]:
-        """:meth:`without_each`, but images of which no weight (B, 1, n) would be left keep all of them."""
+        """:meth:`without_each` of weights (B, 1, n), but images that would be left without any keep all of them."""
         sets = self.without_each(weights)
         return [torch.where(left.sum(2, keepdim=True) > 0, left, weights) for left in sets]
 
     def of_own(self, values: Sequence[Tensor]) -> Tensor:
-        """Of values (B, C, n) for each group, those for the group of each pixel."""
+        """Select, at each pixel, the values (B, C, n) that belong to its own group from those for every group."""
         return torch.stack(list(values)).gather(0, self.groups.expand(1, *values[0].shape)).squeeze(0)
 
     def sums(self, values: Tensor) -> Tensor:
