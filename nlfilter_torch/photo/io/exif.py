@@ -17,7 +17,7 @@ INTEROP = int(ExifTags.IFD.Interop)  # a field of the first of these that points
 
 
 class Latin1(str):
-    """Text of a field that is written as the bytes it was read from.
+    """Text of a field that Pillow writes as the bytes that it was read from.
 
     Pillow reads text as latin-1, which keeps the bytes of any encoding, but writes it as ASCII with question marks.
     """
@@ -30,7 +30,7 @@ class Latin1(str):
 
 
 def writable(value: object) -> object:
-    """The value of a field as it is to be given to Pillow."""
+    """The value of a field in the form in which Pillow writes it unchanged."""
     return Latin1(value) if isinstance(value, str) else value
 
 

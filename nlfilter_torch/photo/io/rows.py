@@ -29,9 +29,10 @@ from nlfilter_torch.photo.tiled.tiles import Tiling
 
 ZARR = ".zarr"
 CHUNK = 256  # side of the chunks of a new zarr array
-FIFTH = psutil.virtual_memory().total // 5  # bytes that a command uses, at most, if no limit is given
-WHOLE = min(FIFTH, 2_000_000_000)  # bytes of an edit, likewise; a photograph that needs more is edited in tiles
-TILED = 1_000_000_000  # bytes of these tiles, likewise; more saves no time
+# Bytes that a command may use if no limit is given.
+FIFTH = psutil.virtual_memory().total // 5
+WHOLE = min(FIFTH, 2_000_000_000)  # a photograph that needs more is edited in tiles
+TILED = 1_000_000_000  # for tiles; with more they are no faster
 CODEC_MEMORY_FACTOR = 8  # memory to decode or encode other formats, as a multiple of the picture's size in bytes
 
 

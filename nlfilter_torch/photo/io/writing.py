@@ -100,7 +100,8 @@ def link_target(path: str | Path) -> Path:
 def name_beside(path: Path) -> Path:
     """Return a unique hidden name in the same folder for a file that is being written.
 
-    It is not longer than file systems allow, 255 bytes; of a longer one, what a killed process leaves is not removed.
+    It fits in the 255 bytes that file systems allow: a longer name is shortened. What a killed process leaves under a
+    shortened name is not removed.
     """
     name, encoded = path.name, os.fsencode(path.name)
     if len(encoded) > LONGEST_STEM:
