@@ -22,6 +22,7 @@ from nlfilter_torch.photo.app.closeup import Closeup
 from nlfilter_torch.photo.app.dialogs import NameDialog
 from nlfilter_torch.photo.app.panel import Panel
 from nlfilter_torch.photo.app.session import Session
+from nlfilter_torch.photo.app.tabs import Link
 from nlfilter_torch.photo.app.tasks import EXPECTED, Tasks
 from nlfilter_torch.photo.app.uploads import Upload
 from nlfilter_torch.photo.declared.presets import Recipe
@@ -82,9 +83,8 @@ class Editor:
             with ui.column().classes("panel"):
                 handle = ui.button(icon="drag_handle").props('flat dense aria-label="Show or hide the controls"')
                 handle.classes("handle").on("click", js_handler="() => page.fold()")
-                self._panel = Panel(
-                    lambda: self.session.recipe, brush, self._change, self._clear_strokes, self._canvas.switch
-                )
+                link = Link(lambda: self.session.recipe, brush, self._change, self._clear_strokes)
+                self._panel = Panel(link, self._canvas.switch)
         ui.keyboard(on_key=self._key)
         ui.on("closeup", lambda event: self._look(event.args))
         ui.on("stroke_dropped", self._canvas.drop_stroke)

@@ -1,0 +1,87 @@
+"""The tab of an edit: its sliders, and the settings of the brush that draws strokes for it."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+
+from nicegui import ui
+
+from nlfilter_torch.photo.app import controls
+from nlfilter_torch.photo.app.brush import BRUSHES, COLOURS, Brush
+from nlfilter_torch.photo.app.controls import Change, Control, Slider
+from nlfilter_torch.photo.declared.parameters import EDITS
+from nlfilter_torch.photo.declared.presets import Recipe
+
+
+@dataclass(frozen=True)
+class Link:
+    """What the tabs show, and what they call.
+
+    Attributes:
+        recipe: returns the current edit.
+        brush: its settings, which the tabs show and change.
+        change: is called with changes of the parameters of a step.
+        clear: is called with a step whose strokes are to be removed.
+    """
+
+    recipe: Callable[[], Recipe]
+    brush: Brush
+    change: Change
+    clear: Callable[[str], None]
+
+
+class EditTab:
+    """The tab of an edit, built into the open element."""
+
+    def __init__(self, edit: str, link: Link) -> None:
+        self._edit, self._link = edit, link
+        self._sliders: list[Slider] = []
+        self._build()
+
+    def follow(self) -> None:
+        """Show the current edit."""
+        for slider in self._sliders:
+            slider.follow()
+
+    def draw_response(self, svg: str) -> None:
+        """Show the response of the sliders, in a tab that has a place for it."""
+
+    def _build(self) -> None:
+        ui.label(EDITS[self._edit].hint).classes("hint")
+        self._sliders += [self._slider(control) for control in controls.OF_EDIT[self._edit]]
+        self._build_brush()
+
+    def _slider(self, control: Control, suffix: str = "") -> Slider:
+        return Slider(control, self._link.recipe, self._link.change, suffix)
+
+    def _build_brush(self, hint: str = "") -> None:
+        """Build the settings of the brush, if the edit takes strokes."""
+        if self._edit not in BRUSHES:
+            return
+        brush, edit = self._link.brush, self._edit
+        ui.label("Brush").classes("group")
+        if hint:
+            ui.label(hint).classes("hint")
+        with ui.row().classes("w-full items-center no-wrap gap-2 q-mt-xs"):
+            words = ui.toggle(BRUSHES[edit], value=brush.word[edit]).props("dense no-caps unelevated")
+            words.on_value_change(lambda event: brush.word.update({edit: event.value}))
+            ui.space()
+            clear = ui.button("Clear strokes", on_click=partial(self._link.clear, edit))
+            clear.props("flat dense no-caps")
+        if "colour" in BRUSHES[edit]:
+            self._build_colours()
+        with ui.row().classes("w-full items-center no-wrap gap-3 q-mt-xs"):
+            ui.label("Size").tooltip("Radius of the brush, in hundredths of the short side")
+            size = ui.slider(min=0.5, max=10, step=0.5, value=100 * brush.radius[edit])
+            size.props('dense label aria-label="Brush size"')
+            size.on_value_change(lambda event: brush.radius.update({edit: event.value / 100}))
+
+    def _build_colours(self) -> None:
+        brush = self._link.brush
+        field = ui.color_input("Colour", value=brush.colour, on_change=lambda event: brush.choose_colour(event.value))
+        field.props("dense outlined").classes("w-full q-mt-xs")
+        with ui.row().classes("gap-2 q-mt-xs"):
+            for colour in COLOURS:
+                ui.button(on_click=partial(field.set_value, colour)).props(
+                    f'round dense unelevated size=sm aria-label="{colour}"'
+                ).style(f"background: {colour} !important")

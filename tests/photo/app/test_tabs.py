@@ -1,0 +1,65 @@
+"""The tab of an edit: its sliders, and the settings of the brush."""
+
+import pytest
+from nicegui import Client, ui
+
+from nlfilter_torch.photo.app.brush import BRUSHES, COLOURS, Brush
+from nlfilter_torch.photo.app.tabs import EditTab
+from nlfilter_torch.photo.declared.parameters import EDITS
+from nlfilter_torch.photo.declared.presets import Recipe
+from nlfilter_torch.photo.declared.steps import Step
+from tests.photo.app.page_controls import Controls
+
+
+@pytest.fixture
+def shown(client: Client) -> Controls:
+    return Controls(client)
+
+
+@pytest.mark.parametrize("name", EDITS)
+def test_an_edit_has_its_hint_its_sliders_and_its_brush(shown: Controls, name: str) -> None:
+    EditTab(name, shown.link)
+    assert EDITS[name].hint in shown.texts()
+    labels = {p.slider.label for p in EDITS[name] if p.slider is not None}
+    assert shown.sliders().keys() - {"Brush size"} == labels
+    assert ("Brush" in shown.texts()) == (name in BRUSHES) == ("Brush size" in shown.sliders())
+
+
+def test_the_sliders_follow_the_edit(shown: Controls) -> None:
+    shown.show(EditTab("tone", shown.link), Recipe((Step("tone", contrast=0.8),)))
+    assert shown.sliders()["Contrast"] == 0.8
+    assert shown.changes == []
+
+
+def test_the_settings_of_the_brush(shown: Controls) -> None:
+    EditTab("recolor", shown.link)
+    EditTab("defocus", shown.link)
+    words, others = shown.of(ui.toggle)
+    assert (words.value, others.value) == ("colour", "in")
+    words.set_value("keep")
+    assert shown.brush.paint("recolor") == "keep"
+    assert shown.brush.paint("defocus") == "in"
+    words.set_value("colour")
+    shown.click(COLOURS[2])
+    assert shown.brush.paint("recolor") == COLOURS[2]
+    sizes = [slider for slider in shown.of(ui.slider) if slider.props["aria-label"] == "Brush size"]
+    sizes[1].set_value(5.0)
+    assert (shown.brush.radius["recolor"], shown.brush.radius["defocus"]) == (0.02, 0.05)
+
+
+def test_strokes_are_cleared(shown: Controls) -> None:
+    EditTab("recolor", shown.link)
+    shown.click("Clear strokes")
+    assert shown.cleared == ["recolor"]
+
+
+def test_what_the_brush_paints() -> None:
+    brush = Brush()
+    assert brush.paint("detail") == "in"
+    brush.word["detail"] = "out"
+    assert brush.paint("detail") == "out"
+    brush.choose_colour("#ABCDEF")
+    assert brush.paint("recolor") == "#abcdef"
+    for value in ("#abc", "red", None, "1234567"):
+        brush.choose_colour(value)
+    assert brush.colour == "#abcdef"
