@@ -1,4 +1,4 @@
-"""The README's pictures, sharpening against an unsharp mask: ``python -m benchmarks.detail_pictures [FOLDER]``.
+"""Pictures for the documentation: sharpening, and an unsharp mask: ``python -m benchmarks.detail_pictures [FOLDER]``.
 
 Both edit the luminance of the same photograph and keep its colour. The unsharp mask is scikit-image's, of radius 2,
 with the amount that gives the same detail gain: the ratio, after to before, of the RMS difference between luminance and

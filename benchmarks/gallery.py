@@ -1,4 +1,4 @@
-"""The README's pictures of edits, before and after: ``python -m benchmarks.gallery [FOLDER]``.
+"""Pictures of edits for the documentation, before and after: ``python -m benchmarks.gallery [FOLDER]``.
 
 Each has three panels, such as the photograph with scribbles, what they select, and the result.
 """
@@ -113,7 +113,7 @@ EDITS: dict[str, Callable[[], dict[str, Tensor]]] = {
 
 def main(arguments: list[str] | None = None) -> None:
     """Write a picture for every edit."""
-    parser = argparse.ArgumentParser(description="Write the pictures of edits for the README.")
+    parser = argparse.ArgumentParser(description="Write the pictures of edits for the documentation.")
     parser.add_argument("folder", nargs="?", type=Path, default=Path("docs"), help="folder for the pictures")
     folder = parser.parse_args(arguments).folder
     folder.mkdir(exist_ok=True)
