@@ -217,11 +217,10 @@ class Session:
             raise ValueError(f"{step} takes no strokes: it holds for the whole photograph")
         stroke = Stroke.from_entries(entries, words, step)
         last = self.recipe.last(step)
-        if (
-            step == "detail" and paint == "in" and not last.has_region()
-        ):  # the region begins with the sliders of the rest
-            self.set("detail", inside=last["alpha"])
-        self.set(step, strokes=(*last.strokes, stroke))
+        painted = last.changed(strokes=(*last.strokes, stroke))
+        if painted.has_region() and not last.has_region():  # it begins with the sliders of the rest
+            painted = painted.changed(inside=last["alpha"])
+        self.recipe = self.recipe.with_last(painted)
         self.commit()
 
     def render(self, upto: str | None = None) -> Tensor:
