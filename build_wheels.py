@@ -1,9 +1,10 @@
 """Source distribution and wheels, and whether they work: ``make wheels``, or ``python build_wheels.py FOLDER``.
 
 The wheels are built from the source distribution: one for x86-64, and one for AArch64 where its cross compiler is.
-Both take kernels that need no later glibc than torch does. Checked are the kernels, by ``tests/kernels_check.c`` (for
-AArch64 in an emulator), the platforms that auditwheel finds the wheels to suit, which it puts into their names, and
-the installation into empty environments, with a wheel and from source without a compiler.
+Both take kernels that need no later glibc than torch does. Checked are the kernels, by
+``tests/core/kernels/kernels_check.c`` (for AArch64 in an emulator), the platforms that auditwheel finds the wheels to
+suit, which it puts into their names, and the installation into empty environments, with a wheel and from source
+without a compiler.
 """
 
 import os
@@ -49,7 +50,7 @@ def unpacked(source: Path, folder: Path) -> Path:
 
 def check_kernels(root: Path, folder: Path, processor: str) -> None:
     """Run the kernels of a processor against loops in float64."""
-    sources = [root / "tests" / "kernels_check.c", *sorted((root / "nlfilter_torch/core/kernels").glob("*.c"))]
+    sources = [root / "tests/core/kernels/kernels_check.c", *sorted((root / "nlfilter_torch/core/kernels").glob("*.c"))]
     program = folder / f"kernels_check_{processor}"
     run(COMPILERS[processor], *FLAGS, "-o", program, *sources, "-lm")
     lines = run(*EMULATORS[processor], program).splitlines()

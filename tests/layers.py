@@ -15,8 +15,8 @@ OPTIONS = {"photometric_bandwidth": 0.2, "num_landmarks": 20}
 EVERYTHING = ("alpha", "residual", "photometric_bandwidth", "spatial_bandwidth", "patch_weights")
 
 
-def image(seed: int = 0, batch: int = 2) -> Tensor:
-    return noise(batch, 3, 12, 13, seed=seed, dtype=torch.float32)
+def image(seed: int = 0, batch: int = 2, *, dtype: torch.dtype = torch.float32) -> Tensor:
+    return noise(batch, 3, 12, 13, seed=seed, dtype=dtype)
 
 
 def everything(**options: object) -> NonlocalFilter:

@@ -11,5 +11,5 @@ def run_ranks(work: Callable[..., None], arguments: tuple[object, ...], processe
 
     They are forked from a process that has imported the modules, as the imports take longer than the work.
     """
-    multiprocessing.set_forkserver_preload(["tests.test_sharding", "tests.clients.test_fsdp"])
+    multiprocessing.set_forkserver_preload(["tests.core.test_communicator", "tests.themes.clients.test_fsdp"])
     start_processes(work, arguments, processes, start_method="forkserver")

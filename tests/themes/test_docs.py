@@ -52,7 +52,7 @@ def test_code_and_commands_run(page: Page, folder: Path) -> None:
     assert {kind for kind, _ in page.blocks()} <= {"python", "sh", "text", "{toctree}"}
     with torch.random.fork_rng():
         torch.manual_seed(0)
-        page.run_python(without="import deepinv")  # which tests/clients/test_deepinv.py runs
+        page.run_python(without="import deepinv")  # which tests/themes/clients/test_deepinv.py runs
     for arguments in page.commands("nlfilter-torch"):
         assert main(arguments) == 0
 

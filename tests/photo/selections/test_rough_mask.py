@@ -9,8 +9,8 @@ from nlfilter_torch.photo.picture.in_memory import InMemory, InMemoryOperator
 from nlfilter_torch.photo.selections import rough_mask
 from nlfilter_torch.photo.selections.rough_mask import Points, RoughMasks, region_guide
 from nlfilter_torch.photo.selections.scribbled_colours import frame_places
+from tests.filtering.test_scribbles import kriging
 from tests.problems import box, colour, noise
-from tests.test_strokes import kriging
 
 
 @pytest.mark.parametrize("enlarged", [1.0, 3.0])

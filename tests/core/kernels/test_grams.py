@@ -1,0 +1,31 @@
+"""Gram matrices of a factor: the kernel in C agrees with the definition in torch."""
+
+import pytest
+import torch
+
+from nlfilter_torch.core.kernels import definitions_only, grams
+from nlfilter_torch.core.kernels.grams import sum_grams
+from tests.native import by_torch, random, sizes
+
+
+@pytest.mark.parametrize(("pixels", "marks"), sizes([1, 17, 1024, 1025, 9000], [1, 3, 6, 7, 50, 400], 3_000_000))
+@pytest.mark.parametrize("count", [1, 2, 4])
+def test_grams(level: int, pixels: int, marks: int, count: int) -> None:
+    factor, scaling, remainder = random(2, marks, pixels), random(2, pixels, seed=1).exp(), random(2, pixels).sigmoid()
+    found = sum_grams(factor, scaling, remainder, count)
+    plain = by_torch(sum_grams, factor, scaling, remainder, count)
+    scaled = (factor * scaling.unsqueeze(1)).double()
+    for j in range(count):
+        exact = (scaled * remainder.double().unsqueeze(1) ** j) @ scaled.mT
+        size = exact.diagonal(dim1=1, dim2=2).amax() * 3e-7
+        assert (found[:, j] - exact).abs().max() <= size
+        assert (plain[:, j] - exact).abs().max() <= 10 * size
+    assert torch.equal(found, found.mT)
+
+
+def test_a_gram_matrix_of_weighted_columns() -> None:
+    factor, weights = random(2, 6, 400), random(2, 400, seed=1).exp()
+    exact = (factor.double() * weights.double().unsqueeze(1)) @ factor.double().mT
+    torch.testing.assert_close(grams.gram(factor, weights), exact.float(), rtol=1e-4, atol=1e-3)
+    with definitions_only():
+        torch.testing.assert_close(grams.gram(factor, weights), exact.float(), rtol=1e-4, atol=1e-3)

@@ -1,0 +1,111 @@
+"""Products with few rows equal plain matrix products, whether divided into parts or not."""
+
+from contextlib import nullcontext
+
+import pytest
+import torch
+from torch import Tensor
+
+from nlfilter_torch.core.blocks import SWEPT
+from nlfilter_torch.core.communicator import ALONE
+from nlfilter_torch.core.kernels import definitions_only, tall_skinny
+from nlfilter_torch.core.kernels.tall_skinny import gather, moment, spread
+from nlfilter_torch.operator.scaling import KernelMatrix, _sweep, weighted_moment
+from tests.native import by_torch, random, sizes
+
+
+def doubles(*shape: int) -> Tensor:
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+
+
+@pytest.fixture(params=[1, 2, 3])
+def several_threads(request: pytest.FixtureRequest):
+    before = torch.get_num_threads()
+    torch.set_num_threads(request.param)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.mark.usefixtures("several_threads")
+@pytest.mark.parametrize("pixels", [1, 7, 64, SWEPT, 2 * SWEPT + 5])
+@pytest.mark.parametrize("rows", [1, 3, 5, 30])
+@pytest.mark.parametrize("batch", [1, 2])
+def test_equal_to_matrix_products(pixels: int, rows: int, batch: int):
+    factor, vectors, images = doubles(batch, 6, pixels), doubles(batch, rows, 6), doubles(batch, rows, pixels)
+    gathered = images @ factor.mT
+    torch.testing.assert_close(spread(vectors, factor), vectors @ factor)
+    scaling = doubles(batch, pixels)
+    torch.testing.assert_close(spread(vectors, factor, scaling), vectors @ factor * scaling.unsqueeze(1))
+    torch.testing.assert_close(gather(images, factor), gathered)
+    torch.testing.assert_close(moment(factor, images), gathered.mT)
+
+
+@pytest.mark.usefixtures("several_threads")
+def test_factors_of_any_layout():
+    factor, vectors, images = doubles(1, 64, 6).mT, doubles(1, 6, 2).mT, doubles(1, 64, 2).mT
+    torch.testing.assert_close(spread(vectors, factor), vectors @ factor)
+    torch.testing.assert_close(gather(images, factor), images @ factor.mT)
+
+
+@pytest.mark.usefixtures("several_threads")
+def test_derivatives_of_any_order():
+    leaves = [part.requires_grad_() for part in (doubles(1, 2, 3), doubles(1, 3, 8), doubles(1, 2, 8))]
+    torch.autograd.gradgradcheck(lambda rows, factor, _: spread(rows, factor), leaves)
+    torch.autograd.gradgradcheck(lambda _, factor, images: gather(images, factor), leaves)
+
+
+def swept(factor: Tensor, diagonal: Tensor, total: Tensor) -> tuple[Tensor, Tensor]:
+    return _sweep(KernelMatrix(factor, diagonal), total)
+
+
+@pytest.mark.parametrize(("pixels", "marks"), sizes([1, 7, 255, 8256, 40_000], [1, 3, 50, 900]))
+def test_sweep(level: int, pixels: int, marks: int) -> None:
+    factor = random(2, marks, pixels).abs()
+    factor = factor / factor.square().sum(1, keepdim=True).sqrt() * torch.linspace(0, 1, pixels)
+    diagonal = 1 - factor.square().sum(1).clamp(max=1)
+    total = random(2, marks, 1, seed=1).abs().double() * pixels**0.5
+    exact = swept(factor.double(), diagonal.double(), total)
+    found = swept(factor, diagonal, total)
+    plain = by_torch(swept, factor, diagonal, total)
+    torch.testing.assert_close(found[0], exact[0].float(), rtol=1e-5, atol=0)
+    error, usual = (found[1] - exact[1]).abs().max(), (plain[1] - exact[1]).abs().max()
+    assert error <= 2 * usual + 1e-5 * exact[1].abs().max(), (error, usual)
+
+
+@pytest.mark.parametrize("pixels", [1, 9, 63, 4128, 4129, 30_001])
+@pytest.mark.parametrize("rows", [1, 2, 3, 8])
+@pytest.mark.parametrize("marks", [1, 2, 3, 5, 100])
+def test_products_with_few_rows(level: int, pixels: int, rows: int, marks: int) -> None:
+    batch = 1 if pixels in (1, 4129, 30_001) else 2
+    factor, vectors, images = random(batch, marks, pixels), random(batch, rows, marks), random(batch, rows, pixels)
+    image = (vectors.double() @ factor.double()).float()
+    torch.testing.assert_close(spread(vectors, factor), image, atol=1e-5, rtol=1e-6)
+    scaling = random(batch, pixels, seed=1)
+    torch.testing.assert_close(spread(vectors, factor, scaling), image * scaling.unsqueeze(1), atol=1e-4, rtol=1e-6)
+    found = moment(factor, images)
+    assert found.dtype == torch.float64
+    size = (factor.double().abs() @ images.double().mT.abs()) * 1e-6
+    assert ((found - factor.double() @ images.double().mT).abs() <= size).all()
+
+
+@pytest.mark.parametrize(("pixels", "marks"), sizes([1, 300, 8256, 40_000], [1, 3, 50, 900]))
+def test_weighted_moments(level: int, pixels: int, marks: int) -> None:
+    arguments = random(2, marks, pixels), random(2, pixels, seed=1).exp(), ALONE, random(2, marks, 1).double()
+    factor, weights, total = (t.double() for t in arguments if isinstance(t, Tensor))
+    exact = factor @ (weights.unsqueeze(2) * (factor.mT @ total.float().double()))
+    found = weighted_moment(*arguments)
+    plain = by_torch(weighted_moment, *arguments)
+    error, usual = (found - exact).abs().max(), (plain - exact).abs().max()
+    assert error <= 2 * usual + 1e-6 * exact.abs().max(), (error, usual)
+
+
+def test_weights_count_pixels() -> None:
+    factor, diagonal = random(2, 6, 40).abs() / 10, random(2, 40).sigmoid()
+    half, copies = random(2, 6, seed=1).abs(), torch.arange(40) % 3 + 1
+    repeated = (part.repeat_interleave(copies, dim=-1) for part in (factor, diagonal))
+    for context in (nullcontext(), definitions_only()):
+        with context:
+            scaling, found = tall_skinny.sweep(factor, diagonal, half, 2.0, copies.expand(2, -1).float())
+    many, expected = tall_skinny.sweep(*repeated, half, 2.0)
+    torch.testing.assert_close(scaling.repeat_interleave(copies, dim=1), many)
+    torch.testing.assert_close(found, expected, rtol=1e-6, atol=0)

@@ -1,0 +1,76 @@
+"""Private parts of torch answer the questions that they are used for, and stand in one module."""
+
+import ast
+import re
+from pathlib import Path
+
+import torch
+from torch import Tensor
+from torch._subclasses.fake_tensor import FakeTensorMode
+from torch.autograd import forward_ad
+
+import nlfilter_torch
+from nlfilter_torch.core import torch_internals as internals
+
+
+def test_transforms_are_noticed() -> None:
+    seen = []
+
+    def function(x: Tensor) -> Tensor:
+        seen.append((internals.is_transformed(x), internals.in_transform()))
+        return x.sum()
+
+    function(torch.ones(3))
+    torch.func.grad(function)(torch.ones(3))
+    torch.func.vmap(function)(torch.ones(2, 3))
+    assert seen == [(False, False), (True, True), (True, True)]
+    assert not internals.in_transform()
+
+
+def test_forward_mode_is_noticed() -> None:
+    assert not internals.in_forward_mode()
+    with forward_ad.dual_level():
+        assert internals.in_forward_mode()
+
+
+def test_fake_tensors_are_noticed_and_constants_are_real() -> None:
+    assert not internals.in_fake_mode()
+    with FakeTensorMode():
+        assert internals.in_fake_mode()
+        assert internals.is_fake_tensor(torch.ones(2))
+        with internals.outside_modes():
+            real = torch.ones(2)
+    assert not internals.is_fake_tensor(real)
+    assert real.tolist() == [1.0, 1.0]
+
+
+def test_tracing_is_noticed() -> None:
+    assert not internals.is_traced()
+
+
+def test_tensors_without_memory_and_nested_replacement() -> None:
+    class Marked(Tensor):
+        @classmethod
+        def __torch_dispatch__(cls, func: object, types: object, args: object = (), kwargs: object = None) -> None:
+            raise AssertionError
+
+    marked = internals.without_memory(Marked, (2, 3), torch.ones(1, dtype=torch.float64))
+    assert isinstance(marked, Marked)
+    assert (tuple(marked.shape), marked.dtype) == ((2, 3), torch.float64)
+    nested = internals.replace_instances(Marked, lambda _: "replaced", ([marked, 1], {"a": marked}))
+    assert nested == (["replaced", 1], {"a": "replaced"})
+
+
+def test_no_other_module_uses_private_parts_of_torch() -> None:
+    root = Path(nlfilter_torch.__file__).parent
+    for path in root.rglob("*.py"):
+        if path == Path(internals.__file__):
+            continue
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            parts: list[str] = []
+            if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "torch":
+                parts = [*(node.module or "").split("."), *(alias.name for alias in node.names)]
+            elif isinstance(node, ast.Attribute) and re.fullmatch(r"(torch|dist|forward_ad)[\w.]+", ast.unparse(node)):
+                parts = ast.unparse(node).split(".")
+            private = [part for part in parts if re.match("_[^_]", part)]
+            assert not private, (path, private)

@@ -1,0 +1,299 @@
+"""The trained denoiser: no change without noise, no seams between tiles, precisions, gradients and what it refuses."""
+
+import pytest
+import torch
+from torch import Tensor
+
+from nlfilter_torch import NonlocalDenoiser, denoise
+from nlfilter_torch.nn.denoiser import tiles
+from nlfilter_torch.nn.denoiser.colours import join_colours, split_colours
+from nlfilter_torch.nn.denoiser.network import PIXELS, WIDTH
+from nlfilter_torch.nn.denoiser.tiles import SIDE, STEP, in_tiles
+from tests.problems import colour, decibels, noisy, seeded
+
+TRAINED_ONE = NonlocalDenoiser.trained()
+CAT = colour("chelsea", 96, 128)
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+@pytest.mark.parametrize(("level", "gain"), [(5, 1.0), (15, 4.0), (50, 8.0)])
+def test_photographs_come_closer(channels: int, level: int, gain: float) -> None:
+    clean = CAT[:, :channels]
+    image = noisy(clean, level / 255)
+    with torch.no_grad():
+        found = TRAINED_ONE(image, level / 255)
+    assert decibels(found, clean) > decibels(image, clean) + gain
+    torch.testing.assert_close(denoise(image, noise_level=level / 255), found, rtol=0, atol=1e-6)
+
+
+def test_it_is_better_than_the_rule() -> None:
+    image = noisy(CAT, 25 / 255)
+    network, rule = (denoise(image, noise_level=25 / 255, method=method) for method in ("network", "rule"))
+    assert decibels(network, CAT) > decibels(rule, CAT) + 1
+
+
+def test_no_noise_changes_nothing() -> None:
+    assert torch.equal(TRAINED_ONE(CAT, 0.0), CAT)
+    half = torch.zeros(1, 1, *CAT.shape[-2:])
+    half[..., 64:] = 0.1
+    found = TRAINED_ONE(CAT, half)
+    assert torch.equal(found[..., :64], CAT[..., :64])
+    assert not torch.equal(found[..., 64:], CAT[..., 64:])
+    assert torch.equal(denoise(CAT, strength=0.0), CAT)
+
+
+def test_the_level_is_not_rounded_to_the_precision_of_the_image() -> None:
+    image = noisy(CAT[..., :64, :64], 0.0123).bfloat16()
+    wanted = TRAINED_ONE(image.float(), 0.0123).bfloat16()
+    assert torch.equal(TRAINED_ONE(image, 0.0123), wanted)
+    assert torch.equal(TRAINED_ONE(image, torch.full((1, 1, 64, 64), 0.0123)), wanted)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (2, 3), (5, 200), (97, 95), (98, 96), (150, 131)])
+def test_every_size(size: tuple[int, int]) -> None:
+    image = noisy(torch.full((1, 1, *size), 0.5), 0.1)
+    with torch.no_grad():
+        found = TRAINED_ONE(image, 0.1)
+    assert found.shape == image.shape
+    assert found.isfinite().all()
+
+
+@pytest.mark.parametrize("size", [(40, 300), (300, 310)])
+def test_tiles_put_together_what_they_took_apart(size: tuple[int, int]) -> None:
+    image = torch.rand(2, 3, *size, generator=seeded(0))
+    noise = torch.rand(2, 1, *size, generator=seeded(1))
+    torch.testing.assert_close(in_tiles(image, noise, lambda x, n: x + n), image + noise, rtol=0, atol=1e-6)
+
+
+def test_tiles_cover_images_of_every_size() -> None:
+    for length in range(1, 600):
+        parts = tiles._divided(length)
+        assert [tile.start for tile in parts] == [STEP * n for n in range(len(parts))]
+        assert parts[-1].stop >= length + 2 * tiles.BORDER
+        assert all(tile.stop - tile.start == SIDE for tile in parts[:-1])
+        assert parts[-1].stop - parts[-1].start <= SIDE
+
+
+def test_rows_that_begin_at_a_tile_are_those_of_the_whole() -> None:
+    image = noisy(colour("chelsea", 300, 150)[:, :1], 0.1)
+    noise = torch.full_like(image, 0.1)
+    with torch.no_grad():
+        whole = in_tiles(image, noise, TRAINED_ONE.estimate_noise)
+        lower = in_tiles(image[..., STEP:, :], noise[..., STEP:, :], TRAINED_ONE.estimate_noise)
+    torch.testing.assert_close(lower[..., SIDE:, :], whole[..., STEP + SIDE :, :], rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("inner", [(slice(80, 200), slice(None)), (slice(None), slice(30, 31)), (slice(299, 300),) * 2])
+def test_only_the_tiles_of_a_part_are_computed(inner: tuple[slice, slice]) -> None:
+    image = noisy(colour("chelsea", 300, 300)[:, :1], 0.1)
+    noise, computed = torch.full_like(image, 0.1), []
+
+    def watched(tiles: torch.Tensor, levels: torch.Tensor) -> torch.Tensor:
+        computed.append(len(tiles))
+        return TRAINED_ONE.estimate_noise(tiles, levels)
+
+    with torch.no_grad():
+        whole = in_tiles(image, noise, watched)
+        count = sum(computed)
+        computed.clear()
+        part = in_tiles(image, noise, watched, inner)
+    torch.testing.assert_close(part[..., *inner], whole[..., *inner], rtol=0, atol=1e-6)
+    assert part.isfinite().all()
+    assert sum(computed) < 0.8 * count
+
+
+def test_colours_are_split_and_joined() -> None:
+    image = torch.rand(2, 3, 4, 6, generator=seeded(0)).double()
+    planes, noise = split_colours(image, torch.full((2, 1, 4, 6), 0.3).double())
+    torch.testing.assert_close(join_colours(planes, 3), image)
+    torch.testing.assert_close(noise[0, :, 0, 0], torch.tensor([0.3 / 3**0.5, 0.3]).double())
+    sample = 0.3 * torch.randn(1, 3, 300, 300, generator=seeded(1)).double()
+    spread = split_colours(sample, torch.full((1, 1, 300, 300), 0.3).double())[0].std((0, 2, 3))
+    torch.testing.assert_close(spread, torch.tensor([0.3 / 3**0.5, 0.3, 0.3]).double(), rtol=0.02, atol=0)
+
+
+def test_images_of_a_batch_are_denoised_as_alone() -> None:
+    images = torch.cat([noisy(CAT, 0.1), noisy(colour("coffee", 96, 128), 0.05)])
+    levels = torch.tensor([0.1, 0.05])
+    with torch.no_grad():
+        both = TRAINED_ONE(images, levels)
+        for i in range(2):
+            alone = TRAINED_ONE(images[i : i + 1], levels[i])
+            # Rounding may assign a pixel to another landmark.
+            torch.testing.assert_close(both[i : i + 1], alone, rtol=0, atol=1e-3)
+            torch.testing.assert_close(TRAINED_ONE(images[i], levels[i].view(1, 1, 1).expand(1, 96, 128)), alone[0])
+
+
+def test_turns_are_averaged_and_better() -> None:
+    image = noisy(CAT, 0.1)
+    with torch.no_grad():
+        found = {turns: TRAINED_ONE(image, 0.1, turns=turns) for turns in (1, 2, 4)}
+        half = TRAINED_ONE(image.rot90(2, (2, 3)), 0.1).rot90(2, (2, 3))
+    scores = [decibels(found[turns], CAT) for turns in (1, 2, 4)]
+    assert scores == sorted(scores)
+    assert decibels((found[1] + half) / 2, CAT) == pytest.approx(scores[1], abs=0.1)  # the tiles differ
+    with pytest.raises(ValueError, match="turns must be 1, 2 or 4, got 3"):
+        TRAINED_ONE(image, 0.1, turns=3)
+
+
+def test_numbers_and_maps_of_the_noise_agree() -> None:
+    image = noisy(CAT, 0.1)
+    maps = (torch.full((1, channels, 96, 128), 0.1) for channels in (1, 3))
+    with torch.no_grad():
+        wanted = TRAINED_ONE(image, 0.1)
+        for noise in (torch.tensor(0.1), torch.tensor([0.1]), *maps):
+            torch.testing.assert_close(TRAINED_ONE(image, noise), wanted, rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("channels", [2, 4])
+def test_other_channels_are_denoised_one_by_one(channels: int) -> None:
+    image = noisy(CAT[:, :1].repeat(2, channels, 1, 1), 0.1)
+    with torch.no_grad():
+        found = TRAINED_ONE(image, 0.1)
+        torch.testing.assert_close(found[1:, 1:2], TRAINED_ONE(image[1:, 1:2], 0.1), rtol=0, atol=1e-4)
+
+
+def test_bright_pictures_are_denoised_as_their_scaled_selves() -> None:
+    image = noisy(CAT[..., :64, :64], 0.1)  # a single tile
+    image = 2 * image / image.max()
+    with torch.no_grad():
+        torch.testing.assert_close(
+            TRAINED_ONE(4 * image, 0.4), 4 * TRAINED_ONE(image, 0.1), rtol=0, atol=1e-3
+        )  # the largest magnitude that the network sees is 2
+
+
+def test_levels_far_above_those_of_training_leave_the_contrast() -> None:
+    image = CAT[..., :64, :64]
+    with torch.no_grad():
+        found = [TRAINED_ONE(image, level / 255) for level in (100, 255)]
+    assert torch.equal(*found)
+    assert found[1].mean() > 0.9 * image.mean()
+    assert (found[1] - image).square().mean().sqrt() < 30 / 255
+
+
+def test_gradients_reach_everything() -> None:
+    model = NonlocalDenoiser.trained()
+    image = noisy(CAT[..., :32, :32], 0.1).requires_grad_()
+    noise = torch.full((1,), 0.1, requires_grad=True)
+    (model(image, noise) - CAT[..., :32, :32]).square().mean().backward()
+    for name, parameter in model.named_parameters():
+        assert parameter.grad is not None, name
+        assert parameter.grad.abs().sum() > 0, name
+    assert image.grad is not None
+    assert image.grad.isfinite().all()
+    assert noise.grad is not None
+    assert noise.grad.abs() > 0
+
+
+def test_gradients_of_float64_are_those_of_differences() -> None:
+    model = NonlocalDenoiser.trained().double()
+    image = noisy(CAT[:, :1, :16, :16], 0.1).double()
+    weights = torch.randn(image.shape, generator=seeded(3)).double()
+    direction = torch.randn(image.shape, generator=seeded(4)).double()
+    point = image.clone().requires_grad_()
+    (weights * model(point, 0.1)).sum().backward()
+    assert point.grad is not None
+    step = 1e-8  # small, since a pixel near the border of two clusters may change to the other
+    with torch.no_grad():
+        ends = [(weights * model(image + sign * step * direction, 0.1)).sum() for sign in (1, -1)]
+    assert float((point.grad * direction).sum()) == pytest.approx(float(ends[0] - ends[1]) / (2 * step), rel=1e-5)
+
+
+def test_autocast_rounds_neither_guide_nor_filter() -> None:
+    features, planes = torch.randn(1, WIDTH, 24, 32, generator=seeded(5)), noisy(CAT[..., :24, :32], 0.1)
+    with torch.no_grad():
+        wanted = TRAINED_ONE.smooth(features, planes, PIXELS)
+        with torch.autocast("cpu", torch.bfloat16):
+            assert torch.equal(TRAINED_ONE.smooth(features, planes, PIXELS), wanted)
+
+
+def test_precisions() -> None:
+    image = noisy(CAT, 0.1)
+    with torch.no_grad():
+        wanted = TRAINED_ONE(image, 0.1)
+        half = TRAINED_ONE(image.bfloat16(), 0.1)
+        with torch.autocast("cpu", torch.bfloat16):
+            cast = TRAINED_ONE(image, 0.1)
+    assert half.dtype == torch.bfloat16
+    assert cast.dtype == torch.float32
+    assert (cast - wanted).abs().mean() < 0.005
+    assert decibels(cast, CAT) == pytest.approx(decibels(wanted, CAT), abs=0.1)
+    double = denoise(image.double(), noise_level=0.1)
+    assert double.dtype == torch.float64
+    # Rounding may assign a pixel to another landmark.
+    assert (double - denoise(image, noise_level=0.1)).abs().mean() < 1e-3
+
+
+@pytest.mark.parametrize(
+    ("image", "noise", "error", "message"),
+    [
+        (torch.zeros(8, 8), 0.1, ValueError, "noisy must have shape"),
+        (torch.full((1, 1, 8, 8), torch.nan), 0.1, ValueError, "noisy must be finite"),
+        (torch.zeros(1, 3, 8, 8), -0.1, ValueError, "noise must be at least 0"),
+        (torch.zeros(1, 3, 8, 8), torch.full((1, 1, 8, 8), torch.nan), ValueError, "noise must be finite"),
+        (torch.zeros(1, 3, 8, 8), torch.full((1, 1, 8, 8), -1.0), ValueError, "noise must be at least 0"),
+        (torch.zeros(1, 3, 8, 8), torch.zeros(1, 1, 8, 9), ValueError, "noise must have the height and width"),
+        (
+            torch.zeros(1, 3, 8, 8),
+            torch.zeros(1, 2, 8, 8),
+            ValueError,
+            "noise must have 1 channel or as many as the image",
+        ),
+        (torch.zeros(1, 3, 8, 8), torch.zeros(3), ValueError, "noise must be a number or have shape"),
+        (torch.zeros(1, 3, 8, 8), "much", TypeError, "noise must be a number"),
+    ],
+)
+def test_bad_input(image: Tensor, noise: object, error: type[Exception], message: str) -> None:
+    with pytest.raises(error, match=message):
+        TRAINED_ONE(image, noise)
+
+
+def test_the_edit_refuses_what_it_cannot_take() -> None:
+    with pytest.raises(
+        ValueError, match=r"noise_level must be a number or have shape \(B,\) for method rule, got a map"
+    ):
+        denoise(CAT, noise_level=torch.zeros_like(CAT), method="rule")
+    with pytest.raises(ValueError, match="method must be one of 'network', 'rule', got 'luck'"):
+        denoise(CAT, method="luck")  # type: ignore[arg-type]
+    with pytest.raises(TypeError, match="denoise has no argument landmark"):
+        denoise(CAT, landmark=3)
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+def test_gradient_by_the_noise_where_it_is_zero(channels: int) -> None:
+    network = NonlocalDenoiser.trained(dtype=torch.float64)
+    image = colour("chelsea")[:, :channels, :16, :16].double()
+    direction = torch.ones(1, 1, 16, 16, dtype=torch.float64)
+    level = torch.zeros(1, 1, 16, 16, dtype=torch.float64, requires_grad=True)
+    (slope,) = torch.autograd.grad(network(image, level).sum(), level)
+    step = 1e-7
+    change = (network(image, step * direction) - network(image, 0 * direction)).sum() / step
+    torch.testing.assert_close((slope * direction).sum(), change.detach(), rtol=1e-3, atol=1e-3)
+
+
+def test_half_precision_has_a_finite_gradient_by_the_noise() -> None:
+    network, image = NonlocalDenoiser.trained().bfloat16(), colour("chelsea")[..., :32, :32].bfloat16()
+    level = torch.full((1, 1, 32, 32), 0.1, dtype=torch.bfloat16)
+    level[..., :5] = 0
+    network(image, level.requires_grad_()).sum().backward()
+    assert level.grad is not None
+    assert level.grad.isfinite().all()
+
+
+def test_compiled() -> None:
+    torch.compiler.reset()
+    image = noisy(CAT[..., :20, :24], 0.1)
+    with torch.no_grad():
+        found = torch.compile(TRAINED_ONE, backend="eager")(image, 0.1)
+        torch.testing.assert_close(found, TRAINED_ONE(image, 0.1), atol=1e-5, rtol=0)
+
+
+def test_transforms_are_refused() -> None:
+    with pytest.raises(TypeError, match=r"noisy must not be transformed by torch\.func"):
+        torch.vmap(lambda one: TRAINED_ONE(one, 0.1))(noisy(CAT, 0.1)[None])
+
+
+@pytest.mark.parametrize("turns", [2.0, True])
+def test_turns_are_whole_numbers(turns: object) -> None:
+    with pytest.raises(TypeError, match="turns must be an int"):
+        TRAINED_ONE(noisy(CAT, 0.1), 0.1, turns=turns)

@@ -1,0 +1,143 @@
+"""The layers: results equal to those of the functions, and parameters that can be saved, moved and learned."""
+
+import copy
+
+import pytest
+import torch
+from torch import nn
+
+from nlfilter_torch import (
+    DiffusionMask,
+    Look,
+    NonlocalFilter,
+    PolynomialSliders,
+    SegmentMask,
+    detail_layers,
+    nonlocal_operator,
+    polynomial_filter,
+)
+from tests.layers import ALPHA, OPTIONS, image
+from tests.problems import noise, picture
+
+
+@pytest.mark.parametrize("residual", [None, 0.0, 1.0])
+def test_filter_is_the_function(residual: float | None) -> None:
+    layer = NonlocalFilter(ALPHA, residual=residual, **OPTIONS)
+    expected = polynomial_filter(nonlocal_operator(image(), **OPTIONS), image(), torch.tensor(ALPHA), residual=residual)
+    torch.testing.assert_close(layer(image()), expected, atol=0, rtol=0)
+
+
+@pytest.mark.parametrize("channels", [1, 2, 5])
+@pytest.mark.parametrize("guide_channels", [1, 2, 3])
+def test_guide_may_be_another_picture(channels: int, guide_channels: int) -> None:
+    guide, picture_ = noise(2, guide_channels, 12, 13, seed=1), noise(2, channels, 12, 13)
+    found = NonlocalFilter(ALPHA, **OPTIONS)(picture_, guide=guide)
+    expected = polynomial_filter(nonlocal_operator(guide, **OPTIONS), picture_, torch.tensor(ALPHA))
+    torch.testing.assert_close(found, expected)
+
+
+def test_mask_blends() -> None:
+    layer, mask = NonlocalFilter(ALPHA, **OPTIONS), noise(2, 1, 12, 13, seed=2, dtype=torch.float32)
+    filtered = layer(image())
+    expected = image() + mask * (filtered - image())
+    torch.testing.assert_close(layer(image(), mask=mask), expected)
+    torch.testing.assert_close(layer(image(), mask=torch.zeros_like(mask)), image(), atol=0, rtol=0)
+    torch.testing.assert_close(layer(image(), mask=torch.ones_like(mask)), filtered)
+
+
+def test_ones_are_the_identity() -> None:
+    torch.testing.assert_close(NonlocalFilter(**OPTIONS)(image()), image(), atol=1e-5, rtol=0)
+
+
+def test_alpha_is_the_parameter_and_is_saved() -> None:
+    layer = NonlocalFilter(ALPHA, **OPTIONS)
+    assert [tuple(p.shape) for p in layer.parameters()] == [(4,)]
+    assert next(layer.parameters()) is layer.alpha
+    other = NonlocalFilter((1, 1, 1, 1), **OPTIONS)
+    other.load_state_dict(layer.state_dict())
+    torch.testing.assert_close(other(image()), layer(image()), atol=0, rtol=0)
+    torch.testing.assert_close(copy.deepcopy(layer)(image()), layer(image()), atol=0, rtol=0)
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float32, torch.float64])
+def test_layer_converts_and_images_keep_their_dtype(dtype: torch.dtype) -> None:
+    layer = NonlocalFilter(ALPHA, **OPTIONS).to(dtype)
+    assert layer.sliders.alpha.dtype == dtype
+    filtered = layer(image(dtype=dtype))
+    assert filtered.dtype == dtype
+    assert filtered.isfinite().all()
+    assert layer(image()).dtype == torch.float32
+
+
+def test_every_option_is_shown() -> None:
+    layer = NonlocalFilter(ALPHA, patch_size=3, landmarks="uniform", spatial_bandwidth=7.5, **OPTIONS)
+    text = repr(layer)
+    for part in ("3.0, 0.5, 4.0, 1.05", "patch_size=3", "'uniform'", "spatial_bandwidth=7.5", "num_landmarks=20"):
+        assert part in text
+    assert "time=2.5" in repr(DiffusionMask(time=2.5))
+    assert "time=2.5" in repr(SegmentMask(time=2.5))
+
+
+def test_layer_is_part_of_a_network_that_learns() -> None:
+    clean = picture("camera", 24, 26, torch.float32)
+    target = polynomial_filter(nonlocal_operator(clean, **OPTIONS), clean, torch.tensor([2.0, 1.5, 1.0, 1.0]))
+    layer = NonlocalFilter(**OPTIONS)
+    optimizer = torch.optim.Adam(layer.parameters(), lr=0.05)
+    losses = []
+    for _ in range(60):
+        optimizer.zero_grad()
+        loss = (layer(clean) - target).square().mean()
+        loss.backward()
+        optimizer.step()
+        losses.append(loss.item())
+    assert losses[-1] < losses[0] / 20
+
+
+def test_gradients_reach_the_network_before_the_layer() -> None:
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        network = nn.Conv2d(3, 4, 3, padding=1)
+    layer = NonlocalFilter(ALPHA, guide_channels="all", **OPTIONS)
+    layer(image(), guide=network(image())).square().mean().backward()
+    for parameter in [*network.parameters(), *layer.parameters()]:
+        assert parameter.grad is not None
+        assert parameter.grad.isfinite().all()
+    assert network.weight.grad.abs().max() > 0
+    assert layer.sliders.alpha.grad.abs().min() > 0
+
+
+def test_modules_without_values_can_be_printed() -> None:
+    with torch.device("meta"):
+        layer = NonlocalFilter(learn=("alpha", "photometric_bandwidth"), photometric_bandwidth=0.1)
+    assert "alpha=(4,) without values" in repr(layer)
+
+
+def test_an_unknown_option_of_a_look_is_refused() -> None:
+    with pytest.raises(TypeError, match="num_landmark"):
+        Look(num_landmark=3)
+
+
+@pytest.mark.parametrize("shape", [(4,), (2, 4), (2, 4, 12, 13), (1, 4, 12, 13), (2, 6)])
+def test_sliders_of_a_call_come_from_elsewhere(shape: tuple[int, ...]) -> None:
+    layer = NonlocalFilter(ALPHA, learn=(), **OPTIONS)
+    alpha = noise(*shape, seed=5, dtype=torch.float32).requires_grad_()
+    filtered = layer(image(), alpha=alpha)
+    torch.testing.assert_close(filtered, polynomial_filter(nonlocal_operator(image(), **OPTIONS), image(), alpha))
+    filtered.square().mean().backward()
+    assert (alpha.grad != 0).all()
+
+
+def test_sliders_of_a_call_train_the_network_that_finds_them() -> None:
+    layer = NonlocalFilter(learn=(), **OPTIONS)
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        network = nn.Conv2d(3, 4, 3, padding=1)
+    layer(image(), alpha=network(image())).square().mean().backward()
+    assert all((p.grad != 0).any() for p in network.parameters())
+
+
+def test_held_layers_take_sliders_of_a_call() -> None:
+    operator, alpha = nonlocal_operator(image(), **OPTIONS), noise(2, 4, seed=5, dtype=torch.float32)
+    sliders = PolynomialSliders(ALPHA)
+    layers = detail_layers(operator, image())
+    torch.testing.assert_close(sliders.combine(layers, alpha), sliders(operator, image(), alpha))

@@ -1,0 +1,57 @@
+"""The scaling as the root for a moment, and the damped method, which converges from any start."""
+
+import pytest
+import torch
+
+from nlfilter_torch.operator.scaling import LARGEST, KernelMatrix, Solution, damped, scaling_from_moment
+from nlfilter_torch.operator.sinkhorn import sinkhorn_balance
+from tests.problems import noise
+
+
+@pytest.mark.parametrize("half", [-3.0, -1e-3, 0.0, 1e-3, 3.0])
+@pytest.mark.parametrize("diagonal", [1e-3, 0.1, 1.0])
+def test_the_scaling_is_the_root_for_either_sign(half: float, diagonal: float) -> None:
+    factor, rest = torch.ones(1, 1, 1, dtype=torch.float64), torch.full((1, 1), diagonal, dtype=torch.float64)
+    scaling = scaling_from_moment(factor, rest, torch.full((1, 1, 1), 2 * half, dtype=torch.float64))
+    assert scaling > 0
+    torch.testing.assert_close(scaling * (2 * half + diagonal * scaling), torch.ones_like(scaling), atol=0, rtol=1e-9)
+
+
+@pytest.mark.parametrize("start", [1e-6, 1.0, 1e6])
+def test_the_damped_method_converges_from_any_start(start: float) -> None:
+    factor = noise(2, 5, 60, seed=3) - 0.3  # with negative affinities
+    factor = factor / factor.norm(dim=1, keepdim=True).clamp(min=1.0)
+    diagonal = (1 - factor.square().sum(1)).clamp(min=0.01)
+    assert (factor.mT @ factor).min() < -0.05
+    scaling = torch.full((2, 60), start, dtype=torch.float64)
+    infinite = torch.full((2,), torch.inf, dtype=torch.float64)
+    begun = Solution(scaling, factor @ scaling.unsqueeze(2), infinite, 0, torch.eye(5).double().expand(2, -1, -1))
+    found = damped(KernelMatrix(factor, diagonal), begun, 1e-12)
+    sums = found.scaling * ((factor.mT @ found.moment).squeeze(2) + diagonal * found.scaling)
+    torch.testing.assert_close(sums, torch.ones_like(sums), atol=1e-11, rtol=0)
+    assert found.residual.max() < 1e-11
+
+
+def test_damped_steps_take_over_where_sweeps_do_not_converge() -> None:
+    """The scaling d of a pixel exceeds the bound of the sweeps."""
+    factor = torch.tensor([[[1.0, -0.9, -0.9, 0.4]]], dtype=torch.float64)
+    diagonal = 1 - factor.square().sum(1) + 1e-3
+    result = sinkhorn_balance(factor, diagonal, completed=True)
+    assert result.scaling.max() > LARGEST
+    sums = result.scaling * ((factor.mT @ result.moment).squeeze(2) + diagonal * result.scaling)
+    torch.testing.assert_close(sums, torch.ones_like(sums), atol=1e-11, rtol=0)
+
+
+def test_damped_steps_balance_weighted_points() -> None:
+    factor = noise(1, 4, 30, seed=3) - 0.3
+    factor = factor / factor.norm(dim=1, keepdim=True).clamp(min=1.0)
+    diagonal, weights = (1 - factor.square().sum(1)).clamp(min=0.01), noise(1, 30, seed=5) * 9 + 0.5
+    scaling = torch.full((1, 30), 1e4, dtype=torch.float64)
+    start = Solution(
+        scaling, factor @ scaling.unsqueeze(2), torch.full((1,), torch.inf).double(), 0, torch.eye(4).double()
+    )
+    found = damped(KernelMatrix(factor, diagonal, weights), start, 1e-12)
+    sums = found.scaling * ((factor.mT @ found.moment).squeeze(2) + diagonal * found.scaling)
+    torch.testing.assert_close(sums, torch.ones_like(sums), atol=1e-11, rtol=0)
+    total = factor @ (weights * found.scaling).unsqueeze(2)
+    torch.testing.assert_close(found.moment, total, atol=1e-9, rtol=0)
