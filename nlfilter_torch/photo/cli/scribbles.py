@@ -2,10 +2,10 @@
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import ClassVar, Self
 
 import numpy as np
 import torch
@@ -14,9 +14,10 @@ from PIL import ImageColor
 from torch import Tensor
 
 from nlfilter_torch.photo.cli.options import parse_sliders
-from nlfilter_torch.photo.declared.steps import Step
+from nlfilter_torch.photo.declared.declaration import Edit
 from nlfilter_torch.photo.io.photographs import check_depth
 from nlfilter_torch.photo.io.rows import StoredPicture
+from nlfilter_torch.photo.picture.drawn import Drawn
 from nlfilter_torch.photo.tiled.pictures import LazyRows, Picture, mask_of, transparency
 
 Size = tuple[int, int]  # (height, width) of the photograph
@@ -135,9 +136,13 @@ class Overlay(ABC):
         assert picture is not None  # for mypy
         return LazyRows(self.shape[:2], lambda rows: holds(self._of_picture(rows, picture)[..., self.marked])).any()
 
+    def planes(self, rows: slice) -> Tensor:
+        """Some rows, as planes (1, S, h, W)."""
+        return torch.from_numpy(self[rows]).permute(2, 0, 1)[None]
+
     def at_once(self) -> Tensor:
         """All rows, as planes (1, S, H, W)."""
-        return torch.from_numpy(self[slice(0, self.shape[0])]).permute(2, 0, 1)[None].contiguous()
+        return self.planes(slice(0, self.shape[0])).contiguous()
 
 
 class Regions(Overlay):
@@ -174,33 +179,76 @@ class Strokes(Overlay):
         return np.concatenate([colours.to(torch.float32), transparency(tile, "float32")], axis=2)
 
 
-def of_edit(step: Step, size: Size, given: Mapping[str, Any], read: Open) -> tuple[tuple[Any, ...], dict[str, Any]]:
-    """Read scribbles and masks from the options of an edit; as in :func:`scribbles_of`, but sources of rows."""
-    mask, regions = given.get("mask"), given.get("region")
-    if step.edit in ("recolor", "colorize"):
-        keep = selection(size, None, given.get("keep"), "--keep", read)
-        strokes = _strokes(size, given.get("strokes"), regions, read)
-        return (strokes, None), {} if keep is None else {"keep": keep}
-    if step.edit == "defocus":
-        focus = selection(size, mask, regions, "--region", read)
-        if focus is None:
-            raise ValueError(
-                "give --region X,Y,W,H or --mask FILE to mark what stays sharp, such as --region 190,60,60,60"
-            )
-        background = selection(size, None, given.get("background"), "--background", read)
-        return (focus,), {} if background is None else {"background": background}
-    if step.edit != "detail" or (mask is None and not regions):
-        return (), {}
-    masks, sliders = _slider_regions(size, mask, regions, torch.tensor(step["alpha"]), read)
-    return (masks,), {"alpha": sliders}
+@dataclass(frozen=True)
+class ScribbleOptions:
+    """The options of a command that mark parts of a photograph.
+
+    Attributes:
+        region: rectangles on the objects.
+        strokes: a picture of coloured scribbles.
+        mask: a picture of the objects.
+        backgrounds: rectangles on the background, by their options.
+    """
+
+    region: list[str] | None = None
+    strokes: Path | None = None
+    mask: Path | None = None
+    backgrounds: Mapping[str, list[str] | None] = field(default_factory=dict)
+
+    @property
+    def marks_objects(self) -> bool:
+        """Whether an object is marked."""
+        return bool(self.region) or self.mask is not None or self.strokes is not None
+
+    @property
+    def called(self) -> str:
+        """Name of the coloured scribbles in errors."""
+        return "--region" if self.strokes is None else str(self.strokes)
 
 
-def at_once(scribbles: tuple[Any, ...], named: dict[str, Any]) -> tuple[tuple[Tensor, ...], dict[str, Any]]:
-    """Convert the result of :func:`of_edit` to tensors."""
-    planes = [rows.at_once() for rows in scribbles if rows is not None]
-    if scribbles and isinstance(scribbles[0], Strokes):
-        planes = list(planes[0].split([3, 1], dim=1))
-    return tuple(planes), {name: v.at_once() if isinstance(v, Overlay) else v for name, v in named.items()}
+def of_edit(
+    edit: Edit, alpha: tuple[float, ...] | None, size: Size, options: ScribbleOptions, read: Open
+) -> Drawn[Overlay]:
+    """Read the scribbles and masks of an edit from options, as rows.
+
+    ``alpha`` are the sliders of regions without their own, if the edit takes regions that have sliders.
+    """
+    masks: dict[str, Overlay] = {}
+    colours, sliders = None, None
+    for scribble in edit.scribbles:
+        region: Overlay | None = None
+        if scribble.kind == "colours":
+            colours = _strokes(size, options.strokes, options.region, read)
+        elif scribble.role == "background":
+            texts = options.backgrounds.get(scribble.option)
+            region = selection(size, None, texts, scribble.option, read)
+        elif alpha is not None and scribble.kind == "sliders":
+            if options.marks_objects:
+                region, sliders = _slider_regions(size, options.mask, options.region, torch.tensor(alpha), read)
+        else:
+            region = selection(size, options.mask, options.region, "--region", read)
+            if region is None and scribble.needed:
+                raise ValueError(scribble.advice)
+        masks |= {} if region is None else {scribble.argument: region}
+    return Drawn(masks, colours, sliders)
+
+
+def at_once(edit: Edit, drawn: Drawn[Overlay]) -> Drawn[Tensor]:
+    """Convert scribbles to tensors."""
+    masks, colours = {name: overlay.at_once() for name, overlay in drawn.masks.items()}, None
+    if drawn.colours is not None:
+        colours, mask = drawn.colours.at_once().split([3, 1], dim=1)
+        masks |= {scribble.argument: mask for scribble in edit.scribbles if scribble.kind == "colours"}
+    return Drawn(masks, colours, drawn.sliders)
+
+
+def overlays(edit: Edit, drawn: Drawn[Overlay]) -> Iterator[tuple[str, Overlay]]:
+    """Yield the scribbles of an edit, with the option that they come from."""
+    if drawn.colours is not None:
+        yield "--region", drawn.colours
+    for scribble in edit.scribbles:
+        if scribble.argument in drawn.masks:
+            yield scribble.option or "--region", drawn.masks[scribble.argument]
 
 
 def _strokes(size: Size, path: Path | None, regions: list[str] | None, read: Open) -> Strokes:

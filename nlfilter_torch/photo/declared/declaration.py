@@ -187,24 +187,24 @@ class Parameter:
             return max(value / 100 * min(size), self.min_pixels)
         return value / stride if self.unit == "px" and self.kind == "number" else value
 
-    def pixels(self, given: float | None, size: tuple[int, int]) -> float:
+    def pixels(self, value: float | None, size: tuple[int, int]) -> float:
         """Return a length in pixels for an image of that size: the one given to the function, or the default."""
-        return float(self.argument_of(self.default, size) if given is None else given)
+        return float(self.argument_of(self.default, size) if value is None else value)
 
-    def distance(self, given: Any, size: Sequence[int]) -> Any:
-        """Return a distance in pixels for a picture (H, W): the one given to the function, or :attr:`share` for None.
+    def distance(self, value: Any, size: Sequence[int]) -> Any:
+        """Return a distance in pixels for a picture (H, W): the function's argument, or for None :attr:`share` if any.
 
         It is relative so that a preview and the photograph agree. The word ``"none"`` gives None, for no limit.
 
         Raises:
             ValueError: if another word is given.
         """
-        if isinstance(given, str) and self.words:
+        if isinstance(value, str) and self.words:
             from nlfilter_torch.core.checks import check_choice
 
-            check_choice(given, self.keyword, self.words)
+            check_choice(value, self.keyword, self.words)
             return None
-        return self.share * min(size) if given is None else given
+        return self.share * min(size) if value is None and self.share else value
 
     def check_argument(self, value: Any, batch: int | None = None) -> None:
         """Check that a function can take ``value``; with ``batch``, if :attr:`per_image`, also shape () or (batch,).
@@ -229,9 +229,61 @@ class Parameter:
                 checks.check_values(value, name, self.domain, batch, self.zero_meaning)
 
 
+ScribbleKind = Literal["colours", "mask", "sliders"]
+ScribbleRole = Literal["object", "background"]
+
+
+@dataclass(frozen=True)
+class Scribble:
+    """A kind of scribbles that an edit takes.
+
+    Commands, files and the editor offer what is declared here; the edit's object receives the scribbles under the name
+    of the argument.
+
+    Attributes:
+        argument: name of the mask among the arguments of the edit's function.
+        word: meaning of a stroke in files; ``colour`` stands for any colour.
+        label: text of the brush in the editor.
+        kind: ``"colours"`` are scribbles whose colours count, ``"mask"`` is a single mask, and ``"sliders"`` are masks
+            of several regions that have sliders of their own.
+        role: ``"object"`` marks what the edit changes, or keeps sharp; ``"background"`` marks what it leaves out.
+            Scribbles on the object cover those on the background.
+        needed: whether the edit has no effect without them.
+        option: for the background, the option of the command that takes a rectangle; without one, the command does not
+            offer these scribbles.
+        option_help: description of that option.
+        advice: for objects that are needed, the error of the command if there are none.
+    """
+
+    argument: str
+    word: str
+    label: str
+    kind: ScribbleKind = "mask"
+    role: ScribbleRole = "object"
+    needed: bool = False
+    option: str = ""
+    option_help: str = ""
+    advice: str = ""
+
+
+@dataclass(frozen=True)
+class Condition:
+    """A value of another parameter without which a parameter has no effect.
+
+    Attributes:
+        name: the other parameter.
+        value: its value.
+        note: what the command says after the name of an option that has no effect.
+    """
+
+    name: str
+    value: str
+    note: str
+
+
 @dataclass(frozen=True)
 class Edit:
-    """An edit and its parameters.
+    """What an edit is called, takes and offers; :mod:`nlfilter_torch.photo.edits` holds what it does.
 
     Attributes:
         name: name of its command, and of its steps in files.
@@ -239,9 +291,12 @@ class Edit:
         parameters: parameters of the edit itself, then those of its filter.
         function: public name of its function, if that is not ``name``.
         hint: sentence shown in the editor.
-        brushes: what strokes can mean, each with its label in the editor; ``colour`` stands for any colour.
-        requires_strokes: whether the edit has no effect without strokes.
+        scribbles: the kinds of scribbles that it takes, the one on the object first.
         coloured: whether the edit turns a grey photograph into a colour one.
+        map_help: description of the option ``--map``, if the edit can draw a map of what it estimates.
+        presets: names of the edits, besides this one, of which the command takes a single step as a preset; without any
+            it takes no presets.
+        filter_condition: when the parameters of the filter have an effect; None is always.
     """
 
     name: str
@@ -249,9 +304,11 @@ class Edit:
     parameters: tuple[Parameter, ...]
     function: str = ""
     hint: str = ""
-    brushes: tuple[tuple[str, str], ...] = ()
-    requires_strokes: bool = False
+    scribbles: tuple[Scribble, ...] = ()
     coloured: bool = False
+    map_help: str = ""
+    presets: tuple[str, ...] = ()
+    filter_condition: Condition | None = None
 
     def __iter__(self) -> Iterator[Parameter]:
         """Iterate over the parameters."""
@@ -273,8 +330,23 @@ class Edit:
 
     @property
     def words(self) -> tuple[str, ...]:
-        """The words of :attr:`brushes`."""
-        return tuple(word for word, _ in self.brushes)
+        """The meanings that strokes can have."""
+        return tuple(scribble.word for scribble in self.scribbles)
+
+    @property
+    def requires_strokes(self) -> bool:
+        """Whether the edit has no effect without strokes."""
+        return any(scribble.needed for scribble in self.scribbles)
+
+    @property
+    def backgrounds(self) -> tuple[Scribble, ...]:
+        """The scribbles on the background that the command offers."""
+        return tuple(scribble for scribble in self.scribbles if scribble.option)
+
+    @property
+    def regional(self) -> Scribble | None:
+        """The scribbles on regions that have sliders of their own, if the edit takes such."""
+        return next((scribble for scribble in self.scribbles if scribble.kind == "sliders"), None)
 
 
 def parse_json(text: str | bytes, name: str, remedy: str) -> Any:

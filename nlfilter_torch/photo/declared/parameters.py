@@ -5,7 +5,15 @@
 
 from dataclasses import replace
 
-from nlfilter_torch.photo.declared.declaration import FILTER_PANEL, GAINS, Edit, Parameter, Slider
+from nlfilter_torch.photo.declared.declaration import (
+    FILTER_PANEL,
+    GAINS,
+    Condition,
+    Edit,
+    Parameter,
+    Scribble,
+    Slider,
+)
 from nlfilter_torch.photo.declared.shared_parameters import (
     LIMITS,
     LOOK,
@@ -22,6 +30,7 @@ from nlfilter_torch.photo.declared.shared_parameters import (
 )
 
 CRISP = (2.2, 2.2, 2.2, 1.0)
+BACKGROUND_HELP = "A rectangle of the background, where too much is selected. May be repeated."
 
 DETAIL = Edit(
     "detail",
@@ -92,7 +101,11 @@ DETAIL = Edit(
     ),
     function="enhance",
     hint="Paint on an area to give it its own sliders; everything that resembles it is selected too.",
-    brushes=(("in", "Edit this"), ("out", "Not this")),
+    scribbles=(
+        Scribble("regions", "in", "Edit this", "sliders"),
+        Scribble("negative", "out", "Not this", role="background"),
+    ),
+    presets=("look",),
 )
 
 SHARPEN = Edit(
@@ -199,6 +212,10 @@ DENOISE = Edit(
         *filter_parameters(share=0.2, landmarks=200),
     ),
     hint="Estimates the noise and removes as much of it as you choose.",
+    map_help="Also write a picture of the standard deviation of the noise at every pixel; white is 64 grey levels.",
+    filter_condition=Condition(
+        "method", "rule", "has no effect on the network; add --method rule to denoise by the filter alone"
+    ),
 )
 
 RECOLOR = Edit(
@@ -229,8 +246,17 @@ RECOLOR = Edit(
         *filter_parameters(share=1.2, patch_size=1)[1:],
     ),
     hint="Choose a colour and paint some of it on an object; similar areas take it too.",
-    brushes=(("colour", "Paint"), ("keep", "Keep as it is")),
-    requires_strokes=True,
+    scribbles=(
+        Scribble("stroke_mask", "colour", "Paint", "colours", needed=True),
+        Scribble(
+            "keep",
+            "keep",
+            "Keep as it is",
+            role="background",
+            option="--keep",
+            option_help="A rectangle; everything that resembles it stays unchanged. May be repeated.",
+        ),
+    ),
 )
 
 COLORIZE = Edit(
@@ -265,8 +291,7 @@ COLORIZE = Edit(
         *filter_parameters(bandwidth=40.0, share=0.7, patch_size=1)[:4],
     ),
     hint="For grey photographs: paint some colours, and they spread over similar areas nearby.",
-    brushes=(("colour", "Paint"),),
-    requires_strokes=True,
+    scribbles=(Scribble("stroke_mask", "colour", "Paint", "colours", needed=True),),
     coloured=True,
 )
 
@@ -300,8 +325,18 @@ DEFOCUS = Edit(
         *filter_parameters(share=0.3, patch_size=1)[1:],
     ),
     hint="Paint on some of the object to keep sharp; the rest of it is found, and the background is blurred.",
-    brushes=(("in", "Keep sharp"), ("out", "Blur this")),
-    requires_strokes=True,
+    scribbles=(
+        Scribble(
+            "focus_region",
+            "in",
+            "Keep sharp",
+            needed=True,
+            advice="give --region X,Y,W,H or --mask FILE to mark what stays sharp, such as --region 190,60,60,60",
+        ),
+        Scribble(
+            "background", "out", "Blur this", role="background", option="--background", option_help=BACKGROUND_HELP
+        ),
+    ),
 )
 
 MASK = Edit(
@@ -322,6 +357,18 @@ MASK = Edit(
         *(p for p in filter_parameters(share=0.45)[1:] if p.name != "patch_size"),
     ),
     function="region_mask",
+    scribbles=(
+        Scribble(
+            "scribbles",
+            "in",
+            "Select this",
+            needed=True,
+            advice="give --region X,Y,W,H or --mask FILE to mark part of the object, such as --region 190,60,60,60",
+        ),
+        Scribble(
+            "background", "out", "Not this", role="background", option="--background", option_help=BACKGROUND_HELP
+        ),
+    ),
 )
 
 ABSTRACT = Edit(

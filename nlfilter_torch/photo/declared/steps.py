@@ -82,8 +82,13 @@ class Step:
         return inside or (1.0,) * len(self["alpha"])
 
     def has_region(self) -> bool:
-        """Whether this is a detail step with a region that has sliders of its own."""
-        return self.edit == "detail" and bool(self.painted("in"))
+        """Whether a region has sliders of its own."""
+        regional = self.declared.regional
+        return regional is not None and bool(self.painted(regional.word))
+
+    def is_drawn(self) -> bool:
+        """Whether the edit uses strokes: it requires them, or a region has sliders of its own."""
+        return self.declared.requires_strokes or self.has_region()
 
     def changes(self) -> bool:
         """Whether the step has any effect."""
@@ -149,18 +154,18 @@ class Step:
         parameters = {parameter.name: parameter for parameter in declared}
         strokes: tuple[Stroke, ...] = ()
         for entry, value in entries.items():
-            if entry == "strokes" and declared.brushes:
+            if entry == "strokes" and declared.scribbles:
                 strokes = _read_strokes(value, declared, place)
                 continue
             if entry not in parameters:
-                names = [*parameters, *(["strokes"] if declared.brushes else [])]
+                names = [*parameters, *(["strokes"] if declared.scribbles else [])]
                 raise ValueError(f"{place} must have no entries other than {', '.join(names)}, got {entry}; remove it")
             if not parameters[entry].is_valid(value):
                 wanted = parameters[entry].wanted
                 raise ValueError(f"{entry} of {place} must be {wanted}, got {shown(value)}; correct it")
             values[entry] = tuple(map(float, value)) if isinstance(value, list) else value
         step = Step(edit, strokes, **values)
-        if edit == "detail" and len(step.sliders_inside) != len(step["alpha"]):
+        if declared.regional is not None and len(step.sliders_inside) != len(step["alpha"]):
             raise ValueError(f"inside of {place} must have as many numbers as alpha; add or drop some")
         return step
 

@@ -3,17 +3,26 @@
 Edges and tones after Winnemoeller, Olsen and Gooch, "Real-Time Video Abstraction", SIGGRAPH 2006 (the paper's [30]).
 """
 
-from typing import Any
+from dataclasses import dataclass
+from functools import partial
+from typing import ClassVar
 
 import torch
 from torch import Tensor
 
 from nlfilter_torch.core.checks import check_count, check_reach
-from nlfilter_torch.operator.features import blur, blur_margin
+from nlfilter_torch.core.inner import Inner
+from nlfilter_torch.operator.features import GuideChannels, blur, blur_margin
+from nlfilter_torch.operator.landmarks import Sampling
+from nlfilter_torch.operator.nystrom import Completion
+from nlfilter_torch.operator.products import Columns
+from nlfilter_torch.photo.declared.declaration import Edit
 from nlfilter_torch.photo.declared.parameters import ABSTRACT
 from nlfilter_torch.photo.edits.synthesis import synthesize
 from nlfilter_torch.photo.picture.colour import merge_luminance, split_luminance
-from nlfilter_torch.photo.picture.in_memory import edit_of
+from nlfilter_torch.photo.picture.drawn import Drawn, M
+from nlfilter_torch.photo.picture.edit import FilteredEdit, edit_image
+from nlfilter_torch.photo.picture.pixels import whole_image
 from nlfilter_torch.photo.picture.source import Fitted, Guide, Pixels, Planes, Source
 from nlfilter_torch.photo.picture.viewing import fit_change, viewed_size
 
@@ -28,10 +37,8 @@ MIN_SQUARED_GRADIENT = 1e-12  # lower limit of squared gradients; keeps the deri
 EDGE_GRADIENT = 2.0  # gradient of luminance from 0 to 100, per pixel of the viewing size, from which on steps are CRISP
 
 
-@edit_of("image")
 def abstract(
-    source: Source,
-    /,
+    image: Tensor,
     *,
     power: float | Tensor = ABSTRACT.defaults["power"],
     edges: float = ABSTRACT.defaults["edges"],
@@ -42,8 +49,11 @@ def abstract(
     spatial_bandwidth: float | Tensor | None = None,
     patch_size: int = ABSTRACT.defaults["patch_size"],
     num_landmarks: int = ABSTRACT.defaults["num_landmarks"],
-    **options: Any,
-) -> Fitted:
+    landmarks: Sampling = ABSTRACT.defaults["landmarks"],
+    completion: Completion = "diagonal",
+    guide_channels: GuideChannels = "all",
+    generator: torch.Generator | None = None,
+) -> Tensor:
     """Remove small detail from a photograph and keep its outlines: ``W^k y`` with a fractional k.
 
     Paper: Sec. V-D. The kernel compares colours and has a spatial term, so that the filter is local. Lines along edges
@@ -62,7 +72,10 @@ def abstract(
         spatial_bandwidth: h_x in pixels; None is 0.15 of the short side.
         patch_size: width of the compared patches.
         num_landmarks: M; fewer give coarser pictures.
-        **options: further options of :func:`nonlocal_operator`.
+        landmarks: how the landmarks are chosen, see :func:`nonlocal_operator`.
+        completion: of the kernel's diagonal, see :func:`nonlocal_operator`.
+        guide_channels: what the filter compares, ``"luminance"`` or ``"all"`` channels.
+        generator: source of randomness for the landmarks; None draws the same for every call.
 
     Returns:
         (B, C, H, W). Differentiable in image and power; the bandwidth ``"auto"`` counts as a constant.
@@ -77,67 +90,117 @@ def abstract(
         >>> bool((abstract(image, power=0.0, num_landmarks=50) - image).abs().max() < 1e-5)
         True
     """
-    check_count(num_landmarks, "num_landmarks")
-    ABSTRACT.check(source.batch, power=power, edges=edges, edge_width=edge_width, viewing_size=viewing_size)
-    width = ABSTRACT["edge_width"].pixels(edge_width, source.size)
-    check_reach(width, "edge_width", source.size)
-    ABSTRACT.check(tones=tones)
-    if (edges > 0 or tones is not None) and source.channels not in (1, 3):
-        raise ValueError(f"image must have 1 or 3 channels for edges and tones, got {source.channels}; select 1 or 3")
+    edit = Abstract(
+        power=power,
+        edges=edges,
+        edge_width=edge_width,
+        tones=tones,
+        viewing_size=viewing_size,
+        photometric_bandwidth=photometric_bandwidth,
+        spatial_bandwidth=spatial_bandwidth,
+        patch_size=patch_size,
+        num_landmarks=num_landmarks,
+        landmarks=landmarks,
+        completion=completion,
+        guide_channels=guide_channels,
+        generator=generator,
+    )
+    return edit_image(edit, image)
 
-    def change(viewed: Source) -> Fitted:
-        flat = flattened(
-            viewed,
-            power,
-            num_landmarks=num_landmarks,
-            spatial_bandwidth=spatial_bandwidth,
-            photometric_bandwidth=photometric_bandwidth,
-            patch_size=patch_size,
-            **options,
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Abstract(FilteredEdit):
+    """The edit of :func:`abstract`."""
+
+    declared: ClassVar[Edit] = ABSTRACT
+    power: float | Tensor
+    edges: float
+    edge_width: float | None
+    tones: int | None
+    viewing_size: float
+    guide_channels: GuideChannels = "all"
+
+    def fit(self, source: Source[M], drawn: Drawn[M]) -> Fitted:
+        """Fit the flattened picture, with lines and tones."""
+        check_count(self.num_landmarks, "num_landmarks")
+        ABSTRACT.check(source.batch, power=self.power, edges=self.edges, edge_width=self.edge_width)
+        ABSTRACT.check(source.batch, viewing_size=self.viewing_size)
+        width = ABSTRACT["edge_width"].pixels(self.edge_width, source.size)
+        check_reach(width, "edge_width", source.size)
+        ABSTRACT.check(tones=self.tones)
+        if (self.edges > 0 or self.tones is not None) and source.channels not in (1, 3):
+            raise ValueError(
+                f"image must have 1 or 3 channels for edges and tones, got {source.channels}; select 1 or 3"
+            )
+        fitted = fit_change(source, self._change, whole_image, self.viewing_size, "none")
+        if self.edges == 0 and self.tones is None:
+            return fitted
+        scale = source.size[0] / viewed_size(source.size, self.viewing_size)[0]
+        drawing = partial(_drawn, edges=self.edges, width=width, tones=self.tones, scale=scale)
+        return Fitted(fitted.pixels, drawing, margin=blur_margin(WIDER * width) + 1)
+
+    def _change(self, viewed: Source[M]) -> Fitted:
+        """The change of a picture at the viewing size."""
+        return Fitted(self.flattened(viewed).change)
+
+    def flattened(self, source: Source[M]) -> "Flattened":
+        """Compute ``W^k y``."""
+        options = self.filter_options(
+            source.size, num_landmarks=min(self.num_landmarks, source.size[0] * source.size[1])
         )
-        return Fitted(lambda pixels: flat(pixels) - pixels.image)
+        operator = source.operator(Guide(options, spectral=True))
+        # W preserves constants, but the span of the factor need not contain them: filter without the mean.
+        mean = source.mean(whole_image)
+        exponent = torch.as_tensor(self.power, dtype=torch.float64, device=mean.device).reshape(-1, 1)
+        coefficients = operator.coefficients(partial(_varying, mean))
+        residual_exponent = RESIDUAL_EXPONENT * exponent.to(source.dtype).unsqueeze(2)
+        return Flattened(
+            mean,
+            captured=synthesize(operator, torch.ones_like, coefficients),
+            smoothed=synthesize(operator, partial(torch.pow, exponent=exponent), coefficients),
+            residual_gain=operator.each(partial(_residual_gain, residual_exponent)),
+        )
 
-    fitted = fit_change(source, change, lambda pixels: pixels.image, viewing_size, "none")
-    if edges == 0 and tones is None:
-        return fitted
-    scale = source.size[0] / viewed_size(source.size, viewing_size)[0]
-    return Fitted(
-        fitted.pixels,
-        lambda _, planes, __: draw(planes, edges, width, tones, scale),
-        margin=blur_margin(WIDER * width) + 1,
-    )
+
+def _drawn(
+    _: Tensor, planes: Tensor, __: Inner, *, edges: float, width: float, tones: int | None, scale: float
+) -> Tensor:
+    return draw(planes, edges, width, tones, scale)
 
 
-def flattened(
-    source: Source,
-    power: float | Tensor,
-    *,
-    num_landmarks: int,
-    spatial_bandwidth: float | Tensor | None,
-    **options: Any,
-) -> Planes:
-    """Compute ``W^k y``."""
-    options = {"guide_channels": "all"} | options
-    options |= {
-        "num_landmarks": min(num_landmarks, source.size[0] * source.size[1]),
-        "spatial_bandwidth": ABSTRACT["spatial_bandwidth"].distance(spatial_bandwidth, source.size),
-    }
-    operator = source.operator(Guide(options, spectral=True))
-    # W preserves constants, but the span of the factor need not contain them: filter without the mean.
-    mean = source.mean(lambda pixels: pixels.image)
+def _varying(mean: Tensor, pixels: Pixels) -> Tensor:
+    return pixels.image - mean
 
-    def varying(pixels: Pixels) -> Tensor:
-        return pixels.image - mean
 
-    exponent = torch.as_tensor(power, dtype=torch.float64, device=mean.device).reshape(-1, 1)
-    coefficients = operator.coefficients(varying)
-    captured = synthesize(operator, torch.ones_like, coefficients)
-    smoothed = synthesize(operator, lambda eigenvalues: eigenvalues**exponent, coefficients)
-    residual_exponent = RESIDUAL_EXPONENT * exponent.to(source.dtype).unsqueeze(2)
-    residual_gain = operator.each(
-        lambda columns: columns.remainder.clamp(MIN_REMAINDER, 1.0).unsqueeze(1) ** residual_exponent
-    )
-    return lambda pixels: mean + smoothed(pixels) + residual_gain(pixels) * (varying(pixels) - captured(pixels))
+def _residual_gain(exponent: Tensor, columns: Columns) -> Tensor:
+    """Gain (B, 1, n) of what the eigenvectors do not capture."""
+    return columns.remainder.clamp(MIN_REMAINDER, 1.0).unsqueeze(1) ** exponent
+
+
+@dataclass(frozen=True, eq=False)
+class Flattened:
+    """``W^k y`` of a picture y.
+
+    Attributes:
+        mean: of the picture, (B, C, 1, 1); what follows is of the picture less its mean.
+        captured: projected on the eigenvectors.
+        smoothed: and filtered.
+        residual_gain: gain of the rest.
+    """
+
+    mean: Tensor
+    captured: Planes
+    smoothed: Planes
+    residual_gain: Planes
+
+    def __call__(self, pixels: Pixels) -> Tensor:
+        """The flattened pixels."""
+        residual = pixels.image - self.mean - self.captured(pixels)
+        return self.mean + self.smoothed(pixels) + self.residual_gain(pixels) * residual
+
+    def change(self, pixels: Pixels) -> Tensor:
+        """The change of the pixels."""
+        return self(pixels) - pixels.image
 
 
 def draw(flat: Tensor, edges: float, width: float, tones: int | None, scale: float = 1.0) -> Tensor:

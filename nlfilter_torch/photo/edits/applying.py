@@ -1,8 +1,6 @@
 """Applying a step to an image, and caching what later steps of the same kind can reuse."""
 
-from collections.abc import Callable, Sequence
-from functools import lru_cache, partial
-from typing import Any
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
@@ -12,141 +10,108 @@ from nlfilter_torch.core.precision import full_precision, working_dtype
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.declared.shared_parameters import FILTER
 from nlfilter_torch.photo.declared.steps import Step
-from nlfilter_torch.photo.declared.strokes import Stroke
-from nlfilter_torch.photo.edits.abstract import abstract
-from nlfilter_torch.photo.edits.colorize import colorize
-from nlfilter_torch.photo.edits.defocus import defocus
-from nlfilter_torch.photo.edits.denoise import denoise
-from nlfilter_torch.photo.edits.detail import enhance
-from nlfilter_torch.photo.edits.look import apply_look
-from nlfilter_torch.photo.edits.recolor import recolor
-from nlfilter_torch.photo.edits.sharpen import sharpen
-from nlfilter_torch.photo.edits.tone import adjust_tone
-from nlfilter_torch.photo.picture.in_memory import InMemory, edited
-from nlfilter_torch.photo.picture.painting import mask_of, paint
+from nlfilter_torch.photo.edits.table import EDIT_OF
+from nlfilter_torch.photo.picture.drawn import Drawn, M, Painter, TensorPainter
+from nlfilter_torch.photo.picture.edit import PhotoEdit
+from nlfilter_torch.photo.picture.in_memory import InMemory
 from nlfilter_torch.photo.picture.source import Fitted, Source, seeded
 from nlfilter_torch.photo.picture.viewing import viewed_size
 
-#: The function of each edit.
-FUNCTIONS: dict[str, Any] = {
-    "detail": enhance,
-    "sharpen": sharpen,
-    "tone": adjust_tone,
-    "denoise": denoise,
-    "recolor": recolor,
-    "colorize": colorize,
-    "defocus": defocus,
-    "abstract": abstract,
-    "look": apply_look,
-}
 
-
-def check_channels(edit: str, channels: int) -> None:
-    """Raise if a grey photograph is to be recoloured."""
-    if edit == "recolor" and channels < 3:
-        raise ValueError("recolor needs a colour photograph, got a grey one; use colorize for grey photographs")
-
-
-def scribbles_of(
-    step: Step,
-    size: tuple[int, int],
-    colours: Callable[[Sequence[Stroke], tuple[int, int]], tuple[Any, ...]] = paint,
-    mask: Callable[..., Any] = mask_of,
-) -> tuple[tuple[Any, ...], dict[str, Any]]:
-    """Convert the strokes of a step to the function's arguments after an image (H, W), positional and by keyword.
-
-    ``colours`` and ``mask`` rasterise strokes to colours with their mask, and to a mask; by default to tensors.
+def scribbles_of(step: Step, size: tuple[int, int], painter: Painter[M]) -> Drawn[M]:
+    """Rasterise the strokes of a step over a picture (H, W).
 
     Raises:
         ValueError: if no pixel is under the strokes that mark the objects.
     """
+    if not step.is_drawn():
+        return Drawn()
+    masks: dict[str, M] = {}
+    colours: M | None = None
+    on_object = step.painted(step.declared.words[0])
+    for scribble in step.declared.scribbles:
+        strokes = step.painted(scribble.word)
+        if scribble.kind == "colours":
+            colours, mask = painter.colours(strokes, size)
+            _check_covered(step, painter, [colours if mask is None else mask])
+            masks |= {} if mask is None else {scribble.argument: mask}
+        elif scribble.role == "object":
+            masks[scribble.argument] = painter.mask(strokes, size)
+            _check_covered(step, painter, [masks[scribble.argument]])
+        elif strokes:
+            mask = painter.mask(strokes, size, above=on_object)
+            masks |= {scribble.argument: mask} if painter.covers(mask) else {}
+    if step.declared.regional is None:
+        return Drawn(masks, colours)
+    return Drawn(masks, colours, torch.tensor(step.sliders_inside)[None], torch.tensor(step["alpha"]))
 
-    def seen(planes: tuple[Any, ...]) -> tuple[Any, ...]:
-        """Return the planes of strokes, one of which is or has their mask."""
-        if not any(bool(plane.any()) for plane in planes if plane is not None):
-            raise ValueError(
-                f"strokes of {step.edit} must cover a pixel of the photograph, got none that do; move them"
-            )
-        return planes
 
-    def others(word: str, argument: str) -> dict[str, Any]:
-        """Return the argument for strokes that need not be there, and that those on objects may cover."""
-        strokes = step.painted(word)
-        if not strokes:
-            return {}
-        found = mask(strokes, size, above=step.painted(step.declared.words[0]))
-        return {argument: found} if bool(found.any()) else {}
+def _check_covered(step: Step, painter: Painter[M], marks: list[M]) -> None:
+    if not any(map(painter.covers, marks)):
+        raise ValueError(f"strokes of {step.edit} must cover a pixel of the photograph, got none that do; move them")
 
-    if step.edit in ("recolor", "colorize"):
-        return seen(colours(step.painted("colour"), size)), others("keep", "keep")
-    if step.edit == "defocus":
-        return seen((mask(step.painted("in"), size),)), others("out", "background")
-    if not step.has_region():
-        return (), {}
-    sliders = {"alpha": torch.tensor(step.sliders_inside)[None], "outside": torch.tensor(step["alpha"])}
-    return seen((mask(step.painted("in"), size),)), sliders | others("out", "negative")
+
+def edit_of(
+    step: Step, size: tuple[int, int], *, stride: float = 1, generator: torch.Generator | None = None
+) -> PhotoEdit:
+    """The edit of a step, with the settings for a picture.
+
+    Args:
+        step: step of an edit.
+        size: (H, W) of the picture.
+        stride: sampling step of the picture relative to the photograph, in pixels along each axis.
+        generator: source of randomness; None is that of the command line.
+    """
+    arguments = step.arguments(size, viewed_stride(step, size, stride))
+    return EDIT_OF[step.edit].of(arguments | {"generator": generator or seeded()})
 
 
 def fit_step(
     step: Step,
-    source: Source,
-    scribbles: tuple[Any, ...],
-    named: dict[str, Any],
+    source: Source[M],
+    drawn: Drawn[M],
     *,
     stride: float = 1,
     generator: torch.Generator | None = None,
 ) -> Fitted:
-    """Fit a step to a source, with the given scribbles in place of the step's own; see :func:`scribbles_of`.
+    """Fit a step to a picture, with the given scribbles in place of the step's own; see :func:`scribbles_of`.
 
     Args:
         step: step of an edit.
-        source: the picture; scribbles, also those in ``named``, are in the form that it takes.
-        scribbles: positional arguments of the edit after the picture.
-        named: further arguments of the edit.
+        source: the picture.
+        drawn: the scribbles.
         stride: sampling step of the source relative to the photograph, in pixels along each axis.
         generator: source of randomness; None is that of the command line.
     """
-    check_channels(step.edit, source.channels)
-    function = FUNCTIONS[step.edit]
-    arguments = step.arguments(source.size, viewed_stride(step, source.size, stride)) | named
-    if step.edit == "detail":
-        scribbles = (torch.as_tensor(arguments.pop("alpha")), *scribbles)
-    return function.fit(source, *scribbles, **arguments, generator=generator or seeded())
+    edit = edit_of(step, source.size, stride=stride, generator=generator)
+    edit.check_channels(source.channels)
+    return edit.fit(source, drawn)
 
 
 @full_precision
-def apply_to(
-    step: Step,
-    image: Tensor,
-    scribbles: tuple[Tensor, ...],
-    named: dict[str, Tensor],
-    *,
-    generator: torch.Generator | None = None,
-) -> Tensor:
-    """Apply a step to an image, with the given scribbles in place of the step's own; see :func:`scribbles_of`."""
-    check_photograph(image, "image")
-    return edited(image, partial(fit_step, step), scribbles, named, generator=generator)
-
-
 def apply_step(step: Step, image: Tensor, *, generator: torch.Generator | None = None) -> Tensor:
     """Apply a step to an image (B, C, H, W) in [0, 1]; without a generator, with the seed of the command line."""
-    return apply_to(step, image, *scribbles_of(step, (image.shape[-2], image.shape[-1])), generator=generator)
+    check_photograph(image, "image")
+    source = InMemory(image.to(working_dtype(image)))
+    drawn = scribbles_of(step, source.size, TensorPainter())
+    return source.all(fit_step(step, source, drawn, generator=generator)).to(image.dtype)
 
 
-def prepare(step: Step, image: Tensor, *, stride: float = 1) -> Callable[[Step], Tensor]:
-    """Return a function that applies steps with equal :func:`filter_key` to an image (1, C, H, W) in [0, 1].
+class PreparedStep:
+    """Applies steps with equal :func:`filter_key` to an image (1, C, H, W) in [0, 1].
 
     The filter is computed once, for the first of them, and strokes are rasterised once. ``stride`` is the sampling step
     of the image relative to the photograph.
     """
-    source = InMemory(image.to(working_dtype(image)), {})
-    colours, mask = lru_cache(maxsize=1)(paint), lru_cache(maxsize=2)(mask_of)
 
-    def edit(step: Step) -> Tensor:
-        fitted = fit_step(step, source, *scribbles_of(step, source.size, colours, mask), stride=stride)
-        return source.all(fitted).to(image.dtype)
+    def __init__(self, image: Tensor, *, stride: float = 1) -> None:
+        self._source, self._dtype, self._stride = InMemory(image.to(working_dtype(image)), {}), image.dtype, stride
+        self._painter = TensorPainter()
 
-    return edit
+    def __call__(self, step: Step) -> Tensor:
+        """Apply a step."""
+        drawn = scribbles_of(step, self._source.size, self._painter)
+        return self._source.all(fit_step(step, self._source, drawn, stride=self._stride)).to(self._dtype)
 
 
 def viewed_stride(step: Step, size: tuple[int, int], stride: float) -> float:

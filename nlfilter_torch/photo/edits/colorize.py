@@ -16,20 +16,22 @@ only where this reduces the chroma.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Literal, cast
+from typing import ClassVar, Generic, Literal, cast
 
 import torch
 from torch import Tensor
 
-from nlfilter_torch.core.checks import check_count, check_patch_size, check_positive, check_tensor
+from nlfilter_torch.core.checks import check_count, check_patch_size, check_positive
 from nlfilter_torch.core.precision import per_image
 from nlfilter_torch.filtering.masks import segment
 from nlfilter_torch.filtering.scribbles import fit_strokes
 from nlfilter_torch.operator.features import reduce_channels
+from nlfilter_torch.operator.products import Columns
 from nlfilter_torch.operator.spectrum import Spectrum
+from nlfilter_torch.photo.declared.declaration import Edit
 from nlfilter_torch.photo.declared.parameters import COLORIZE
 from nlfilter_torch.photo.picture.colour import (
     group_colours,
@@ -38,10 +40,20 @@ from nlfilter_torch.photo.picture.colour import (
     split_luminance,
     with_green,
 )
-from nlfilter_torch.photo.picture.in_memory import edit_of
+from nlfilter_torch.photo.picture.drawn import Drawn, M
+from nlfilter_torch.photo.picture.edit import PhotoEdit, Rows, edit_image
 from nlfilter_torch.photo.picture.pixels import part_of
-from nlfilter_torch.photo.picture.scribbled_pixels import scribbled_blocks
-from nlfilter_torch.photo.picture.source import Fitted, Guide, Operator, Planes, Source, luminance
+from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles, scribbled_blocks
+from nlfilter_torch.photo.picture.source import (
+    FilterOptions,
+    Fitted,
+    Guide,
+    Operator,
+    Pixels,
+    Planes,
+    Source,
+    luminance,
+)
 from nlfilter_torch.photo.picture.viewing import Coarse, viewed_size
 from nlfilter_torch.photo.selections.local_values import ABSOLUTE, RELATIVE, Links, LocalValues
 from nlfilter_torch.photo.selections.mask import blocks_of
@@ -91,6 +103,8 @@ LARGE_VARIANCE = 0.45  # of chroma among strokes on similar pixels
 MOST_CHANGE = 1.6
 SAME_ERROR = 0.13  # squared error of a predicted stroke that hardly counts
 ERROR_EXPONENT, MOST_WEIGHT = 2.0, 3.0  # exponent of the ratio of errors, and limit of the resulting factor
+COLOUR_ROWS = 16  # rows of a photograph that are read to see whether it is in colour
+COLOURED, COLOURED_SHARE = 0.04, 0.01  # difference of channels in a coloured pixel, and share of such pixels
 FEW_STROKES = 5  # number of compared strokes at which the factor is about half of that for many
 
 
@@ -100,10 +114,8 @@ def colorize_guide(image: Tensor) -> Tensor:
     return GUIDE_SCALE * with_texture(brightness, brightness, TEXTURE_WEIGHT)
 
 
-@edit_of("grey", channels=1)
 def colorize(
-    source: Source,
-    /,
+    grey: Tensor,
     strokes: Tensor,
     stroke_mask: Tensor,
     *,
@@ -116,7 +128,7 @@ def colorize(
     num_landmarks: int = COLORIZE.defaults["num_landmarks"],
     viewing_size: float = COLORIZE.defaults["viewing_size"],
     generator: torch.Generator | None = None,
-) -> Fitted:
+) -> Tensor:
     """Colour a grey image from strokes; its luminance is kept.
 
     Paper: Sec. V-B. ``"regression"`` extends the chroma of the strokes by :func:`propagate_strokes`, first over long
@@ -162,99 +174,211 @@ def colorize(
         >>> bool((colour[:, 2] > colour[:, 0])[..., :10].all()), bool((colour[:, 0] > colour[:, 2])[..., 14:].all())
         (True, True)
     """
-    if source.whole:  # otherwise they are checked when they are read
-        check_tensor(strokes, "strokes")
-    COLORIZE.check(method=method)
-    if method == "kmeans" and not source.whole:
-        raise ValueError(
-            "method must be regression for a picture processed in tiles, got kmeans, which needs all pixels in memory; "
-            "choose regression, or allow more memory"
-        )
-    COLORIZE.check(source.batch, strength=strength)
-    check_positive(time, "time", source.batch)
-    check_positive(photometric_bandwidth, "photometric_bandwidth", source.batch)
-    if spatial_bandwidth is not None:
-        check_positive(spatial_bandwidth, "spatial_bandwidth", source.batch)
-    check_patch_size(patch_size)
-    check_count(num_landmarks, "num_landmarks")
-    COLORIZE.check(viewing_size=viewing_size)
-    scribbles, viewed = source.scribbles(stroke_mask, strokes, "stroke_mask"), source
-    small = viewed_size(source.size, viewing_size)
-    if small != source.size:
-        viewed = source.resized(small)
-        steps = (source.size[0] / small[0], source.size[1] / small[1])
-        scribbles = blocks_of(scribbles, viewed, source.size, steps)
-    pixels = small[0] * small[1]
-    options = {"patch_size": patch_size, "num_landmarks": min(num_landmarks, pixels), "generator": generator}
-    ratio = viewed.measured(bandwidth_ratio)
-    mean = per_image(COLORIZE["spatial_bandwidth"].distance(spatial_bandwidth, small), ratio, 1)
-    bandwidths = mean / ratio.sqrt(), mean * ratio.sqrt()
+    edit = Colorize(
+        method=method,
+        strength=strength,
+        time=time,
+        photometric_bandwidth=photometric_bandwidth,
+        spatial_bandwidth=spatial_bandwidth,
+        patch_size=patch_size,
+        num_landmarks=num_landmarks,
+        viewing_size=viewing_size,
+        generator=generator,
+    )
+    return edit_image(edit, grey, Drawn({"stroke_mask": stroke_mask}, strokes), name="grey", channels=1)
 
-    def operator_of(stage: Stage) -> Operator:
-        scaled = {
-            "photometric_bandwidth": stage.photometric * photometric_bandwidth,
-            "spatial_bandwidth": tuple(stage.spatial * bandwidth for bandwidth in bandwidths),
-        }
-        return viewed.operator(Guide(options | scaled, colorize_guide, TEXTURE_MARGIN, 5, spectral=True))
 
-    assert scribbles.colours is not None  # for mypy
-    wanted = split_luminance(scribbles.colours.unsqueeze(2))[1].squeeze(2)  # (B, 3, n)
-    if method == "kmeans":
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Colorize(PhotoEdit):
+    """The edit of :func:`colorize`."""
+
+    declared: ClassVar[Edit] = COLORIZE
+    method: Method
+    strength: float | Tensor
+    time: float | Tensor = 1.0
+    photometric_bandwidth: float | Tensor
+    spatial_bandwidth: float | Tensor | None
+    patch_size: int
+    num_landmarks: int
+    viewing_size: float
+    generator: torch.Generator | None = None
+
+    def notes(self, rows: Rows) -> Iterator[str]:
+        """Note that a photograph in colour loses its own colours."""
+        height, step = rows.size[0], max(1, rows.size[0] // COLOUR_ROWS)
+        sample = torch.cat([rows.read(slice(y, y + 1)).float() for y in range(step // 2, height, step)], dim=2)
+        if bool(((sample.amax(1) - sample.amin(1)) > COLOURED).float().mean() > COLOURED_SHARE):
+            yield (
+                f"{rows.name} is in colour: colorize replaces its colours everywhere by those of the scribbles; "
+                "to change the colour of one object, use recolor"
+            )
+
+    def fit(self, source: Source[M], drawn: Drawn[M]) -> Fitted:
+        """Fit the colours to strokes."""
+        self._check(source)
+        scribbles = source.scribbles(drawn.masks.get("stroke_mask"), drawn.colours, "stroke_mask")
+        small = viewed_size(source.size, self.viewing_size)
+        viewed = source if small == source.size else source.resized(small)
+        if viewed is not source:
+            steps = (source.size[0] / small[0], source.size[1] / small[1])
+            scribbles = blocks_of(scribbles, viewed, source.size, steps)
+        ratio = viewed.measured(bandwidth_ratio)
+        mean = per_image(COLORIZE["spatial_bandwidth"].distance(self.spatial_bandwidth, small), ratio, 1)
+        operators = Operators(self, viewed, (mean / ratio.sqrt(), mean * ratio.sqrt()))
+        if scribbles.colours is None:  # no scribbles were painted, which the source refuses
+            raise ValueError("strokes must hold a painted pixel, got none; paint at least one")
+        wanted = split_luminance(scribbles.colours.unsqueeze(2))[1].squeeze(2)  # (B, 3, n)
+        if self.method == "kmeans":
+            return _coloured(source, viewed, self._segments(operators, scribbles, wanted))
+        return _coloured(source, viewed, Estimates.of(operators, scribbles, wanted[:, ::2], self.strength))
+
+    def _check(self, source: Source[M]) -> None:
+        """Raise an error for an invalid setting."""
+        COLORIZE.check(method=self.method)
+        if self.method == "kmeans":
+            source.check_all_in_memory(
+                "method must be regression for a picture processed in tiles, got kmeans, which needs all pixels in "
+                "memory; choose regression, or allow more memory"
+            )
+        COLORIZE.check(source.batch, strength=self.strength)
+        check_positive(self.time, "time", source.batch)
+        check_positive(self.photometric_bandwidth, "photometric_bandwidth", source.batch)
+        if self.spatial_bandwidth is not None:
+            check_positive(self.spatial_bandwidth, "spatial_bandwidth", source.batch)
+        check_patch_size(self.patch_size)
+        check_count(self.num_landmarks, "num_landmarks")
+        COLORIZE.check(viewing_size=self.viewing_size)
+
+    def _segments(self, operators: "Operators[M]", scribbles: Scribbles, wanted: Tensor) -> Planes:
+        """Chroma, red and blue, of the segment of each pixel."""
         regions, colours, valid = group_colours(wanted.unsqueeze(2), scribbles.weights.unsqueeze(2))
-        planes = scribbles.weighted(regions.squeeze(2)).planes(viewed)
-        pieces = segment(cast(Spectrum, operator_of(FAR).pairs), planes, time, valid)
-        chroma = torch.einsum("bkhw,bkc->bchw", pieces, colours)
-        return _coloured(source, viewed, part_of(chroma[:, ::2]))
-    wanted = wanted[:, ::2]  # green follows from red and blue
-    mean_square = region_means(squared_sum(wanted).unsqueeze(2), scribbles.weights.unsqueeze(2))  # (B, 1, 1)
-    saturation = (mean_square + NO_CHROMA).sqrt()
-    wanted = wanted / saturation
+        planes = operators.viewed.all(Fitted(scribbles.weighted(regions.squeeze(2)).planes))
+        pieces = segment(cast(Spectrum, operators.of(FAR).pairs), planes, self.time, valid)
+        return part_of(torch.einsum("bkhw,bkc->bchw", pieces, colours)[:, ::2])
 
-    usual_there = usual_chroma(scribbles.image.unsqueeze(2)).squeeze(2)
-    # Cubed, so that pixels partly covered by the border of a scribble count little; how many there are depends on the
-    # size of the picture.
-    cubed, scaled = scribbles.weights**3, wanted / usual_there.sqrt()
 
-    groups = StrokeGroups.of(scribbles, small)
+@dataclass(frozen=True, eq=False)
+class Operators(Generic[M]):
+    """The operators of a picture for the stages of a regression.
 
-    def propagated(links: Links, values: Tensor, predicted: Tensor | None = None) -> LocalValues:
-        guide, places = viewed.reduced(luminance, links.step(small)), scribbles.places
-        solved = partial(LocalValues.of, links, guide, small, places, cubed, values, groups, predicted)
-        return viewed.kept(links, [guide, places, cubed, values], solved)
+    Attributes:
+        settings: of the edit.
+        viewed: the picture at the viewing size.
+        bandwidths: vertical and horizontal bandwidth, (B,) each.
+    """
 
-    def interpolated(found: LocalValues, some: Any, own: Tensor) -> Tensor:
-        place = (found.links, some.first, some.image.shape)
-        return viewed.kept(place, [found.values], lambda: found(own, some.first))
+    settings: Colorize
+    viewed: Source[M]
+    bandwidths: tuple[Tensor, Tensor]
 
-    absolute = propagated(ABSOLUTE, scaled)
-    relative = propagated(RELATIVE, torch.cat([scaled, wanted], dim=1), wanted)
-    weights = [scribbles.weights, *groups.weights_without_each(scribbles.weights)]
-    (far, near), residuals = extended(operator_of, scribbles.places, weights, wanted / usual_there, pixels, strength)
-    everywhere = per_image(strength, wanted, 4)
-    regression_weight = factor_of_count(0)
-    if relative.left_out is not None:
-        residual = groups.of_own(residuals[1:]) * usual_there
-        regression_weight = compared(groups, scribbles.weights, residual, wanted, relative.left_out)
+    @property
+    def pixels(self) -> int:
+        """Number of pixels of the picture."""
+        return self.viewed.size[0] * self.viewed.size[1]
 
-    def chroma_of(some: Any) -> Tensor:
-        own = luminance(some)
+    def of(self, stage: Stage) -> Operator:
+        """Build the operator of a stage."""
+        options = FilterOptions(
+            photometric_bandwidth=stage.photometric * self.settings.photometric_bandwidth,
+            spatial_bandwidth=(stage.spatial * self.bandwidths[0], stage.spatial * self.bandwidths[1]),
+            patch_size=self.settings.patch_size,
+            num_landmarks=min(self.settings.num_landmarks, self.pixels),
+            landmarks="kmeans",
+            completion="diagonal",
+            guide_channels="luminance",
+            generator=self.settings.generator,
+        )
+        return self.viewed.operator(Guide(options, colorize_guide, TEXTURE_MARGIN, 5, spectral=True))
+
+
+@dataclass(frozen=True, eq=False)
+class Estimates(Generic[M]):
+    """The chroma of the pixels of a picture as a mean of three estimates.
+
+    Attributes:
+        viewed: the picture at the viewing size.
+        saturation: of the strokes, (B, 1, 1), the unit of all chroma.
+        far: results of the regression over long distances: chroma, and the mean of its squared saturation.
+        near: results of the regression nearby: the residual of the chroma, and the support by strokes.
+        absolute: propagation by absolute differences.
+        relative: propagation by relative differences: relative to the usual chroma, and unscaled.
+        everywhere: the strength of the edit, (B, 1, 1, 1).
+        regression_weight: factor of the regression.
+    """
+
+    viewed: Source[M]
+    saturation: Tensor
+    far: Planes
+    near: Planes
+    absolute: LocalValues
+    relative: LocalValues
+    everywhere: Tensor
+    regression_weight: float | Tensor
+
+    @staticmethod
+    def of(operators: Operators[M], scribbles: Scribbles, wanted: Tensor, strength: float | Tensor) -> "Estimates[M]":
+        """Fit the estimates to the chroma, red and blue, (B, 2, n), of scribbles; green follows from these."""
+        viewed = operators.viewed
+        mean_square = region_means(squared_sum(wanted).unsqueeze(2), scribbles.weights.unsqueeze(2))  # (B, 1, 1)
+        saturation = (mean_square + NO_CHROMA).sqrt()
+        wanted = wanted / saturation
+        usual = usual_chroma(scribbles.image.unsqueeze(2)).squeeze(2)
+        scaled = wanted / usual.sqrt()
+        groups = StrokeGroups.of(scribbles, viewed.size)
+        propagation = Propagation(viewed, scribbles, groups)
+        absolute = propagation.solve(ABSOLUTE, scaled)
+        relative = propagation.solve(RELATIVE, torch.cat([scaled, wanted], dim=1), wanted)
+        weights = [scribbles.weights, *groups.weights_without_each(scribbles.weights)]
+        (far, near), residuals = extended(operators, scribbles.places, weights, wanted / usual, strength)
+        regression_weight = factor_of_count(0)
+        if relative.left_out is not None:
+            residual = groups.of_own(residuals[1:]) * usual
+            regression_weight = compared(groups, scribbles.weights, residual, wanted, relative.left_out)
+        everywhere = per_image(strength, wanted, 4)
+        return Estimates(viewed, saturation, far, near, absolute, relative, everywhere, regression_weight)
+
+    def __call__(self, pixels: Pixels) -> Tensor:
+        """The chroma of pixels, (B, 2, h, w)."""
+        own = luminance(pixels)
         usual = usual_chroma(own)
-        connected, influence = interpolated(absolute, some, own).tensor_split([2], dim=1)
-        around, unscaled = interpolated(relative, some, own)[:, :4].split(2, dim=1)
+        connected, influence = self._interpolated(self.absolute, pixels, own).tensor_split([2], dim=1)
+        around, unscaled = self._interpolated(self.relative, pixels, own)[:, :4].split(2, dim=1)
         around = limit_saturation(unscaled, around * usual.sqrt())
-        mean, square = far(some).tensor_split([2], dim=1)
-        residual, support = near(some).tensor_split([2], dim=1)
+        mean, square = self.far(pixels).tensor_split([2], dim=1)
+        residual, support = self.near(pixels).tensor_split([2], dim=1)
         variance = (square - squared_sum(mean)) * usual.square()
         alike = (mean + residual) * usual
-        around = torch.lerp(alike, around, influence + everywhere * (1 - influence))
+        around = torch.lerp(alike, around, influence + self.everywhere * (1 - influence))
         connected = torch.lerp((alike + around) / 2, connected * usual.sqrt(), influence)
         trust = (support.clamp(min=0.0) + LEAST_SUPPORT) ** 1.5 / (1 + variance.clamp(min=0.0) / LARGE_VARIANCE)
-        factors = regression_weight * trust, influence**2, RELATIVE_WEIGHT
+        factors = self.regression_weight * trust, influence**2, RELATIVE_WEIGHT
         change = weighted_mean((alike, connected, around), factors) - around
-        limited = change * (1 + squared_sum(change) / (regression_weight * MOST_CHANGE**2)).rsqrt()
-        return saturation.unsqueeze(3) * (around + limited)
+        limited = change * (1 + squared_sum(change) / (self.regression_weight * MOST_CHANGE**2)).rsqrt()
+        return self.saturation.unsqueeze(3) * (around + limited)
 
-    return _coloured(source, viewed, chroma_of)
+    def _interpolated(self, estimate: LocalValues, pixels: Pixels, own: Tensor) -> Tensor:
+        place = (estimate.links, pixels.first, pixels.image.shape)
+        return self.viewed.kept(place, [estimate.values], partial(estimate, own, pixels.first))
+
+
+@dataclass(frozen=True, eq=False)
+class Propagation(Generic[M]):
+    """Propagation of values from scribbles to neighbouring pixels of a picture."""
+
+    viewed: Source[M]
+    scribbles: Scribbles
+    groups: StrokeGroups
+
+    def solve(self, links: Links, values: Tensor, predicted: Tensor | None = None) -> LocalValues:
+        """Solve for values (B, C, n) of the scribbled pixels; ``predicted`` are compared with those of other strokes.
+
+        Weights are cubed, so that pixels partly covered by the border of a scribble count little; how many there are
+        depends on the size of the picture.
+        """
+        size, places, cubed = self.viewed.size, self.scribbles.places, self.scribbles.weights**3
+        guide = self.viewed.reduced(luminance, links.step(size))
+        solve = partial(LocalValues.of, links, guide, size, places, cubed, values, self.groups, predicted)
+        return self.viewed.kept(links, [guide, places, cubed, values], solve)
 
 
 def usual_chroma(image: Tensor) -> Tensor:
@@ -263,7 +387,7 @@ def usual_chroma(image: Tensor) -> Tensor:
     return ((own * (1 - own)).clamp(min=0.0) + LEAST_CHROMA).sqrt()
 
 
-def bandwidth_ratio(source: Source) -> Tensor:
+def bandwidth_ratio(source: Source[M]) -> Tensor:
     """Ratio (B,) of the horizontal to the vertical bandwidth, from changes of brightness at a large scale.
 
     Where sky, buildings and ground lie above each other, brightness changes more from top to bottom, and so do colours.
@@ -277,21 +401,15 @@ def bandwidth_ratio(source: Source) -> Tensor:
 
 
 def extended(
-    operator_of: Callable[[Stage], Operator],
-    places: Tensor,
-    weights: list[Tensor],
-    wanted: Tensor,
-    pixels: int,
-    strength: float | Tensor,
+    operators: Operators[M], places: Tensor, weights: list[Tensor], wanted: Tensor, strength: float | Tensor
 ) -> tuple[list[Planes], list[Tensor]]:
     """Extend values by the regressions :data:`FAR` and :data:`NEAR`, for several sets of weights.
 
     Args:
-        operator_of: the operator of a stage.
+        operators: of the picture.
         places: row-major indices of the scribbled pixels, (n,).
         weights: of the scribbled pixels, for each set (B, 1, n).
         wanted: values of the scribbled pixels, (B, 2, n).
-        pixels: number of pixels of the picture.
         strength: of the first regression, see :func:`propagate_strokes`.
 
     Returns:
@@ -302,27 +420,32 @@ def extended(
     residuals = [wanted] * len(weights)
     planes = []
     for stage, other in ((FAR, squared_sum(wanted)), (NEAR, torch.ones_like(wanted[:, :1]))):
-        operator = operator_of(stage)
+        operator = operators.of(stage)
         columns = operator.at(places)
         fits = [
             fit_strokes(
                 partial(scribbled_blocks, [(columns, own, torch.cat([residual, other], dim=1))]),
                 operator.pairs,
-                pixels,
+                operators.pixels,
                 strength=strength if stage is FAR else 0.0,
                 reach=stage.reach,
                 smoothness=stage.smoothness,
             )
             for own, residual in zip(weights, residuals, strict=True)
         ]
-        found = [[fitted(block)[:, :2] for fitted in fits] for block in columns()]  # columns are computed once for all
+        explained = [[fit(block)[:, :2] for fit in fits] for block in columns()]  # columns are computed once for all
         residuals = [
             before - torch.cat(blocks, dim=2)
-            for before, blocks in zip(residuals, zip(*found, strict=True), strict=True)
+            for before, blocks in zip(residuals, zip(*explained, strict=True), strict=True)
         ]
-        planes.append(operator.each(lambda found, fitted=fits[0]: fitted(found.factor)))  # type: ignore[misc]
+        planes.append(operator.each(partial(_of_factor, fits[0])))
         del operator  # frees its factor before the next one is computed
     return planes, residuals
+
+
+def _of_factor(fit: Callable[[Tensor], Tensor], columns: Columns) -> Tensor:
+    """What a regression gives for columns of the factor."""
+    return fit(columns.factor)
 
 
 def compared(groups: StrokeGroups, weights: Tensor, residual: Tensor, wanted: Tensor, left_out: Tensor) -> Tensor:
@@ -372,7 +495,7 @@ def weighted_mean(estimates: tuple[Tensor, Tensor, Tensor], factors: tuple[float
     """
     alike, connected, around = estimates
     pairs = ((alike, connected), (connected, around), (around, alike))
-    first, second, third = (squared_sum(one - other) for one, other in pairs)
+    first, second, third = (squared_sum(estimate - other) for estimate, other in pairs)
     distances = (first + third, first + second, second + third)
     total, weights = around.new_zeros(()), around.new_zeros(())
     for estimate, factor, distance in zip(estimates, factors, distances, strict=True):
@@ -381,17 +504,26 @@ def weighted_mean(estimates: tuple[Tensor, Tensor, Tensor], factors: tuple[float
     return total / weights
 
 
-def _coloured(source: Source, viewed: Source, chroma: Planes) -> Fitted:
+def _coloured(source: Source[M], viewed: Source[M], chroma: Planes) -> Fitted:
     """A picture in the chroma (B, 2, h, w), red and blue, of its reduction; edges follow those of its luminance.
 
     A source may be in colour: only its luminance counts.
     """
     if source is viewed:
-        return Fitted(lambda some: merge_luminance(luminance(some), with_green(chroma(some))))
+        return Fitted(partial(_in_chroma, chroma))
+    before = viewed.all(Fitted(_luminance_twice))
+    changes = Coarse.of(before, viewed.all(Fitted(chroma)), None, "none").changes(source, _luminance_twice)
+    return Fitted(partial(_in_changed_chroma, changes))
 
-    def twice(some: Any) -> Tensor:
-        return luminance(some).expand(-1, 2, -1, -1)
 
-    before = viewed.all(Fitted(twice))
-    changes = Coarse.of(before, viewed.all(Fitted(chroma)), None, "none").changes(source, twice)
-    return Fitted(lambda some: merge_luminance(luminance(some), with_green(changes(some)[0])))
+def _in_chroma(chroma: Planes, pixels: Pixels) -> Tensor:
+    return merge_luminance(luminance(pixels), with_green(chroma(pixels)))
+
+
+def _in_changed_chroma(changes: Callable[[Pixels], tuple[Tensor, Tensor]], pixels: Pixels) -> Tensor:
+    return merge_luminance(luminance(pixels), with_green(changes(pixels)[0]))
+
+
+def _luminance_twice(pixels: Pixels) -> Tensor:
+    """Luminance, (B, 2, h, w), one plane for each of red and blue."""
+    return luminance(pixels).expand(-1, 2, -1, -1)

@@ -1,17 +1,23 @@
 """Synthetic defocus: a sharp subject before a blurred background, as with a wide aperture. Paper: Sec. V-C."""
 
 import math
-from typing import Any, Literal
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import ClassVar, Literal
 
 import torch
 from torch import Tensor
 
 from nlfilter_torch.core.checks import check_reach
 from nlfilter_torch.core.inner import Inner
+from nlfilter_torch.operator.landmarks import Sampling
+from nlfilter_torch.operator.nystrom import Completion
+from nlfilter_torch.photo.declared.declaration import Edit
 from nlfilter_torch.photo.declared.parameters import DEFOCUS
-from nlfilter_torch.photo.picture.in_memory import edit_of
+from nlfilter_torch.photo.picture.drawn import Drawn, M
+from nlfilter_torch.photo.picture.edit import PhotoEdit, edit_image
 from nlfilter_torch.photo.picture.source import Fitted, Source
-from nlfilter_torch.photo.selections.mask import background_of, fit_regions
+from nlfilter_torch.photo.selections.mask import RegionMask, background_of, fit_regions
 
 Aperture = Literal["disc", "gaussian"]
 
@@ -22,10 +28,8 @@ SUBJECT_WEIGHT = 1e-5  # weight of the subject in the blur of the background
 ROWS, FAST = 192, 64  # rows of a Fourier transform, about; its sizes are multiples of this, which makes it fast
 
 
-@edit_of("image")
 def defocus(
-    source: Source,
-    /,
+    image: Tensor,
     focus_region: Tensor,
     *,
     background: Tensor | None = None,
@@ -35,8 +39,11 @@ def defocus(
     photometric_bandwidth: float | Tensor = DEFOCUS.defaults["photometric_bandwidth"],
     spatial_bandwidth: float | Tensor | None = None,
     patch_size: int = DEFOCUS.defaults["patch_size"],
-    **options: Any,
-) -> Fitted:
+    num_landmarks: int = DEFOCUS.defaults["num_landmarks"],
+    landmarks: Sampling = DEFOCUS.defaults["landmarks"],
+    completion: Completion = "diagonal",
+    generator: torch.Generator | None = None,
+) -> Tensor:
     """Blur the background of a subject that stays in focus.
 
     Paper: Sec. V-C, Fig. 17, with :func:`region_mask` in place of its mask. Only the background is blurred, so the
@@ -54,7 +61,10 @@ def defocus(
         photometric_bandwidth: that of :func:`region_mask`, in hundredths of Lab.
         spatial_bandwidth: that of :func:`region_mask`, in pixels; None is 0.3 of the short side.
         patch_size: width of the compared patches.
-        **options: further options of :func:`region_mask`, such as ``num_landmarks`` or ``generator``.
+        num_landmarks: M of the filter.
+        landmarks: how the landmarks are chosen, see :func:`nonlocal_operator`.
+        completion: of the kernel's diagonal, see :func:`nonlocal_operator`.
+        generator: source of randomness for the landmarks; None draws the same for every call.
 
     Returns:
         (B, C, H, W), within the range of ``image`` and equal to it to rounding where it is in focus. Differentiable in
@@ -75,27 +85,68 @@ def defocus(
         >>> bool(blurred[..., :18].std() < image[..., :18].std() / 2)
         True
     """
-    if source.channels not in (1, 3):
-        raise ValueError(f"image must have 1 or 3 channels, got {source.channels}; select 1 or 3")
-    DEFOCUS.check(aperture=aperture, radius=radius)
-    blur_radius = float(DEFOCUS["radius"].pixels(radius, source.size))
-    check_reach(blur_radius, "radius", source.size)
-    scribbles = source.scribbles(focus_region, None, "focus_region")
-    found = fit_regions(
-        source,
-        [scribbles],
-        background_of(source, background, scribbles, "background"),
+    edit = Defocus(
+        radius=radius,
+        aperture=aperture,
         reach=reach,
         photometric_bandwidth=photometric_bandwidth,
-        spatial_bandwidth=DEFOCUS["spatial_bandwidth"].distance(spatial_bandwidth, source.size),
+        spatial_bandwidth=spatial_bandwidth,
         patch_size=patch_size,
-        **options,
+        num_landmarks=num_landmarks,
+        landmarks=landmarks,
+        completion=completion,
+        generator=generator,
     )
+    masks = {"focus_region": focus_region} | ({} if background is None else {"background": background})
+    return edit_image(edit, image, Drawn(masks))
 
-    def finish(image: Tensor, masks: Tensor, _: Inner) -> Tensor:
-        return blur_behind(image, focus_of(masks), blur_radius, aperture)
 
-    return Fitted(found.masks, finish, _kernel_radius(blur_radius, aperture))
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Defocus(PhotoEdit):
+    """The edit of :func:`defocus`."""
+
+    declared: ClassVar[Edit] = DEFOCUS
+    radius: float | None
+    aperture: Aperture
+    reach: float | Tensor = REACH
+    photometric_bandwidth: float | Tensor
+    spatial_bandwidth: float | Tensor | None
+    patch_size: int
+    num_landmarks: int
+    landmarks: Sampling = "kmeans"
+    completion: Completion = "diagonal"
+    generator: torch.Generator | None = None
+
+    def selection(self) -> RegionMask:
+        """The mask of the subject, without the default of the spatial bandwidth, which depends on the size."""
+        return RegionMask(
+            reach=self.reach,
+            photometric_bandwidth=self.photometric_bandwidth,
+            spatial_bandwidth=self.spatial_bandwidth,
+            num_landmarks=self.num_landmarks,
+            landmarks=self.landmarks,
+            completion=self.completion,
+            generator=self.generator,
+        )
+
+    def fit(self, source: Source[M], drawn: Drawn[M]) -> Fitted:
+        """Fit the mask of the subject."""
+        if source.channels not in (1, 3):
+            raise ValueError(f"image must have 1 or 3 channels, got {source.channels}; select 1 or 3")
+        DEFOCUS.check(aperture=self.aperture, radius=self.radius)
+        radius = float(DEFOCUS["radius"].pixels(self.radius, source.size))
+        check_reach(radius, "radius", source.size)
+        scribbles = source.scribbles(drawn.masks.get("focus_region"), None, "focus_region")
+        background = background_of(source, drawn.masks.get("background"), scribbles, "background")
+        distance = DEFOCUS["spatial_bandwidth"].distance(self.spatial_bandwidth, source.size)
+        selector = replace(self.selection(), spatial_bandwidth=distance, patch_size=self.patch_size)
+        subject = fit_regions(source, [scribbles], background, selector)
+        finish = partial(_blurred, radius=radius, aperture=self.aperture)
+        return Fitted(subject.masks, finish, _kernel_radius(radius, self.aperture))
+
+
+def _blurred(image: Tensor, masks: Tensor, _: Inner, *, radius: float, aperture: Aperture) -> Tensor:
+    return blur_behind(image, focus_of(masks), radius, aperture)
 
 
 def focus_of(mask: Tensor) -> Tensor:
@@ -141,8 +192,8 @@ def convolve(planes: Tensor, kernel: Tensor) -> Tensor:
     spectrum, parts = torch.fft.rfft2(kernel, s=size), []
     for first in range(0, height, step):
         top = max(0, first - half)
-        some = planes[..., top : first + step + half, :]
-        found = torch.fft.irfft2(torch.fft.rfft2(some, s=size) * spectrum, s=size)
+        strip = planes[..., top : first + step + half, :]
+        blurred = torch.fft.irfft2(torch.fft.rfft2(strip, s=size) * spectrum, s=size)
         start = first - top + half
-        parts.append(found[..., start : start + min(step, height - first), half : half + width])
+        parts.append(blurred[..., start : start + min(step, height - first), half : half + width])
     return torch.cat(parts, dim=-2)

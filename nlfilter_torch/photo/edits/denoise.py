@@ -3,7 +3,9 @@
 Paper: Sec. III, Fig. 6(c), (d); Sec. V.
 """
 
-from typing import Any, Literal
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import ClassVar, Literal, Self
 
 import torch
 from torch import Tensor
@@ -16,22 +18,30 @@ from nlfilter_torch.filtering.filters import weigh_layers
 from nlfilter_torch.nn.denoiser.network import NonlocalDenoiser
 from nlfilter_torch.nn.denoiser.noise import Noise, noise_map
 from nlfilter_torch.nn.denoiser.tiles import STEP
+from nlfilter_torch.operator.features import GuideChannels
+from nlfilter_torch.operator.landmarks import Sampling
+from nlfilter_torch.operator.nystrom import Completion
+from nlfilter_torch.photo.declared.declaration import Edit
 from nlfilter_torch.photo.declared.parameters import DENOISE
 from nlfilter_torch.photo.edits.noise import noise_of
-from nlfilter_torch.photo.picture.in_memory import edit_of
-from nlfilter_torch.photo.picture.source import Fitted, Guide, Operator, Pixels, Source
+from nlfilter_torch.photo.edits.synthesis import remainder
+from nlfilter_torch.photo.picture.drawn import Drawn, M
+from nlfilter_torch.photo.picture.edit import FilteredEdit, edit_image
+from nlfilter_torch.photo.picture.pixels import whole_image
+from nlfilter_torch.photo.picture.source import Fitted, Guide, Operator, Pixels, Planes, Source
 
 Method = Literal["network", "rule"]
 
 GUIDE_BLUR = 0.7  # pixels; without the blur, pixels would be similar by their noise
 ORDER = 2
-NEGLIGIBLE_NOISE = 0.1 / 255  # noise level below what 8 bits resolve; the image is returned unchanged
+LEVELS = 255  # grey levels of white
+VISIBLE_LEVELS = 0.5  # change in grey levels that is hardly visible: the rounding error of eight bits
+WHITE_LEVELS = 64  # standard deviation in grey levels that is white in a map of the noise
+NEGLIGIBLE_NOISE = 0.1 / LEVELS  # noise level below what 8 bits resolve; the image is returned unchanged
 
 
-@edit_of("image")
 def denoise(
-    source: Source,
-    /,
+    image: Tensor,
     *,
     noise_level: float | Tensor | None = DENOISE.defaults["noise_level"],
     strength: float | Tensor = DENOISE.defaults["strength"],
@@ -40,8 +50,11 @@ def denoise(
     spatial_bandwidth: float | Tensor | None = None,
     patch_size: int = DENOISE.defaults["patch_size"],
     num_landmarks: int = DENOISE.defaults["num_landmarks"],
-    **options: Any,
-) -> Fitted:
+    landmarks: Sampling = DENOISE.defaults["landmarks"],
+    completion: Completion = "diagonal",
+    guide_channels: GuideChannels = "all",
+    generator: torch.Generator | None = None,
+) -> Tensor:
     """Remove noise of known or estimated level.
 
     The network is :meth:`NonlocalDenoiser.trained`. With ``method="rule"`` nothing is learned: the sliders of eq. (12)
@@ -59,7 +72,10 @@ def denoise(
         spatial_bandwidth: h_x in pixels; None is 0.2 of the short side.
         patch_size: width of the compared patches.
         num_landmarks: M; more keep more rare detail.
-        **options: further options of :func:`nonlocal_operator`.
+        landmarks: how the landmarks are chosen, see :func:`nonlocal_operator`.
+        completion: of the kernel's diagonal, see :func:`nonlocal_operator`.
+        guide_channels: what the filter of the rule compares, ``"luminance"`` or ``"all"`` channels.
+        generator: source of randomness for the landmarks; None draws the same for every call.
 
     Returns:
         (B, C, H, W), equal to ``image`` where the noise level is less than a tenth of a grey level. Differentiable in
@@ -75,29 +91,95 @@ def denoise(
         >>> bool((denoise(noisy) - clean).std() < 0.03), bool((denoise(noisy, method="rule") - clean).std() < 0.06)
         (True, True)
     """
-    DENOISE.check(source.batch, strength=strength, method=method)
-    check_count(num_landmarks, "num_landmarks")
-    is_map = isinstance(noise_level, Tensor) and noise_level.ndim == 4
-    if not isinstance(noise_level, Noise) and not is_map:  # commands pass the noise that they have estimated
-        DENOISE.check(source.batch, noise_level=noise_level)
-    noise: float | Tensor | Noise = noise_of(source) if noise_level is None else noise_level
-    if method == "network":
-        return _by_network(source, noise, strength)
-    if is_map:
-        raise ValueError(
-            "noise_level must be a number or have shape (B,) for method rule, got a map; use method network"
-        )
-    level = noise.level if isinstance(noise, Noise) else torch.as_tensor(noise, dtype=source.dtype)
-    level = level.reshape(-1) * torch.as_tensor(strength, dtype=source.dtype).reshape(-1)
-    return _by_rule(
-        source,
-        level,
+    edit = Denoise(
+        noise_level=noise_level,
+        strength=strength,
+        method=method,
         photometric_bandwidth=photometric_bandwidth,
         spatial_bandwidth=spatial_bandwidth,
         patch_size=patch_size,
         num_landmarks=num_landmarks,
-        **options,
+        landmarks=landmarks,
+        completion=completion,
+        guide_channels=guide_channels,
+        generator=generator,
     )
+    return edit_image(edit, image)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Denoise(FilteredEdit):
+    """The edit of :func:`denoise`; ``noise_level`` may also be the estimated noise."""
+
+    declared: ClassVar[Edit] = DENOISE
+    reports_change: ClassVar[bool] = True
+    noise_level: float | Tensor | Noise | None
+    strength: float | Tensor
+    method: Method
+    guide_channels: GuideChannels = "all"
+
+    def fit(self, source: Source[M], drawn: Drawn[M]) -> Fitted:
+        """Fit the network, or the sliders of the rule."""
+        DENOISE.check(source.batch, strength=self.strength, method=self.method)
+        check_count(self.num_landmarks, "num_landmarks")
+        is_map = isinstance(self.noise_level, Tensor) and self.noise_level.ndim == 4
+        if not isinstance(self.noise_level, Noise) and not is_map:
+            DENOISE.check(source.batch, noise_level=self.noise_level)
+        noise = noise_of(source) if self.noise_level is None else self.noise_level
+        if self.method == "network":
+            if is_map:
+                source.check_all_in_memory(
+                    "noise_level must be a number for a picture processed in tiles, got a map; denoise it in memory"
+                )
+            return Fitted(first_channel, NetworkDenoising(noise, self.strength), margin=2 * STEP, step=STEP)
+        if is_map:
+            raise ValueError(
+                "noise_level must be a number or have shape (B,) for method rule, got a map; use method network"
+            )
+        level = noise.level if isinstance(noise, Noise) else torch.as_tensor(noise, dtype=source.dtype)
+        level = level.reshape(-1) * torch.as_tensor(self.strength, dtype=source.dtype).reshape(-1)
+        return self._fit_rule(source, level)
+
+    def _fit_rule(self, source: Source[M], level: Tensor) -> Fitted:
+        assumed, pixels = level.clamp(min=NEGLIGIBLE_NOISE), source.size[0] * source.size[1]
+        options = self.filter_options(
+            source.size,
+            photometric_bandwidth=assumed if self.photometric_bandwidth is None else self.photometric_bandwidth,
+            num_landmarks=min(self.num_landmarks, pixels),
+        )
+        operator = source.operator(Guide(options, blur=GUIDE_BLUR))
+        layers = operator.layers(whole_image, ORDER)  # (B, ORDER+1, C, H, W)
+        energy = operator.layers(partial(_energy, layers), 1)  # of planes (B, ORDER, H, W)
+        noise = assumed.square().reshape(-1, 1) * _noise_in_layers(operator, pixels)  # (B, ORDER)
+        return Fitted(RuleDenoising(layers, energy, noise, level))
+
+    def measured(self, source: Source[M]) -> Self:
+        """Return the edit with the noise of the picture, if its level is not set."""
+        return replace(self, noise_level=noise_of(source)) if self.noise_level is None else self
+
+    def map_of(self, image: Tensor) -> Tensor:
+        """Standard deviation of the noise, 1 at :data:`WHITE_LEVELS`."""
+        deviation = self._noise.at(image).square().mean(1, keepdim=True).sqrt()
+        return (deviation * (LEVELS / WHITE_LEVELS)).clamp(0, 1)
+
+    @property
+    def _noise(self) -> Noise:
+        if isinstance(self.noise_level, Noise):
+            return self.noise_level
+        return Noise.even(torch.as_tensor([self.noise_level]))
+
+    def summary(self, change: float) -> str:
+        """The noise, measured or set, and how much the pixels changed."""
+        noise, level = self._noise, LEVELS * float(self._noise.level)
+        ends = [LEVELS * float((noise.floor + light * noise.gain).sqrt()) for light in (0.0, 1.0)]
+        spread = f" ({ends[0]:.2f} in black, {ends[1]:.2f} in white)" if noise.gain > 0 else ""
+        estimated = isinstance(self.noise_level, Noise)
+        text = f"denoise: {'estimated' if estimated else 'given'} noise of {level:.2f} grey levels{spread}"
+        if level < LEVELS * NEGLIGIBLE_NOISE:
+            return f"{text}, less than {LEVELS * NEGLIGIBLE_NOISE:.1f}; no pixel changed"
+        weak = "" if change >= VISIBLE_LEVELS else ", which is barely visible"
+        remedy = "; --strength 2 removes more" if weak and estimated and 0 < float(self.strength) < 2 else ""
+        return f"{text}; {super().summary(change)}{weak}{remedy}"
 
 
 @cached_constants
@@ -106,41 +188,56 @@ def _network(device: torch.device, dtype: torch.dtype) -> NonlocalDenoiser:
     return NonlocalDenoiser.trained(device=device, dtype=dtype).requires_grad_(False)
 
 
-def _by_network(source: Source, noise: float | Tensor | Noise, strength: float | Tensor) -> Fitted:
-    """Fit denoising by the network, with tiles at the same positions in memory and for a picture read by rows."""
-    if isinstance(noise, Tensor) and noise.ndim == 4 and not source.whole:
-        raise ValueError(
-            "noise_level must be a number for a picture processed in tiles, got a map; denoise it in memory"
-        )
+def first_channel(pixels: Pixels) -> Tensor:
+    """The first channel of a picture; the network needs the neighbourhood of a pixel, and sees it afterwards."""
+    return pixels.image[:, :1]
 
-    def finish(image: Tensor, _: Tensor, inner: Inner) -> Tensor:
-        level = noise.at(image) if isinstance(noise, Noise) else noise_map(noise, image, "noise_level")
-        level = level * per_image(strength, level, 4)
+
+@dataclass(frozen=True, eq=False)
+class NetworkDenoising:
+    """Denoising by the network, with tiles at the same positions in memory and for a picture read by rows."""
+
+    noise: float | Tensor | Noise
+    strength: float | Tensor
+
+    def __call__(self, image: Tensor, _: Tensor, inner: Inner) -> Tensor:
+        """Denoise an image."""
+        if isinstance(self.noise, Noise):
+            level = self.noise.at(image)
+        else:
+            level = noise_map(self.noise, image, "noise_level")
+        level = level * per_image(self.strength, level, 4)
         level = torch.where(level < NEGLIGIBLE_NOISE, torch.zeros_like(level), level)
         return image - _network(image.device, image.dtype).estimate_in_tiles(image, level, turns=1, inner=inner)
 
-    return Fitted(lambda pixels: pixels.image[:, :1], finish, margin=2 * STEP, step=STEP)
+
+def _energy(layers: Planes, pixels: Pixels) -> Tensor:
+    """Energy of each detail layer but the smooth one."""
+    return layers(pixels)[:, :-1].square().mean(2)
 
 
-def _by_rule(source: Source, level: Tensor, *, photometric_bandwidth: float | Tensor | None, **options: Any) -> Fitted:
-    assumed = level.clamp(min=NEGLIGIBLE_NOISE)
-    options = {"guide_channels": "all"} | options
-    options |= {
-        "photometric_bandwidth": assumed if photometric_bandwidth is None else photometric_bandwidth,
-        "spatial_bandwidth": DENOISE["spatial_bandwidth"].distance(options["spatial_bandwidth"], source.size),
-        "num_landmarks": min(options["num_landmarks"], source.size[0] * source.size[1]),
-    }
-    operator = source.operator(Guide(options, blur=GUIDE_BLUR))
-    layers = operator.layers(lambda pixels: pixels.image, ORDER)  # (B, ORDER+1, C, H, W)
-    energy = operator.layers(lambda pixels: layers(pixels)[:, :-1].square().mean(2), 1)  # of planes (B, ORDER, H, W)
-    noise = assumed.square().reshape(-1, 1) * _noise_in_layers(operator, source.size[0] * source.size[1])  # (B, ORDER)
+@dataclass(frozen=True, eq=False)
+class RuleDenoising:
+    """Denoising by sliders set for each pixel.
 
-    def cleaned(pixels: Pixels) -> Tensor:
-        kept = (1 - noise[..., None, None].to(pixels.image) / energy(pixels)[:, -1].clamp(min=1e-12)).clamp(0.0, 1.0)
-        weighed = weigh_layers(layers(pixels), torch.cat([kept, torch.ones_like(kept[:, :1])], dim=1))
-        return torch.where((level < NEGLIGIBLE_NOISE).reshape(-1, 1, 1, 1), pixels.image, weighed)
+    Attributes:
+        layers: detail layers of the picture.
+        energy: of the layers but the smooth one, and its mean over similar pixels, as two detail layers.
+        noise: variance (B, k) of the noise in each layer.
+        level: standard deviation (B,) of the noise.
+    """
 
-    return Fitted(cleaned)
+    layers: Planes
+    energy: Planes
+    noise: Tensor
+    level: Tensor
+
+    def __call__(self, pixels: Pixels) -> Tensor:
+        """Denoise pixels."""
+        noise = self.noise[..., None, None].to(pixels.image)
+        kept = (1 - noise / self.energy(pixels)[:, -1].clamp(min=1e-12)).clamp(0.0, 1.0)
+        weighed = weigh_layers(self.layers(pixels), torch.cat([kept, torch.ones_like(kept[:, :1])], dim=1))
+        return torch.where((self.level < NEGLIGIBLE_NOISE).reshape(-1, 1, 1, 1), pixels.image, weighed)
 
 
 def _noise_in_layers(operator: Operator, pixels: int) -> Tensor:
@@ -148,13 +245,22 @@ def _noise_in_layers(operator: Operator, pixels: int) -> Tensor:
 
     Outside the span of the eigenvectors W is nearly its diagonal part r, which gives the rest of the trace.
     """
-
-    def gain(eigenvalues: Tensor, order: int) -> Tensor:
-        return (eigenvalues**order * (1 - eigenvalues)).square()
-
     ritz, support = operator.pairs.ritz, operator.pairs.support
-    inside = [ritz.apply(lambda s, i=i: gain(s.clamp(0.0, 1.0), i), support) for i in range(ORDER)]  # type: ignore[misc]
+    inside = [ritz.apply(partial(_clamped_gain, order), support) for order in range(ORDER)]
     traces = torch.stack([matrix.diagonal(dim1=1, dim2=2).sum(1) for matrix in inside], dim=1) / pixels
-    share = operator.each(lambda columns: columns.remainder.unsqueeze(1))
-    outside = operator.mean(lambda some: torch.cat([gain(share(some), i) for i in range(ORDER)], dim=1))
+    outside = operator.mean(partial(_gains, operator.each(remainder)))
     return traces.to(outside) + (1 - support.sum(1, keepdim=True) / pixels) * outside
+
+
+def _gain(order: int, eigenvalues: Tensor) -> Tensor:
+    """Gain of the variance of white noise in a detail layer."""
+    return (eigenvalues**order * (1 - eigenvalues)).square()
+
+
+def _clamped_gain(order: int, eigenvalues: Tensor) -> Tensor:
+    return _gain(order, eigenvalues.clamp(0.0, 1.0))
+
+
+def _gains(share: Planes, pixels: Pixels) -> Tensor:
+    """Gains of all detail layers, for the diagonal part of W."""
+    return torch.cat([_gain(order, share(pixels)) for order in range(ORDER)], dim=1)

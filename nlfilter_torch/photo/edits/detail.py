@@ -1,7 +1,10 @@
 """Detail sliders for the whole image, or for everything similar to painted regions. Paper: Figs. 12, 13."""
 
 import math
-from typing import Any
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, ClassVar, Literal, Self
 
 import torch
 from torch import Tensor
@@ -11,14 +14,16 @@ from nlfilter_torch.core.checks import (
     check_count,
     check_dtype,
     check_finite,
-    check_image,
     check_positive,
     check_shape,
 )
 from nlfilter_torch.core.inner import Inner
-from nlfilter_torch.operator.features import blur_margin
+from nlfilter_torch.operator.features import GuideChannels, blur_margin
+from nlfilter_torch.operator.landmarks import Sampling
+from nlfilter_torch.operator.nystrom import Completion
+from nlfilter_torch.photo.declared.declaration import Edit
 from nlfilter_torch.photo.declared.parameters import DETAIL, MASK
-from nlfilter_torch.photo.edits.synthesis import polynomial
+from nlfilter_torch.photo.edits.synthesis import Polynomial
 from nlfilter_torch.photo.picture.changes import (
     VARIANCE_SIGMA,
     activity,
@@ -28,24 +33,26 @@ from nlfilter_torch.photo.picture.changes import (
     split_sliders,
     sum_of,
 )
-from nlfilter_torch.photo.picture.in_memory import edit_of
+from nlfilter_torch.photo.picture.drawn import Drawn, M
+from nlfilter_torch.photo.picture.edit import FilteredEdit, edit_image
 from nlfilter_torch.photo.picture.limits import Limits
-from nlfilter_torch.photo.picture.source import Fitted, Guide, Pixels, Source, luminance
+from nlfilter_torch.photo.picture.pixels import whole_image
+from nlfilter_torch.photo.picture.source import Fitted, Guide, Pixels, Planes, Source, luminance
 from nlfilter_torch.photo.picture.viewing import fit_change
-from nlfilter_torch.photo.selections.mask import select_regions
+from nlfilter_torch.photo.selections.mask import RegionMask, Regions
+
+Channels = Literal["luminance", "all"]
 
 
-@edit_of("image")
 def enhance(
-    source: Source,
-    /,
+    image: Tensor,
     alpha: Tensor,
     regions: Tensor | None = None,
     *,
     negative: Tensor | None = None,
     outside: Tensor | None = None,
     residual: float | Tensor | None = DETAIL.defaults["residual"],
-    channels: str = DETAIL.defaults["channels"],
+    channels: Channels = DETAIL.defaults["channels"],
     reach: float | Tensor = DETAIL.defaults["reach"],
     mask_bandwidth: float | Tensor = DETAIL.defaults["mask_bandwidth"],
     threshold: float | Tensor = DETAIL.defaults["threshold"],
@@ -53,9 +60,13 @@ def enhance(
     viewing_size: float = DETAIL.defaults["viewing_size"],
     photometric_bandwidth: float | Tensor | str = DETAIL.defaults["photometric_bandwidth"],
     spatial_bandwidth: float | Tensor | str | None = DETAIL.defaults["spatial_bandwidth"],
+    patch_size: int = DETAIL.defaults["patch_size"],
     num_landmarks: int = DETAIL.defaults["num_landmarks"],
-    **options: Any,
-) -> Fitted:
+    landmarks: Sampling = DETAIL.defaults["landmarks"],
+    completion: Completion = "diagonal",
+    guide_channels: GuideChannels = "luminance",
+    generator: torch.Generator | None = None,
+) -> Tensor:
     """Apply detail sliders to a photograph, or separate sliders to everything similar to each of several regions.
 
     Paper: eq. (12), (13). The filter compares luminance; the masks are those of :func:`region_mask`.
@@ -82,7 +93,11 @@ def enhance(
         spatial_bandwidth: h_x of the filter in pixels; None is a twelfth of the short side, ``"none"`` compares pixels
             regardless of their distance, so that shading counts as detail, too.
         num_landmarks: M of the filter; a spatial term needs more. The masks use as many, but at most 100.
-        **options: further options of :func:`nonlocal_operator` for the filter; ``generator`` also applies to the masks.
+        patch_size: width of the compared patches of the filter.
+        landmarks: how the landmarks are chosen, see :func:`nonlocal_operator`.
+        completion: of the kernel's diagonal, see :func:`nonlocal_operator`.
+        guide_channels: what the filter compares, ``"luminance"`` or ``"all"`` channels.
+        generator: source of randomness for the landmarks of filter and masks; None draws the same for every call.
 
     Returns:
         (B, C, H, W) in the image's dtype; values may leave [0, 1]. Differentiable in image, sliders and regions.
@@ -98,84 +113,188 @@ def enhance(
         >>> enhance(image, torch.tensor([3.0, 3.0, 4.0, 1.05]), region, num_landmarks=50).shape
         torch.Size([1, 3, 24, 24])
     """
-    check_alpha(alpha)
-    check_count(num_landmarks, "num_landmarks")
-    if regions is not None and source.whole:  # otherwise they are checked when they are read
-        check_image(regions, "regions", batch=source.batch)
-    DETAIL.check(source.batch, channels=channels, limits=limits, viewing_size=viewing_size, threshold=threshold)
-    DETAIL.check(source.batch, residual=residual)
-    if regions is None and (negative is not None or outside is not None):
-        name = "outside" if negative is None else "negative"
-        raise ValueError(f"{name} must be given together with regions, got no regions; mark the regions to edit")
-    if outside is not None:
-        check_shape(outside, (alpha.shape[-1],), "outside", "give as many sliders as alpha has")
-        check_dtype(outside, "outside", "write 1.0 instead of 1")
-        check_finite(outside, "outside")
-    planes = (lambda pixels: pixels.image) if channels == "all" else luminance
-    order = (alpha.shape[1] if alpha.ndim == 4 else alpha.shape[-1]) - 1
-    sliders = alpha - 1  # so that sliders of 1 change nothing, bit for bit
+    edit = Detail(
+        alpha=alpha,
+        outside=outside,
+        residual=residual,
+        channels=channels,
+        reach=reach,
+        mask_bandwidth=mask_bandwidth,
+        threshold=threshold,
+        limits=limits,
+        viewing_size=viewing_size,
+        photometric_bandwidth=photometric_bandwidth,
+        spatial_bandwidth=spatial_bandwidth,
+        patch_size=patch_size,
+        num_landmarks=num_landmarks,
+        landmarks=landmarks,
+        completion=completion,
+        guide_channels=guide_channels,
+        generator=generator,
+    )
+    masks = {"regions": regions, "negative": negative}
+    return edit_image(edit, image, Drawn({name: mask for name, mask in masks.items() if mask is not None}))
 
-    if regions is not None:
-        check_positive(mask_bandwidth, "mask_bandwidth", source.batch)
-        count = regions.shape[1] if source.whole else 1 if len(regions.shape) == 2 else regions.shape[2]
-        if alpha.ndim == 1:
-            sliders = sliders.expand(count, -1)
-        elif alpha.ndim != 2 or len(alpha) != count:
-            raise ValueError(
-                f"alpha must have shape ({count}, k+1), a row of sliders for each of the regions, or (k+1,), got "
-                f"{tuple(alpha.shape)}; reshape it"
-            )
 
-    elif alpha.ndim == 2 and len(alpha) not in (1, source.batch):
-        raise ValueError(
-            f"alpha must have shape (k+1,), or ({source.batch}, k+1) for a row per image, got {tuple(alpha.shape)}; "
-            "select the rows"
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Detail(FilteredEdit):
+    """The edit of :func:`enhance`."""
+
+    alpha: Tensor
+    outside: Tensor | None = None
+    residual: float | Tensor | None
+    channels: Channels
+    reach: float | Tensor
+    mask_bandwidth: float | Tensor
+    threshold: float | Tensor
+    limits: Limits
+    viewing_size: float
+    declared: ClassVar[Edit] = DETAIL
+
+    @classmethod
+    def of(cls, arguments: Mapping[str, Any]) -> Self:
+        """Create the edit from :meth:`Step.arguments`."""
+        return cls(**{**arguments, "alpha": torch.as_tensor(arguments["alpha"])})
+
+    def selection(self) -> RegionMask:
+        """The masks of the regions; with a generator, both filters draw from the same state."""
+        generator = self.generator
+        return RegionMask(
+            reach=self.reach,
+            photometric_bandwidth=self.mask_bandwidth,
+            spatial_bandwidth=None,
+            num_landmarks=min(self.num_landmarks, MASK.defaults["num_landmarks"]),
+            generator=generator.clone_state() if isinstance(generator, torch.Generator) else None,
         )
 
-    def change(viewed: Source) -> Fitted:
-        nearness = DETAIL["spatial_bandwidth"].distance(spatial_bandwidth, viewed.size)
-        filter_options = options | {
-            "photometric_bandwidth": photometric_bandwidth,
-            "spatial_bandwidth": nearness,
-            "num_landmarks": min(num_landmarks, math.prod(viewed.size)),
-        }
-        fewer = min(num_landmarks, MASK.defaults["num_landmarks"])
-        compared: dict[str, Any] = {"photometric_bandwidth": mask_bandwidth, "reach": reach, "num_landmarks": fewer}
-        if isinstance(options.get("generator"), torch.Generator):  # both filters draw from the same state
-            compared["generator"] = options["generator"].clone_state()
-        operator = viewed.operator(Guide(filter_options, exact=residual is not None))
-        changed = polynomial(operator, planes, order, None if residual is None else residual - 1)
+    def fit(self, source: Source[M], drawn: Drawn[M]) -> Fitted:
+        """Fit the change of detail of a picture, or of its regions."""
+        alpha = self.alpha if drawn.sliders is None else drawn.sliders
+        outside = self.outside if drawn.outside is None else drawn.outside
+        regions = drawn.masks.get("regions")
+        count = None if regions is None else source.num_regions(regions, "regions")
+        self._check(source.batch, drawn.masks, alpha, outside)
+        if count is None:
+            return self._fit_whole(source, alpha)
+        return self._fit_regions(source, drawn.masks, region_sliders(alpha, count), outside)
 
-        def added_and_rest(pixels: Pixels, moved: Tensor) -> Tensor:
-            halves = zip(split_sliders(moved), (0.0, None), strict=True)
-            return torch.cat([changed(pixels, half, weight) for half, weight in halves], dim=1)
+    def _check(self, batch: int, masks: Mapping[str, object], alpha: Tensor, outside: Tensor | None) -> None:
+        """Raise an error for an invalid setting."""
+        check_alpha(alpha)
+        check_count(self.num_landmarks, "num_landmarks")
+        DETAIL.check(batch, channels=self.channels, limits=self.limits, viewing_size=self.viewing_size)
+        DETAIL.check(batch, threshold=self.threshold, residual=self.residual)
+        if "regions" not in masks and ("negative" in masks or outside is not None):
+            name = "outside" if "negative" not in masks else "negative"
+            raise ValueError(f"{name} must be given together with regions, got no regions; mark the regions to edit")
+        if outside is not None:
+            check_shape(outside, (alpha.shape[-1],), "outside", "give as many sliders as alpha has")
+            check_dtype(outside, "outside", "write 1.0 instead of 1")
+            check_finite(outside, "outside")
+        if "regions" in masks:
+            check_positive(self.mask_bandwidth, "mask_bandwidth", batch)
 
-        def limited(image: Tensor, found: Tensor, _: Inner) -> Tensor:
-            return limit_by_activity(found, activity(image), threshold)
+    @property
+    def planes(self) -> Planes:
+        """What is changed: luminance, or all channels."""
+        return whole_image if self.channels == "all" else luminance
 
-        if regions is None:
-            if not isinstance(threshold, Tensor) and threshold == 0:
-                return Fitted(lambda pixels: sum_of(added_and_rest(pixels, sliders)))
-            return Fitted(lambda pixels: added_and_rest(pixels, sliders), limited, blur_margin(VARIANCE_SIGMA))
+    def _filtered(self, viewed: Source[M], order: int) -> Polynomial:
+        """The filter of a picture, which gives changes by sliders less 1."""
+        options = self.filter_options(viewed.size, num_landmarks=min(self.num_landmarks, math.prod(viewed.size)))
+        residual = None if self.residual is None else self.residual - 1
+        operator = viewed.operator(Guide(options, exact=residual is not None))
+        return Polynomial.of(operator, self.planes, order, residual)
 
-        def weights(of: Any, name: str) -> Any:
-            return of if of is None or viewed.size == source.size else source.resized_weights(of, viewed.size, name)
+    def _fit_whole(self, source: Source[M], alpha: Tensor) -> Fitted:
+        if alpha.ndim == 2 and len(alpha) not in (1, source.batch):
+            raise ValueError(
+                f"alpha must have shape (k+1,), or ({source.batch}, k+1) for a row per image, got "
+                f"{tuple(alpha.shape)}; select the rows"
+            )
+        sliders = alpha - 1  # so that sliders of 1 change nothing, bit for bit
+        brighter = None if alpha.ndim == 4 else sliders[..., -1].reshape(-1, 1, 1, 1).to(source.dtype)
+        change = partial(self._change, sliders)
+        return fit_change(source, change, self.planes, self.viewing_size, self.limits, brighter=brighter)
 
-        marked = weights(regions, "regions"), weights(negative, "negative")
-        masks = select_regions(viewed, *marked, names=("regions", "negative"), **compared)
+    def _change(self, sliders: Tensor, viewed: Source[M]) -> Fitted:
+        """The change of a picture at the viewing size."""
+        order = (sliders.shape[1] if sliders.ndim == 4 else sliders.shape[-1]) - 1
+        change = DetailChange(self._filtered(viewed, order), sliders)
+        if not isinstance(self.threshold, Tensor) and self.threshold == 0:
+            return Fitted(change.total)
+        return Fitted(change, self._limited, blur_margin(VARIANCE_SIGMA))
+
+    def _fit_regions(
+        self, source: Source[M], masks: Mapping[str, M], sliders: Tensor, outside: Tensor | None
+    ) -> Fitted:
         elsewhere = torch.zeros_like(sliders[0]) if outside is None else outside - 1
-        rows = [*sliders, elsewhere]
-
-        def blended(pixels: Pixels) -> Tensor:
-            changes = torch.cat([added_and_rest(pixels, row) for row in rows], dim=1)
-            return blend_changes(changes, masks.masks(pixels))
-
-        return Fitted(blended, limited, blur_margin(VARIANCE_SIGMA))
-
-    brighter: Tensor | None = None
-    if regions is not None:
         brighter = None if outside is None else change_of_mean(torch.cat([sliders, outside[None] - 1]))
-    elif alpha.ndim != 4:
-        brighter = sliders[..., -1].reshape(-1, 1, 1, 1)
-    brighter = None if brighter is None else brighter.to(source.dtype)
-    return fit_change(source, change, planes, viewing_size, limits, brighter=brighter)
+        return fit_change(
+            source,
+            partial(self._change_of_regions, source, masks, [*sliders, elsewhere]),
+            self.planes,
+            self.viewing_size,
+            self.limits,
+            brighter=None if brighter is None else brighter.to(source.dtype),
+        )
+
+    def _change_of_regions(
+        self, source: Source[M], masks: Mapping[str, M], sliders: list[Tensor], viewed: Source[M]
+    ) -> Fitted:
+        """The change of the regions of a picture at the viewing size, by a row of sliders for each and for the rest."""
+        selector = self.selection()  # takes the state of the generator before the filter draws from it
+        filtered = self._filtered(viewed, sliders[0].shape[-1] - 1)
+        if viewed.size != source.size:
+            masks = {name: source.resized_weights(mask, viewed.size, name) for name, mask in masks.items()}
+        regions = selector.select(viewed, masks["regions"], masks.get("negative"), names=("regions", "negative"))
+        changes = [DetailChange(filtered, row) for row in sliders]
+        return Fitted(RegionalChange(changes, regions), self._limited, blur_margin(VARIANCE_SIGMA))
+
+    def _limited(self, image: Tensor, changes: Tensor, _: Inner) -> Tensor:
+        return limit_by_activity(changes, activity(image), self.threshold)
+
+
+def region_sliders(alpha: Tensor, count: int) -> Tensor:
+    """Sliders less 1, (K, k+1), of K regions.
+
+    Raises:
+        ValueError: if ``alpha`` is neither (k+1,) nor (K, k+1).
+    """
+    if alpha.ndim == 1:
+        return (alpha - 1).expand(count, -1)
+    if alpha.ndim != 2 or len(alpha) != count:
+        raise ValueError(
+            f"alpha must have shape ({count}, k+1), a row of sliders for each of the regions, or (k+1,), got "
+            f"{tuple(alpha.shape)}; reshape it"
+        )
+    return alpha - 1
+
+
+@dataclass(frozen=True, eq=False)
+class DetailChange:
+    """The change of detail by sliders less 1, as added detail and the rest, (B, 2 C, h, w)."""
+
+    filtered: Polynomial
+    sliders: Tensor
+
+    def __call__(self, pixels: Pixels) -> Tensor:
+        """Added detail and the rest of the change at the given pixels."""
+        halves = zip(split_sliders(self.sliders), (0.0, None), strict=True)
+        return torch.cat([self.filtered(pixels, half, weight) for half, weight in halves], dim=1)
+
+    def total(self, pixels: Pixels) -> Tensor:
+        """The change at the given pixels, (B, C, h, w)."""
+        return sum_of(self(pixels))
+
+
+@dataclass(frozen=True, eq=False)
+class RegionalChange:
+    """Changes of detail inside each region, and of the rest of the picture, blended by the masks of the regions."""
+
+    changes: list[DetailChange]
+    regions: Regions
+
+    def __call__(self, pixels: Pixels) -> Tensor:
+        """Added detail and the rest of the change at the given pixels."""
+        return blend_changes(torch.cat([change(pixels) for change in self.changes], dim=1), self.regions.masks(pixels))

@@ -1,30 +1,34 @@
 """A look: sliders of detail and blurs, tone curves, colours, levels, local contrast, as found by :func:`fit_look`."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import ClassVar
 
 import torch
 from torch import Tensor
 
 from nlfilter_torch.core.inner import EVERYWHERE, Inner
-from nlfilter_torch.operator.features import reduce_channels
+from nlfilter_torch.operator.features import GuideChannels, reduce_channels
+from nlfilter_torch.operator.landmarks import Sampling
+from nlfilter_torch.operator.nystrom import Completion
+from nlfilter_torch.photo.declared.declaration import Edit
 from nlfilter_torch.photo.declared.shared_parameters import LOOK
-from nlfilter_torch.photo.edits.synthesis import polynomial
+from nlfilter_torch.photo.edits.synthesis import Polynomial
 from nlfilter_torch.photo.looks.histogram import LocalCurves, Stretch, ramps, tones
 from nlfilter_torch.photo.looks.look_filter import BAND_MARGIN, acts, band_change, check_part, pointwise, texture_change
-from nlfilter_torch.photo.picture.in_memory import edit_of
-from nlfilter_torch.photo.picture.pixels import corner
+from nlfilter_torch.photo.picture.drawn import Drawn, M
+from nlfilter_torch.photo.picture.edit import FilteredEdit, Rows, edit_image
+from nlfilter_torch.photo.picture.pixels import corner, whole_image
 from nlfilter_torch.photo.picture.source import Fitted, Guide, Pixels, Planes, Source, luminance
 from nlfilter_torch.photo.picture.viewing import fit_change
 
 Numbers = Tensor | Sequence[float]
+TINT = 1 / 255  # difference of channels of a grey pixel that a look colours
 
 
-@edit_of("image")
 def apply_look(
-    source: Source,
-    /,
+    image: Tensor,
     *,
     alpha: Numbers = LOOK.defaults["alpha"],
     bands: Numbers = LOOK.defaults["bands"],
@@ -40,9 +44,13 @@ def apply_look(
     viewing_size: float = LOOK.defaults["viewing_size"],
     photometric_bandwidth: float | Tensor | str = LOOK.defaults["photometric_bandwidth"],
     spatial_bandwidth: float | Tensor | str | None = LOOK.defaults["spatial_bandwidth"],
+    patch_size: int = LOOK.defaults["patch_size"],
     num_landmarks: int = LOOK.defaults["num_landmarks"],
-    **options: Any,
-) -> Fitted:
+    landmarks: Sampling = LOOK.defaults["landmarks"],
+    completion: Completion = "diagonal",
+    guide_channels: GuideChannels = "luminance",
+    generator: torch.Generator | None = None,
+) -> Tensor:
     """Put a photograph under a look: the image plus what each part changes.
 
     Args:
@@ -70,7 +78,11 @@ def apply_look(
         spatial_bandwidth: h_x in pixels; None is a twelfth of the short side, ``"none"`` compares spots however far
             apart they are.
         num_landmarks: M.
-        **options: further ones of :func:`nonlocal_operator`.
+        patch_size: width of the compared patches of the filter.
+        landmarks: how the landmarks are chosen, see :func:`nonlocal_operator`.
+        completion: of the kernel's diagonal, see :func:`nonlocal_operator`.
+        guide_channels: what the filter compares, ``"luminance"`` or ``"all"`` channels.
+        generator: source of randomness for the landmarks; None draws the same for every call.
 
     Returns:
         (B, C, H, W) in the image's dtype; values may leave [0, 1]. Differentiable in image and look.
@@ -84,104 +96,226 @@ def apply_look(
         >>> apply_look(image, matrix=sepia).shape
         torch.Size([1, 3, 24, 24])
     """
-    if source.channels not in (1, 3):
-        raise ValueError(f"image must have 1 or 3 channels, got {source.channels}; pass grey or RGB")
-    LOOK.check(source.batch, amount=amount, viewing_size=viewing_size)
-    given = {"alpha": alpha, "bands": bands, "texture": texture, "saturation": saturation}
-    given |= {"stretch": stretch, "local": local, "red": red, "green": green, "blue": blue}
-    sliders, gains, textured, factors, levels, strengths, *channels = (
-        _numbers(value, name, source) for name, value in given.items()
+    edit = LookEdit(
+        alpha=alpha,
+        bands=bands,
+        texture=texture,
+        red=red,
+        green=green,
+        blue=blue,
+        matrix=matrix,
+        saturation=saturation,
+        stretch=stretch,
+        local=local,
+        amount=amount,
+        viewing_size=viewing_size,
+        photometric_bandwidth=photometric_bandwidth,
+        spatial_bandwidth=spatial_bandwidth,
+        patch_size=patch_size,
+        num_landmarks=num_landmarks,
+        landmarks=landmarks,
+        completion=completion,
+        guide_channels=guide_channels,
+        generator=generator,
     )
-    if len({channel.shape[-1] for channel in channels}) > 1:
-        lengths = ", ".join(str(channel.shape[-1]) for channel in channels)
-        raise ValueError(f"red, green and blue must be equally many numbers, got {lengths}; add or drop some")
-    batch = max(channel.shape[0] if channel.ndim == 2 else 1 for channel in channels)
-    curves = torch.stack([channel.expand(batch, -1) for channel in channels], dim=1)
-    colours = _numbers(matrix, "matrix", source)
-    if colours.shape[-1] != 9:
-        raise ValueError(f"matrix must be 9 numbers, row by row, got {colours.shape[-1]}; add or drop some")
-    colours = colours.unflatten(-1, (3, 3))
-    parts = {"alpha": sliders, "bands": gains, "texture": textured, "curves": curves, "matrix": colours}
-    parts |= {"saturation": factors, "stretch": levels, "local": strengths}
-    for name, value in parts.items():
-        check_part(value, name, source.batch)
-    strength = torch.as_tensor(amount).to(source.dtype).reshape(-1, 1, 1, 1)
+    return edit_image(edit, image)
 
-    def change(viewed: Source) -> Fitted:
-        moved: Planes | None = None
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LookEdit(FilteredEdit):
+    """The edit of :func:`apply_look`."""
+
+    declared: ClassVar[Edit] = LOOK
+    alpha: Numbers
+    bands: Numbers
+    texture: Numbers
+    red: Numbers
+    green: Numbers
+    blue: Numbers
+    matrix: Numbers
+    saturation: Numbers
+    stretch: Numbers
+    local: Numbers
+    amount: float | Tensor
+    viewing_size: float
+
+    def notes(self, rows: Rows) -> Iterator[str]:
+        """Note that a grey photograph stays grey, if the look gives colours to greys."""
+        if rows.channels == 1:
+            ramp = torch.linspace(0, 1, 64).view(1, 1, 8, 8).expand(-1, 3, -1, -1)
+            shown = edit_image(self, ramp)
+            if bool((shown.amax(1) - shown.amin(1)).amax() > TINT):
+                yield f"{rows.name} is grey and stays grey, without the colours of the look; convert it to RGB first"
+
+    def fit(self, source: Source[M], drawn: Drawn[M]) -> Fitted:
+        """Fit the parts of the look to a picture."""
+        if source.channels not in (1, 3):
+            raise ValueError(f"image must have 1 or 3 channels, got {source.channels}; pass grey or RGB")
+        LOOK.check(source.batch, amount=self.amount, viewing_size=self.viewing_size)
+        parts = self._parts(source.dtype)
+        for name, value in parts.items():
+            check_part(value, name, source.batch)
+        change = partial(self._change, parts)
+        fitted = fit_change(source, change, whole_image, self.viewing_size, "none")
+        strength = torch.as_tensor(self.amount).to(source.dtype).reshape(-1, 1, 1, 1)
+        light = _change_of_light(source, parts["stretch"], parts["local"])
+        result = UnderLook(fitted, light, parts["curves"], parts["matrix"], parts["saturation"], strength)
+        if fitted.finish is None:
+            return Fitted(result.pixels)
+        return Fitted(result.planes, result.finish, fitted.margin)
+
+    def _parts(self, dtype: torch.dtype) -> dict[str, Tensor]:
+        """The parts of the look as tensors, by their names.
+
+        Raises:
+            TypeError, ValueError: if a part has the wrong number of values.
+        """
+        names = ("alpha", "bands", "texture", "saturation", "stretch", "local")
+        parts = {name: _numbers(getattr(self, name), name, dtype) for name in names}
+        channels = [_numbers(getattr(self, name), name, dtype) for name in ("red", "green", "blue")]
+        if len({channel.shape[-1] for channel in channels}) > 1:
+            lengths = ", ".join(str(channel.shape[-1]) for channel in channels)
+            raise ValueError(f"red, green and blue must be equally many numbers, got {lengths}; add or drop some")
+        batch = max(channel.shape[0] if channel.ndim == 2 else 1 for channel in channels)
+        parts["curves"] = torch.stack([channel.expand(batch, -1) for channel in channels], dim=1)
+        colours = _numbers(self.matrix, "matrix", dtype)
+        if colours.shape[-1] != 9:
+            raise ValueError(f"matrix must be 9 numbers, row by row, got {colours.shape[-1]}; add or drop some")
+        order = ("alpha", "bands", "texture", "curves", "matrix", "saturation", "stretch", "local")
+        parts["matrix"] = colours.unflatten(-1, (3, 3))
+        return {name: parts[name] for name in order}
+
+    def _change(self, parts: dict[str, Tensor], viewed: Source[M]) -> Fitted:
+        """The change of detail of a picture at the viewing size."""
+        sliders, gains, textured = parts["alpha"], parts["bands"], parts["texture"]
+        pixels: Planes = no_change
         if acts(sliders):
-            filter_options = options | {
-                "photometric_bandwidth": photometric_bandwidth,
-                "spatial_bandwidth": LOOK["spatial_bandwidth"].distance(spatial_bandwidth, viewed.size),
-                "num_landmarks": num_landmarks,
-            }
-            filtered = polynomial(viewed.operator(Guide(filter_options)), luminance, sliders.shape[-1] - 1, None)
-
-            moved = partial(filtered, alpha=sliders - 1)
-
-        def pixels(some: Pixels) -> Tensor:
-            return torch.zeros_like(some.image) if moved is None else moved(some).expand_as(some.image)
-
+            operator = viewed.operator(Guide(self.filter_options(viewed.size)))
+            filtered = Polynomial.of(operator, luminance, sliders.shape[-1] - 1, None)
+            pixels = partial(_for_all_channels, partial(filtered, alpha=sliders - 1))
         if not acts(gains) and not acts(textured):
             return Fitted(pixels)
         mean = viewed.mean(luminance) if acts(gains) else None
+        return Fitted(pixels, Bands(gains, mean, textured if acts(textured) else None), BAND_MARGIN)
 
-        def around(image: Tensor, found: Tensor, _: Inner) -> Tensor:
-            found = found if mean is None else found + band_change(image, gains, mean)
-            return found + texture_change(image, textured) if acts(textured) else found
 
-        return Fitted(pixels, around, BAND_MARGIN)
+def no_change(pixels: Pixels) -> Tensor:
+    """Zeros in the shape of the pixels."""
+    return torch.zeros_like(pixels.image)
 
-    fitted = fit_change(source, change, lambda pixels: pixels.image, viewing_size, "none")
 
-    brightened = _change_of_brightness(source, levels, strengths)
+def _for_all_channels(planes: Planes, pixels: Pixels) -> Tensor:
+    return planes(pixels).expand_as(pixels.image)
 
-    def result(image: Tensor, moved: Tensor) -> Tensor:
+
+@dataclass(frozen=True, eq=False)
+class Bands:
+    """Changes of the detail that blurs find, added to another change.
+
+    Attributes:
+        gains: of the bands.
+        mean: of luminance; None if ``gains`` change nothing.
+        textured: gains where luminance varies little, or None.
+    """
+
+    gains: Tensor
+    mean: Tensor | None
+    textured: Tensor | None
+
+    def __call__(self, image: Tensor, change: Tensor, _: Inner) -> Tensor:
+        """Add the changes of an image (B, C, H, W)."""
+        if self.mean is not None:
+            change = change + band_change(image, self.gains, self.mean)
+        return change if self.textured is None else change + texture_change(image, self.textured)
+
+
+@dataclass(frozen=True, eq=False)
+class UnderLook:
+    """A picture under a look.
+
+    Attributes:
+        fitted: the picture with the change of its detail.
+        light: change of its brightness by levels and local curves; None if there is none.
+        curves: tone curves.
+        matrix: of colours.
+        saturation: factors of the saturation.
+        strength: amount of the look, (B or 1, 1, 1, 1).
+    """
+
+    fitted: Fitted
+    light: Planes | None
+    curves: Tensor
+    matrix: Tensor
+    saturation: Tensor
+    strength: Tensor
+
+    def pixels(self, pixels: Pixels) -> Tensor:
+        """The result at pixels, if it depends on no others."""
+        return self.finish(pixels.image, self.planes(pixels), EVERYWHERE)
+
+    def planes(self, pixels: Pixels) -> Tensor:
+        """The change of pixels, and that of their brightness as further planes."""
+        moved = self.fitted.pixels(pixels)
+        return moved if self.light is None else torch.cat([moved, self.light(pixels)], dim=1)
+
+    def finish(self, image: Tensor, planes: Tensor, inner: Inner) -> Tensor:
+        """The result, from :meth:`planes`."""
+        moved, light = (planes, None) if self.light is None else planes.tensor_split([-image.shape[1]], dim=1)
+        moved = moved if self.fitted.finish is None else self.fitted.finish(image, moved, inner)
         coloured = image.expand(-1, 3, -1, -1)
-        shown = pointwise(coloured, curves, colours, factors) - coloured
-        shown = reduce_channels(shown, "luminance") if image.shape[1] == 1 else shown
-        return image + strength * (moved - image + shown)
-
-    def planes(pixels: Pixels) -> Tensor:
-        """The change of some pixels, and that of their brightness as further planes."""
-        moved = fitted.pixels(pixels)
-        return moved if brightened is None else torch.cat([moved, brightened(pixels)], dim=1)
-
-    def finished(image: Tensor, found: Tensor, inner: Inner) -> Tensor:
-        moved, light = (found, None) if brightened is None else found.tensor_split([-image.shape[1]], dim=1)
-        shown = result(image, moved if fitted.finish is None else fitted.finish(image, moved, inner))
-        return shown if light is None else shown + strength * light
-
-    if fitted.finish is None:
-        return Fitted(lambda pixels: finished(pixels.image, planes(pixels), EVERYWHERE))
-    return Fitted(planes, finished, fitted.margin)
+        colours = pointwise(coloured, self.curves, self.matrix, self.saturation) - coloured
+        colours = reduce_channels(colours, "luminance") if image.shape[1] == 1 else colours
+        shown = image + self.strength * (moved - image + colours)
+        return shown if light is None else shown + self.strength * light
 
 
-def _change_of_brightness(source: Source, levels: Tensor, strengths: Tensor) -> Planes | None:
-    """The change (B, C, h, W) by automatic levels and local tone curves, or None if there is none."""
+def _change_of_light(source: Source[M], levels: Tensor, strengths: Tensor) -> Planes | None:
+    """The change (B, C, h, w) by automatic levels and local tone curves, or None if there is none."""
     if not acts(levels, 0.0) and not acts(strengths, 0.0):
         return None
-
-    stretch = source.kept(
-        "range of brightness", [], lambda: Stretch.of(source.ends(lambda pixels: tones(pixels.image)))
-    )
-    if not acts(strengths, 0.0):
-        return lambda pixels: stretch.change(pixels.image, levels)
-
-    def curves() -> LocalCurves:
-        ramped = partial(source.reduced, lambda pixels: ramps(pixels.image, stretch))
-        return LocalCurves.of(source.size, stretch, ramped)
-
-    weighed = source.kept("local curves", [], curves).weighed(strengths)
-
-    def change(pixels: Pixels) -> Tensor:
-        found = weighed.rectangle(pixels.image, corner(pixels)).sum(1)
-        return found + stretch.change(pixels.image, levels) if acts(levels, 0.0) else found
-
-    return change
+    stretch = source.kept("range of brightness", [], partial(_range_of, source))
+    curves = None
+    if acts(strengths, 0.0):
+        curves = source.kept("local curves", [], partial(_curves_of, source, stretch)).weighed(strengths)
+    return ChangeOfLight(stretch, curves, levels if curves is None or acts(levels, 0.0) else None)
 
 
-def _numbers(value: Numbers, name: str, source: Source) -> Tensor:
+def _tones(pixels: Pixels) -> Tensor:
+    return tones(pixels.image)
+
+
+def _range_of(source: Source[M]) -> Stretch:
+    return Stretch.of(source.ends(_tones))
+
+
+def _ramps(stretch: Stretch, pixels: Pixels) -> Tensor:
+    return ramps(pixels.image, stretch)
+
+
+def _curves_of(source: Source[M], stretch: Stretch) -> LocalCurves:
+    return LocalCurves.of(source.size, stretch, partial(source.reduced, partial(_ramps, stretch)))
+
+
+@dataclass(frozen=True, eq=False)
+class ChangeOfLight:
+    """Changes of brightness by the histogram of a picture: by local curves, by levels, or by both."""
+
+    stretch: Stretch
+    curves: LocalCurves | None
+    levels: Tensor | None
+
+    def __call__(self, pixels: Pixels) -> Tensor:
+        """The change of pixels."""
+        change: Tensor | None = None
+        if self.curves is not None:
+            change = self.curves.rectangle(pixels.image, corner(pixels)).sum(1)
+        if self.levels is not None:
+            levels = self.stretch.change(pixels.image, self.levels)
+            change = levels if change is None else change + levels
+        return no_change(pixels) if change is None else change
+
+
+def _numbers(value: Numbers, name: str, dtype: torch.dtype) -> Tensor:
     """A part of a look as a tensor of at least one dimension."""
     try:
         numbers = value if isinstance(value, Tensor) else torch.tensor(value)
@@ -189,4 +323,4 @@ def _numbers(value: Numbers, name: str, source: Source) -> Tensor:
         raise TypeError(f"{name} must be a list of numbers or a tensor, got {value!r}; pass numbers") from error
     if numbers.ndim == 0:
         raise ValueError(f"{name} must be several numbers, got a single one; pass a list or a tensor of them")
-    return numbers.to(source.dtype)
+    return numbers.to(dtype)

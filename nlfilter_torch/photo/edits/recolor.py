@@ -1,18 +1,21 @@
 """Recolouring of objects by strokes of colour. Paper: Sec. V-A, Figs. 14, 15."""
 
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import torch
 from torch import Tensor
 
-from nlfilter_torch.core.checks import check_tensor
+from nlfilter_torch.operator.landmarks import Sampling
+from nlfilter_torch.operator.nystrom import Completion
+from nlfilter_torch.photo.declared.declaration import Edit
 from nlfilter_torch.photo.declared.parameters import RECOLOR
 from nlfilter_torch.photo.picture.colour import dot, group_colours, merge_luminance, region_means, split_luminance
-from nlfilter_torch.photo.picture.in_memory import edit_of
+from nlfilter_torch.photo.picture.drawn import Drawn, M
+from nlfilter_torch.photo.picture.edit import PhotoEdit, edit_image
 from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles
-from nlfilter_torch.photo.picture.source import Fitted, Source
-from nlfilter_torch.photo.selections.mask import background_of, fit_regions
+from nlfilter_torch.photo.picture.source import Fitted, Pixels, Source
+from nlfilter_torch.photo.selections.mask import RegionMask, Regions, background_of, fit_regions
 from nlfilter_torch.photo.selections.matting import Sides, colours_beside, refine_mask
 
 EPSILON = 1e-12  # keeps the derivative of a root finite
@@ -21,10 +24,8 @@ ROOM = 0.8  # share of the chroma at which a channel reaches 1 that the mean of 
 GREY_CHROMA = 0.05  # chroma below this counts as grey, without variations to keep
 
 
-@edit_of("image", channels=3)
 def recolor(
-    source: Source,
-    /,
+    image: Tensor,
     strokes: Tensor,
     stroke_mask: Tensor,
     *,
@@ -33,8 +34,11 @@ def recolor(
     photometric_bandwidth: float | Tensor = RECOLOR.defaults["photometric_bandwidth"],
     spatial_bandwidth: float | Tensor | None = None,
     patch_size: int = RECOLOR.defaults["patch_size"],
-    **options: Any,
-) -> Fitted:
+    num_landmarks: int = RECOLOR.defaults["num_landmarks"],
+    landmarks: Sampling = RECOLOR.defaults["landmarks"],
+    completion: Completion = "diagonal",
+    generator: torch.Generator | None = None,
+) -> Tensor:
     """Recolour the objects that strokes are painted on, and similar pixels around them.
 
     Paper: Sec. V-A, with :func:`region_mask` in place of k-means, for any number of colours.
@@ -52,7 +56,10 @@ def recolor(
         photometric_bandwidth: in hundredths of Lab: 0.08 is 8 units.
         spatial_bandwidth: in pixels; None is 1.2 of the short side, ``math.inf`` no limit.
         patch_size: width of the compared patches.
-        **options: further options of :func:`region_mask`, such as ``num_landmarks`` or ``generator``.
+        num_landmarks: M of the filter.
+        landmarks: how the landmarks are chosen, see :func:`nonlocal_operator`.
+        completion: of the kernel's diagonal, see :func:`nonlocal_operator`.
+        generator: source of randomness for the landmarks; None draws the same for every call.
 
     Returns:
         (B, 3, H, W), with the luminance of ``image``, and equal to it where a pixel is similar to no stroke.
@@ -71,39 +78,92 @@ def recolor(
         >>> torch.equal(blue[..., :8], image[..., :8]), bool((blue[:, 2] > blue[:, 0])[..., 14:].all())
         (True, True)
     """
-    if source.whole:  # otherwise they are checked when they are read
-        check_tensor(strokes, "strokes")
-    RECOLOR.check(source.batch, reach=reach)
-    scribbles = source.scribbles(stroke_mask, strokes, "stroke_mask")
-    kept = background_of(source, keep, scribbles, "keep")
-
-    colours, regions, valid = _grouped(scribbles)
-    brightness, old = (
-        region_means(part, regions.unsqueeze(2)) for part in split_luminance(scribbles.image.unsqueeze(2))
-    )
-    colours = with_room(colours, brightness)
-    inside = [scribbles.weighted(part) for part in regions.split(1, dim=1)]
-    found = fit_regions(
-        source,
-        inside,
-        kept,
+    edit = Recolor(
         reach=reach,
         photometric_bandwidth=photometric_bandwidth,
-        spatial_bandwidth=RECOLOR["spatial_bandwidth"].distance(spatial_bandwidth, source.size),
+        spatial_bandwidth=spatial_bandwidth,
         patch_size=patch_size,
-        **options,
+        num_landmarks=num_landmarks,
+        landmarks=landmarks,
+        completion=completion,
+        generator=generator,
     )
-    change = Recoloring(colours, old, valid)
-    reduced = split_luminance(found.reduced)[1]
-    beside = []
-    for share in change.shares(found.reduced_masks()).split(1, dim=1):
-        beside.append(colours_beside(reduced, refine_mask(reduced, share)).planes)
+    masks = {"stroke_mask": stroke_mask} | ({} if keep is None else {"keep": keep})
+    return edit_image(edit, image, Drawn(masks, strokes), channels=3)
 
-    def recoloured(pixels: Any) -> Tensor:
-        sides = [Sides.of(found.rows(planes, pixels)) for planes in beside]
-        return change(pixels.image, found.masks(pixels), sides)
 
-    return Fitted(recoloured)
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Recolor(PhotoEdit):
+    """The edit of :func:`recolor`."""
+
+    declared: ClassVar[Edit] = RECOLOR
+    reach: float | Tensor
+    photometric_bandwidth: float | Tensor
+    spatial_bandwidth: float | Tensor | None
+    patch_size: int
+    num_landmarks: int
+    landmarks: Sampling = "kmeans"
+    completion: Completion = "diagonal"
+    generator: torch.Generator | None = None
+
+    def check_channels(self, channels: int) -> None:
+        """Raise ValueError for a grey photograph."""
+        if channels < 3:
+            raise ValueError("recolor needs a colour photograph, got a grey one; use colorize for grey photographs")
+
+    def selection(self) -> RegionMask:
+        """The masks of the objects, without the default of the spatial bandwidth, which depends on the size."""
+        return RegionMask(
+            reach=self.reach,
+            photometric_bandwidth=self.photometric_bandwidth,
+            spatial_bandwidth=self.spatial_bandwidth,
+            num_landmarks=self.num_landmarks,
+            landmarks=self.landmarks,
+            completion=self.completion,
+            generator=self.generator,
+        )
+
+    def fit(self, source: Source[M], drawn: Drawn[M]) -> Fitted:
+        """Fit the new colours of the objects under the strokes."""
+        RECOLOR.check(source.batch, reach=self.reach)
+        scribbles = source.scribbles(drawn.masks.get("stroke_mask"), drawn.colours, "stroke_mask")
+        kept = background_of(source, drawn.masks.get("keep"), scribbles, "keep")
+
+        colours, regions, valid = _grouped(scribbles)
+        brightness, old = (
+            region_means(part, regions.unsqueeze(2)) for part in split_luminance(scribbles.image.unsqueeze(2))
+        )
+        colours = with_room(colours, brightness)
+        inside = [scribbles.weighted(part) for part in regions.split(1, dim=1)]
+        distance = RECOLOR["spatial_bandwidth"].distance(self.spatial_bandwidth, source.size)
+        selector = replace(self.selection(), spatial_bandwidth=distance, patch_size=self.patch_size)
+        objects = fit_regions(source, inside, kept, selector)
+        change = Recoloring(colours, old, valid)
+        reduced = split_luminance(objects.reduced)[1]
+        beside = []
+        for share in change.shares(objects.reduced_masks()).split(1, dim=1):
+            beside.append(colours_beside(reduced, refine_mask(reduced, share)).planes)
+        return Fitted(RecoloredPixels(change, objects, beside))
+
+
+@dataclass(frozen=True, eq=False)
+class RecoloredPixels:
+    """The recoloured pixels of a picture.
+
+    Attributes:
+        change: of the colours, given masks.
+        objects: the masks.
+        beside: for each object, what :func:`colours_beside` found, in the reduced picture.
+    """
+
+    change: "Recoloring"
+    objects: Regions
+    beside: list[Tensor]
+
+    def __call__(self, pixels: Pixels) -> Tensor:
+        """Recolour pixels."""
+        sides = [Sides.of(self.objects.rows(planes, pixels)) for planes in self.beside]
+        return self.change(pixels.image, self.objects.masks(pixels), sides)
 
 
 def with_room(chroma: Tensor, brightness: Tensor) -> Tensor:

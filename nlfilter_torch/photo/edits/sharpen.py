@@ -1,19 +1,26 @@
 """Sharpening with little noise gain: unsharp masking of what the filter shows not to be noise. Paper: Fig. 6."""
 
-from typing import Any
+from dataclasses import dataclass
+from functools import partial
+from typing import ClassVar
 
 import torch
 from torch import Tensor
 
 from nlfilter_torch.core.checks import check_reach
 from nlfilter_torch.core.inner import Inner
+from nlfilter_torch.nn.denoiser.noise import Noise
 from nlfilter_torch.operator.features import blur, blur_margin, reduce_channels
+from nlfilter_torch.operator.landmarks import Sampling
+from nlfilter_torch.operator.nystrom import Completion
+from nlfilter_torch.photo.declared.declaration import Edit
 from nlfilter_torch.photo.declared.parameters import SHARPEN
 from nlfilter_torch.photo.edits.noise import noise_of
 from nlfilter_torch.photo.picture.changes import VARIANCE_SIGMA, activity
-from nlfilter_torch.photo.picture.in_memory import edit_of
+from nlfilter_torch.photo.picture.drawn import Drawn, M
+from nlfilter_torch.photo.picture.edit import FilteredEdit, edit_image
 from nlfilter_torch.photo.picture.limits import Limits
-from nlfilter_torch.photo.picture.source import Fitted, Guide, Source, luminance
+from nlfilter_torch.photo.picture.source import Fitted, Guide, Pixels, Planes, Source, luminance
 from nlfilter_torch.photo.picture.viewing import fit_change
 
 RADIUS = 1.5  # standard deviation in pixels of the blur of the unsharp mask
@@ -22,18 +29,21 @@ FAINT = 5 / 255  # standard deviation of luminance around a pixel below which a 
 NOISE_RATIO = 2.0  # ratio of that deviation to the noise below which a noisy one is
 
 
-@edit_of("image")
 def sharpen(
-    source: Source,
-    /,
+    image: Tensor,
     *,
     amount: float | Tensor = SHARPEN.defaults["amount"],
     guide_blur: float = SHARPEN.defaults["guide_blur"],
     limits: Limits = SHARPEN.defaults["limits"],
     viewing_size: float = SHARPEN.defaults["viewing_size"],
     photometric_bandwidth: float | Tensor | str = SHARPEN.defaults["photometric_bandwidth"],
-    **options: Any,
-) -> Fitted:
+    spatial_bandwidth: float | Tensor | None = SHARPEN.defaults["spatial_bandwidth"],
+    patch_size: int = SHARPEN.defaults["patch_size"],
+    num_landmarks: int = SHARPEN.defaults["num_landmarks"],
+    landmarks: Sampling = SHARPEN.defaults["landmarks"],
+    completion: Completion = "diagonal",
+    generator: torch.Generator | None = None,
+) -> Tensor:
     """Sharpen a photograph, noisy or not.
 
     An unsharp mask of what is left of luminance without its noise. The finest layer of the filter, which contains the
@@ -51,7 +61,12 @@ def sharpen(
         viewing_size: in megapixels; larger images are edited like their reduction to this size, with patches and
             bandwidths in its pixels; 0 is the size of the image.
         photometric_bandwidth: h_y of the blurred guide.
-        **options: further options of :func:`nonlocal_operator`.
+        spatial_bandwidth: h_x in pixels; None is no limit.
+        patch_size: width of the compared patches.
+        num_landmarks: M of the filter.
+        landmarks: how the landmarks are chosen, see :func:`nonlocal_operator`.
+        completion: of the kernel's diagonal, see :func:`nonlocal_operator`.
+        generator: source of randomness for the landmarks; None draws the same for every call.
 
     Returns:
         (B, C, H, W); values may leave [0, 1]. Differentiable in image and amount; the estimated noise
@@ -66,27 +81,68 @@ def sharpen(
         >>> sharp.shape, bool(sharp.std() > image.std())
         (torch.Size([1, 3, 32, 32]), True)
     """
-    SHARPEN.check(source.batch, amount=amount, guide_blur=guide_blur, limits=limits, viewing_size=viewing_size)
-    strength = (torch.as_tensor(amount, dtype=source.dtype).reshape(-1, 1, 1, 1) - 1) / UNIT
+    edit = Sharpen(
+        amount=amount,
+        guide_blur=guide_blur,
+        limits=limits,
+        viewing_size=viewing_size,
+        photometric_bandwidth=photometric_bandwidth,
+        spatial_bandwidth=spatial_bandwidth,
+        patch_size=patch_size,
+        num_landmarks=num_landmarks,
+        landmarks=landmarks,
+        completion=completion,
+        generator=generator,
+    )
+    return edit_image(edit, image)
 
-    def change(viewed: Source) -> Fitted:
-        check_reach(guide_blur, "guide_blur", viewed.size)
-        filter_options = options | {"photometric_bandwidth": photometric_bandwidth}
-        layers = viewed.operator(Guide(filter_options, transform=_grey, blur=guide_blur)).layers(luminance, 1)
-        noise = viewed.kept("noise of luminance", [], lambda: noise_of(viewed, "luminance"))
 
-        def finish(image: Tensor, planes: Tensor, _: Inner) -> Tensor:
-            fine, smooth = planes.chunk(2, dim=1)
-            variance = noise.at(_grey(image)).square()
-            signal = (activity(image) - variance).clamp(min=0)
-            kept = signal / (signal + NOISE_RATIO**2 * variance + FAINT**2)
-            clean = smooth + kept * fine
-            return strength.to(image) * kept * (clean - blur(clean, RADIUS))
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Sharpen(FilteredEdit):
+    """The edit of :func:`sharpen`."""
 
+    declared: ClassVar[Edit] = SHARPEN
+    amount: float | Tensor
+    guide_blur: float
+    limits: Limits
+    viewing_size: float
+
+    def fit(self, source: Source[M], drawn: Drawn[M]) -> Fitted:
+        """Fit the unsharp mask of a picture."""
+        SHARPEN.check(source.batch, amount=self.amount, guide_blur=self.guide_blur, limits=self.limits)
+        SHARPEN.check(source.batch, viewing_size=self.viewing_size)
+        return fit_change(source, self._change, luminance, self.viewing_size, self.limits)
+
+    def _change(self, viewed: Source[M]) -> Fitted:
+        """The unsharp mask of a picture at the viewing size."""
+        check_reach(self.guide_blur, "guide_blur", viewed.size)
+        guide = Guide(self.filter_options(viewed.size), transform=_grey, blur=self.guide_blur)
+        layers = viewed.operator(guide).layers(luminance, 1)
+        noise = viewed.kept("noise of luminance", [], partial(noise_of, viewed, "luminance"))
+        strength = (torch.as_tensor(self.amount, dtype=viewed.dtype).reshape(-1, 1, 1, 1) - 1) / UNIT
         margin = blur_margin(RADIUS) + blur_margin(VARIANCE_SIGMA)
-        return Fitted(lambda pixels: layers(pixels).flatten(1, 2), finish, margin)
+        return Fitted(partial(_flat_layers, layers), UnsharpMask(noise, strength), margin)
 
-    return fit_change(source, change, luminance, viewing_size, limits)
+
+def _flat_layers(layers: Planes, pixels: Pixels) -> Tensor:
+    return layers(pixels).flatten(1, 2)
+
+
+@dataclass(frozen=True, eq=False)
+class UnsharpMask:
+    """An unsharp mask of luminance without its noise, times a strength (B or 1, 1, 1, 1)."""
+
+    noise: Noise
+    strength: Tensor
+
+    def __call__(self, image: Tensor, planes: Tensor, _: Inner) -> Tensor:
+        """The mask (B, 1, H, W) of an image, from the fine and the smooth layer of its luminance."""
+        fine, smooth = planes.chunk(2, dim=1)
+        variance = self.noise.at(_grey(image)).square()
+        signal = (activity(image) - variance).clamp(min=0)
+        kept = signal / (signal + NOISE_RATIO**2 * variance + FAINT**2)
+        clean = smooth + kept * fine
+        return self.strength.to(image) * kept * (clean - blur(clean, RADIUS))
 
 
 def _grey(image: Tensor) -> Tensor:

@@ -1,15 +1,15 @@
 """Functions of the spectrum and polynomials of an operator, for planes of a picture from any source."""
 
-from collections.abc import Callable
-from typing import Any
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from nlfilter_torch.core.kernels.tall_skinny import spread
 from nlfilter_torch.filtering.filters import residual_change, weigh_layers
+from nlfilter_torch.operator.products import Columns
 from nlfilter_torch.operator.spectrum import Response
-from nlfilter_torch.photo.picture.source import Operator, Planes
+from nlfilter_torch.photo.picture.source import Operator, Pixels, Planes
 
 
 def synthesize(operator: Operator, response: Response, coefficients: Tensor) -> Planes:
@@ -18,22 +18,43 @@ def synthesize(operator: Operator, response: Response, coefficients: Tensor) -> 
     return operator.each(lambda columns: spread(total.to(columns.factor), columns.factor, columns.scaling))
 
 
-def polynomial(
-    operator: Operator, planes: Planes, order: int, residual: float | Tensor | None
-) -> Callable[..., Tensor]:
-    """Prepare :func:`polynomial_filter` of planes of a picture.
+@dataclass(frozen=True, eq=False)
+class Polynomial:
+    """:func:`polynomial_filter` of planes of a picture, for any sliders.
 
-    Returns a function of pixels, sliders and, optionally, a weight of the residual that replaces ``residual``.
+    Attributes:
+        planes: what is filtered.
+        layers: its detail layers.
+        residual: default weight of the residual; None is that of eq. 12.
+        captured: the planes, projected on the eigenvectors; None if ``residual`` is.
+        share: remainder r of the diagonal of W; None if ``residual`` is.
     """
-    layers = operator.layers(planes, order)
-    if residual is None:
-        return lambda pixels, alpha, _=None: weigh_layers(layers(pixels), alpha)
-    captured = synthesize(operator, torch.ones_like, operator.coefficients(planes))
-    share = operator.each(lambda columns: columns.remainder.unsqueeze(1))
 
-    def filtered(pixels: Any, alpha: Tensor, weight: float | Tensor | None = None) -> Tensor:
-        weight = residual if weight is None else weight
-        change = residual_change(alpha, weight, planes(pixels) - captured(pixels), share(pixels))
-        return weigh_layers(layers(pixels), alpha) + change
+    planes: Planes
+    layers: Planes
+    residual: float | Tensor | None = None
+    captured: Planes | None = None
+    share: Planes | None = None
 
-    return filtered
+    @staticmethod
+    def of(operator: Operator, planes: Planes, order: int, residual: float | Tensor | None) -> "Polynomial":
+        """Prepare the filter of planes of a picture."""
+        layers = operator.layers(planes, order)
+        if residual is None:
+            return Polynomial(planes, layers)
+        captured = synthesize(operator, torch.ones_like, operator.coefficients(planes))
+        return Polynomial(planes, layers, residual, captured, operator.each(remainder))
+
+    def __call__(self, pixels: Pixels, alpha: Tensor, weight: float | Tensor | None = None) -> Tensor:
+        """Filter pixels by sliders; ``weight`` of the residual, if given, replaces :attr:`residual`."""
+        filtered = weigh_layers(self.layers(pixels), alpha)
+        if self.residual is None or self.captured is None or self.share is None:
+            return filtered
+        weight = self.residual if weight is None else weight
+        change = residual_change(alpha, weight, self.planes(pixels) - self.captured(pixels), self.share(pixels))
+        return filtered + change
+
+
+def remainder(columns: Columns) -> Tensor:
+    """Part r of the diagonal of W that the factor lacks, (B, 1, n)."""
+    return columns.remainder.unsqueeze(1)

@@ -1,24 +1,29 @@
 """Contrast and local contrast around the mean by the last two sliders. Paper: Figs. 6(a), 7(b) to 10(b)."""
 
 import math
-from typing import Any
+from dataclasses import dataclass
+from functools import partial
+from typing import ClassVar
 
 import torch
 from torch import Tensor
 
 from nlfilter_torch.core.checks import check_count, check_order
+from nlfilter_torch.operator.features import GuideChannels
+from nlfilter_torch.operator.landmarks import Sampling
+from nlfilter_torch.operator.nystrom import Completion
+from nlfilter_torch.photo.declared.declaration import Edit
 from nlfilter_torch.photo.declared.parameters import TONE
-from nlfilter_torch.photo.edits.synthesis import polynomial
-from nlfilter_torch.photo.picture.in_memory import edit_of
+from nlfilter_torch.photo.edits.synthesis import Polynomial
+from nlfilter_torch.photo.picture.drawn import Drawn, M
+from nlfilter_torch.photo.picture.edit import FilteredEdit, edit_image
 from nlfilter_torch.photo.picture.limits import Limits
-from nlfilter_torch.photo.picture.source import Fitted, Guide, Source, luminance
+from nlfilter_torch.photo.picture.source import Fitted, Guide, Pixels, Source, luminance
 from nlfilter_torch.photo.picture.viewing import fit_change
 
 
-@edit_of("image")
 def adjust_tone(
-    source: Source,
-    /,
+    image: Tensor,
     *,
     contrast: float | Tensor = TONE["contrast"].idle,
     clarity: float | Tensor = TONE["clarity"].idle,
@@ -27,9 +32,13 @@ def adjust_tone(
     viewing_size: float = TONE.defaults["viewing_size"],
     photometric_bandwidth: float | Tensor | str = TONE.defaults["photometric_bandwidth"],
     spatial_bandwidth: float | Tensor | str | None = TONE.defaults["spatial_bandwidth"],
+    patch_size: int = TONE.defaults["patch_size"],
     num_landmarks: int = TONE.defaults["num_landmarks"],
-    **options: Any,
-) -> Fitted:
+    landmarks: Sampling = TONE.defaults["landmarks"],
+    completion: Completion = "diagonal",
+    guide_channels: GuideChannels = "luminance",
+    generator: torch.Generator | None = None,
+) -> Tensor:
     """Change the contrast of large shapes, and of the coarsest detail on them, without changing the mean.
 
     Paper: eq. (12) with alpha_{k+1} = contrast and alpha_k = clarity, applied to the image less its mean: since W
@@ -48,7 +57,11 @@ def adjust_tone(
         spatial_bandwidth: h_x in pixels; None is a twelfth of the short side, ``"none"`` compares pixels regardless of
             their distance.
         num_landmarks: M.
-        **options: further options of :func:`nonlocal_operator`.
+        patch_size: width of the compared patches of the filter.
+        landmarks: how the landmarks are chosen, see :func:`nonlocal_operator`.
+        completion: of the kernel's diagonal, see :func:`nonlocal_operator`.
+        guide_channels: what the filter compares, ``"luminance"`` or ``"all"`` channels.
+        generator: source of randomness for the landmarks; None draws the same for every call.
 
     Returns:
         (B, C, H, W) with nearly the same mean brightness; with ``limits="none"``, exactly the same mean in every
@@ -64,25 +77,59 @@ def adjust_tone(
         >>> bool((strong.mean((2, 3)) - image.mean((2, 3))).abs().max() < 1e-5), bool(strong.std() > image.std())
         (True, True)
     """
-    check_order(order)
-    check_count(num_landmarks, "num_landmarks")
-    TONE.check(source.batch, contrast=contrast, limits=limits, viewing_size=viewing_size, clarity=clarity)
+    edit = Tone(
+        contrast=contrast,
+        clarity=clarity,
+        order=order,
+        limits=limits,
+        viewing_size=viewing_size,
+        photometric_bandwidth=photometric_bandwidth,
+        spatial_bandwidth=spatial_bandwidth,
+        patch_size=patch_size,
+        num_landmarks=num_landmarks,
+        landmarks=landmarks,
+        completion=completion,
+        guide_channels=guide_channels,
+        generator=generator,
+    )
+    return edit_image(edit, image)
 
-    def slider(value: float | Tensor) -> Tensor:
-        return torch.as_tensor(value, dtype=source.dtype).reshape(-1).expand(source.batch)
 
-    fine = [torch.zeros_like(slider(1.0))] * (order - 1)
-    # Less 1, so that the filter gives the change.
-    sliders = torch.stack([*fine, slider(clarity) - 1, slider(contrast) - 1], dim=1)
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Tone(FilteredEdit):
+    """The edit of :func:`adjust_tone`."""
 
-    def change(viewed: Source) -> Fitted:
-        filter_options = options | {
-            "photometric_bandwidth": photometric_bandwidth,
-            "spatial_bandwidth": TONE["spatial_bandwidth"].distance(spatial_bandwidth, viewed.size),
-            "num_landmarks": min(num_landmarks, math.prod(viewed.size)),
-        }
-        operator, mean = viewed.operator(Guide(filter_options)), viewed.mean(luminance)
-        changed = polynomial(operator, lambda pixels: luminance(pixels) - mean, order, None)
-        return Fitted(lambda pixels: changed(pixels, sliders))
+    declared: ClassVar[Edit] = TONE
+    contrast: float | Tensor
+    clarity: float | Tensor
+    order: int = 3
+    limits: Limits
+    viewing_size: float
 
-    return fit_change(source, change, luminance, viewing_size, limits)
+    def fit(self, source: Source[M], drawn: Drawn[M]) -> Fitted:
+        """Fit the change of contrast of a picture."""
+        check_order(self.order)
+        check_count(self.num_landmarks, "num_landmarks")
+        TONE.check(source.batch, contrast=self.contrast, limits=self.limits, viewing_size=self.viewing_size)
+        TONE.check(source.batch, clarity=self.clarity)
+        return fit_change(source, self._change, luminance, self.viewing_size, self.limits)
+
+    def _change(self, viewed: Source[M]) -> Fitted:
+        """The change of luminance of a picture at the viewing size."""
+        options = self.filter_options(viewed.size, num_landmarks=min(self.num_landmarks, math.prod(viewed.size)))
+        operator, mean = viewed.operator(Guide(options)), viewed.mean(luminance)
+        filtered = Polynomial.of(operator, partial(_without, mean), self.order, None)
+        return Fitted(partial(filtered, alpha=self._sliders(viewed.batch, viewed.dtype)))
+
+    def _sliders(self, batch: int, dtype: torch.dtype) -> Tensor:
+        """Sliders less 1, (B, k+1), with which the filter gives the change."""
+        clarity, contrast = (
+            torch.as_tensor(value, dtype=dtype).reshape(-1).expand(batch) - 1 for value in (self.clarity, self.contrast)
+        )
+        fine = [torch.zeros(batch, dtype=contrast.dtype, device=contrast.device)] * (self.order - 1)
+        return torch.stack([*fine, clarity, contrast], dim=1)
+
+
+def _without(mean: Tensor, pixels: Pixels) -> Tensor:
+    """Luminance of pixels less the mean."""
+    return luminance(pixels) - mean

@@ -1,17 +1,15 @@
-"""An image or a batch in memory as the source of an edit, with gradients, and edits as functions of an image."""
+"""An image or a batch in memory as the source of an edit, with gradients."""
 
-import inspect
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
-from functools import cached_property, wraps
-from typing import Any, Concatenate, Literal, ParamSpec, Protocol, cast, overload
+from functools import cached_property, partial
+from typing import cast
 
 import torch
 from torch import Tensor
 
-from nlfilter_torch.core.checks import check_image, check_photograph, check_same_size, check_unit_range
+from nlfilter_torch.core.checks import check_image, check_photograph, check_same_size, check_tensor, check_unit_range
 from nlfilter_torch.core.inner import EVERYWHERE
-from nlfilter_torch.core.precision import full_precision, working_dtype
 from nlfilter_torch.filtering.filters import detail_layers
 from nlfilter_torch.filtering.scribbles import check_painted
 from nlfilter_torch.operator.build import nonlocal_operator, operator_from_guide
@@ -25,7 +23,7 @@ from nlfilter_torch.photo.picture.resizing import block_means, resize
 from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles
 from nlfilter_torch.photo.picture.source import SAMPLE, Blocks, Guide, Kept, Source, sampled_pairs, sampled_places
 
-P = ParamSpec("P")
+Cache = dict[Hashable, tuple[Sequence[Tensor], object]]  # results by their names, with the tensors they depend on
 
 
 class InMemory:
@@ -35,9 +33,8 @@ class InMemory:
     """
 
     first = 0
-    whole = True
 
-    def __init__(self, image: Tensor, cache: dict[Any, Any] | None = None) -> None:
+    def __init__(self, image: Tensor, cache: Cache | None = None) -> None:
         self.image, self.cache, self.dtype = image, cache, image.dtype
         self.batch, self.channels, *size = image.shape
         self.size, self.width = (size[0], size[1]), size[1]
@@ -45,22 +42,27 @@ class InMemory:
     def operator(self, guide: Guide) -> "InMemoryOperator":
         """Build, or take from the cache, :func:`nonlocal_operator` of the guide.
 
-        Of operators that differ only in options that are tensors, the last is cached, unless these need gradients.
+        The cache holds one operator for each set of options that are not tensors; other tensors replace it. Operators
+        of tensors that need gradients are not cached.
         """
-
-        def build() -> InMemoryOperator:
-            operator = operator_from_guide(guide(self.image), OperatorOptions(**guide.options))
-            return InMemoryOperator(operator, self, guide.sampled, None if self.cache is None else {})
-
-        options = [(name, value) for name, value in sorted(guide.options.items()) if name != "generator"]
-        tensors = [one for _, value in options for one in tensors_in(value)]
-        if any(one.requires_grad for one in tensors):
-            return build()
+        options = [(name, value) for name, value in sorted(vars(guide.options).items()) if name != "generator"]
+        tensors = [tensor for _, value in options for tensor in tensors_in(value)]
+        if any(tensor.requires_grad for tensor in tensors):
+            return self._build(guide)
         named = tuple((name, without_tensors(value)) for name, value in options)
-        return self.kept((guide.transform, guide.blur, *named), [one.clone() for one in tensors], build)
+        copies = [tensor.clone() for tensor in tensors]
+        return self.kept((guide.transform, guide.blur, *named), copies, partial(self._build, guide))
 
-    def scribbles(self, mask: Tensor, colours: Tensor | None, name: str, *, needed: bool = True) -> Scribbles:
+    def _build(self, guide: Guide) -> "InMemoryOperator":
+        operator = nonlocal_operator(guide(self.image), **vars(guide.options))
+        return InMemoryOperator(operator, self, guide.sampled, None if self.cache is None else {})
+
+    def scribbles(self, mask: Tensor | None, colours: Tensor | None, name: str, *, needed: bool = True) -> Scribbles:
         """Read scribbles from tensors, ``mask`` (B, 1, H, W) and ``colours`` (B, 3, H, W)."""
+        if colours is not None:
+            check_tensor(colours, "strokes")
+        if mask is None:
+            raise TypeError(f"{name} must be a tensor (B, 1, H, W), got None; pass the mask of the scribbles")
         check_image(mask, name, channels=1, batch=self.batch)
         check_same_size(mask, self.size, name, "image")
         if colours is not None:
@@ -71,10 +73,10 @@ class InMemory:
         else:
             check_unit_range(mask, name)
         weights = mask.to(self.image).expand(self.batch, -1, -1, -1).flatten(2)
-        some = torch.ones_like(weights[0, 0], dtype=torch.bool)
+        marked = torch.ones_like(weights[0, 0], dtype=torch.bool)
         if not weights.requires_grad:  # pixels of weight 0 matter only to the derivative by the weights
-            some = (weights > 0).any(0).squeeze(0)
-        places = some.nonzero().squeeze(1)
+            marked = (weights > 0).any(0).squeeze(0)
+        places = marked.nonzero().squeeze(1)
         image = self.image.flatten(2)[:, :, places]
         shown = None
         if colours is not None:
@@ -91,15 +93,15 @@ class InMemory:
         """Planes of all pixels in another size."""
         return resize(planes(self), size)
 
-    def kept(self, name: Any, given: Sequence[Tensor], compute: Callable[[], Kept]) -> Kept:
+    def kept(self, name: Hashable, tensors: Sequence[Tensor], compute: Callable[[], Kept]) -> Kept:
         """The result of a function, from the cache if it was last computed from equal tensors."""
-        return kept_in(self.cache, name, given, compute)
+        return kept_in(self.cache, name, tensors, compute)
 
     def blocks(self, step: float, floats: int) -> "InMemory":
         """Reduce the image by :func:`block_means`."""
         if step == 1:
             return self
-        cache: dict[Any, Any] | None = None if self.cache is None else {}
+        cache: Cache | None = None if self.cache is None else {}
         return self.kept(("blocks", step), [], lambda: InMemory(block_means(self.image, step), cache))
 
     def resized_weights(self, weights: Tensor, size: tuple[int, int], name: str) -> Tensor:
@@ -134,6 +136,14 @@ class InMemory:
         check_image(masks, name, batch=self.batch)
         return [self.scribbles(mask, None, name) for mask in masks.split(1, dim=1)]
 
+    def num_regions(self, masks: Tensor, name: str) -> int:
+        """K, of masks (B, K, H, W)."""
+        check_image(masks, name, batch=self.batch)
+        return masks.shape[1]
+
+    def check_all_in_memory(self, sentence: str) -> None:
+        """All pixels are in memory."""
+
     def mean(self, planes: Planes) -> Tensor:
         """Means over all pixels."""
         return planes(self).mean((2, 3), keepdim=True)
@@ -146,7 +156,7 @@ class InMemory:
         """Means over blocks of pixels."""
         return block_means(planes(self), step)
 
-    def measured(self, function: Callable[[Source], Tensor]) -> Tensor:
+    def measured(self, function: Callable[[Source[Tensor]], Tensor]) -> Tensor:
         """Apply a measurement to the image."""
         return function(self)
 
@@ -165,7 +175,7 @@ class InMemoryOperator:
     operator: NonlocalOperator
     source: InMemory
     sampled: bool = False
-    cache: dict[Any, Any] | None = None
+    cache: Cache | None = None
 
     @cached_property
     def pairs(self) -> RitzPairs:
@@ -173,14 +183,14 @@ class InMemoryOperator:
         count = self.operator.factor.shape[2]
         if not self.sampled or count <= SAMPLE:
             return self.operator.spectrum()
-        some, of = sampled_places(count).to(self.operator.factor.device), self.operator
-        columns = Columns(of.factor[:, :, some], of.scaling[:, some], of.remainder[:, some])
+        operator, places = self.operator, sampled_places(count).to(self.operator.factor.device)
+        columns = Columns(operator.factor[:, :, places], operator.scaling[:, places], operator.remainder[:, places])
         return sampled_pairs([columns], count, of.factor.dtype)
 
     def each(self, function: Callable[[Columns], Tensor]) -> Planes:
         """Apply a function to the columns of all pixels."""
-        found = function(Columns(self.operator.factor, self.operator.scaling, self.operator.remainder))
-        return part_of(found.unflatten(2, self.source.size))
+        planes = function(Columns(self.operator.factor, self.operator.scaling, self.operator.remainder))
+        return part_of(planes.unflatten(2, self.source.size))
 
     def layers(self, planes: Planes, order: int) -> Planes:
         """Compute :func:`detail_layers`."""
@@ -203,105 +213,24 @@ class InMemoryOperator:
         return lambda: [columns]
 
 
-def kept_in(cache: dict[Any, Any] | None, name: Any, given: Sequence[Tensor], compute: Callable[[], Kept]) -> Kept:
+def kept_in(cache: Cache | None, name: Hashable, tensors: Sequence[Tensor], compute: Callable[[], Kept]) -> Kept:
     """The result of a function, from a cache if it was last computed from equal tensors under this name."""
     if cache is None:
         return compute()
-    found = cache.get(name)
-    if found is None or not all(torch.equal(a, b) for a, b in zip(found[0], given, strict=True)):
-        found = cache[name] = (given, compute())
-    return cast(Kept, found[1])
+    entry = cache.get(name)
+    if entry is None or not all(torch.equal(a, b) for a, b in zip(entry[0], tensors, strict=True)):
+        entry = cache[name] = (tensors, compute())
+    return cast(Kept, entry[1])
 
 
-def tensors_in(option: Any) -> list[Tensor]:
+def tensors_in(option: object) -> list[Tensor]:
     """The tensors among an option, which may be several values."""
-    return [one for one in (option if isinstance(option, tuple | list) else [option]) if isinstance(one, Tensor)]
+    values = option if isinstance(option, tuple | list) else [option]
+    return [value for value in values if isinstance(value, Tensor)]
 
 
-def without_tensors(option: Any) -> Any:
+def without_tensors(option: object) -> Hashable:
     """An option with its type in place of every tensor."""
     if isinstance(option, tuple | list):
         return tuple(map(without_tensors, option))
-    return Tensor if isinstance(option, Tensor) else option
-
-
-def edited(image: Tensor, fit: Callable[..., Fitted], /, *arguments: Any, **options: Any) -> Tensor:
-    """Fit an edit to an image in memory and apply it; the result has the image's dtype."""
-    source = InMemory(image.to(working_dtype(image)))
-    return source.all(fit(source, *arguments, **options)).to(image.dtype)
-
-
-class EditOfImage(Protocol[P]):
-    """An edit of an image; ``fit`` fits it to a source, given scribbles in the form that the source takes."""
-
-    fit: Callable[..., Fitted]
-
-    def __call__(self, image: Tensor, *args: P.args, **kwargs: P.kwargs) -> Tensor:
-        """Edit the image."""
-
-
-class EditOfGrey(Protocol[P]):
-    """An edit like :class:`EditOfImage`, of an image that is the argument ``grey``."""
-
-    fit: Callable[..., Fitted]
-
-    def __call__(self, grey: Tensor, *args: P.args, **kwargs: P.kwargs) -> Tensor:
-        """Edit the image."""
-
-
-@overload
-def edit_of(
-    picture: Literal["image"], *, channels: int | None = None
-) -> Callable[[Callable[Concatenate[Source, P], Fitted]], EditOfImage[P]]: ...
-
-
-@overload
-def edit_of(
-    picture: Literal["grey"], *, channels: int | None = None
-) -> Callable[[Callable[Concatenate[Source, P], Fitted]], EditOfGrey[P]]: ...
-
-
-def edit_of(picture: str, *, channels: int | None = None) -> Any:
-    """Turn a function that fits an edit to a source into a function that edits an image.
-
-    The decorated function takes a :class:`Source` and returns :class:`Fitted`. Callers pass an image in place of the
-    source and receive the edited image, in its dtype; the docstring and the annotations are written for them. The
-    function of a source remains available as the attribute ``fit``.
-
-    Callers know the image by the name ``picture``; it must have so many ``channels``, if given. Further options are
-    those of :func:`nonlocal_operator`.
-    """
-
-    def decorate(fit: Callable[..., Fitted]) -> Any:
-        signature = inspect.signature(fit)
-        known = [
-            name for each in (signature, inspect.signature(nonlocal_operator)) for name in list(each.parameters)[1:]
-        ]
-        takes_options = any(one.kind is inspect.Parameter.VAR_KEYWORD for one in signature.parameters.values())
-
-        @full_precision
-        @wraps(fit)
-        def edit(*args: Any, **kwargs: Any) -> Tensor:
-            if picture in kwargs and not args:
-                args = (kwargs.pop(picture),)
-            if picture in kwargs or not args:
-                problem = "got multiple values for argument" if args else "missing 1 required positional argument:"
-                raise TypeError(f"{fit.__name__}() {problem} {picture!r}")
-            unknown = sorted(set(kwargs).difference(known)) if takes_options else []
-            if unknown:
-                raise TypeError(
-                    f"{fit.__name__} has no argument {unknown[0]}; see its documentation for the valid ones"
-                )
-            image, *others = args
-            check_photograph(image, picture, channels=channels)
-            return edited(image, fit, *others, **kwargs)
-
-        image = inspect.Parameter(picture, inspect.Parameter.POSITIONAL_OR_KEYWORD, annotation=Tensor)
-        parameters = [image, *list(signature.parameters.values())[1:]]
-        function: Any = edit
-        function.fit = fit
-        function.__signature__ = signature.replace(parameters=parameters, return_annotation=Tensor)
-        function.__annotations__ = {p.name: p.annotation for p in parameters} | {"return": Tensor}
-        return function
-
-    return decorate
+    return Tensor if isinstance(option, Tensor) else cast(Hashable, option)

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -34,7 +34,12 @@ def corner(pixels: Pixels) -> tuple[int, int]:
     return divmod(pixels.first, pixels.width)
 
 
-Planes = Callable[[Any], Tensor]  # values (B, C, h, W) at given pixels
+Planes = Callable[[Pixels], Tensor]  # values (B, C, h, W) at given pixels
+
+
+def whole_image(pixels: Pixels) -> Tensor:
+    """All channels of the picture."""
+    return pixels.image
 
 
 def part_of(planes: Tensor) -> Planes:
@@ -81,7 +86,7 @@ class Fitted:
     Attributes:
         pixels: function that returns the edited pixels, or planes that ``finish`` takes.
         finish: function of the image, these planes and the part that is needed, which returns the edited image, for
-            edits that depend on the neighbourhood of a pixel; values elsewhere may be any.
+            edits that depend on the neighbourhood of a pixel; outside that part, the values it returns are not used.
         margin: radius of this neighbourhood in pixels.
         step: period, in rows and in columns, of what ``finish`` does, counted from the first row and column that it is
             given; tiles begin at multiples of it, and ``margin`` is a multiple of it.

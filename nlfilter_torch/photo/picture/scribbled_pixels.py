@@ -2,12 +2,11 @@
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import torch
 from torch import Tensor
 
-from nlfilter_torch.photo.picture.pixels import corner
+from nlfilter_torch.photo.picture.pixels import Pixels, corner
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +45,7 @@ class Scribbles:
         """Replace the weights by others, (B, K, n)."""
         return replace(self, weights=weights)
 
-    def planes(self, pixels: Any) -> Tensor:
+    def planes(self, pixels: Pixels) -> Tensor:
         """Return the weights (B, K, h, w) at some pixels of the picture."""
         height, width = pixels.image.shape[-2:]
         top, left = corner(pixels)

@@ -6,17 +6,20 @@ image or a batch in memory, with gradients; in :mod:`nlfilter_torch.photo.tiled.
 rows at a time.
 """
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol, TypeVar
+from typing import Protocol, TypeVar
 
 import torch
 from torch import Tensor
 
 from nlfilter_torch.core.kernels.grams import compute_grams
-from nlfilter_torch.operator.features import blur, blur_margin, reduce_channels
+from nlfilter_torch.operator.features import GuideChannels, SpatialBandwidth, blur, blur_margin, reduce_channels
+from nlfilter_torch.operator.landmarks import Sampling
+from nlfilter_torch.operator.nystrom import Completion
 from nlfilter_torch.operator.products import Columns
 from nlfilter_torch.operator.spectrum import RitzPairs
+from nlfilter_torch.photo.picture.drawn import M
 from nlfilter_torch.photo.picture.pixels import Fitted as Fitted
 from nlfilter_torch.photo.picture.pixels import Pixels as Pixels
 from nlfilter_torch.photo.picture.pixels import Planes as Planes
@@ -28,12 +31,26 @@ Kept = TypeVar("Kept")
 Blocks = Callable[[], Iterable[Tensor]]  # columns (B, M, n) of the factor, block by block
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FilterOptions:
+    """Options of :func:`nonlocal_operator` for the filter of an edit."""
+
+    photometric_bandwidth: float | Tensor | str
+    spatial_bandwidth: SpatialBandwidth | None
+    patch_size: int
+    num_landmarks: int
+    landmarks: Sampling
+    completion: Completion
+    guide_channels: GuideChannels
+    generator: torch.Generator | None
+
+
 @dataclass(frozen=True)
 class Guide:
     """The guide image of an edit's filter, and the options of the filter.
 
     Attributes:
-        options: of :func:`nonlocal_operator`.
+        options: of the filter.
         transform: function that computes the guide from an image (B, C, H, W); None uses the image itself.
         radius: radius in pixels of the neighbourhood that ``transform`` depends on.
         channels: number of channels of the guide; None is that of the image.
@@ -44,7 +61,7 @@ class Guide:
             a sample lacks.
     """
 
-    options: Mapping[str, Any]
+    options: FilterOptions
     transform: Callable[[Tensor], Tensor] | None = None
     radius: int = 0
     channels: int | None = None
@@ -94,8 +111,8 @@ class Operator(Protocol):
         """Columns of the factor at single pixels, given by ascending row-major indices."""
 
 
-class Source(Protocol):
-    """A picture to edit."""
+class Source(Protocol[M]):
+    """A picture to edit, whose masks and scribbles have the type M."""
 
     @property
     def size(self) -> tuple[int, int]:
@@ -113,28 +130,30 @@ class Source(Protocol):
     def dtype(self) -> torch.dtype:
         """Precision of the computation, float32 or float64."""
 
-    @property
-    def whole(self) -> bool:
-        """Whether all pixels are in memory."""
-
     def operator(self, guide: Guide) -> Operator:
         """Build the filter of the picture."""
 
-    def scribbles(self, mask: Any, colours: Any, name: str, *, needed: bool = True) -> Scribbles:
-        """Read scribbles in the form that this source takes; ``name`` is the name of the mask in errors.
+    def scribbles(self, mask: M | None, colours: M | None, name: str, *, needed: bool = True) -> Scribbles:
+        """Read scribbles; ``name`` is the name of the mask in errors.
+
+        Args:
+            mask: of the scribbles; None if it is the fourth channel of the colours.
+            colours: of the scribbles, if these count.
+            name: of the mask, in errors.
+            needed: whether a pixel must be covered.
 
         Raises:
             ValueError: if they do not fit the picture, or are ``needed`` and cover no pixel.
         """
 
-    def resized(self, size: tuple[int, int]) -> "Source":
+    def resized(self, size: tuple[int, int]) -> "Source[M]":
         """Reduce the picture to a smaller size (H, W)."""
 
     def shrunk(self, planes: Planes, size: tuple[int, int]) -> Tensor:
         """Planes (B, C, h, w) of all its pixels in a smaller size."""
 
-    def resized_weights(self, weights: Any, size: tuple[int, int], name: str) -> Any:
-        """Reduce weights (B, K, H, W) of the pixels, in the form that this source takes, to a smaller size (H, W).
+    def resized_weights(self, weights: M, size: tuple[int, int], name: str) -> M:
+        """Reduce weights of the pixels for K regions to a smaller size (H, W).
 
         Raises:
             ValueError: if they do not fit the picture; ``name`` is their name in the message.
@@ -149,8 +168,14 @@ class Source(Protocol):
     def mean_of(self, fitted: "Fitted", function: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
         """Means (B, S, 1, 1) of a function of the image and of an edit's result; the function returns (B, S, h, W)."""
 
-    def regions(self, masks: Any, name: str) -> list[Scribbles]:
+    def regions(self, masks: M, name: str) -> list[Scribbles]:
         """Read the scribbles of several regions, see :meth:`scribbles`."""
+
+    def num_regions(self, masks: M, name: str) -> int:
+        """Number of regions that have scribbles in ``masks``, which errors call ``name``."""
+
+    def check_all_in_memory(self, sentence: str) -> None:
+        """Raise ValueError with this sentence if the picture is read in parts."""
 
     def colours(self, places: Tensor) -> Tensor:
         """Colours (B, C, n) of single pixels, given by ascending row-major indices."""
@@ -173,14 +198,14 @@ class Source(Protocol):
             MemoryError: if there is no room for ``floats`` numbers per pixel of the reduced picture.
         """
 
-    def kept(self, name: Any, given: Sequence[Tensor], compute: Callable[[], Kept]) -> Kept:
+    def kept(self, name: Hashable, tensors: Sequence[Tensor], compute: Callable[[], Kept]) -> Kept:
         """Result, called ``name``, of a function of picture and tensors; a preview keeps it for the next edit."""
 
-    def measured(self, function: Callable[["Source"], Tensor]) -> Tensor:
+    def measured(self, function: Callable[["Source[M]"], Tensor]) -> Tensor:
         """Apply a measurement to the picture; for a frame of a film, average it over the reference frames."""
 
 
-class Reduced(Source, Pixels, Protocol):
+class Reduced(Source[Tensor], Pixels, Protocol):
     """A picture in memory: a source, and the set of all its pixels."""
 
 

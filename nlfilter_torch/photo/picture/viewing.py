@@ -24,6 +24,7 @@ from torch import Tensor
 
 from nlfilter_torch.core.values import cached_constants
 from nlfilter_torch.operator.features import pad_border
+from nlfilter_torch.photo.picture.drawn import M
 from nlfilter_torch.photo.picture.limits import Balance, Limits, balance_of, balanced, clamped, limit, move_luminance
 from nlfilter_torch.photo.picture.pixels import Fitted, Pixels, Planes, corner
 from nlfilter_torch.photo.picture.resizing import interpolation, resized, rows_of
@@ -48,8 +49,8 @@ def viewed_size(size: tuple[int, int], megapixels: float) -> tuple[int, int]:
 
 
 def fit_change(
-    source: Source,
-    change: Callable[[Source], Fitted],
+    source: Source[M],
+    change: Callable[[Source[M]], Fitted],
     planes: Planes,
     size: float,
     limits: Limits,
@@ -79,7 +80,7 @@ def fit_change(
 
 
 def within_limits(
-    source: Source, change: Fitted, limits: Limits, brighter: float | Tensor | Balance | None = 0.0
+    source: Source[M], change: Fitted, limits: Limits, brighter: float | Tensor | Balance | None = 0.0
 ) -> Fitted:
     """The edit that applies a change of brightness to a picture; arguments as those of :func:`fit_change`."""
     fitted, balance = _limited(source, change, limits, brighter)
@@ -91,13 +92,13 @@ def _with_balance(image: Tensor, moved: Tensor, balance: Balance | None, limits:
     return move_luminance(image, *balanced(image, moved, balance, limits))
 
 
-def balance(source: Source, change: Fitted, limits: Limits, brighter: float | Tensor) -> Balance | None:
+def balance(source: Source[M], change: Fitted, limits: Limits, brighter: float | Tensor) -> Balance | None:
     """The balance of a picture under a change of its brightness; arguments as those of :func:`fit_change`."""
     return _limited(source, change, limits, brighter)[1]
 
 
 def _limited(
-    source: Source, change: Fitted, limits: Limits, brighter: float | Tensor | Balance | None
+    source: Source[M], change: Fitted, limits: Limits, brighter: float | Tensor | Balance | None
 ) -> tuple[Fitted, Balance | None]:
     """The change, limited, and the balance of the picture."""
     if limits == "none":
@@ -130,11 +131,11 @@ class Coarse:
         parts = [before, change, slope(before, change), *([] if saturation is None else [saturation])]
         return Coarse(torch.cat(parts, dim=1), before.shape[1], limits)
 
-    def enlarged(self, source: Source, planes: Planes) -> "EnlargedChange":
+    def enlarged(self, source: Source[M], planes: Planes) -> "EnlargedChange":
         """The change of a larger picture whose ``planes`` it changes."""
         return EnlargedChange(self, planes, source.size).corrected(source)
 
-    def changes(self, source: Source, planes: Planes) -> Callable[[Pixels], tuple[Tensor, Tensor]]:
+    def changes(self, source: Source[M], planes: Planes) -> Callable[[Pixels], tuple[Tensor, Tensor]]:
         """Function from pixels of a larger picture to the changes of their ``planes`` and of their saturation."""
         return self.enlarged(source, planes).changes
 
@@ -172,7 +173,7 @@ class EnlargedChange:
         image = pixels.image
         return move_luminance(image, *(clamped(image, *changed) if self.coarse.limits == "soft" else changed))
 
-    def corrected(self, source: Source) -> "EnlargedChange":
+    def corrected(self, source: Source[M]) -> "EnlargedChange":
         """Correct the change so that its mean over blocks of the larger picture is the change of the small one.
 
         The change of detail that the small picture lacks has a nonzero mean, which is subtracted here.

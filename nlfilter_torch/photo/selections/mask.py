@@ -13,19 +13,25 @@ from its own colour; results in tiles are therefore exact.
 import math
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import ClassVar
 
 import torch
 from torch import Tensor
 
 from nlfilter_torch.core.checks import check_count, check_positive
+from nlfilter_torch.operator.features import SpatialBandwidth
+from nlfilter_torch.operator.landmarks import Sampling
+from nlfilter_torch.operator.nystrom import Completion
+from nlfilter_torch.operator.options import OperatorOptions
+from nlfilter_torch.photo.declared.declaration import Edit
 from nlfilter_torch.photo.declared.parameters import MASK
 from nlfilter_torch.photo.declared.shared_parameters import VIEWING_SIZE
-from nlfilter_torch.photo.picture.in_memory import edit_of
-from nlfilter_torch.photo.picture.pixels import corner
+from nlfilter_torch.photo.picture.drawn import Drawn, M
+from nlfilter_torch.photo.picture.edit import PhotoEdit, edit_image
+from nlfilter_torch.photo.picture.pixels import Pixels, corner
 from nlfilter_torch.photo.picture.resizing import enlarged
 from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles
-from nlfilter_torch.photo.picture.source import Fitted, Pixels, Reduced, Source
+from nlfilter_torch.photo.picture.source import Fitted, Reduced, Source
 from nlfilter_torch.photo.picture.viewing import viewed_size
 from nlfilter_torch.photo.selections.closed_form import LinearMasks, linear_mask, linear_models, solve_linear
 from nlfilter_torch.photo.selections.random_walker import solve_mask
@@ -39,19 +45,20 @@ ODDS, STEEPNESS = 1.5, 1.4  # of the curve from the solution along borders, too 
 EPSILON = 1e-6
 
 
-@edit_of("image")
 def region_mask(
-    source: Source,
-    /,
+    image: Tensor,
     scribbles: Tensor,
     background: Tensor | None = None,
     *,
     reach: float | Tensor = MASK.defaults["reach"],
     photometric_bandwidth: float | Tensor = MASK.defaults["photometric_bandwidth"],
     spatial_bandwidth: float | Tensor | None = None,
+    patch_size: int = 1,
     num_landmarks: int = MASK.defaults["num_landmarks"],
-    **options: Any,
-) -> Fitted:
+    landmarks: Sampling = MASK.defaults["landmarks"],
+    completion: Completion = "diagonal",
+    generator: torch.Generator | None = None,
+) -> Tensor:
     """Soft object masks from foreground and background scribbles.
 
     A regression on colour and texture separates the two: pixels similar to the scribbles belong to the region, pixels
@@ -72,7 +79,10 @@ def region_mask(
         photometric_bandwidth: in hundredths of Lab: 0.08 is 8 units.
         spatial_bandwidth: in pixels; None is 0.45 of the short side, ``math.inf`` no limit: similar pixels anywhere.
         num_landmarks: M of the operator.
-        **options: further ones of :func:`nonlocal_operator`, such as ``generator``.
+        patch_size: width of the compared patches.
+        landmarks: how the landmarks are chosen, see :func:`nonlocal_operator`.
+        completion: of the kernel's diagonal, see :func:`nonlocal_operator`.
+        generator: source of randomness for the landmarks; None draws the same for every call.
 
     Returns:
         (B, K, H, W) in [0, 1], about 1 on scribbles and about 0 on those of the background. Differentiable in image,
@@ -91,17 +101,67 @@ def region_mask(
         >>> bool(mask[..., 10:22, 10:22].min() > 0.8), bool(mask[..., :6, :].max() < 0.1)
         (True, True)
     """
-    regions = select_regions(
-        source,
-        scribbles,
-        background,
+    edit = RegionMask(
         reach=reach,
         photometric_bandwidth=photometric_bandwidth,
         spatial_bandwidth=spatial_bandwidth,
+        patch_size=patch_size,
         num_landmarks=num_landmarks,
-        **options,
+        landmarks=landmarks,
+        completion=completion,
+        generator=generator,
     )
-    return Fitted(regions.masks)
+    masks = {"scribbles": scribbles} | ({} if background is None else {"background": background})
+    return edit_image(edit, image, Drawn(masks))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RegionMask(PhotoEdit):
+    """The settings of :func:`region_mask`, which other edits use to select objects."""
+
+    declared: ClassVar[Edit] = MASK
+    reach: float | Tensor
+    photometric_bandwidth: float | Tensor
+    spatial_bandwidth: float | Tensor | None
+    num_landmarks: int
+    patch_size: int = 1
+    landmarks: Sampling = "kmeans"
+    completion: Completion = "diagonal"
+    generator: torch.Generator | None = None
+
+    def fit(self, source: Source[M], drawn: Drawn[M]) -> Fitted:
+        """Fit the masks of scribbled regions."""
+        return Fitted(self.select(source, drawn.masks["scribbles"], drawn.masks.get("background")).masks)
+
+    def selection(self) -> "RegionMask":
+        """The masks themselves."""
+        return self
+
+    def select(
+        self,
+        source: Source[M],
+        scribbles: M,
+        background: M | None = None,
+        *,
+        names: tuple[str, str] = ("scribbles", "background"),
+    ) -> "Regions":
+        """Compute the masks of regions from scribbles in the form that the source takes; ``names`` are for errors."""
+        if source.channels not in (1, 3):
+            raise ValueError(f"image must have 1 or 3 channels, got {source.channels}; select 1 or 3")
+        inside = source.regions(scribbles, names[0])
+        outside = [] if background is None else source.regions(background, names[1])
+        if len(outside) not in (0, 1, len(inside)):
+            raise ValueError(
+                f"{names[1]} must have 1 channel or one for each of the {len(inside)} regions, got {len(outside)}; "
+                "add or drop some"
+            )
+        regions = fit_regions(source, inside, outside, self)
+        if outside and bool((regions.background_weights.detach() <= 0).any()):
+            raise ValueError(
+                f"{names[1]} must hold a painted pixel outside the scribbles of each region in every image, got none; "
+                "paint outside them, or omit it"
+            )
+        return regions
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,38 +205,8 @@ class Regions:
         return torch.cat([calibrated(linear_mask(image, functions)) for functions in self.functions.unbind(1)], dim=1)
 
 
-def select_regions(
-    source: Source,
-    scribbles: Any,
-    background: Any = None,
-    *,
-    names: tuple[str, str] = ("scribbles", "background"),
-    **options: Any,
-) -> Regions:
-    """Compute the masks of regions from scribbles in the form that the source takes; ``names`` name them in errors.
-
-    Further arguments are those of :func:`region_mask`.
-    """
-    if source.channels not in (1, 3):
-        raise ValueError(f"image must have 1 or 3 channels, got {source.channels}; select 1 or 3")
-    inside = source.regions(scribbles, names[0])
-    others = [] if background is None else source.regions(background, names[1])
-    if len(others) not in (0, 1, len(inside)):
-        raise ValueError(
-            f"{names[1]} must have 1 channel or one for each of the {len(inside)} regions, got {len(others)}; "
-            "add or drop some"
-        )
-    regions = fit_regions(source, inside, others, **options)
-    if others and bool((regions.background_weights.detach() <= 0).any()):
-        raise ValueError(
-            f"{names[1]} must hold a painted pixel outside the scribbles of each region in every image, got none; "
-            "paint outside them, or omit it"
-        )
-    return regions
-
-
-def background_of(source: Source, mask: Any, inside: Scribbles, name: str) -> list[Scribbles]:
-    """Read scribbles on the background of objects, if any are drawn, in the form that the source takes.
+def background_of(source: Source[M], mask: M | None, inside: Scribbles, name: str) -> list[Scribbles]:
+    """Read scribbles on the background of objects, if there is a mask of them.
 
     Raises:
         ValueError: if in any image all of them lie under those on the objects; the message calls them ``name``.
@@ -195,35 +225,26 @@ def background_of(source: Source, mask: Any, inside: Scribbles, name: str) -> li
 
 
 def fit_regions(
-    source: Source,
-    inside: list[Scribbles],
-    background: list[Scribbles],
-    *,
-    reach: float | Tensor = MASK.defaults["reach"],
-    spatial_bandwidth: float | Tensor | None = None,
-    **options: Any,
+    source: Source[M], inside: list[Scribbles], background: list[Scribbles], settings: RegionMask
 ) -> Regions:
-    """Compute the masks of regions from scribbles on each, and on the background: none, one for all, or one for each.
-
-    Further arguments are those of :func:`region_mask`.
-    """
-    MASK.check(source.batch, reach=reach)
-    if "guide_channels" in options:
-        raise TypeError("guide_channels must not be given: masks compare colours and texture; leave it out")
+    """Compute the masks of regions from scribbles on each, and on the background: none, one for all, or one for each."""
+    MASK.check(source.batch, reach=settings.reach)
     several = len(background) > 1
     scribbles = [_against(inside, k, background[k : k + 1] if several else background) for k in range(len(inside))]
-    defaults = {name: MASK.defaults[name] for name in ("photometric_bandwidth", "num_landmarks")}
-    options = defaults | {"patch_size": 1} | options | {"guide_channels": "all"}
-    check_positive(options["photometric_bandwidth"], "photometric_bandwidth", source.batch)
-    check_count(options["num_landmarks"], "num_landmarks")
-    small, steps = _reduced(source, FLOATS_PER_PIXEL + options["num_landmarks"])
-    options["num_landmarks"] = min(options["num_landmarks"], small.size[0] * small.size[1])
-    if not (isinstance(spatial_bandwidth, float) and spatial_bandwidth == math.inf):
-        if spatial_bandwidth is not None:
-            check_positive(spatial_bandwidth, "spatial_bandwidth", source.batch)
-            spatial_bandwidth = spatial_bandwidth / math.sqrt(steps[0] * steps[1])
-        options["spatial_bandwidth"] = MASK["spatial_bandwidth"].distance(spatial_bandwidth, small.size)
-    rough = RoughMasks.of(small, options, reach)
+    check_positive(settings.photometric_bandwidth, "photometric_bandwidth", source.batch)
+    check_count(settings.num_landmarks, "num_landmarks")
+    small, steps = _reduced(source, FLOATS_PER_PIXEL + settings.num_landmarks)
+    options = OperatorOptions(
+        photometric_bandwidth=settings.photometric_bandwidth,
+        spatial_bandwidth=_nearness(settings.spatial_bandwidth, source.batch, steps, small.size),
+        patch_size=settings.patch_size,
+        num_landmarks=min(settings.num_landmarks, small.size[0] * small.size[1]),
+        landmarks=settings.landmarks,
+        completion=settings.completion,
+        guide_channels="all",
+        generator=settings.generator,
+    )
+    rough = RoughMasks.of(small, options, settings.reach)
     reduced = [blocks_of(drawn, small, source.size, steps) for drawn in scribbles]
     image = small.image.clamp(0.0, 1.0)  # a far brighter pixel of a float file would upset the linear functions
     masks = torch.cat([rough.mask(number, drawn) for number, drawn in enumerate(reduced)], dim=1)
@@ -232,7 +253,7 @@ def fit_regions(
     return Regions(image, steps, functions, scribbles)
 
 
-def _reduced(source: Source, floats: int) -> tuple[Reduced, tuple[float, float]]:
+def _reduced(source: Source[M], floats: int) -> tuple[Reduced, tuple[float, float]]:
     """The reduced picture that masks are computed in, and height and width of one of its pixels.
 
     It is reduced by way of the size of a preview, so that masks are the same in a preview and in the photograph.
@@ -251,7 +272,19 @@ def _fit_borders(small: Reduced, image: Tensor, rough: Tensor, front: Tensor, ba
     return fit_borders(image, small.kept("models", [], partial(linear_models, image)), rough, front, back)
 
 
-def blocks_of(scribbles: Scribbles, small: Source, size: tuple[int, int], steps: tuple[float, float]) -> Scribbles:
+def _nearness(
+    bandwidth: float | Tensor | None, batch: int, steps: tuple[float, float], size: tuple[int, int]
+) -> SpatialBandwidth | None:
+    """Spatial bandwidth in pixels of the reduced picture (h, w), from that in pixels of the picture."""
+    if isinstance(bandwidth, float) and bandwidth == math.inf:
+        return None
+    if bandwidth is not None:
+        check_positive(bandwidth, "spatial_bandwidth", batch)
+        bandwidth = bandwidth / math.sqrt(steps[0] * steps[1])
+    return MASK["spatial_bandwidth"].distance(bandwidth, size)
+
+
+def blocks_of(scribbles: Scribbles, small: Source[M], size: tuple[int, int], steps: tuple[float, float]) -> Scribbles:
     """Scribbles on the reduced picture; weight and colour of a block are the means of its pixels.
 
     Args:

@@ -6,16 +6,16 @@ region; points on a grid count as scribbled if an even area, such as a sky, link
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from nlfilter_torch.filtering.scribbles import fit_strokes
 from nlfilter_torch.operator.features import blur
+from nlfilter_torch.operator.options import OperatorOptions
 from nlfilter_torch.operator.products import Columns
 from nlfilter_torch.photo.picture.colour import LIGHTNESS, hundredths_of_lab
 from nlfilter_torch.photo.picture.resizing import block_means, enlarged
@@ -96,12 +96,12 @@ class RoughMasks:
     reach: float | Tensor
 
     @staticmethod
-    def of(picture: Reduced, options: Mapping[str, Any], reach: float | Tensor) -> "RoughMasks":
+    def of(picture: Reduced, options: OperatorOptions, reach: float | Tensor) -> "RoughMasks":
         """Prepare a picture: build its operator, with options of :func:`nonlocal_operator`, and choose the points."""
         guide = Guide(options, region_guide, TEXTURE_MARGIN, NUM_CHANNELS, spectral=True, sampled=True)
         operator = picture.operator(guide)
         frame, grid = (Points.of(picture, operator, choose(picture.size)) for choose in (frame_places, inner_places))
-        bandwidth = torch.as_tensor(options["photometric_bandwidth"], dtype=picture.dtype)
+        bandwidth = torch.as_tensor(options.photometric_bandwidth, dtype=picture.dtype)
         return RoughMasks(picture, operator, frame, grid, bandwidth, reach)
 
     @cached_property

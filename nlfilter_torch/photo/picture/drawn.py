@@ -1,0 +1,66 @@
+"""Scribbles of an edit, in the form that a source takes, and what rasterises strokes to that form."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import lru_cache
+from typing import Generic, Protocol, TypeVar
+
+from torch import Tensor
+
+from nlfilter_torch.photo.declared.strokes import Stroke
+from nlfilter_torch.photo.picture.painting import mask_of, paint
+
+M = TypeVar("M")  # masks and colours of pixels as a source takes them: tensors in memory, rows in tiles
+M_co = TypeVar("M_co", covariant=True)  # likewise, of values that are only read
+
+Size = tuple[int, int]  # (H, W)
+
+
+@dataclass(frozen=True, eq=False)
+class Drawn(Generic[M_co]):
+    """The scribbles of an edit.
+
+    Attributes:
+        masks: by the name of the argument of the edit's function.
+        colours: of the scribbles that have colours, RGB; or with their mask as a fourth channel, in place of an entry
+            of ``masks``.
+        sliders: (K, k+1), a row for each region that has sliders of its own; None if none has.
+        outside: sliders (k+1,) outside these regions; None leaves the other pixels unchanged.
+    """
+
+    masks: Mapping[str, M_co] = field(default_factory=dict)
+    colours: M_co | None = None
+    sliders: Tensor | None = None
+    outside: Tensor | None = None
+
+
+class Painter(Protocol[M]):
+    """Rasterises strokes to masks and colours as a source takes them."""
+
+    def mask(self, strokes: Sequence[Stroke], size: Size, *, above: Sequence[Stroke] = ()) -> M:
+        """The mask of strokes on a picture (H, W), which is 0 where the strokes ``above`` cover them."""
+
+    def colours(self, strokes: Sequence[Stroke], size: Size) -> tuple[M, M | None]:
+        """Colours of strokes and their mask, which is None if it is the fourth channel of the colours."""
+
+    def covers(self, marks: M) -> bool:
+        """Whether a mask or colours cover a pixel of the picture."""
+
+
+class TensorPainter:
+    """Rasterises strokes to tensors; the last few are cached."""
+
+    def __init__(self) -> None:
+        self._paint, self._mask = lru_cache(maxsize=1)(paint), lru_cache(maxsize=2)(mask_of)
+
+    def mask(self, strokes: Sequence[Stroke], size: Size, *, above: Sequence[Stroke] = ()) -> Tensor:
+        """Return :func:`mask_of` strokes, (1, 1, H, W)."""
+        return self._mask(tuple(strokes), size, above=tuple(above))
+
+    def colours(self, strokes: Sequence[Stroke], size: Size) -> tuple[Tensor, Tensor]:
+        """Colours (1, 3, H, W) and their mask (1, 1, H, W), see :func:`paint`."""
+        return self._paint(tuple(strokes), size)
+
+    def covers(self, marks: Tensor) -> bool:
+        """Whether a mask or colours cover a pixel."""
+        return bool(marks.any())

@@ -1,0 +1,135 @@
+"""An edit with its settings, as functions, commands, files and the editor use it."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar, Self
+
+import torch
+from torch import Tensor
+
+from nlfilter_torch.core.checks import check_photograph
+from nlfilter_torch.core.precision import full_precision, working_dtype
+from nlfilter_torch.operator.features import GuideChannels
+from nlfilter_torch.operator.landmarks import Sampling
+from nlfilter_torch.operator.nystrom import Completion
+from nlfilter_torch.photo.declared.declaration import Edit
+from nlfilter_torch.photo.picture.drawn import Drawn, M
+from nlfilter_torch.photo.picture.in_memory import InMemory
+from nlfilter_torch.photo.picture.pixels import Fitted
+from nlfilter_torch.photo.picture.source import FilterOptions, Source
+
+
+@dataclass(frozen=True)
+class Rows:
+    """A photograph whose rows are read as they are needed.
+
+    Attributes:
+        name: for messages.
+        size: (H, W).
+        channels: 1 or 3.
+        read: reads rows as (1, C, h, W) in [0, 1].
+    """
+
+    name: str
+    size: tuple[int, int]
+    channels: int
+    read: Callable[[slice], Tensor]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PhotoEdit(ABC):
+    """An edit with its settings; the fields are arguments of its function.
+
+    Attributes:
+        declared: its name, parameters and scribbles.
+        reports_change: whether the command reports how much it changed the pixels, see :meth:`summary`.
+    """
+
+    declared: ClassVar[Edit]
+    reports_change: ClassVar[bool] = False
+
+    @classmethod
+    def of(cls, arguments: Mapping[str, Any]) -> Self:
+        """Create the edit from :meth:`Step.arguments`, which were read from options or JSON."""
+        return cls(**arguments)
+
+    @abstractmethod
+    def fit(self, source: Source[M], drawn: Drawn[M]) -> Fitted:
+        """Fit the edit to a picture, with scribbles in the form that the source takes.
+
+        Raises:
+            TypeError, ValueError: if a setting or the scribbles do not suit the picture.
+        """
+
+    def check_channels(self, channels: int) -> None:
+        """Raise ValueError if the edit cannot be applied to a photograph with that number of channels."""
+
+    def notes(self, rows: Rows) -> Iterator[str]:
+        """What a user should know before the edit is applied to a photograph."""
+        return iter(())
+
+    def measured(self, source: Source[M]) -> Self:
+        """Return the edit with what it would otherwise estimate from the picture."""
+        return self
+
+    def summary(self, change: float) -> str:
+        """What a command prints after the edit changed the pixels by so many grey levels (RMS)."""
+        return f"pixels changed by {change:.2f} grey levels (RMS)"
+
+    def map_of(self, image: Tensor) -> Tensor:
+        """The map (B, 1, H, W) in [0, 1] of what the edit estimates, for those that declare one; see :meth:`measured`.
+
+        It depends on at most two pixels around each.
+        """
+        raise NotImplementedError(f"{self.declared.name} draws no map")
+
+    def selection(self) -> "PhotoEdit | None":
+        """The mask of the scribbled objects, for the picture that shows it; None if every pixel is changed."""
+        return None
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FilteredEdit(PhotoEdit):
+    """An edit with a filter; the fields are options of :func:`nonlocal_operator`."""
+
+    photometric_bandwidth: float | Tensor | str | None
+    spatial_bandwidth: float | Tensor | str | None
+    patch_size: int
+    num_landmarks: int
+    landmarks: Sampling = "kmeans"
+    completion: Completion = "diagonal"
+    guide_channels: GuideChannels = "luminance"
+    generator: torch.Generator | None = None
+
+    def filter_options(self, size: tuple[int, int], **replaced: Any) -> FilterOptions:
+        """Options of the filter of a picture (H, W); ``replaced`` are used in place of the fields of these names."""
+        options = {
+            "photometric_bandwidth": self.photometric_bandwidth,
+            "spatial_bandwidth": self.declared["spatial_bandwidth"].distance(self.spatial_bandwidth, size),
+            "patch_size": self.patch_size,
+            "num_landmarks": self.num_landmarks,
+            "landmarks": self.landmarks,
+            "completion": self.completion,
+            "guide_channels": self.guide_channels,
+            "generator": self.generator,
+        }
+        return FilterOptions(**(options | replaced))
+
+
+@full_precision
+def edit_image(
+    edit: PhotoEdit,
+    image: Tensor,
+    drawn: Drawn[Tensor] | None = None,
+    *,
+    name: str = "image",
+    channels: int | None = None,
+) -> Tensor:
+    """Edit an image (B, C, H, W) in [0, 1]; the result has its dtype.
+
+    ``name`` is that of the image in errors, and ``channels`` the number that it must have, if any.
+    """
+    check_photograph(image, name, channels=channels)
+    source = InMemory(image.to(working_dtype(image)))
+    return source.all(edit.fit(source, Drawn() if drawn is None else drawn)).to(image.dtype)
