@@ -21,6 +21,7 @@ from .io.photographs import write_photograph as write_photograph
 from .look_fitting.fit_look import FittedLook as FittedLook
 from .look_fitting.fit_look import fit_look as fit_look
 from .looks.look_module import Look as Look
+from .picture.drawn import Drawn as Drawn
 from .plotting import plot_eigenvalues as plot_eigenvalues
 from .plotting import plot_response as plot_response
 from .plotting import save_figure as save_figure
@@ -29,3 +30,4 @@ from .plotting import show_images as show_images
 from .plotting import show_layers as show_layers
 from .plotting import show_mask as show_mask
 from .selections.mask import region_mask as region_mask
+from .tiled.streaming import stream as stream

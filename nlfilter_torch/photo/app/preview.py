@@ -33,14 +33,14 @@ from nlfilter_torch.photo.declared.parameters import DETAIL, MASK
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.declared.shared_parameters import VIEWING_SIZE
 from nlfilter_torch.photo.declared.steps import Step
-from nlfilter_torch.photo.edits.applying import filter_key, prepare, scribbles_of
+from nlfilter_torch.photo.edits.applying import PreparedStep, edit_of, filter_key, scribbles_of
 from nlfilter_torch.photo.picture.changes import activity, change_of_mean, limit_by_activity, split_sliders
+from nlfilter_torch.photo.picture.drawn import TensorPainter
 from nlfilter_torch.photo.picture.in_memory import InMemory
 from nlfilter_torch.photo.picture.pixels import Fitted, Pixels, Planes, part_of
 from nlfilter_torch.photo.picture.resizing import resize
 from nlfilter_torch.photo.picture.source import seeded
 from nlfilter_torch.photo.picture.viewing import MEGAPIXEL, viewed_size, within_limits
-from nlfilter_torch.photo.selections.mask import region_mask
 
 Key = tuple[object, ...]  # the settings on which a cached result depends
 PIXELS = round(VIEWING_SIZE.default * MEGAPIXEL)  # of a preview, at most
@@ -228,19 +228,11 @@ class Preview:
             fewer = min(detail["landmarks"], MASK.defaults["num_landmarks"])
             if (detail["tolerance"], fewer) != self._compared_by:
                 self._source, self._compared_by = InMemory(self.pixels, {}), (detail["tolerance"], fewer)
-            (inner,), others = scribbles_of(detail, self.size)
-            names = ("mask_bandwidth", "reach")
-            bandwidth, reach = (detail.arguments(self.size)[name] for name in names)
-            fitted = region_mask.fit(
-                self._source,
-                inner,
-                others.get("negative"),
-                names=("regions", "negative"),
-                photometric_bandwidth=bandwidth,
-                reach=reach,
-                num_landmarks=fewer,
-                generator=seeded(),
-            )
+            edit, drawn = edit_of(detail, self.size), scribbles_of(detail, self.size, TensorPainter())
+            selection = edit.selection()
+            if selection is None:
+                return None
+            fitted = selection.fit(self._source, edit.marks(drawn))
             self._mask = (key, self._source.all(fitted))
         return self._mask[1]
 
@@ -294,7 +286,7 @@ class Preview:
             self._filter = None  # released first, since two filters would take twice the memory
         # A reduced photograph goes a little beyond its range, here as in saving.
         image = image.clamp(0, 1) if before else image
-        edit = between_knots(step.declared, prepare(step, image, stride=self.stride), image)
+        edit = between_knots(step.declared, PreparedStep(image, stride=self.stride), image)
         if keep:
             self._filter = (key, edit)
         return edit

@@ -24,6 +24,7 @@ from typing import ClassVar, Generic, Literal, cast
 import torch
 from torch import Tensor
 
+from nlfilter_torch.operator.options import OperatorOptions
 from nlfilter_torch.core.checks import check_count, check_patch_size, check_positive
 from nlfilter_torch.core.precision import per_image
 from nlfilter_torch.filtering.masks import segment
@@ -45,7 +46,7 @@ from nlfilter_torch.photo.picture.edit import PhotoEdit, Rows, edit_image
 from nlfilter_torch.photo.picture.pixels import part_of
 from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles, scribbled_blocks
 from nlfilter_torch.photo.picture.source import (
-    FilterOptions,
+    OperatorOptions,
     Fitted,
     Guide,
     Operator,
@@ -278,7 +279,7 @@ class Operators(Generic[M]):
 
     def of(self, stage: Stage) -> Operator:
         """Build the operator of a stage."""
-        options = FilterOptions(
+        options = OperatorOptions(
             photometric_bandwidth=stage.photometric * self.settings.photometric_bandwidth,
             spatial_bandwidth=(stage.spatial * self.bandwidths[0], stage.spatial * self.bandwidths[1]),
             patch_size=self.settings.patch_size,

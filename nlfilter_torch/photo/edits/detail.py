@@ -165,6 +165,7 @@ class Detail(FilteredEdit):
             spatial_bandwidth=None,
             num_landmarks=min(self.num_landmarks, MASK.defaults["num_landmarks"]),
             generator=generator.clone_state() if isinstance(generator, torch.Generator) else None,
+            names=("regions", "negative"),
         )
 
     def fit(self, source: Source[M], drawn: Drawn[M]) -> Fitted:
@@ -247,7 +248,7 @@ class Detail(FilteredEdit):
         filtered = self._filtered(viewed, sliders[0].shape[-1] - 1)
         if viewed.size != source.size:
             masks = {name: source.resized_weights(mask, viewed.size, name) for name, mask in masks.items()}
-        regions = selector.select(viewed, masks["regions"], masks.get("negative"), names=("regions", "negative"))
+        regions = selector.select(viewed, masks["regions"], masks.get("negative"))
         changes = [DetailChange(filtered, row) for row in sliders]
         return Fitted(RegionalChange(changes, regions), self._limited, blur_margin(VARIANCE_SIGMA))
 

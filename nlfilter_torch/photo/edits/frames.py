@@ -1,22 +1,28 @@
 """Filtering of all frames of a film by one filter fitted to some of them."""
 
 from collections.abc import Iterable, Iterator, Sequence
-from typing import Any
+from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from torch import Tensor
 
 from nlfilter_torch.core.checks import check_alpha, check_image, check_photograph, check_same_size, check_values
+from nlfilter_torch.core.inner import Inner
 from nlfilter_torch.core.precision import working_dtype
-from nlfilter_torch.filtering.fitted import fit_filter
+from nlfilter_torch.filtering.fitted import FittedFilter, fit_filter
 from nlfilter_torch.operator.build import operator_from_guide
-from nlfilter_torch.operator.features import reduce_channels
 from nlfilter_torch.operator.options import OperatorOptions
+from nlfilter_torch.operator.features import SpatialBandwidth, reduce_channels
+from nlfilter_torch.operator.landmarks import Sampling
+from nlfilter_torch.operator.nystrom import Completion
 from nlfilter_torch.photo.declared.parameters import DETAIL
+from nlfilter_torch.photo.edits.detail import Channels
 from nlfilter_torch.photo.picture.changes import activity, limit_by_activity, split_sliders
 from nlfilter_torch.photo.picture.in_memory import InMemory
 from nlfilter_torch.photo.picture.limits import Balance, Limits
-from nlfilter_torch.photo.picture.source import Fitted, Pixels, Source, luminance
+from nlfilter_torch.photo.picture.pixels import whole_image
+from nlfilter_torch.photo.picture.source import Fitted, Pixels, Planes, Source, luminance
 from nlfilter_torch.photo.picture.viewing import balance, fit_change, viewed_size
 
 
@@ -26,11 +32,17 @@ def filter_frames(
     *,
     references: Sequence[Tensor],
     residual: float | Tensor | None = DETAIL.defaults["residual"],
-    channels: str = DETAIL.defaults["channels"],
+    channels: Channels = DETAIL.defaults["channels"],
     threshold: float = DETAIL.defaults["threshold"],
     limits: Limits = DETAIL.defaults["limits"],
     viewing_size: float = DETAIL.defaults["viewing_size"],
-    **options: Any,
+    photometric_bandwidth: float | Tensor | Literal["auto"] = "auto",
+    spatial_bandwidth: SpatialBandwidth | None = None,
+    patch_size: int = DETAIL.defaults["patch_size"],
+    num_landmarks: int = 100,
+    landmarks: Sampling = DETAIL.defaults["landmarks"],
+    completion: Completion = "diagonal",
+    generator: torch.Generator | None = None,
 ) -> Iterator[Tensor]:
     """Filter the frames of a film, or any set of similar images, with one filter, so that the edit does not flicker.
 
@@ -44,7 +56,13 @@ def filter_frames(
         threshold: that of :func:`enhance`.
         limits: that of :func:`enhance`.
         viewing_size: that of :func:`enhance`, in megapixels.
-        **options: options of :func:`nonlocal_operator` for the luminance of the references.
+        photometric_bandwidth: h_y of the filter of the references' luminance, or ``"auto"``.
+        spatial_bandwidth: h_x in pixels; None is no limit.
+        patch_size: width of the compared patches.
+        num_landmarks: M.
+        landmarks: how the landmarks are chosen, see :func:`nonlocal_operator`.
+        completion: of the kernel's diagonal, see :func:`nonlocal_operator`.
+        generator: source of randomness for the landmarks; None draws the same for every call.
 
     Returns:
         An iterator over the edited frames, each computed on demand; values may leave [0, 1].
@@ -61,17 +79,42 @@ def filter_frames(
     """
     check_alpha(alpha, dimensions=(1,))
     DETAIL.check(channels=channels)
-    if not isinstance(references, Sequence):
-        raise TypeError(f"references must be a list of frames, got {type(references).__name__}; wrap it in a list")
     if not isinstance(frames, Iterable) or (isinstance(frames, Tensor) and frames.ndim == 0):
         raise TypeError(
             f"frames must be an iterable of images, got {type(frames).__name__}; pass a list or a generator"
         )
     if residual is not None:
         check_values(residual, "residual", "finite")
+    _check_references(references, spatial_bandwidth)
+    DETAIL.check(limits=limits, threshold=threshold, viewing_size=viewing_size)
+    # References are stacked vertically to one image, at the cost of a few patches across the seams.
+    viewed = viewed_size((references[0].shape[-2], references[0].shape[-1]), viewing_size)
+    stacked = torch.cat([InMemory(f.to(working_dtype(f))).resized(viewed).image for f in references], dim=2)
+    grey = reduce_channels(stacked, "luminance")
+    options = OperatorOptions(
+        photometric_bandwidth=photometric_bandwidth,
+        spatial_bandwidth=spatial_bandwidth,
+        patch_size=patch_size,
+        num_landmarks=num_landmarks,
+        landmarks=landmarks,
+        completion=completion,
+        generator=generator,
+    )
+    operator = operator_from_guide(grey, options)
+    fitted = fit_filter(operator, stacked if channels == "all" else grey, order=alpha.shape[-1] - 1)
+    planes = whole_image if channels == "all" else luminance
+    change = FrameChange(fitted, planes, alpha, residual, threshold)
+    edit = FrameEdit(change, InMemory(stacked), limits, viewing_size)
+    return map(edit, frames)
+
+
+def _check_references(references: Sequence[Tensor], spatial_bandwidth: SpatialBandwidth | None) -> None:
+    """Raise unless these are frames to which a filter can be fitted."""
+    if not isinstance(references, Sequence):
+        raise TypeError(f"references must be a list of frames, got {type(references).__name__}; wrap it in a list")
     if len(references) == 0:
         raise ValueError("references must hold at least one frame, got none; pass the first of the film")
-    if len(references) > 1 and options.get("spatial_bandwidth") is not None:
+    if len(references) > 1 and spatial_bandwidth is not None:
         raise ValueError(
             f"references must hold a single frame if spatial_bandwidth is given, got {len(references)}; "
             "pass one frame, or no spatial_bandwidth"
@@ -79,41 +122,53 @@ def filter_frames(
     for frame in references:
         check_photograph(frame, "references", batch=1)
         check_same_size(frame, (references[0].shape[-2], references[0].shape[-1]), "references", "first one")
-    DETAIL.check(limits=limits, threshold=threshold, viewing_size=viewing_size)
-    # References are stacked vertically to one image, at the cost of a few patches across the seams.
-    viewed = viewed_size((references[0].shape[-2], references[0].shape[-1]), viewing_size)
-    stacked = torch.cat([InMemory(f.to(working_dtype(f))).resized(viewed).image for f in references], dim=2)
-    grey = reduce_channels(stacked, "luminance")
-    filtered = stacked if channels == "all" else grey
-    fitted = fit_filter(operator_from_guide(grey, OperatorOptions(**options)), filtered, order=alpha.shape[-1] - 1)
-    planes = (lambda pixels: pixels.image) if channels == "all" else luminance
 
-    def change(source: Source) -> Fitted:
-        def of(pixels: Pixels) -> Tensor:
-            before, guide = planes(pixels), luminance(pixels)
 
-            def changed(sliders: Tensor, weight: float | Tensor | None) -> Tensor:
-                return fitted(before, sliders, guide, residual=weight)
+@dataclass(frozen=True, eq=False)
+class FrameChange:
+    """The change of detail of a frame by a filter fitted to references."""
 
-            added, rest = split_sliders(alpha - 1)
-            if residual is None:
-                return torch.cat([changed(added, None), changed(rest, None)], dim=1)
-            return torch.cat([changed(added, 0.0), changed(rest, residual - 1)], dim=1)
+    fitted: FittedFilter
+    planes: Planes
+    alpha: Tensor
+    residual: float | Tensor | None
+    threshold: float
 
-        return Fitted(of, lambda image, found, _: limit_by_activity(found, activity(image), threshold))
+    def __call__(self, source: Source[Tensor]) -> Fitted:
+        """Fit the change to a frame."""
+        return Fitted(self._changes, self._limited)
 
-    whole = InMemory(stacked)
+    def _changes(self, pixels: Pixels) -> Tensor:
+        """Added detail and the rest of the change."""
+        before, guide = self.planes(pixels), luminance(pixels)
+        weights = (None, None) if self.residual is None else (0.0, self.residual - 1)
+        halves = zip(split_sliders(self.alpha - 1), weights, strict=True)
+        return torch.cat([self.fitted(before, half, guide, residual=weight) for half, weight in halves], dim=1)
 
-    def shared_balance() -> Balance | None:
-        """The balance of all frames; if each had its own, the brightness of the film would flicker."""
-        return balance(whole, change(whole), limits, alpha[-1] - 1)
+    def _limited(self, image: Tensor, changes: Tensor, _: Inner) -> Tensor:
+        return limit_by_activity(changes, activity(image), self.threshold)
 
-    constant = None if alpha.requires_grad else shared_balance()  # a gradient needs a graph for each frame
 
-    def edit(frame: Tensor) -> Tensor:
+class FrameEdit:
+    """The edit of single frames.
+
+    All frames share the balance of the references: if each had its own, the brightness of the film would flicker.
+    """
+
+    def __init__(self, change: FrameChange, references: InMemory, limits: Limits, viewing_size: float) -> None:
+        self.change, self.references, self.limits, self.viewing_size = change, references, limits, viewing_size
+        self._differentiable = change.alpha.requires_grad  # a gradient needs a graph for each frame
+        self._constant = None if self._differentiable else self._balance()
+
+    def _balance(self) -> Balance | None:
+        brighter = self.change.alpha[-1] - 1
+        return balance(self.references, self.change(self.references), self.limits, brighter)
+
+    def __call__(self, frame: Tensor) -> Tensor:
+        """Edit a frame (B, C, H, W)."""
         check_image(frame, "frames")
         source = InMemory(frame.to(working_dtype(frame)))
-        brighter = shared_balance() if alpha.requires_grad else constant
-        return source.all(fit_change(source, change, planes, viewing_size, limits, brighter=brighter)).to(frame.dtype)
-
-    return map(edit, frames)
+        brighter = self._balance() if self._differentiable else self._constant
+        planes = self.change.planes
+        fitted = fit_change(source, self.change, planes, self.viewing_size, self.limits, brighter=brighter)
+        return source.all(fitted).to(frame.dtype)

@@ -8,6 +8,7 @@ from typing import Any, ClassVar, Self
 import torch
 from torch import Tensor
 
+from nlfilter_torch.operator.options import OperatorOptions
 from nlfilter_torch.core.checks import check_photograph
 from nlfilter_torch.core.precision import full_precision, working_dtype
 from nlfilter_torch.operator.features import GuideChannels
@@ -17,7 +18,7 @@ from nlfilter_torch.photo.declared.declaration import Edit
 from nlfilter_torch.photo.picture.drawn import Drawn, M
 from nlfilter_torch.photo.picture.in_memory import InMemory
 from nlfilter_torch.photo.picture.pixels import Fitted
-from nlfilter_torch.photo.picture.source import FilterOptions, Source
+from nlfilter_torch.photo.picture.source import Source
 
 
 @dataclass(frozen=True)
@@ -85,8 +86,14 @@ class PhotoEdit(ABC):
         raise NotImplementedError(f"{self.declared.name} draws no map")
 
     def selection(self) -> "PhotoEdit | None":
-        """The mask of the scribbled objects, for the picture that shows it; None if every pixel is changed."""
+        """The edit that computes the mask of the scribbled objects; None if every pixel is changed."""
         return None
+
+    def marks(self, drawn: Drawn[M]) -> Drawn[M]:
+        """The scribbles under the names that :meth:`selection` takes."""
+        names = {"object": "scribbles", "background": "background"}
+        scribbles = (scribble for scribble in self.declared.scribbles if scribble.argument in drawn.masks)
+        return Drawn({names[scribble.role]: drawn.masks[scribble.argument] for scribble in scribbles})
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -102,7 +109,7 @@ class FilteredEdit(PhotoEdit):
     guide_channels: GuideChannels = "luminance"
     generator: torch.Generator | None = None
 
-    def filter_options(self, size: tuple[int, int], **replaced: Any) -> FilterOptions:
+    def filter_options(self, size: tuple[int, int], **replaced: Any) -> OperatorOptions:
         """Options of the filter of a picture (H, W); ``replaced`` are used in place of the fields of these names."""
         options = {
             "photometric_bandwidth": self.photometric_bandwidth,
@@ -114,7 +121,7 @@ class FilteredEdit(PhotoEdit):
             "guide_channels": self.guide_channels,
             "generator": self.generator,
         }
-        return FilterOptions(**(options | replaced))
+        return OperatorOptions(**(options | replaced))
 
 
 @full_precision

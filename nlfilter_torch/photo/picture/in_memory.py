@@ -54,7 +54,7 @@ class InMemory:
         return self.kept((guide.transform, guide.blur, *named), copies, partial(self._build, guide))
 
     def _build(self, guide: Guide) -> "InMemoryOperator":
-        operator = nonlocal_operator(guide(self.image), **vars(guide.options))
+        operator = operator_from_guide(guide(self.image), guide.options)
         return InMemoryOperator(operator, self, guide.sampled, None if self.cache is None else {})
 
     def scribbles(self, mask: Tensor | None, colours: Tensor | None, name: str, *, needed: bool = True) -> Scribbles:
@@ -185,7 +185,7 @@ class InMemoryOperator:
             return self.operator.spectrum()
         operator, places = self.operator, sampled_places(count).to(self.operator.factor.device)
         columns = Columns(operator.factor[:, :, places], operator.scaling[:, places], operator.remainder[:, places])
-        return sampled_pairs([columns], count, of.factor.dtype)
+        return sampled_pairs([columns], count, operator.factor.dtype)
 
     def each(self, function: Callable[[Columns], Tensor]) -> Planes:
         """Apply a function to the columns of all pixels."""
@@ -229,8 +229,8 @@ def tensors_in(option: object) -> list[Tensor]:
     return [value for value in values if isinstance(value, Tensor)]
 
 
-def without_tensors(option: object) -> Hashable:
+def without_tensors(option: Hashable) -> Hashable:
     """An option with its type in place of every tensor."""
     if isinstance(option, tuple | list):
         return tuple(map(without_tensors, option))
-    return Tensor if isinstance(option, Tensor) else cast(Hashable, option)
+    return Tensor if isinstance(option, Tensor) else option

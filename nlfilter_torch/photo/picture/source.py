@@ -14,9 +14,8 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.core.kernels.grams import compute_grams
-from nlfilter_torch.operator.features import GuideChannels, SpatialBandwidth, blur, blur_margin, reduce_channels
-from nlfilter_torch.operator.landmarks import Sampling
-from nlfilter_torch.operator.nystrom import Completion
+from nlfilter_torch.operator.features import blur, blur_margin, reduce_channels
+from nlfilter_torch.operator.options import OperatorOptions
 from nlfilter_torch.operator.products import Columns
 from nlfilter_torch.operator.spectrum import RitzPairs
 from nlfilter_torch.photo.picture.drawn import M
@@ -29,20 +28,6 @@ SAMPLE = 1 << 15  # size of the sample of pixels that sums are estimated from, w
 
 Kept = TypeVar("Kept")
 Blocks = Callable[[], Iterable[Tensor]]  # columns (B, M, n) of the factor, block by block
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class FilterOptions:
-    """Options of :func:`nonlocal_operator` for the filter of an edit."""
-
-    photometric_bandwidth: float | Tensor | str
-    spatial_bandwidth: SpatialBandwidth | None
-    patch_size: int
-    num_landmarks: int
-    landmarks: Sampling
-    completion: Completion
-    guide_channels: GuideChannels
-    generator: torch.Generator | None
 
 
 @dataclass(frozen=True)
@@ -61,7 +46,7 @@ class Guide:
             a sample lacks.
     """
 
-    options: FilterOptions
+    options: OperatorOptions
     transform: Callable[[Tensor], Tensor] | None = None
     radius: int = 0
     channels: int | None = None

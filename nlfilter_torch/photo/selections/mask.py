@@ -117,7 +117,11 @@ def region_mask(
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RegionMask(PhotoEdit):
-    """The settings of :func:`region_mask`, which other edits use to select objects."""
+    """The settings of :func:`region_mask`, which other edits use to select objects.
+
+    Attributes:
+        names: of the scribbles and of those on the background, in errors.
+    """
 
     declared: ClassVar[Edit] = MASK
     reach: float | Tensor
@@ -128,6 +132,7 @@ class RegionMask(PhotoEdit):
     landmarks: Sampling = "kmeans"
     completion: Completion = "diagonal"
     generator: torch.Generator | None = None
+    names: tuple[str, str] = ("scribbles", "background")
 
     def fit(self, source: Source[M], drawn: Drawn[M]) -> Fitted:
         """Fit the masks of scribbled regions."""
@@ -137,28 +142,21 @@ class RegionMask(PhotoEdit):
         """The masks themselves."""
         return self
 
-    def select(
-        self,
-        source: Source[M],
-        scribbles: M,
-        background: M | None = None,
-        *,
-        names: tuple[str, str] = ("scribbles", "background"),
-    ) -> "Regions":
-        """Compute the masks of regions from scribbles in the form that the source takes; ``names`` are for errors."""
+    def select(self, source: Source[M], scribbles: M, background: M | None = None) -> "Regions":
+        """Compute the masks of regions from scribbles in the form that the source takes."""
         if source.channels not in (1, 3):
             raise ValueError(f"image must have 1 or 3 channels, got {source.channels}; select 1 or 3")
-        inside = source.regions(scribbles, names[0])
-        outside = [] if background is None else source.regions(background, names[1])
+        inside = source.regions(scribbles, self.names[0])
+        outside = [] if background is None else source.regions(background, self.names[1])
         if len(outside) not in (0, 1, len(inside)):
             raise ValueError(
-                f"{names[1]} must have 1 channel or one for each of the {len(inside)} regions, got {len(outside)}; "
+                f"{self.names[1]} must have 1 channel or one for each of the {len(inside)} regions, got {len(outside)}; "
                 "add or drop some"
             )
         regions = fit_regions(source, inside, outside, self)
         if outside and bool((regions.background_weights.detach() <= 0).any()):
             raise ValueError(
-                f"{names[1]} must hold a painted pixel outside the scribbles of each region in every image, got none; "
+                f"{self.names[1]} must hold a painted pixel outside the scribbles of each region in every image, got none; "
                 "paint outside them, or omit it"
             )
         return regions

@@ -23,9 +23,10 @@ from nlfilter_torch.operator.scaling import PixelScaling
 from nlfilter_torch.operator.spectrum import RitzPairs
 from nlfilter_torch.photo.declared.steps import Step, acting_steps
 from nlfilter_torch.photo.edits.applying import fit_step
+from nlfilter_torch.photo.picture.drawn import Drawn
 from nlfilter_torch.photo.picture.source import Fitted, Guide, Planes, Source, seeded
 from nlfilter_torch.photo.tiled.operator import TiledOperator, first_plane
-from nlfilter_torch.photo.tiled.pictures import Picture
+from nlfilter_torch.photo.tiled.pictures import Picture, RowSource
 from nlfilter_torch.photo.tiled.sampling import CHUNK, ColumnCache, GuidePicture, Pilot
 from nlfilter_torch.photo.tiled.source import Tiled
 from nlfilter_torch.photo.tiled.statistics import Block, Sums
@@ -160,7 +161,7 @@ class Frame(Tiled):
         least, largest = zip(*(Tiled.ends(frame, planes) for frame in self.reference_frames()), strict=True)
         return average(least), average(largest)
 
-    def measured(self, function: Callable[[Source], Tensor]) -> Tensor:
+    def measured(self, function: Callable[[Source[RowSource]], Tensor]) -> Tensor:
         """The mean of a measurement over the references."""
         return self.cached_result(partial(self._average, function))
 
@@ -180,7 +181,7 @@ def learn_filter(pictures: Sequence[Picture], guide: Guide) -> LearntFilter:
     Coordinates of a pixel are those in its own picture. The weights of all pictures together sum to the number of
     pixels of one.
     """
-    options = dict(guide.options)
+    options = dict(vars(guide.options))
     channels, bandwidth = options.pop("guide_channels", "luminance"), options.pop("photometric_bandwidth", "auto")
     window = unit_window(options.pop("patch_size", 5), None).to(pictures[0].dtype)
     spatial, generator = options.pop("spatial_bandwidth", None), options.pop("generator", None)
@@ -266,7 +267,7 @@ class FilmEdit:
     def edit(self, step: Step, picture: Picture, references: References) -> FrameArray:
         """Apply a step to a frame (H, W, C)."""
         frame = Frame(picture, self.passes, references)
-        rows = frame.rows(fit_step(step, frame, (), {}, generator=seeded(self.seed)), plain=True)
+        rows = frame.rows(fit_step(step, frame, Drawn(), generator=seeded(self.seed)), plain=True)
         return np.concatenate([values for _, values in rows])
 
     def __call__(self, frame: FrameArray) -> FrameArray:

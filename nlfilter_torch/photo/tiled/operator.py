@@ -89,6 +89,16 @@ class BlockPixels:
     image: Tensor
     known_columns: Columns
 
+    @property
+    def first(self) -> int:
+        """A sample of pixels has no place in the picture."""
+        raise TypeError("planes that are summed over pixels must not depend on their place, got planes that do")
+
+    @property
+    def width(self) -> int:
+        """A sample of pixels has no place in the picture."""
+        return self.first
+
     def columns(self, operator: "TiledOperator") -> Columns:
         """Columns of the pixels."""
         return self.known_columns

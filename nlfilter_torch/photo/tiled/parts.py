@@ -21,7 +21,7 @@ from nlfilter_torch.photo.picture.source import Fitted
 from nlfilter_torch.photo.tiled.operator import TiledOperator, TilePixels
 from nlfilter_torch.photo.tiled.pictures import LazyRows, Picture, RowSource, Tile
 from nlfilter_torch.photo.tiled.sampling import ColumnCache, GuidePicture, Report, in_silence
-from nlfilter_torch.photo.tiled.scribbles import colour_rows, mask_rows
+from nlfilter_torch.photo.tiled.scribbles import RowPainter
 from nlfilter_torch.photo.tiled.source import Tiled
 from nlfilter_torch.photo.tiled.tiles import Passes, Statistics, intermediate
 from nlfilter_torch.photo.tiled.workers import in_order
@@ -151,7 +151,7 @@ class Stage:
         if self._fitted is None or self._fitted[0] != step:
             self._fitted = None
             tiled = Tiled(self.picture, passes)
-            fitted = fit_step(step, tiled, *scribbles_of(step, tiled.size, colour_rows, mask_rows))
+            fitted = fit_step(step, tiled, scribbles_of(step, tiled.size, RowPainter()))
             for operator in tiled.operators:
                 operator.prepare()
             self._fitted = step, tiled, fitted

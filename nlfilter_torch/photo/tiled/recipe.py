@@ -11,7 +11,7 @@ from nlfilter_torch.photo.declared.steps import Step, acting_steps
 from nlfilter_torch.photo.edits.applying import fit_step, scribbles_of
 from nlfilter_torch.photo.picture.changes import blend_edited
 from nlfilter_torch.photo.tiled.pictures import Picture, Rows, RowSource, Tile, mask_of
-from nlfilter_torch.photo.tiled.scribbles import colour_rows, mask_rows
+from nlfilter_torch.photo.tiled.scribbles import RowPainter
 from nlfilter_torch.photo.tiled.source import Tiled
 from nlfilter_torch.photo.tiled.tiles import TILE_PIXELS, Passes, TileEdit, Tiling
 from nlfilter_torch.photo.tiled.workers import single_threaded
@@ -83,7 +83,7 @@ def step_tiling(step: Step, passes: Passes, source: RowSource, name: str) -> Ite
     """Yield the rows of a picture after a step, not yet computed."""
     tiled = Tiled(Picture(source, name), passes)
     with single_threaded(passes.workers(1)):
-        fitted = fit_step(step, tiled, *scribbles_of(step, tiled.size, colour_rows, mask_rows))
+        fitted = fit_step(step, tiled, scribbles_of(step, tiled.size, RowPainter()))
     with tiled.tiling(fitted) as tiling:
         yield tiling
 

@@ -1,9 +1,11 @@
 """The scribbled pixels of a picture that is read by rows."""
 
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from nlfilter_torch.photo.declared.strokes import Stroke
@@ -14,14 +16,30 @@ from nlfilter_torch.photo.tiled.pictures import LazyRows, Picture, RowSource, st
 ReadRows = Callable[[int, int], Tensor]  # (start, stop) to these rows
 
 
-def mask_rows(strokes: Sequence[Stroke], size: tuple[int, int], *, above: Sequence[Stroke] = ()) -> LazyRows:
-    """The mask of strokes over a picture (H, W), rasterised as it is read: rows (H, W, 1), see :func:`mask_of`."""
-    return LazyRows((*size, 1), lambda rows: stored_as(mask_of(strokes, size, rows, above=above), "float32"))
+class RowPainter:
+    """Rasterises strokes as they are read: to rows, of which only a few are in memory at once."""
+
+    def mask(self, strokes: Sequence[Stroke], size: tuple[int, int], *, above: Sequence[Stroke] = ()) -> RowSource:
+        """The mask of strokes over a picture (H, W): rows (H, W, 1), see :func:`mask_of`."""
+        return LazyRows((*size, 1), partial(_mask_rows, strokes, size, above))
+
+    def colours(self, strokes: Sequence[Stroke], size: tuple[int, int]) -> tuple[RowSource, None]:
+        """Strokes over a picture (H, W): rows (H, W, 4) in RGB with their mask, and None."""
+        return LazyRows((*size, 4), partial(_colour_rows, strokes, size)), None
+
+    def covers(self, marks: RowSource) -> bool:
+        """Whether a mask or colours cover a pixel."""
+        return LazyRows(tuple(marks.shape), marks.__getitem__, marks.dtype).any()
 
 
-def colour_rows(strokes: Sequence[Stroke], size: tuple[int, int]) -> tuple[LazyRows, None]:
-    """Strokes over a picture (H, W), rasterised as they are read: rows (H, W, 4) in RGB with their mask, and None."""
-    return LazyRows((*size, 4), lambda rows: stored_as(torch.cat(paint(strokes, size, rows), dim=1), "float32")), None
+def _mask_rows(
+    strokes: Sequence[Stroke], size: tuple[int, int], above: Sequence[Stroke], rows: slice
+) -> NDArray[np.generic]:
+    return stored_as(mask_of(strokes, size, rows, above=above), "float32")
+
+
+def _colour_rows(strokes: Sequence[Stroke], size: tuple[int, int], rows: slice) -> NDArray[np.generic]:
+    return stored_as(torch.cat(paint(strokes, size, rows), dim=1), "float32")
 
 
 def region_rows(masks: RowSource, region: int) -> LazyRows:

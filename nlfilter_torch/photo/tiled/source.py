@@ -1,11 +1,10 @@
 """A picture that is read a few rows at a time as the source of an edit: sums in passes, output in tiles."""
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 import torch
@@ -88,7 +87,6 @@ class Tiled:
     """A picture that is read in tiles, as the source of an edit; errors call its scribbles ``strokes``."""
 
     batch = 1
-    whole = False
 
     def __init__(self, picture: Picture, passes: Passes, strokes: str = "strokes") -> None:
         self.picture, self.passes, self.strokes = picture, passes, strokes
@@ -107,11 +105,11 @@ class Tiled:
         Raises:
             MemoryError: if the samples or a row do not fit in memory.
         """
-        options = dict(guide.options)
-        patch_size, count = options.get("patch_size", 5), options.get("num_landmarks", 100)
+        options = guide.options
+        patch_size, count = options.patch_size, options.num_landmarks
         check_count(patch_size, "patch_size")
         check_count(count, "num_landmarks")
-        compared = guide.channels or (self.channels if options.get("guide_channels") == "all" else 1)
+        compared = guide.channels or (self.channels if options.guide_channels == "all" else 1)
         num_features = patch_size**2 * compared + 2
         for other in self.operators:
             other.cache = ColumnCache(1, 0)  # frees memory
@@ -123,7 +121,7 @@ class Tiled:
             self.guide_floats += picture.pixels * compared
             self.fitting_rows(num_features, count)
             picture.store(max(1, TILE_PIXELS // self.size[1]), workers)
-        pilot = take_pilot(picture, passes.report, workers, **options)
+        pilot = take_pilot(picture, passes.report, workers, **vars(options))
         sampled, count = passes.sample < picture.pixels, pilot.moment.shape[1]
         cached_pixels = cacheable_pixels(picture, passes, num_features, count, self.stored_floats(num_features))
         self.cached_floats = cached_pixels * (count + 2)
@@ -134,7 +132,7 @@ class Tiled:
             passes.sample if sampled else None,
             full_passes=not sampled or passes.statistics == "full" or guide.exact,
             kernel=pilot.kernel,
-            bounded=is_bounded(options.get("landmarks", "kmeans"), picture.pixels, count),
+            bounded=is_bounded(options.landmarks, picture.pixels, count),
             workers=workers,
             cache=ColumnCache(picture.statistics_rows * self.size[1], cached_pixels),
         )
@@ -192,6 +190,14 @@ class Tiled:
         if len(masks.shape) == 2:
             return [self.scribbles(masks, None, name)]
         return [self.scribbles(region_rows(masks, k), None, name) for k in range(masks.shape[2])]
+
+    def num_regions(self, masks: RowSource, name: str) -> int:
+        """K, of rows (H, W, K), or 1 for rows (H, W)."""
+        return 1 if len(masks.shape) == 2 else masks.shape[2]
+
+    def check_all_in_memory(self, sentence: str) -> None:
+        """Raise ValueError with this sentence."""
+        raise ValueError(sentence)
 
     def colours(self, places: Tensor) -> Tensor:
         """Read the colours (1, C, n) of single pixels."""
@@ -325,12 +331,12 @@ class Tiled:
             )
         return InMemory(self.reduced(lambda pixels: pixels.image, round(step)))
 
-    def kept(self, name: Any, given: Sequence[Tensor], compute: Callable[[], Kept]) -> Kept:
+    def kept(self, name: Hashable, tensors: Sequence[Tensor], compute: Callable[[], Kept]) -> Kept:
         """The result of a function, of which nothing is kept."""
         return compute()
 
     @torch.no_grad()
-    def measured(self, function: Callable[[Source], Tensor]) -> Tensor:
+    def measured(self, function: Callable[[Source[RowSource]], Tensor]) -> Tensor:
         """Apply a measurement to the picture."""
         return function(self)
 
