@@ -3,6 +3,7 @@
 import ast
 import inspect
 import re
+from dataclasses import fields
 from typing import get_args
 
 import pytest
@@ -13,7 +14,9 @@ from benchmarks import parameters
 from nlfilter_torch.photo.declared.declaration import Edit, Parameter
 from nlfilter_torch.photo.declared.parameters import EDITS, MASK
 from nlfilter_torch.photo.declared.shared_parameters import FILTER
-from nlfilter_torch.photo.picture.source import Source
+from nlfilter_torch.photo.edits.applying import EDIT_OF
+from nlfilter_torch.photo.picture.edit import PhotoEdit
+from nlfilter_torch.photo.selections.mask import RegionMask
 from tests.pages import ROOT
 
 EVERY = [(edit, parameter) for edit in EDITS.values() for parameter in edit]
@@ -54,21 +57,30 @@ def test_docstrings_describe_the_arguments_of_the_function_of_an_image(name: str
     described = re.findall(r"^    (\**)(\w+): ", inspect.getdoc(function).split("Args:")[1], flags=re.MULTILINE)
     assert [argument for _, argument in described] == list(inspect.signature(function).parameters)
     assert list(function.__annotations__) == [argument for _, argument in described] + ["return"]
-    of_image, *others = inspect.signature(function).parameters.values()
-    of_source, *same = inspect.signature(function.fit).parameters.values()
-    assert (of_image.annotation, of_source.annotation) == (Tensor, Source)
-    assert others == same
+    assert next(iter(inspect.signature(function).parameters.values())).annotation is Tensor
+
+
+@pytest.mark.parametrize("edit", [*EDIT_OF.values(), RegionMask], ids=lambda edit: edit.declared.name)
+def test_settings_of_an_edit_are_arguments_of_its_function(edit: type[PhotoEdit]) -> None:
+    function = inspect.signature(getattr(nlfilter_torch, edit.declared.function or edit.declared.name)).parameters
+    drawn = {"image", "grey", "strokes", *(scribble.argument for scribble in edit.declared.scribbles)}
+    settings = {field.name for field in fields(edit)} - {"names"}
+    fixed = {"sharpen": {"guide_channels"}}.get(edit.declared.name, set())  # its guide is grey
+    assert settings - fixed == set(function) - drawn
+    assert {parameter.keyword for parameter in edit.declared if parameter.is_option} <= settings
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_the_image_is_the_first_argument_or_a_keyword(name: str) -> None:
     function, picture = getattr(nlfilter_torch, name), "grey" if name == "colorize" else "image"
+    parameters = inspect.signature(function).parameters.values()
+    others = {p.name: None for p in parameters if p.default is inspect.Parameter.empty and p.name != picture}
     with pytest.raises(TypeError, match=rf"{picture} must be a torch.Tensor, got str"):
-        function(**{picture: "photo.png"})
+        function(**{picture: "photo.png"}, **others)
     with pytest.raises(TypeError, match=rf"{name}\(\) missing 1 required positional argument: '{picture}'"):
-        function()
+        function(**others)
     with pytest.raises(TypeError, match=rf"{name}\(\) got multiple values for argument '{picture}'"):
-        function(None, **{picture: None})
+        function(None, **{picture: None}, **others)
 
 
 @pytest.mark.parametrize("edit", [*EDITS.values(), MASK], ids=lambda edit: edit.name)

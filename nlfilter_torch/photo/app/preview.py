@@ -35,8 +35,8 @@ from nlfilter_torch.photo.declared.shared_parameters import VIEWING_SIZE
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.edits.applying import PreparedStep, edit_of, filter_key, scribbles_of
 from nlfilter_torch.photo.picture.changes import activity, change_of_mean, limit_by_activity, split_sliders
-from nlfilter_torch.photo.picture.drawn import TensorPainter
 from nlfilter_torch.photo.picture.in_memory import InMemory
+from nlfilter_torch.photo.picture.painting import TensorPainter
 from nlfilter_torch.photo.picture.pixels import Fitted, Pixels, Planes, part_of
 from nlfilter_torch.photo.picture.resizing import resize
 from nlfilter_torch.photo.picture.source import seeded

@@ -94,7 +94,7 @@ def batch(
         folder, target = folder.absolute(), target.absolute()
     shared = free_memory() if memory is None else allowed_memory(memory)
     settings = {**given, "seed": seed}
-    edit: Callable[..., object] = partial(edit_photograph, "detail", **settings)
+    edit: Callable[..., object] = partial(edit_photograph, EDITS["detail"], **settings)
     if preset is not None and (recipe := other_recipe(context, preset, settings)) is not None:
         settings, edit = {"recipe": recipe.to_json()}, partial(apply, preset=[str(Path(preset).absolute())])
     paths = pictures(folder)

@@ -1,15 +1,17 @@
 """The part shared by all commands that edit one photograph: read, check, edit and write, in tiles if necessary."""
 
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Protocol
 
 import torch
 from torch import Tensor
 
 from nlfilter_torch.photo.cli import options
+from nlfilter_torch.photo.cli.changes import MAP_DEPTH
 from nlfilter_torch.photo.cli.progress import stages, steps
 from nlfilter_torch.photo.declared.steps import Step, working_bytes
 from nlfilter_torch.photo.io.photographs import (
@@ -18,6 +20,7 @@ from nlfilter_torch.photo.io.photographs import (
     check_depth,
     check_memory,
     check_output,
+    check_type,
     read_photograph,
     write_photograph,
 )
@@ -93,6 +96,24 @@ def check_apart(option: str, path: str | Path | None, **files: str | Path | Iter
                 raise ValueError(f"{option} must be another file than the {what}, got {path}; choose another name")
 
 
+def check_written(
+    source: str,
+    target: str,
+    *,
+    show: Path | None,
+    map: Path | None,
+    mask: Path | None,
+    strokes: Path | None,
+    preset: str | None,
+) -> None:
+    """Raise ValueError if a file that a command writes is one that it reads, or its type holds no map."""
+    check_apart("OUT", target, mask=mask, strokes=strokes, preset=preset)
+    for option, path in (("--show", show), ("--map", map)):
+        check_apart(option, path, photograph=source, output=target, mask=mask, strokes=strokes, preset=preset)
+    if map is not None:
+        check_type(map, MAP_DEPTH, alpha=False)
+
+
 @dataclass
 class Job:
     """A photograph that is edited by rows.
@@ -162,30 +183,42 @@ def processes_for(workers: int | None, cluster: str | None, stack: ExitStack) ->
     return stack.enter_context(zarr_processes(workers, cluster))
 
 
+class FileEdit(Protocol):
+    """An edit of a photograph in a file, in memory or by rows."""
+
+    @property
+    def bytes_per_pixel(self) -> int:
+        """Memory that the edit needs per pixel of an image."""
+
+    @property
+    def coloured(self) -> bool:
+        """Whether the edit adds colours to a grey photograph."""
+
+    def edited(self, photograph: Photograph) -> Tensor:
+        """New pixels (1, C, H, W) of a photograph in memory."""
+
+    def tiling(self, job: Job) -> AbstractContextManager[Tiling]:
+        """The edited rows of a photograph that does not fit in memory, which are computed within the block."""
+
+
 def edit_file(
+    edit: FileEdit,
     source: str,
     target: str,
     depth: options.FileDepth | None,
-    edit: Callable[[Photograph], Tensor],
     *,
-    bytes_per_pixel: int,
     memory: float | None,
-    by_rows: Callable[[Job], AbstractContextManager[Tiling]],
-    coloured: bool = False,
     workers: int | None = None,
     cluster: str | None = None,
 ) -> None:
     """Edit the photograph in a file, and write it to another file or the same one, with its metadata.
 
     Args:
+        edit: the edit.
         source: the file to read.
         target: the file to write.
         depth: of the output; None is that of the input.
-        edit: computes new pixels (1, C, H, W) from the photograph.
-        bytes_per_pixel: memory that the edit needs per pixel of an image.
         memory: gigabytes that may be used; None is a fifth of the machine's, but at most 2, or 1 in tiles.
-        by_rows: the same edit for photographs that do not fit in memory.
-        coloured: whether the edit by rows adds colours to a grey photograph.
         workers: number of processes that filter zarr arrays, instead of threads.
         cluster: address of the cluster whose processes do this.
     """
@@ -193,23 +226,22 @@ def edit_file(
     allowed, kind = allowed_memory(memory), None if depth is None else options.DEPTHS[depth]
     with steps(3) as begin:
         begin("Reading")
-        photograph = read_if_it_fits(source, target, bytes_per_pixel, memory)
+        photograph = read_if_it_fits(source, target, edit.bytes_per_pixel, memory)
         if photograph is not None:
-            edited = photograph if kind is None else replace(photograph, depth=kind)
-            check_output(target, edited)
+            output = photograph if kind is None else replace(photograph, depth=kind)
+            check_output(target, output)
             begin("Editing")
-            edited = edited.with_pixels(edit(photograph))
+            output = output.with_pixels(edit.edited(photograph))
             begin("Writing")
-            write_photograph(edited, target)
+            write_photograph(output, target)
             return
     with ExitStack() as stack:
         picture = stack.enter_context(open_picture(Path(source), allowed))
-        found = check_depth(source, picture.rows.dtype)
-        stored = kind or found
-        written = picture.in_colour() if coloured else picture
+        stored = kind or check_depth(source, picture.rows.dtype)
+        written = picture.in_colour() if edit.coloured else picture
         check_place(Path(target), stored, written, allowed)
         processes = processes_for(workers, cluster, stack)
         report = stack.enter_context(stages())
         job = Job(picture, stored, allowed - picture.cached, allowed_memory(memory, TILED), report, stack, processes)
-        with by_rows(job) as tiling:
+        with edit.tiling(job) as tiling:
             write_picture(Path(target), tiling, stored, written)

@@ -1,28 +1,28 @@
 """One command per edit, with options generated from the declaration of its parameters."""
 
 import inspect
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import typer
 
 from nlfilter_torch.photo.cli import options
-from nlfilter_torch.photo.declared.declaration import FILTER_PANEL, UNITS, Edit, Parameter
-from nlfilter_torch.photo.declared.parameters import EDITS
+from nlfilter_torch.photo.declared.declaration import FILTER_PANEL, UNITS, Edit, Parameter, ScribbleKind
+from nlfilter_torch.photo.declared.parameters import DETAIL, EDITS
 from nlfilter_torch.photo.declared.presets import PRESETS, Recipe, find_recipe
 from nlfilter_torch.photo.declared.steps import Step
 
+Command = Callable[..., None]  # typer reads its signature
 #: Options of detail that do not concern regions.
 DETAIL_OPTIONS = tuple(p.name for p in EDITS["detail"] if p.is_option and p.name not in ("reach", "tolerance"))
 TYPES = {"number": float, "count": int, "odd": int, "sliders": str}
 
 
 def plain_step(recipe: Recipe) -> Step | None:
-    """The only step of a recipe, if options of ``detail`` can express it."""
+    """The only step of a recipe, if options of a command that takes presets can express it."""
     step = recipe.steps[0] if len(recipe.steps) == 1 else None
-    return step if step is not None and step.edit == "detail" and not step.strokes else None
+    return step if step is not None and step.declared.presets and not step.strokes else None
 
 
 def typed_options(context: typer.Context, names: Iterable[str]) -> list[str]:
@@ -44,9 +44,10 @@ def other_recipe(context: typer.Context, preset: str, names: Iterable[str]) -> R
     return recipe
 
 
-def look_step(recipe: Recipe) -> Step | None:
-    """The only step of a recipe, if it is a look."""
-    return recipe.steps[0] if [step.edit for step in recipe.steps] == ["look"] else None
+def preset_step(recipe: Recipe, edit: Edit) -> Step | None:
+    """The only step of a recipe, if the command of an edit takes it as it is."""
+    step = recipe.steps[0] if len(recipe.steps) == 1 else None
+    return step if step is not None and step.edit in edit.presets else None
 
 
 def preset_option(help: str, *, plain: bool = True) -> Any:
@@ -59,7 +60,7 @@ def preset_option(help: str, *, plain: bool = True) -> Any:
         step = None if name is None else plain_step(find_recipe(name))
         if step is not None:
             context.default_map = {entry: option_value(step.declared[entry], value) for entry, value in step.values}
-        elif plain and name is not None and look_step(find_recipe(name)) is None:
+        elif plain and name is not None and preset_step(find_recipe(name), DETAIL) is None:
             raise ValueError(
                 f"--preset must hold a look or a single detail step without strokes, got {name}; "
                 "use nlfilter-torch apply, which accepts any edit"
@@ -76,30 +77,31 @@ PresetName = Annotated[
         "replaces the defaults of the other options; options on the command line override it."
     ),
 ]
-#: Options for scribbles, regions and masks, by the name of the edit.
-SCRIBBLES: dict[str, dict[str, Any]] = {
-    "detail": {"preset": PresetName, "region": options.SliderRegions, "mask": options.MaskFile, "show": options.Show},
-    "recolor": {
-        "strokes": options.StrokesFile,
-        "region": options.ColourRegions,
-        "keep": options.Keeps,
-        "show": options.Show,
-    },
-    "denoise": {"map": options.NoiseMap},
-    "colorize": {"strokes": options.StrokesFile, "region": options.ColourRegions, "show": options.Show},
-    "defocus": {
-        "region": options.Regions,
-        "background": options.Backgrounds,
-        "mask": options.MaskFile,
-        "show": options.Show,
-    },
-    "mask": {
-        "region": options.Regions,
-        "background": options.Backgrounds,
-        "mask": options.MaskFile,
-        "show": options.Show,
-    },
+#: The option ``--region`` for each kind of scribbles on an object.
+REGIONS: dict[ScribbleKind, object] = {
+    "colours": options.ColourRegions,
+    "mask": options.Regions,
+    "sliders": options.SliderRegions,
 }
+
+
+def scribble_options(edit: Edit) -> dict[str, object]:
+    """The annotations of an edit's options for presets, scribbles, regions and masks, by their names."""
+    kinds = [scribble.kind for scribble in edit.scribbles if scribble.role == "object"]
+    annotations: dict[str, object] = {"preset": PresetName} if edit.presets else {}
+    for kind in kinds:
+        annotations |= {"strokes": options.StrokesFile} if kind == "colours" else {}
+        annotations["region"] = REGIONS[kind]
+    for scribble in edit.backgrounds:
+        name = scribble.option.removeprefix("--")
+        annotations[name] = options.rectangles(scribble.option, "X,Y,W,H", scribble.option_help)
+    if any(kind != "colours" for kind in kinds):
+        annotations["mask"] = options.MaskFile
+    if edit.scribbles:
+        annotations["show"] = options.Show
+    if edit.map_help:
+        annotations["map"] = options.file("--map", edit.map_help)
+    return annotations
 
 
 def option_value(parameter: Parameter, value: Any) -> Any:
@@ -147,7 +149,7 @@ def signature(edit: Edit, *, target: Any = options.Target, depth: Any = options.
         [
             _argument("source", options.Source, inspect.Parameter.empty),
             _argument("target", target, inspect.Parameter.empty),
-            *(_argument(name, annotation, None) for name, annotation in SCRIBBLES.get(edit.name, {}).items()),
+            *(_argument(name, annotation, None) for name, annotation in scribble_options(edit).items()),
             *(_declared(p) for p in edit if p.is_option),
             _argument("depth", depth, None),
             _argument("seed", options.Seed, 0),
@@ -159,10 +161,10 @@ def signature(edit: Edit, *, target: Any = options.Target, depth: Any = options.
     )
 
 
-def with_options(*names: str, more: Iterable[Edit] = ()) -> Callable[[Callable[..., None]], Callable[..., None]]:
+def with_options(*names: str, more: Iterable[Edit] = ()) -> Callable[[Command], Command]:
     """Replace ``**given`` of a command with the named options of detail and all options of the edits in ``more``."""
 
-    def decorate(function: Callable[..., None]) -> Callable[..., None]:
+    def decorate(function: Command) -> Command:
         found = inspect.signature(function, eval_str=True).parameters.values()
         own = [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in found if p.kind != p.VAR_KEYWORD]
         added = {name: _declared(EDITS["detail"][name]) for name in names}
@@ -171,33 +173,36 @@ def with_options(*names: str, more: Iterable[Edit] = ()) -> Callable[[Callable[.
                 if parameter.is_option and parameter.name not in added:
                     added[parameter.name] = _declared(parameter, f"Options of {edit.name}")
         signature = inspect.Signature([*own, *added.values()])
-        setattr(function, "__signature__", signature)  # noqa: B010  # read by typer; unknown to mypy
-        return function
+        return with_signature(function, signature)
 
     return decorate
 
 
-def command(edit: Edit) -> Callable[..., None]:
+def with_signature(function: Command, signature: inspect.Signature) -> Command:
+    """Give a command the signature that typer reads its options from."""
+    setattr(function, "__signature__", signature)  # noqa: B010  # unknown to mypy
+    return function
+
+
+def command(edit: Edit) -> Command:
     """Create the command of an edit."""
 
-    def run(source: str, target: str, *, context: typer.Context, **given: Any) -> None:
-        edit_photograph(edit.name, source, target, typed=typed_options(context, given), **given)
+    def run(source: str, target: str, *, context: typer.Context, **values: Any) -> None:
+        edit_photograph(edit, source, target, typed=typed_options(context, values), **values)
 
-    run.__name__, run.__doc__ = edit.name, edit.help
-    found = signature(edit)
-    whole = [*found.parameters.values(), _argument("context", typer.Context, inspect.Parameter.empty)]
-    run.__signature__ = found.replace(parameters=whole)  # type: ignore[attr-defined]  # read by typer
-    run.__annotations__ = {}
-    return run
+    run.__name__, run.__doc__, run.__annotations__ = edit.name, edit.help, {}
+    options_of_edit = signature(edit)
+    context = _argument("context", typer.Context, inspect.Parameter.empty)
+    return with_signature(run, options_of_edit.replace(parameters=[*options_of_edit.parameters.values(), context]))
 
 
-def step_of(edit: Edit, given: dict[str, Any]) -> Step:
+def step_of(edit: Edit, options_of_edit: Mapping[str, Any]) -> Step:
     """Create a step from options, without its scribbles."""
     values = {}
     for parameter in edit:
-        if parameter.name not in given:
+        if parameter.name not in options_of_edit:
             continue
-        value = given[parameter.name]
+        value = options_of_edit[parameter.name]
         if parameter.kind == "sliders":
             value = options.parse_sliders(value, f"--{parameter.name}")
         elif parameter.words or (parameter.kind == "number" and isinstance(value, str)):
@@ -209,144 +214,58 @@ def step_of(edit: Edit, given: dict[str, Any]) -> Step:
 
 
 def edit_photograph(
-    name: str,
+    edit: Edit,
     source: str,
     target: str,
     *,
+    typed: Collection[str] = (),
     depth: options.FileDepth | None = None,
     seed: int = 0,
     memory: float | None = None,
     full: bool = False,
     workers: int | None = None,
     cluster: str | None = None,
-    typed: Iterable[str] = (),
-    **given: Any,
+    preset: str | None = None,
+    region: list[str] | None = None,
+    strokes: Path | None = None,
+    mask: Path | None = None,
+    show: Path | None = None,
+    map: Path | None = None,
+    **values: Any,
 ) -> None:
-    """Apply an edit, given by name, to a file.
+    """Apply an edit to a file.
 
-    ``given`` are options of its command, by default those of the edit, and ``typed`` are the names of those that the
-    user gave.
+    ``values`` are those of its parameters and of its options for the background, and ``typed`` are the names of the
+    options that the user typed.
     """
-    edit = EDITS[name]
-    step = step_of(edit, given)
-    preset = given.get("preset")
-    if preset is not None and (look := look_step(find_recipe(preset))) is not None:
+    step = step_of(edit, values)
+    look = None if preset is None else preset_step(find_recipe(preset), edit)
+    if look is not None:
         if {"region", "mask", *(parameter.name for parameter in edit)}.intersection(typed):
             raise ValueError(
                 f"--preset must not be combined with other options of detail if it is a look, got {preset}; drop them"
             )
-        edit, step, name = EDITS["look"], look, "look"
+        step = look
 
-    import torch
-    from torch import Tensor
+    from nlfilter_torch.photo.cli import editing
+    from nlfilter_torch.photo.cli.edit_job import EditJob
+    from nlfilter_torch.photo.cli.scribbles import ScribbleOptions
 
-    from nlfilter_torch.nn.denoiser.noise import Noise
-    from nlfilter_torch.photo.cli import editing, scribbles, showing
-    from nlfilter_torch.photo.cli.editing import Job
-    from nlfilter_torch.photo.cli.noise import MAP_DEPTH, NoiseReport, squared_difference, write_map
-    from nlfilter_torch.photo.edits.applying import apply_to, check_channels, fit_step
-    from nlfilter_torch.photo.edits.noise import noise_of
-    from nlfilter_torch.photo.io.photographs import Photograph, check_type
-    from nlfilter_torch.photo.io.rows import StoredPicture, open_picture
-    from nlfilter_torch.photo.picture.in_memory import InMemory
-    from nlfilter_torch.photo.picture.source import Source, seeded
-    from nlfilter_torch.photo.tiled.pictures import Picture, stored_as
-    from nlfilter_torch.photo.tiled.source import Tiled
-    from nlfilter_torch.photo.tiled.tiles import Tiling
-    from nlfilter_torch.photo.tiled.workers import single_threaded
+    backgrounds = {s.option: values.get(s.option.removeprefix("--")) for s in edit.backgrounds}
+    drawn = ScribbleOptions(region, strokes, mask, backgrounds)
+    note_useless(step, typed, marked=drawn.marks_objects)
+    editing.check_written(source, target, show=show, map=map, mask=mask, strokes=strokes, preset=preset)
+    job = EditJob(step, source, target, drawn, show, map, depth, seed, memory, full)
+    editing.edit_file(job, source, target, depth, memory=memory, workers=workers, cluster=cluster)
 
-    def tell(drawn: tuple[tuple[Any, ...], dict[str, Any]], size: tuple[int, int], read: showing.Read) -> None:
-        """Print what scribbles cover and what is left out, and write the picture of ``--show``."""
-        channels = read(slice(0, 1)).shape[1]
-        check_channels(name, channels)
-        if channels == 1:
-            showing.note_grey([step], source)
-        if given.get("show") is not None and not any(True for _ in showing.overlays(drawn)):
-            raise ValueError("--show needs scribbles; give --region X,Y,W,H, or omit --show")
-        showing.tell_colours(showing.overlays(drawn), read)
-        if given.get("show") is not None:
-            showing.show(given["show"], name, step.arguments, size, read, drawn)
 
-    def measured(named: dict[str, Any], picture: Source, read: showing.Read) -> NoiseReport:
-        """Estimate the noise unless it is given, write its map if requested, and return its report."""
-        level = step.arguments(picture.size)["noise_level"]
-        if level is None:
-            named["noise_level"] = noise_of(picture)
-        found = named.get("noise_level") or Noise.even(torch.as_tensor([level]))
-        if given.get("map") is not None:
-            write_map(found, picture.size, read, given["map"])
-        return NoiseReport(found, given=level is not None, strength=step["strength"])
-
-    def work(photograph: Photograph) -> Tensor:
-        free = editing.allowed_memory(memory)
-        with ExitStack() as files:
-
-            def read(path: Path) -> StoredPicture:
-                return files.enter_context(open_picture(path, free))
-
-            def rows_of(part: slice) -> Tensor:
-                return photograph.pixels[..., part, :]
-
-            drawn = scribbles.of_edit(step, photograph.size, given, read)
-            tell(drawn, photograph.size, rows_of)
-            noise = measured(drawn[1], InMemory(photograph.pixels), rows_of) if name == "denoise" else None
-            marked = scribbles.at_once(*drawn)
-            if name == "colorize":
-                showing.note_colours(source, photograph.size, rows_of)
-            edited = apply_to(step, photograph.pixels, *marked, generator=seeded(seed))
-            if noise is not None:
-                kind = options.DEPTHS[depth] if depth else photograph.depth  # the difference of the files is reported
-                noise.add(squared_difference(stored_as(photograph.pixels, photograph.depth), stored_as(edited, kind)))
-                noise.tell()
-            return edited
-
-    @contextmanager
-    def by_rows(job: Job) -> Iterator[Tiling]:
-        tiled = Tiled(
-            Picture(job.picture.rows, source),
-            job.passes(full, Path(target).parent),
-            str(given.get("strokes") or "--region"),
-        )
-        drawn = scribbles.of_edit(step, job.size, given, job.open)
-
-        def rows_of(part: slice) -> Tensor:
-            return tiled.picture.tile(part.start, part.stop, 0).pixels
-
-        tell(drawn, job.size, rows_of)
-        noise = measured(drawn[1], tiled, rows_of) if name == "denoise" else None
-        with single_threaded(tiled.passes.workers(1)):
-            fitted = fit_step(step, tiled, *drawn, generator=seeded(seed))
-        if name == "colorize":
-            showing.note_colours(source, job.size, rows_of)
-        with tiled.tiling(fitted) as tiling:
-            yield tiling if noise is None else noise.watched(tiling)
-        if noise is not None:
-            noise.tell()
-
-    selected = given.get("region") or given.get("mask")
-    if not (edit.requires_strokes or selected or step.changes()):
-        options.note(f"{name} changes nothing with these options: the photograph is written as it is")
-    if name == "denoise" and step["method"] == "network":
+def note_useless(step: Step, typed: Collection[str], *, marked: bool) -> None:
+    """Print notes if a step changes nothing, or options that the user typed have no effect."""
+    edit = step.declared
+    if not (edit.requires_strokes or marked or step.changes()):
+        options.note(f"{edit.name} changes nothing with these options: the photograph is written as it is")
+    condition = edit.filter_condition
+    if condition is not None and step[condition.name] != condition.value:
         for parameter in edit:
             if parameter.panel == FILTER_PANEL and parameter.name in typed:
-                option = f"--{parameter.name.replace('_', '-')}"
-                options.note(f"{option} has no effect on the network; add --method rule to denoise by the filter alone")
-    read = {what: given.get(what) for what in ("mask", "strokes", "preset")}
-    editing.check_apart("OUT", target, **read)
-    for which in ("show", "map"):
-        editing.check_apart(f"--{which}", given.get(which), photograph=source, output=target, **read)
-    if given.get("map") is not None:
-        check_type(given["map"], MAP_DEPTH, alpha=False)
-    masked = name == "detail" and bool(selected)
-    editing.edit_file(
-        source,
-        target,
-        depth,
-        work,
-        bytes_per_pixel=step.bytes_per_pixel(masked=masked),
-        memory=memory,
-        by_rows=by_rows,
-        coloured=edit.coloured,
-        workers=workers,
-        cluster=cluster,
-    )
+                options.note(f"--{parameter.name.replace('_', '-')} {condition.note}")

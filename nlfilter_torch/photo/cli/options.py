@@ -149,46 +149,40 @@ Cluster = Annotated[
 ]
 
 
-def _file(name: str, help: str) -> object:
+def file(name: str, help: str) -> object:
     """An option for a file."""
     return Annotated[Path | None, typer.Option(name, metavar="FILE", help=help)]
 
 
-def _rectangles(name: str, metavar: str, help: str) -> object:
+def rectangles(name: str, metavar: str, help: str) -> object:
     """An option for rectangles, which may be given several times."""
     return Annotated[list[str] | None, typer.Option(name, metavar=metavar, help=help)]
 
 
-StrokesFile = _file(
+StrokesFile = file(
     "--strokes",
     "Scribbles on the photograph: a PNG, TIFF or WebP picture of its size, transparent where nothing is drawn.",
 )
-ColourRegions = _rectangles(
+ColourRegions = rectangles(
     "--region",
     "X,Y,W,H:COLOUR",
     "A rectangle of colour, instead of scribbles or on top of them: column and row of its upper left corner, width and "
     "height, in pixels or in % of the photograph, and a colour such as red or #c04020; X,Y alone is a small square "
     "around that point. May be repeated; later rectangles cover earlier ones.",
 )
-Keeps = _rectangles("--keep", "X,Y,W,H", "A rectangle; everything that resembles it stays unchanged. May be repeated.")
-Regions = _rectangles(
+Regions = rectangles(
     "--region",
     "X,Y,W,H",
     "A rectangle: column and row of its upper left corner, width and height, in pixels or in % of the photograph; X,Y "
     "alone is a small square around that point. May be repeated.",
 )
-Backgrounds = _rectangles(
-    "--background",
-    "X,Y,W,H",
-    "A rectangle of the background, where too much is selected. May be repeated.",
-)
-SliderRegions = _rectangles(
+SliderRegions = rectangles(
     "--region",
     "X,Y,W,H[:SLIDERS]",
     "Edit only what resembles a rectangle: column and row of its upper left corner, its width and height, and its own "
     "sliders if they differ from --alpha, such as 60,300,20,20:3,3,4,1. May be repeated.",
 )
-MaskFile = _file(
+MaskFile = file(
     "--mask",
     "A picture of the same size as the photograph, white where selected and black elsewhere. Pixels darker than middle "
     "grey are not selected.",
@@ -203,10 +197,7 @@ MasksOfPairs = Annotated[
         help=f"{_LOOK_MASK} For folders of photographs, a folder of such pictures under the same names.",
     ),
 ]
-NoiseMap = _file(
-    "--map", "Also write a picture of the standard deviation of the noise at every pixel; white is 64 grey levels."
-)
-Show = _file(
+Show = file(
     "--show",
     "Picture to write before the edit: the photograph, reduced, with the scribbles and the selected area marked on it.",
 )

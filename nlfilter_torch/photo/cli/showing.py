@@ -16,11 +16,12 @@ from torch import Tensor
 from nlfilter_torch.photo.cli.options import note
 from nlfilter_torch.photo.cli.scribbles import Overlay, overlays
 from nlfilter_torch.photo.declared.declaration import Edit
-from nlfilter_torch.photo.picture.drawn import Drawn
-from nlfilter_torch.photo.picture.edit import PhotoEdit, Rows, edit_image
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.io.photographs import Photograph, write_photograph
 from nlfilter_torch.photo.picture.colour import hundredths_of_lab
+from nlfilter_torch.photo.picture.drawn import Drawn
+from nlfilter_torch.photo.picture.edit import PhotoEdit, Rows
+from nlfilter_torch.photo.picture.in_memory import edit_image
 from nlfilter_torch.photo.selections.scribbled_colours import frame_places
 
 Read = Callable[[slice], Tensor]  # rows of the photograph as (1, C, h, W) in [0, 1]
@@ -46,6 +47,11 @@ class Scribbled:
     rows: Rows
     drawn: Drawn[Overlay]
 
+    def check(self) -> None:
+        """Raise ValueError if there are no scribbles to show."""
+        if not dict(overlays(self.edit, self.drawn)):
+            raise ValueError("--show needs scribbles; give --region X,Y,W,H, or omit --show")
+
     def tell_colours(self) -> None:
         """Print the colour under each rectangle, and a note on standard error if it covers very different colours."""
         for option, overlay in overlays(self.edit, self.drawn):
@@ -59,13 +65,8 @@ class Scribbled:
         Args:
             target: an image file.
             edit_at: the edit with settings for a reduced size and its sampling step in pixels.
-
-        Raises:
-            ValueError: if there are no scribbles.
         """
-        planes = {option: overlay for option, overlay in overlays(self.edit, self.drawn)}
-        if not planes:
-            raise ValueError("--show needs scribbles; give --region X,Y,W,H, or omit --show")
+        planes = dict(overlays(self.edit, self.drawn))
         size = self.rows.size
         stride = math.ceil(math.sqrt(max(1.0, size[0] * size[1] / MAX_PIXELS)))
         image = _reduced(self.rows.read, size, stride, F.avg_pool2d).float().clamp(0, 1).expand(-1, 3, -1, -1)
@@ -145,7 +146,6 @@ def unlike(pixels: Tensor, middle: Tensor) -> float:
 
 def _planes(overlay: Overlay, size: tuple[int, int], stride: int) -> Tensor:
     """Reduce scribbles; one that covers less than a pixel remains visible."""
-
     return _reduced(overlay.planes, size, stride, F.max_pool2d)
 
 

@@ -5,15 +5,7 @@
 
 from dataclasses import replace
 
-from nlfilter_torch.photo.declared.declaration import (
-    FILTER_PANEL,
-    GAINS,
-    Condition,
-    Edit,
-    Parameter,
-    Scribble,
-    Slider,
-)
+from nlfilter_torch.photo.declared.declaration import FILTER_PANEL, GAINS, Condition, Edit, Parameter, Scribble, Slider
 from nlfilter_torch.photo.declared.shared_parameters import (
     LIMITS,
     LOOK,

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from nlfilter_torch.photo.declared.declaration import parse_json, shown
+from nlfilter_torch.photo.declared.json_values import parse_json, shown
 from nlfilter_torch.photo.declared.parameters import EDITS
 from nlfilter_torch.photo.declared.steps import VERSION, Step, acting_steps, json_of
 

@@ -9,7 +9,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from nlfilter_torch.photo.declared.declaration import Edit, shown
+from nlfilter_torch.photo.declared.declaration import Edit
+from nlfilter_torch.photo.declared.json_values import shown
 from nlfilter_torch.photo.declared.parameters import EDITS
 from nlfilter_torch.photo.declared.shared_parameters import FILTER
 

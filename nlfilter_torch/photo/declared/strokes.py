@@ -10,7 +10,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
-from nlfilter_torch.photo.declared.declaration import is_within, shown
+from nlfilter_torch.photo.declared.json_values import is_within, shown
 
 COLOUR = re.compile(r"#[0-9a-f]{6}", re.IGNORECASE)
 

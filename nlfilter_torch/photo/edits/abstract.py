@@ -21,7 +21,8 @@ from nlfilter_torch.photo.declared.parameters import ABSTRACT
 from nlfilter_torch.photo.edits.synthesis import synthesize
 from nlfilter_torch.photo.picture.colour import merge_luminance, split_luminance
 from nlfilter_torch.photo.picture.drawn import Drawn, M
-from nlfilter_torch.photo.picture.edit import FilteredEdit, edit_image
+from nlfilter_torch.photo.picture.edit import FilteredEdit
+from nlfilter_torch.photo.picture.in_memory import edit_image
 from nlfilter_torch.photo.picture.pixels import whole_image
 from nlfilter_torch.photo.picture.source import Fitted, Guide, Pixels, Planes, Source
 from nlfilter_torch.photo.picture.viewing import fit_change, viewed_size

@@ -10,12 +10,25 @@ from nlfilter_torch.core.precision import full_precision, working_dtype
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.declared.shared_parameters import FILTER
 from nlfilter_torch.photo.declared.steps import Step
-from nlfilter_torch.photo.edits.table import EDIT_OF
-from nlfilter_torch.photo.picture.drawn import Drawn, M, Painter, TensorPainter
+from nlfilter_torch.photo.edits.abstract import Abstract
+from nlfilter_torch.photo.edits.colorize import Colorize
+from nlfilter_torch.photo.edits.defocus import Defocus
+from nlfilter_torch.photo.edits.denoise import Denoise
+from nlfilter_torch.photo.edits.detail import Detail
+from nlfilter_torch.photo.edits.look import LookEdit
+from nlfilter_torch.photo.edits.recolor import Recolor
+from nlfilter_torch.photo.edits.sharpen import Sharpen
+from nlfilter_torch.photo.edits.tone import Tone
+from nlfilter_torch.photo.picture.drawn import Drawn, M, Painter
 from nlfilter_torch.photo.picture.edit import PhotoEdit
 from nlfilter_torch.photo.picture.in_memory import InMemory
+from nlfilter_torch.photo.picture.painting import TensorPainter
 from nlfilter_torch.photo.picture.source import Fitted, Source, seeded
 from nlfilter_torch.photo.picture.viewing import viewed_size
+
+#: The edits, and each by its name. A new edit takes a line here.
+EDITS: tuple[type[PhotoEdit], ...] = (Denoise, Detail, Tone, Sharpen, Colorize, Recolor, Defocus, Abstract, LookEdit)
+EDIT_OF: dict[str, type[PhotoEdit]] = {edit.declared.name: edit for edit in EDITS}
 
 
 def scribbles_of(step: Step, size: tuple[int, int], painter: Painter[M]) -> Drawn[M]:

@@ -24,12 +24,12 @@ from typing import ClassVar, Generic, Literal, cast
 import torch
 from torch import Tensor
 
-from nlfilter_torch.operator.options import OperatorOptions
 from nlfilter_torch.core.checks import check_count, check_patch_size, check_positive
 from nlfilter_torch.core.precision import per_image
 from nlfilter_torch.filtering.masks import segment
 from nlfilter_torch.filtering.scribbles import fit_strokes
 from nlfilter_torch.operator.features import reduce_channels
+from nlfilter_torch.operator.options import OperatorOptions
 from nlfilter_torch.operator.products import Columns
 from nlfilter_torch.operator.spectrum import Spectrum
 from nlfilter_torch.photo.declared.declaration import Edit
@@ -42,11 +42,11 @@ from nlfilter_torch.photo.picture.colour import (
     with_green,
 )
 from nlfilter_torch.photo.picture.drawn import Drawn, M
-from nlfilter_torch.photo.picture.edit import PhotoEdit, Rows, edit_image
+from nlfilter_torch.photo.picture.edit import PhotoEdit, Rows
+from nlfilter_torch.photo.picture.in_memory import edit_image
 from nlfilter_torch.photo.picture.pixels import part_of
 from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles, scribbled_blocks
 from nlfilter_torch.photo.picture.source import (
-    OperatorOptions,
     Fitted,
     Guide,
     Operator,

@@ -15,7 +15,8 @@ from nlfilter_torch.operator.nystrom import Completion
 from nlfilter_torch.photo.declared.declaration import Edit
 from nlfilter_torch.photo.declared.parameters import DEFOCUS
 from nlfilter_torch.photo.picture.drawn import Drawn, M
-from nlfilter_torch.photo.picture.edit import PhotoEdit, edit_image
+from nlfilter_torch.photo.picture.edit import PhotoEdit
+from nlfilter_torch.photo.picture.in_memory import edit_image
 from nlfilter_torch.photo.picture.source import Fitted, Source
 from nlfilter_torch.photo.selections.mask import RegionMask, background_of, fit_regions
 

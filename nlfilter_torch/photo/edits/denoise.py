@@ -26,7 +26,8 @@ from nlfilter_torch.photo.declared.parameters import DENOISE
 from nlfilter_torch.photo.edits.noise import noise_of
 from nlfilter_torch.photo.edits.synthesis import remainder
 from nlfilter_torch.photo.picture.drawn import Drawn, M
-from nlfilter_torch.photo.picture.edit import FilteredEdit, edit_image
+from nlfilter_torch.photo.picture.edit import FilteredEdit
+from nlfilter_torch.photo.picture.in_memory import edit_image
 from nlfilter_torch.photo.picture.pixels import whole_image
 from nlfilter_torch.photo.picture.source import Fitted, Guide, Operator, Pixels, Planes, Source
 
@@ -202,10 +203,8 @@ class NetworkDenoising:
 
     def __call__(self, image: Tensor, _: Tensor, inner: Inner) -> Tensor:
         """Denoise an image."""
-        if isinstance(self.noise, Noise):
-            level = self.noise.at(image)
-        else:
-            level = noise_map(self.noise, image, "noise_level")
+        noise = self.noise
+        level = noise.at(image) if isinstance(noise, Noise) else noise_map(noise, image, "noise_level")
         level = level * per_image(self.strength, level, 4)
         level = torch.where(level < NEGLIGIBLE_NOISE, torch.zeros_like(level), level)
         return image - _network(image.device, image.dtype).estimate_in_tiles(image, level, turns=1, inner=inner)

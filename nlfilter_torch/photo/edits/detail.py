@@ -34,7 +34,8 @@ from nlfilter_torch.photo.picture.changes import (
     sum_of,
 )
 from nlfilter_torch.photo.picture.drawn import Drawn, M
-from nlfilter_torch.photo.picture.edit import FilteredEdit, edit_image
+from nlfilter_torch.photo.picture.edit import FilteredEdit
+from nlfilter_torch.photo.picture.in_memory import edit_image
 from nlfilter_torch.photo.picture.limits import Limits
 from nlfilter_torch.photo.picture.pixels import whole_image
 from nlfilter_torch.photo.picture.source import Fitted, Guide, Pixels, Planes, Source, luminance
@@ -92,8 +93,8 @@ def enhance(
         photometric_bandwidth: h_y of the filter, or ``"auto"``.
         spatial_bandwidth: h_x of the filter in pixels; None is a twelfth of the short side, ``"none"`` compares pixels
             regardless of their distance, so that shading counts as detail, too.
-        num_landmarks: M of the filter; a spatial term needs more. The masks use as many, but at most 100.
         patch_size: width of the compared patches of the filter.
+        num_landmarks: M of the filter; a spatial term needs more. The masks use as many, but at most 100.
         landmarks: how the landmarks are chosen, see :func:`nonlocal_operator`.
         completion: of the kernel's diagonal, see :func:`nonlocal_operator`.
         guide_channels: what the filter compares, ``"luminance"`` or ``"all"`` channels.

@@ -18,7 +18,8 @@ from nlfilter_torch.photo.edits.synthesis import Polynomial
 from nlfilter_torch.photo.looks.histogram import LocalCurves, Stretch, ramps, tones
 from nlfilter_torch.photo.looks.look_filter import BAND_MARGIN, acts, band_change, check_part, pointwise, texture_change
 from nlfilter_torch.photo.picture.drawn import Drawn, M
-from nlfilter_torch.photo.picture.edit import FilteredEdit, Rows, edit_image
+from nlfilter_torch.photo.picture.edit import FilteredEdit, Rows
+from nlfilter_torch.photo.picture.in_memory import edit_image
 from nlfilter_torch.photo.picture.pixels import corner, whole_image
 from nlfilter_torch.photo.picture.source import Fitted, Guide, Pixels, Planes, Source, luminance
 from nlfilter_torch.photo.picture.viewing import fit_change
@@ -77,8 +78,8 @@ def apply_look(
         photometric_bandwidth: h_y, or ``"auto"``.
         spatial_bandwidth: h_x in pixels; None is a twelfth of the short side, ``"none"`` compares spots however far
             apart they are.
-        num_landmarks: M.
         patch_size: width of the compared patches of the filter.
+        num_landmarks: M.
         landmarks: how the landmarks are chosen, see :func:`nonlocal_operator`.
         completion: of the kernel's diagonal, see :func:`nonlocal_operator`.
         guide_channels: what the filter compares, ``"luminance"`` or ``"all"`` channels.

@@ -18,7 +18,8 @@ from nlfilter_torch.photo.declared.parameters import SHARPEN
 from nlfilter_torch.photo.edits.noise import noise_of
 from nlfilter_torch.photo.picture.changes import VARIANCE_SIGMA, activity
 from nlfilter_torch.photo.picture.drawn import Drawn, M
-from nlfilter_torch.photo.picture.edit import FilteredEdit, edit_image
+from nlfilter_torch.photo.picture.edit import FilteredEdit
+from nlfilter_torch.photo.picture.in_memory import edit_image
 from nlfilter_torch.photo.picture.limits import Limits
 from nlfilter_torch.photo.picture.source import Fitted, Guide, Pixels, Planes, Source, luminance
 from nlfilter_torch.photo.picture.viewing import fit_change

@@ -16,7 +16,8 @@ from nlfilter_torch.photo.declared.declaration import Edit
 from nlfilter_torch.photo.declared.parameters import TONE
 from nlfilter_torch.photo.edits.synthesis import Polynomial
 from nlfilter_torch.photo.picture.drawn import Drawn, M
-from nlfilter_torch.photo.picture.edit import FilteredEdit, edit_image
+from nlfilter_torch.photo.picture.edit import FilteredEdit
+from nlfilter_torch.photo.picture.in_memory import edit_image
 from nlfilter_torch.photo.picture.limits import Limits
 from nlfilter_torch.photo.picture.source import Fitted, Guide, Pixels, Source, luminance
 from nlfilter_torch.photo.picture.viewing import fit_change
@@ -56,8 +57,8 @@ def adjust_tone(
         photometric_bandwidth: h_y, or ``"auto"``.
         spatial_bandwidth: h_x in pixels; None is a twelfth of the short side, ``"none"`` compares pixels regardless of
             their distance.
-        num_landmarks: M.
         patch_size: width of the compared patches of the filter.
+        num_landmarks: M.
         landmarks: how the landmarks are chosen, see :func:`nonlocal_operator`.
         completion: of the kernel's diagonal, see :func:`nonlocal_operator`.
         guide_channels: what the filter compares, ``"luminance"`` or ``"all"`` channels.

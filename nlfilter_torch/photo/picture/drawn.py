@@ -2,13 +2,11 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import lru_cache
 from typing import Generic, Protocol, TypeVar
 
 from torch import Tensor
 
 from nlfilter_torch.photo.declared.strokes import Stroke
-from nlfilter_torch.photo.picture.painting import mask_of, paint
 
 M = TypeVar("M")  # masks and colours of pixels as a source takes them: tensors in memory, rows in tiles
 M_co = TypeVar("M_co", covariant=True)  # likewise, of values that are only read
@@ -45,22 +43,3 @@ class Painter(Protocol[M]):
 
     def covers(self, marks: M) -> bool:
         """Whether a mask or colours cover a pixel of the picture."""
-
-
-class TensorPainter:
-    """Rasterises strokes to tensors; the last few are cached."""
-
-    def __init__(self) -> None:
-        self._paint, self._mask = lru_cache(maxsize=1)(paint), lru_cache(maxsize=2)(mask_of)
-
-    def mask(self, strokes: Sequence[Stroke], size: Size, *, above: Sequence[Stroke] = ()) -> Tensor:
-        """Return :func:`mask_of` strokes, (1, 1, H, W)."""
-        return self._mask(tuple(strokes), size, above=tuple(above))
-
-    def colours(self, strokes: Sequence[Stroke], size: Size) -> tuple[Tensor, Tensor]:
-        """Colours (1, 3, H, W) and their mask (1, 1, H, W), see :func:`paint`."""
-        return self._paint(tuple(strokes), size)
-
-    def covers(self, marks: Tensor) -> bool:
-        """Whether a mask or colours cover a pixel."""
-        return bool(marks.any())

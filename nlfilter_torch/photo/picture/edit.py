@@ -8,15 +8,12 @@ from typing import Any, ClassVar, Self
 import torch
 from torch import Tensor
 
-from nlfilter_torch.operator.options import OperatorOptions
-from nlfilter_torch.core.checks import check_photograph
-from nlfilter_torch.core.precision import full_precision, working_dtype
 from nlfilter_torch.operator.features import GuideChannels
 from nlfilter_torch.operator.landmarks import Sampling
 from nlfilter_torch.operator.nystrom import Completion
+from nlfilter_torch.operator.options import OperatorOptions
 from nlfilter_torch.photo.declared.declaration import Edit
 from nlfilter_torch.photo.picture.drawn import Drawn, M
-from nlfilter_torch.photo.picture.in_memory import InMemory
 from nlfilter_torch.photo.picture.pixels import Fitted
 from nlfilter_torch.photo.picture.source import Source
 
@@ -65,6 +62,7 @@ class PhotoEdit(ABC):
 
     def check_channels(self, channels: int) -> None:
         """Raise ValueError if the edit cannot be applied to a photograph with that number of channels."""
+        return
 
     def notes(self, rows: Rows) -> Iterator[str]:
         """What a user should know before the edit is applied to a photograph."""
@@ -122,21 +120,3 @@ class FilteredEdit(PhotoEdit):
             "generator": self.generator,
         }
         return OperatorOptions(**(options | replaced))
-
-
-@full_precision
-def edit_image(
-    edit: PhotoEdit,
-    image: Tensor,
-    drawn: Drawn[Tensor] | None = None,
-    *,
-    name: str = "image",
-    channels: int | None = None,
-) -> Tensor:
-    """Edit an image (B, C, H, W) in [0, 1]; the result has its dtype.
-
-    ``name`` is that of the image in errors, and ``channels`` the number that it must have, if any.
-    """
-    check_photograph(image, name, channels=channels)
-    source = InMemory(image.to(working_dtype(image)))
-    return source.all(edit.fit(source, Drawn() if drawn is None else drawn)).to(image.dtype)

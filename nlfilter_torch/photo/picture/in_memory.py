@@ -10,13 +10,15 @@ from torch import Tensor
 
 from nlfilter_torch.core.checks import check_image, check_photograph, check_same_size, check_tensor, check_unit_range
 from nlfilter_torch.core.inner import EVERYWHERE
+from nlfilter_torch.core.precision import full_precision, working_dtype
 from nlfilter_torch.filtering.filters import detail_layers
 from nlfilter_torch.filtering.scribbles import check_painted
-from nlfilter_torch.operator.build import nonlocal_operator, operator_from_guide
+from nlfilter_torch.operator.build import operator_from_guide
 from nlfilter_torch.operator.operator import NonlocalOperator
-from nlfilter_torch.operator.options import OperatorOptions
 from nlfilter_torch.operator.products import Columns
 from nlfilter_torch.operator.spectrum import RitzPairs, Spectrum
+from nlfilter_torch.photo.picture.drawn import Drawn
+from nlfilter_torch.photo.picture.edit import PhotoEdit
 from nlfilter_torch.photo.picture.ends import ends_of
 from nlfilter_torch.photo.picture.pixels import Fitted, Planes, part_of, strips_of
 from nlfilter_torch.photo.picture.resizing import block_means, resize
@@ -234,3 +236,21 @@ def without_tensors(option: Hashable) -> Hashable:
     if isinstance(option, tuple | list):
         return tuple(map(without_tensors, option))
     return Tensor if isinstance(option, Tensor) else option
+
+
+@full_precision
+def edit_image(
+    edit: PhotoEdit,
+    image: Tensor,
+    drawn: Drawn[Tensor] | None = None,
+    *,
+    name: str = "image",
+    channels: int | None = None,
+) -> Tensor:
+    """Edit an image (B, C, H, W) in [0, 1]; the result has its dtype.
+
+    ``name`` is that of the image in errors, and ``channels`` the number that it must have, if any.
+    """
+    check_photograph(image, name, channels=channels)
+    source = InMemory(image.to(working_dtype(image)))
+    return source.all(edit.fit(source, Drawn() if drawn is None else drawn)).to(image.dtype)

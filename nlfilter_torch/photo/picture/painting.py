@@ -1,6 +1,7 @@
 """Rasterisation of brush strokes to masks and colours."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from functools import lru_cache
 from itertools import pairwise
 
 import torch
@@ -82,3 +83,22 @@ def colour_of(paint: str) -> Tensor:
     tensor([1.0000, 0.0000, 0.2000])
     """
     return torch.tensor([int(paint[i : i + 2], 16) for i in (1, 3, 5)]) / 255
+
+
+class TensorPainter:
+    """Rasterises strokes to tensors; the last few are cached."""
+
+    def __init__(self) -> None:
+        self._paint, self._mask = lru_cache(maxsize=1)(paint), lru_cache(maxsize=2)(mask_of)
+
+    def mask(self, strokes: Sequence[Stroke], size: tuple[int, int], *, above: Sequence[Stroke] = ()) -> Tensor:
+        """Return :func:`mask_of` strokes, (1, 1, H, W)."""
+        return self._mask(tuple(strokes), size, above=tuple(above))
+
+    def colours(self, strokes: Sequence[Stroke], size: tuple[int, int]) -> tuple[Tensor, Tensor]:
+        """Colours (1, 3, H, W) and their mask (1, 1, H, W), see :func:`paint`."""
+        return self._paint(tuple(strokes), size)
+
+    def covers(self, marks: Tensor) -> bool:
+        """Whether a mask or colours cover a pixel."""
+        return bool(marks.any())

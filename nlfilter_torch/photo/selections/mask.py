@@ -27,7 +27,8 @@ from nlfilter_torch.photo.declared.declaration import Edit
 from nlfilter_torch.photo.declared.parameters import MASK
 from nlfilter_torch.photo.declared.shared_parameters import VIEWING_SIZE
 from nlfilter_torch.photo.picture.drawn import Drawn, M
-from nlfilter_torch.photo.picture.edit import PhotoEdit, edit_image
+from nlfilter_torch.photo.picture.edit import PhotoEdit
+from nlfilter_torch.photo.picture.in_memory import edit_image
 from nlfilter_torch.photo.picture.pixels import Pixels, corner
 from nlfilter_torch.photo.picture.resizing import enlarged
 from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles
@@ -78,8 +79,8 @@ def region_mask(
             include less similar pixels.
         photometric_bandwidth: in hundredths of Lab: 0.08 is 8 units.
         spatial_bandwidth: in pixels; None is 0.45 of the short side, ``math.inf`` no limit: similar pixels anywhere.
-        num_landmarks: M of the operator.
         patch_size: width of the compared patches.
+        num_landmarks: M of the operator.
         landmarks: how the landmarks are chosen, see :func:`nonlocal_operator`.
         completion: of the kernel's diagonal, see :func:`nonlocal_operator`.
         generator: source of randomness for the landmarks; None draws the same for every call.
@@ -150,14 +151,14 @@ class RegionMask(PhotoEdit):
         outside = [] if background is None else source.regions(background, self.names[1])
         if len(outside) not in (0, 1, len(inside)):
             raise ValueError(
-                f"{self.names[1]} must have 1 channel or one for each of the {len(inside)} regions, got {len(outside)}; "
-                "add or drop some"
+                f"{self.names[1]} must have 1 channel or one for each of the {len(inside)} regions, got "
+                f"{len(outside)}; add or drop some"
             )
         regions = fit_regions(source, inside, outside, self)
         if outside and bool((regions.background_weights.detach() <= 0).any()):
             raise ValueError(
-                f"{self.names[1]} must hold a painted pixel outside the scribbles of each region in every image, got none; "
-                "paint outside them, or omit it"
+                f"{self.names[1]} must hold a painted pixel outside the scribbles of each region in every image, got "
+                "none; paint outside them, or omit it"
             )
         return regions
 
@@ -225,7 +226,7 @@ def background_of(source: Source[M], mask: M | None, inside: Scribbles, name: st
 def fit_regions(
     source: Source[M], inside: list[Scribbles], background: list[Scribbles], settings: RegionMask
 ) -> Regions:
-    """Compute the masks of regions from scribbles on each, and on the background: none, one for all, or one for each."""
+    """Compute the masks of regions from scribbles on each, and on the background: none, for all, or for each."""
     MASK.check(source.batch, reach=settings.reach)
     several = len(background) > 1
     scribbles = [_against(inside, k, background[k : k + 1] if several else background) for k in range(len(inside))]

@@ -189,6 +189,7 @@ def learn_filter(pictures: Sequence[Picture], guide: Guide) -> LearntFilter:
     if isinstance(bandwidth, str):
         guides = (reduce_channels(guide(whole(picture)), channels) for picture in pictures)
         bandwidth = average([estimate_bandwidth(compared, guide_channels=channels) for compared in guides])
+    del options["patch_weights"]  # which no edit sets
     recipe = GuideFeatures(window, bandwidth, spatial, channels)
     count = min(pictures[0].pixels, max(1, REFERENCE_PIXELS // len(pictures)))
     drawn = torch.Generator().manual_seed(generator.initial_seed() % (1 << 63))

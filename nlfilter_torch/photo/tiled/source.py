@@ -32,6 +32,7 @@ from nlfilter_torch.photo.tiled.scribbles import (
 from nlfilter_torch.photo.tiled.tiles import TILE_PIXELS, Passes, Tiling, cacheable_pixels, rows_that_fit
 from nlfilter_torch.photo.tiled.workers import Result, in_order, single_threaded
 
+UNUSED_OPTIONS = ("tolerance", "group", "patch_weights")  # which no edit sets
 CACHED_SHARE = 1 / 16  # largest share of the memory for planes that an edit reuses
 FINISH_FLOATS = 64  # floats per pixel of a tile during ``Fitted.finish``: images, their transforms and products
 
@@ -121,7 +122,8 @@ class Tiled:
             self.guide_floats += picture.pixels * compared
             self.fitting_rows(num_features, count)
             picture.store(max(1, TILE_PIXELS // self.size[1]), workers)
-        pilot = take_pilot(picture, passes.report, workers, **vars(options))
+        used = {name: value for name, value in vars(options).items() if name not in UNUSED_OPTIONS}
+        pilot = take_pilot(picture, passes.report, workers, **used)
         sampled, count = passes.sample < picture.pixels, pilot.moment.shape[1]
         cached_pixels = cacheable_pixels(picture, passes, num_features, count, self.stored_floats(num_features))
         self.cached_floats = cached_pixels * (count + 2)

@@ -1,0 +1,159 @@
+"""One edit of one photograph, in memory or in tiles, with what the command prints about it."""
+
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import typer
+from torch import Tensor
+
+from nlfilter_torch.photo.cli import editing, options
+from nlfilter_torch.photo.cli.changes import ChangeMeter, squared_difference, write_map
+from nlfilter_torch.photo.cli.editing import Job
+from nlfilter_torch.photo.cli.scribbles import Open, Overlay, ScribbleOptions, at_once, of_edit
+from nlfilter_torch.photo.cli.showing import Scribbled
+from nlfilter_torch.photo.declared.steps import Step
+from nlfilter_torch.photo.edits.applying import edit_of
+from nlfilter_torch.photo.io.photographs import Photograph
+from nlfilter_torch.photo.io.rows import StoredPicture, open_picture
+from nlfilter_torch.photo.picture.drawn import Drawn, M
+from nlfilter_torch.photo.picture.edit import PhotoEdit, Rows
+from nlfilter_torch.photo.picture.in_memory import InMemory, edit_image
+from nlfilter_torch.photo.picture.source import Source, seeded
+from nlfilter_torch.photo.tiled.pictures import Picture, RowSource, stored_as
+from nlfilter_torch.photo.tiled.source import Tiled
+from nlfilter_torch.photo.tiled.tiles import Tiling
+from nlfilter_torch.photo.tiled.workers import single_threaded
+
+
+@dataclass(frozen=True)
+class EditJob:
+    """A step that is applied to a photograph in a file.
+
+    Attributes:
+        step: the step, without strokes.
+        source: the file to read.
+        target: the file to write.
+        scribbles: options that mark parts of the photograph.
+        show: file for the picture of scribbles and mask.
+        map: file for the map of what the edit estimates.
+        depth: of the output; None is that of the input.
+        seed: of the random numbers.
+        memory: gigabytes that may be used.
+        full: whether statistics of tiles are of all pixels.
+    """
+
+    step: Step
+    source: str
+    target: str
+    scribbles: ScribbleOptions
+    show: Path | None
+    map: Path | None
+    depth: options.FileDepth | None
+    seed: int
+    memory: float | None
+    full: bool
+
+    @property
+    def bytes_per_pixel(self) -> int:
+        """Memory that the edit needs per pixel of an image."""
+        regional = self.step.declared.regional is not None
+        return self.step.bytes_per_pixel(masked=regional and self.scribbles.marks_objects)
+
+    @property
+    def coloured(self) -> bool:
+        """Whether the edit adds colours to a grey photograph."""
+        return self.step.declared.coloured
+
+    def edited(self, photograph: Photograph) -> Tensor:
+        """The edited pixels of a photograph in memory, (1, C, H, W)."""
+        rows = rows_of(photograph, self.source)
+        with ExitStack() as files:
+            drawn = self._drawn(rows, Opener(files, editing.allowed_memory(self.memory)))
+            self._tell(rows, drawn)
+            edit = self._measured(InMemory(photograph.pixels), rows)
+            pixels = edit_image(edit, photograph.pixels, at_once(self.step.declared, drawn))
+        if edit.reports_change:
+            kind = options.DEPTHS[self.depth] if self.depth else photograph.depth  # the files are compared
+            before, after = stored_as(photograph.pixels, photograph.depth), stored_as(pixels, kind)
+            meter = ChangeMeter()
+            meter.add(squared_difference(before, after))
+            typer.echo(edit.summary(meter.change))
+        return pixels
+
+    @contextmanager
+    def tiling(self, job: Job) -> Iterator[Tiling]:
+        """The edited rows of a photograph that does not fit in memory, which are computed within the block."""
+        passes = job.passes(self.full, Path(self.target).parent)
+        tiled = Tiled(Picture(job.picture.rows, self.source), passes, self.scribbles.called)
+        rows = Rows(self.source, job.size, tiled.channels, partial(pixels_of, tiled.picture))
+        drawn = self._drawn(rows, job.open)
+        self._tell(rows, drawn)
+        edit = self._measured(tiled, rows)
+        with single_threaded(tiled.passes.workers(1)):
+            fitted = edit.fit(tiled, as_rows(drawn))
+        with tiled.tiling(fitted) as tiling:
+            meter = ChangeMeter()
+            yield meter.watched(tiling) if edit.reports_change else tiling
+        if edit.reports_change:
+            typer.echo(edit.summary(meter.change))
+
+    def _edit_at(self, size: tuple[int, int], stride: float = 1) -> PhotoEdit:
+        """The edit with the settings for a picture (H, W), sampled at every so many pixels of the photograph."""
+        return edit_of(self.step, size, stride=stride, generator=seeded(self.seed))
+
+    def _drawn(self, rows: Rows, read: Open) -> Drawn[Overlay]:
+        """The scribbles, from the options."""
+        edit = self.step.declared
+        alpha = None if edit.regional is None else self.step["alpha"]
+        return of_edit(edit, alpha, rows.size, self.scribbles, read)
+
+    def _tell(self, rows: Rows, drawn: Drawn[Overlay]) -> None:
+        """Print what scribbles cover and what the edit leaves out, and write the picture of ``--show``."""
+        edit, scribbled = self._edit_at(rows.size), Scribbled(self.step.declared, rows, drawn)
+        edit.check_channels(rows.channels)
+        if self.show is not None:
+            scribbled.check()
+        scribbled.tell_colours()
+        if self.show is not None:
+            scribbled.show(self.show, self._edit_at)
+        for note in edit.notes(rows):
+            options.note(note)
+
+    def _measured(self, picture: Source[M], rows: Rows) -> PhotoEdit:
+        """The edit with what it estimates from the picture if the command reports it, and its map, if wanted."""
+        edit = self._edit_at(rows.size)
+        edit = edit.measured(picture) if edit.reports_change else edit
+        if self.map is not None:
+            write_map(edit.map_of, rows, self.map)
+        return edit
+
+
+@dataclass(frozen=True)
+class Opener:
+    """Opens pictures of scribbles, which are closed with ``files``."""
+
+    files: ExitStack
+    memory: int
+
+    def __call__(self, path: Path) -> StoredPicture:
+        """Open a picture."""
+        return self.files.enter_context(open_picture(path, self.memory))
+
+
+def pixels_of(picture: Picture, rows: slice) -> Tensor:
+    """Some rows (1, C, h, W) of a picture that is read by rows."""
+    return picture.tile(rows.start, rows.stop, 0).pixels
+
+
+def rows_of(photograph: Photograph, name: str) -> Rows:
+    """The rows of a photograph in memory."""
+    pixels = photograph.pixels
+    return Rows(name, photograph.size, pixels.shape[1], lambda rows: pixels[..., rows, :])
+
+
+def as_rows(drawn: Drawn[Overlay]) -> Drawn[RowSource]:
+    """Scribbles as a picture in tiles takes them."""
+    return Drawn(dict(drawn.masks), drawn.colours, drawn.sliders, drawn.outside)

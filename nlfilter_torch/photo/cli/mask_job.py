@@ -1,0 +1,162 @@
+"""The mask of an object in one photograph, in memory or in tiles, and the file that it is written to."""
+
+from collections.abc import Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from nlfilter_torch.photo.cli import editing, options
+from nlfilter_torch.photo.cli.edit_job import Opener, as_rows, pixels_of, rows_of
+from nlfilter_torch.photo.cli.progress import stages, steps
+from nlfilter_torch.photo.cli.scribbles import Open, Overlay, ScribbleOptions, at_once, of_edit
+from nlfilter_torch.photo.cli.showing import Scribbled, tell_selected
+from nlfilter_torch.photo.declared.parameters import MASK
+from nlfilter_torch.photo.declared.steps import working_bytes
+from nlfilter_torch.photo.io.extras import NO_EXTRAS
+from nlfilter_torch.photo.io.pfm import PFM, write_pfm
+from nlfilter_torch.photo.io.photographs import (
+    Depth,
+    Photograph,
+    check_depth,
+    check_memory,
+    check_output,
+    write_photograph,
+)
+from nlfilter_torch.photo.io.rows import TILED, StoredPicture, check_place, open_picture, write_picture
+from nlfilter_torch.photo.io.writing import check_file
+from nlfilter_torch.photo.picture.drawn import Drawn, M
+from nlfilter_torch.photo.picture.edit import Rows
+from nlfilter_torch.photo.picture.in_memory import InMemory
+from nlfilter_torch.photo.picture.source import Fitted, Source, seeded
+from nlfilter_torch.photo.selections.mask import RegionMask
+from nlfilter_torch.photo.tiled.pictures import Picture
+from nlfilter_torch.photo.tiled.scribbles import region_rows
+from nlfilter_torch.photo.tiled.source import Tiled
+from nlfilter_torch.photo.tiled.workers import single_threaded
+
+PLANE_BYTES = 16  # per pixel, of a mask that is computed in tiles but written at once
+
+
+@dataclass(frozen=True)
+class MaskJob:
+    """A mask that is computed from scribbles on a photograph in a file.
+
+    Attributes:
+        values: of the options of the parameters, by their names.
+        source: the file to read.
+        target: the file to write.
+        scribbles: options that mark parts of the photograph.
+        show: file for the picture of scribbles and mask.
+        seed: of the random numbers.
+        memory: gigabytes that may be used.
+        full: whether statistics of tiles are of all pixels.
+        depth: of the file; None is that of its type.
+    """
+
+    values: Mapping[str, Any]
+    source: str
+    target: Path
+    scribbles: ScribbleOptions
+    show: Path | None
+    seed: int
+    memory: float | None
+    full: bool
+    depth: options.FileDepth | None
+
+    @property
+    def floats(self) -> bool:
+        """Whether the mask is written as a PFM file."""
+        return self.target.suffix.lower() == PFM
+
+    @property
+    def kind(self) -> Depth:
+        """Depth of a file that is not PFM."""
+        return options.DEPTHS[self.depth or ("16" if self.target.suffix.lower() in (".tif", ".tiff") else "8")]
+
+    def check_depth(self) -> None:
+        """Raise ValueError if the file cannot have that depth."""
+        if self.floats and self.depth not in (None, "float"):
+            raise ValueError(
+                f"--depth must be float for a .pfm file, got {self.depth}; leave it out, or write a .tif or .png file"
+            )
+
+    def run(self, workers: int | None, cluster: str | None) -> None:
+        """Compute the mask and write it, in tiles if the photograph does not fit in memory."""
+        allowed = editing.allowed_memory(self.memory)
+        with steps(3) as begin:
+            begin("Reading")
+            needed = working_bytes(self.values["landmarks"], 3)
+            photograph = editing.read_if_it_fits(self.source, str(self.target), needed, self.memory)
+            if photograph is not None:
+                mask = Photograph(photograph.pixels[:, :1], self.kind)
+                check_file(self.target) if self.floats else check_output(self.target, mask)
+                begin("Selecting")
+                mask = self._in_memory(photograph, mask, allowed)
+                begin("Writing")
+                if self.floats:
+                    write_pfm(self.target, mask.pixels[0, 0].float().numpy())
+                else:
+                    write_photograph(mask, self.target)
+                return
+        with open_picture(Path(self.source), allowed) as picture, ExitStack() as files:
+            report = files.enter_context(stages())
+            plain = self._check_rows(picture, allowed)
+            processes = editing.processes_for(workers, cluster, files)
+            limit = editing.allowed_memory(self.memory, TILED)
+            job = editing.Job(picture, self.kind, allowed - picture.cached, limit, report, files, processes)
+            self._by_rows(job, plain)
+
+    def _in_memory(self, photograph: Photograph, mask: Photograph, allowed: int) -> Photograph:
+        """The mask of a photograph in memory."""
+        rows = rows_of(photograph, self.source)
+        with ExitStack() as files:
+            drawn = self._drawn(rows, Opener(files, allowed))
+        image = InMemory(photograph.pixels)
+        return mask.with_pixels(image.all(self._fitted(image, at_once(MASK, drawn))))
+
+    def _check_rows(self, picture: StoredPicture, allowed: int) -> StoredPicture:
+        """Check whether the mask can be written, and return the picture that it is written like."""
+        check_depth(self.source, picture.rows.dtype)
+        plain = replace(picture, rows=region_rows(picture.rows, 0), alpha=False, icc=None, exif=None, extras=NO_EXTRAS)
+        if self.floats:
+            check_file(self.target)
+            height, width = picture.rows.shape[:2]
+            check_memory(Path(self.source), width, height, PLANE_BYTES, allowed)
+        else:
+            check_place(self.target, self.kind, plain, allowed)
+        return plain
+
+    def _by_rows(self, job: editing.Job, plain: StoredPicture) -> None:
+        """Compute the mask in tiles and write it."""
+        tiled = Tiled(Picture(job.picture.rows, self.source), job.passes(self.full, self.target.parent), "--region")
+        rows = Rows(self.source, job.size, tiled.channels, partial(pixels_of, tiled.picture))
+        drawn = self._drawn(rows, job.open)
+        with single_threaded(tiled.passes.workers(1)):
+            fitted = self._fitted(tiled, as_rows(drawn))
+        if self.floats:
+            write_pfm(self.target, tiled.all(fitted)[0, 0].float().numpy())
+            return
+        with tiled.tiling(fitted) as tiling:
+            write_picture(self.target, replace(tiling, transparent=False), self.kind, plain)
+
+    def _edit_at(self, size: tuple[int, int], stride: float = 1) -> RegionMask:
+        """The settings for a picture (H, W), sampled at every so many pixels of the photograph."""
+        arguments = {p.keyword: p.argument_of(self.values[p.name], size, stride) for p in MASK}
+        return RegionMask.of(arguments | {"generator": seeded(self.seed)})
+
+    def _drawn(self, rows: Rows, read: Open) -> Drawn[Overlay]:
+        """The scribbles; prints the colours that they cover, and writes the picture of ``--show``."""
+        drawn = of_edit(MASK, None, rows.size, self.scribbles, read)
+        scribbled = Scribbled(MASK, rows, drawn)
+        scribbled.tell_colours()
+        if self.show is not None:
+            scribbled.show(self.show, self._edit_at)
+        return drawn
+
+    def _fitted(self, source: Source[M], drawn: Drawn[M]) -> Fitted:
+        """Fit the mask, and print how much is selected."""
+        regions = self._edit_at(source.size).select(source, drawn.masks["scribbles"], drawn.masks.get("background"))
+        tell_selected(regions.reduced_masks(), self.scribbles.backgrounds["--background"])
+        return Fitted(regions.masks)

@@ -1,0 +1,80 @@
+"""Recipes that are applied to one photograph, each in a region of its own, in memory or in tiles."""
+
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+from torch import Tensor
+
+from nlfilter_torch.photo.cli import editing, options
+from nlfilter_torch.photo.cli.edit_job import pixels_of, rows_of
+from nlfilter_torch.photo.cli.editing import Job
+from nlfilter_torch.photo.declared.presets import Recipe
+from nlfilter_torch.photo.edits.applying import apply_recipe, edit_of
+from nlfilter_torch.photo.io.photographs import Photograph
+from nlfilter_torch.photo.picture.changes import blend_edited
+from nlfilter_torch.photo.picture.edit import Rows
+from nlfilter_torch.photo.tiled.pictures import Picture
+from nlfilter_torch.photo.tiled.recipe import edit_regions, edit_tiling
+from nlfilter_torch.photo.tiled.tiles import Tiling
+
+
+@dataclass(frozen=True)
+class RecipeJob:
+    """Recipes that are applied to a photograph in a file.
+
+    Attributes:
+        recipes: the only one, or one for each mask.
+        masks: grey pictures of the regions of the recipes.
+        source: the file to read.
+        target: the file to write.
+        full: whether statistics of tiles are of all pixels.
+    """
+
+    recipes: Sequence[Recipe]
+    masks: Sequence[Path]
+    source: str
+    target: str
+    full: bool
+
+    @property
+    def bytes_per_pixel(self) -> int:
+        """Memory that the recipes need per pixel of an image."""
+        return max(recipe.bytes_per_pixel for recipe in self.recipes) + 16 * len(self.masks)
+
+    @property
+    def coloured(self) -> bool:
+        """Whether a recipe adds colours to a grey photograph."""
+        return any(recipe.gives_colour for recipe in self.recipes)
+
+    def edited(self, photograph: Photograph) -> Tensor:
+        """The edited pixels of a photograph in memory, (1, C, H, W)."""
+        self._tell(rows_of(photograph, self.source))
+        pixels = [apply_recipe(recipe, photograph.pixels) for recipe in self.recipes]
+        if not self.masks:
+            return pixels[0]
+        return blend_edited(photograph.pixels, pixels, editing.read_masks(self.masks, self.source, photograph.size))
+
+    def tiling(self, job: Job) -> AbstractContextManager[Tiling]:
+        """The edited rows of a photograph that does not fit in memory."""
+        passes, picture = job.passes(self.full, Path(self.target).parent), Picture(job.picture.rows, self.source)
+        self._tell(Rows(self.source, job.size, picture.colours, partial(pixels_of, picture)))
+        if not self.masks:
+            return edit_tiling(passes, job.picture.rows, self.recipes[0].steps, self.source)
+        masks = [job.open(path) for path in self.masks]
+        for path, mask in zip(self.masks, masks, strict=True):
+            if tuple(mask.shape[:2]) != job.size:
+                raise ValueError(
+                    f"{path} must have the size of {self.source}, {job.size[1]}x{job.size[0]}, got "
+                    f"{mask.shape[1]}x{mask.shape[0]}; resize it"
+                )
+        edits = [recipe.steps for recipe in self.recipes]
+        return edit_regions(passes, job.picture.rows, edits, [mask.rows for mask in masks], self.source)
+
+    def _tell(self, rows: Rows) -> None:
+        """Print the notes of all steps, each of them once."""
+        steps = [step for recipe in self.recipes for step in recipe.acting]
+        for note in dict.fromkeys(note for step in steps for note in edit_of(step, rows.size).notes(rows)):
+            options.note(note)

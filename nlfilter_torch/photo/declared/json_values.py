@@ -1,0 +1,49 @@
+"""Values read from JSON: parsing with clear errors, checks, and how messages show them."""
+
+import json
+import reprlib
+from typing import Any
+
+
+def parse_json(text: str | bytes, name: str, remedy: str) -> Any:
+    """Parse the content of the file ``name``, in UTF-8, UTF-16 or UTF-32 if it is given as bytes.
+
+    Raises:
+        ValueError: if it is not JSON, names an entry twice, or is too deeply nested for Python.
+    """
+    twice: list[str] = []
+
+    def entries(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        found = dict(pairs)
+        if len(found) < len(pairs):
+            names = [key for key, _ in pairs]
+            twice.append(next(key for key in names if names.count(key) > 1))
+        return found
+
+    try:
+        found = json.loads(text, object_pairs_hook=entries)
+    except (ValueError, RecursionError) as error:
+        reason = "it is nested too deeply" if isinstance(error, RecursionError) else f"it is not JSON ({error})"
+        raise ValueError(f"{name} is not a preset: {reason}; {remedy}") from error
+    if twice:
+        raise ValueError(f"{name} must have each entry once, got {shown(twice[0])} twice; remove one of them")
+    return found
+
+
+def shown(value: Any) -> str:
+    """Format a JSON value for a message, shortened if it is long or deeply nested.
+
+    >>> shown({"a": None}), shown([0] * 100)
+    ('{"a": null}', '[0, 0, 0, 0, 0, 0, ...]')
+    """
+    short = reprlib.repr(value)
+    try:
+        text = json.dumps(value)
+    except RecursionError:
+        return short
+    return text if len(text) <= 80 else short
+
+
+def is_within(value: Any, low: float, high: float) -> bool:
+    """Whether a JSON value is a number in a closed, finite range; NaN is not."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and low <= value <= high
