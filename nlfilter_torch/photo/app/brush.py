@@ -5,7 +5,11 @@ from dataclasses import dataclass, field
 from nlfilter_torch.photo.declared.parameters import EDITS
 
 COLOURS = ("#2f6fde", "#12a15f", "#e0b321", "#dd5c21", "#c8283c", "#8a46c8", "#8b5e3c", "#808080")
-BRUSHES: dict[str, dict[str, str]] = {edit.name: dict(edit.brushes) for edit in EDITS.values() if edit.brushes}
+BRUSHES: dict[str, dict[str, str]] = {
+    edit.name: {scribble.word: scribble.label for scribble in edit.scribbles}
+    for edit in EDITS.values()
+    if edit.scribbles
+}
 
 
 @dataclass

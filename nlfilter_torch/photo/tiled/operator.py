@@ -14,7 +14,7 @@ from nlfilter_torch.operator.operator import Kernel
 from nlfilter_torch.operator.products import Columns
 from nlfilter_torch.operator.scaling import PixelScaling
 from nlfilter_torch.operator.spectrum import RitzPairs
-from nlfilter_torch.photo.picture.source import SAMPLE, Blocks, Planes, sampled_pairs, sampled_places
+from nlfilter_torch.photo.picture.source import SAMPLE, Blocks, Pixels, Planes, sampled_pairs, sampled_places
 from nlfilter_torch.photo.tiled import sampling
 from nlfilter_torch.photo.tiled.pictures import Tile
 from nlfilter_torch.photo.tiled.sampling import (
@@ -108,10 +108,20 @@ class BlockPixels:
         return planes.compute(self)
 
 
-PixelsOfPicture = TilePixels | BlockPixels
+def with_columns(pixels: Pixels) -> TilePixels | BlockPixels:
+    """The pixels, with their columns.
+
+    Raises:
+        TypeError: if they are not of a picture that is read in tiles.
+    """
+    if isinstance(pixels, TilePixels | BlockPixels):
+        return pixels
+    raise TypeError(
+        f"pixels must be of a picture in tiles, got {type(pixels).__name__}; use the planes of its own source"
+    )
 
 
-def first_plane(pixels: PixelsOfPicture) -> Tensor:
+def first_plane(pixels: Pixels) -> Tensor:
     """The first channel of a picture."""
     return pixels.image[:, :1]
 
@@ -123,10 +133,10 @@ class ColumnPlanes:
     operator: "TiledOperator"
     function: Callable[[Columns], Tensor]
 
-    def __call__(self, pixels: PixelsOfPicture) -> Tensor:
+    def __call__(self, pixels: Pixels) -> Tensor:
         """The planes (1, C, h, w) at some pixels."""
         height, width = pixels.image.shape[-2:]
-        return self.function(pixels.columns(self.operator)).unflatten(2, (height, width))
+        return self.function(with_columns(pixels).columns(self.operator)).unflatten(2, (height, width))
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,14 +147,14 @@ class LayerPlanes:
     planes: Planes
     coefficients: Tensor
 
-    def __call__(self, pixels: PixelsOfPicture) -> Tensor:
+    def __call__(self, pixels: Pixels) -> Tensor:
         """The layers (1, k+1, C, h, w) at some pixels."""
-        return pixels.layers(self)
+        return with_columns(pixels).layers(self)
 
-    def compute(self, pixels: PixelsOfPicture) -> Tensor:
+    def compute(self, pixels: Pixels) -> Tensor:
         """The layers at some pixels, without a cache."""
         image = self.planes(pixels)
-        layers = layers_of_columns(pixels.columns(self.operator), self.coefficients, image.flatten(2))
+        layers = layers_of_columns(with_columns(pixels).columns(self.operator), self.coefficients, image.flatten(2))
         return layers.unflatten(-1, image.shape[-2:])
 
 

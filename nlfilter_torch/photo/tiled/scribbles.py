@@ -29,7 +29,11 @@ class RowPainter:
 
     def covers(self, marks: RowSource) -> bool:
         """Whether a mask or colours cover a pixel."""
-        return LazyRows(tuple(marks.shape), marks.__getitem__, marks.dtype).any()
+        return LazyRows(tuple(marks.shape), partial(_rows_of, marks), marks.dtype).any()
+
+
+def _rows_of(marks: RowSource, rows: slice) -> NDArray[np.generic]:
+    return np.asarray(marks[rows])
 
 
 def _mask_rows(
@@ -44,7 +48,11 @@ def _colour_rows(strokes: Sequence[Stroke], size: tuple[int, int], rows: slice) 
 
 def region_rows(masks: RowSource, region: int) -> LazyRows:
     """The mask (H, W) of a region, one channel of rows (H, W, K)."""
-    return LazyRows(tuple(masks.shape[:2]), lambda rows: np.asarray(masks[rows])[..., region], masks.dtype)
+    return LazyRows(tuple(masks.shape[:2]), partial(_region_of, masks, region), masks.dtype)
+
+
+def _region_of(masks: RowSource, region: int, rows: slice) -> NDArray[np.generic]:
+    return np.asarray(masks[rows])[..., region]
 
 
 def read_scribbles(
