@@ -19,7 +19,10 @@ from benchmarks.mask_peers import PEERS
 from benchmarks.photographs import photograph
 from nlfilter_torch import region_mask
 from nlfilter_torch.core.precision import working_dtype
+from nlfilter_torch.photo.declared.parameters import MASK
+from nlfilter_torch.photo.picture.drawn import Drawn
 from nlfilter_torch.photo.picture.in_memory import InMemory
+from nlfilter_torch.photo.selections.mask import RegionMask
 
 OURS = "region_mask"
 COUNTS = (1, 2, 4)
@@ -90,12 +93,14 @@ def speed(side: int) -> None:
     inside[..., side // 2 : side // 2 + side // 20, side // 2 :][..., : side // 10] = 1
     outside[..., : side // 20, : side // 10] = 1
     source = InMemory(image.to(working_dtype(image)), {})
-    source.all(region_mask.fit(source, inside, outside))  # caches the operator
+    edit = RegionMask.of(MASK.defaults)
+    marks = {"scribbles": inside, "background": outside}
+    source.all(edit.fit(source, Drawn(marks)))  # caches the operator
 
     def add_scribble() -> Tensor:
         free = (outside[0, 0] == 0).nonzero()[0]
         outside[0, 0, free[0] :, free[1] :][:10, :10] = 1  # otherwise the last mask would be returned
-        return source.all(region_mask.fit(source, inside, outside))
+        return source.all(edit.fit(source, Drawn(marks)))
 
     first, further = timed(lambda: region_mask(image, inside, outside)), timed(add_scribble)
     print(f"{side}x{side} on {torch.get_num_threads()} threads: {first:.2f} s, a further scribble {further:.2f} s")

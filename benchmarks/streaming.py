@@ -24,11 +24,12 @@ import torch
 from numpy.typing import NDArray
 
 from benchmarks.memory import MIB, forget_peak, resident
-from nlfilter_torch import enhance, nonlocal_operator, polynomial_filter
+from nlfilter_torch import nonlocal_operator, polynomial_filter
+from nlfilter_torch.photo import Drawn, Step, stream
 from nlfilter_torch.photo.declared.steps import working_bytes
+from nlfilter_torch.photo.edits.applying import fit_step
 from nlfilter_torch.photo.io.rows import open_picture, write_picture
 from nlfilter_torch.photo.picture.colour import edit_luminance
-from nlfilter_torch.photo.tiled import stream_detail
 from nlfilter_torch.photo.tiled.pictures import Picture
 from nlfilter_torch.photo.tiled.source import Tiled
 from nlfilter_torch.photo.tiled.tiles import SAMPLE, Passes, Statistics
@@ -38,10 +39,11 @@ PLAIN: dict[str, Any] = {  # the filter without limits or threshold, in pixels o
     "limits": "none",
     "threshold": 0.0,
     "viewing_size": 0.0,
-    "photometric_bandwidth": "auto",
+    "bandwidth": "auto",
     "spatial_bandwidth": "none",
-    "num_landmarks": 100,
+    "landmarks": 100,
 }
+DETAIL = Step("detail", alpha=tuple(ALPHA.tolist()), **PLAIN)
 PIECE = 256  # side of a piece of the mosaic
 NAMES = ("astronaut", "chelsea", "coffee", "rocket", "camera", "moon", "coins", "page", "brick", "grass", "gravel")
 Array = NDArray[np.uint8]
@@ -101,7 +103,7 @@ def work(source: Path, target: Path, statistics: Statistics, landmarks: int, mem
 
     with open_picture(source, memory) as picture:
         tiled = Tiled(Picture(picture.rows), Passes("uint8", statistics, memory=memory, report=report))
-        rows = tiled.rows(enhance.fit(tiled, ALPHA, **(PLAIN | {"num_landmarks": landmarks})))
+        rows = tiled.rows(fit_step(DETAIL.changed(landmarks=landmarks), tiled, Drawn()))
         write_picture(target, rows, "uint8", picture)
         pixels = picture.shape[0] * picture.shape[1]
     report("", 0, 0)
@@ -144,7 +146,7 @@ def exactness(side: int, tiles: list[int]) -> dict[str, float]:
 
     def by_rows(**options: Any) -> NDArray[np.float32]:
         edited = np.empty_like(picture)
-        stream_detail(picture, edited, ALPHA, **(PLAIN | {"sample": min(SAMPLE, side * side // 4)} | options))
+        stream(DETAIL, picture, edited, **({"sample": min(SAMPLE, side * side // 4)} | options))
         return edited
 
     sampled = by_rows(tile_rows=tiles[0])

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from benchmarks.streaming import ALPHA, mosaic
 from benchmarks.streaming_strokes import Boxes
 from nlfilter_torch import recolor
+from nlfilter_torch.photo import Drawn, Step, stream
 from nlfilter_torch.photo.edits.detail import enhance
-from nlfilter_torch.photo.tiled import stream_detail, stream_recolor
 from nlfilter_torch.photo.tiled.pictures import stored_as
 
 Edit = Callable[[], NDArray[Any]]
@@ -42,9 +42,9 @@ def ways(verb: str, picture: NDArray[np.uint8], memory: int) -> tuple[Edit, Edit
 
     def in_tiles() -> NDArray[Any]:
         if verb == "detail":
-            stream_detail(picture, edited, ALPHA, memory=memory)
+            stream(Step("detail", alpha=tuple(ALPHA.tolist())), picture, edited, memory=memory)
         else:
-            stream_recolor(picture, edited, strokes, memory=memory)
+            stream(Step("recolor"), picture, edited, drawn=Drawn({}, strokes), memory=memory)
         return edited
 
     return in_memory, in_tiles

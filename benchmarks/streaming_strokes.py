@@ -21,14 +21,15 @@ from numpy.typing import NDArray
 from benchmarks.memory import MIB, forget_peak, resident
 from benchmarks.streaming import mosaic, write_mosaic
 from nlfilter_torch import colorize, recolor
+from nlfilter_torch.photo import Drawn, Step, stream
+from nlfilter_torch.photo.edits.applying import fit_step
 from nlfilter_torch.photo.io.rows import open_picture, write_picture
 from nlfilter_torch.photo.picture.colour import colour_guide, split_luminance
-from nlfilter_torch.photo.tiled import stream_colorize, stream_recolor
 from nlfilter_torch.photo.tiled.pictures import Picture
 from nlfilter_torch.photo.tiled.source import Tiled
 from nlfilter_torch.photo.tiled.tiles import Passes
 
-VERBS: dict[str, Any] = {"recolor": recolor, "colorize": colorize}
+VERBS = ("recolor", "colorize")
 BOXES = (  # (top, left, height, width) as shares of the picture, and RGB
     ((0.25, 0.25, 0.02, 0.03), (0, 0, 255)),
     ((0.70, 0.60, 0.02, 0.02), (255, 0, 0)),
@@ -64,7 +65,9 @@ def work(verb: str, source: Path, target: Path, memory: int) -> dict[str, Any]:
     with open_picture(source, memory) as picture:
         height, width, _ = picture.shape
         tiled = Tiled(Picture(picture.rows), Passes("uint8", memory=memory))
-        write_picture(target, tiled.rows(VERBS[verb].fit(tiled, Boxes((height, width, 4)), None)), "uint8", picture)
+        write_picture(
+            target, tiled.rows(fit_step(Step(verb), tiled, Drawn({}, Boxes((height, width, 4))))), "uint8", picture
+        )
     return {
         "verb": verb,
         "megapixels": height * width / 1e6,
@@ -80,15 +83,15 @@ def exactness(side: int) -> list[str]:
     layer = Boxes((side, side, 4))[slice(0, side)].astype(np.float32) / np.float32(255)
     strokes = torch.from_numpy(layer).permute(2, 0, 1)[None]
     lines = []
-    for verb, stream, whole in (
-        ("recolor", stream_recolor, recolor(image, strokes[:, :3], strokes[:, 3:])),
-        ("colorize", stream_colorize, colorize(split_luminance(image)[0], strokes[:, :3], strokes[:, 3:])),
+    for verb, whole in (
+        ("recolor", recolor(image, strokes[:, :3], strokes[:, 3:])),
+        ("colorize", colorize(split_luminance(image)[0], strokes[:, :3], strokes[:, 3:])),
     ):
         wanted = whole[0].permute(1, 2, 0).numpy()
 
-        def edited(stream: Any = stream, **options: Any) -> NDArray[np.float32]:
+        def edited(verb: str = verb, **options: Any) -> NDArray[np.float32]:
             rows = np.empty_like(picture)
-            stream(picture, rows, layer, **options)
+            stream(Step(verb), picture, rows, drawn=Drawn({}, layer), **options)
             return rows
 
         sampled = edited(sample=side * side // 4, tile_rows=64)

@@ -1,7 +1,5 @@
 """The editor's preview: it shows what is saved, and does not recompute what has not changed."""
 
-from collections.abc import Callable
-
 import pytest
 import torch
 import torch.nn.functional as F
@@ -14,7 +12,7 @@ from nlfilter_torch.photo.declared.parameters import EDITS
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.declared.strokes import Stroke
-from nlfilter_torch.photo.edits.applying import apply_recipe, apply_step, prepare
+from nlfilter_torch.photo.edits.applying import PreparedStep, apply_recipe, apply_step
 from nlfilter_torch.photo.picture.painting import mask_of
 from nlfilter_torch.photo.picture.resizing import resize
 from nlfilter_torch.photo.picture.source import seeded
@@ -50,12 +48,15 @@ def counted(monkeypatch: pytest.MonkeyPatch) -> dict[str, list[str]]:
     """Record events of steps: ``filter`` for each filter that is built, ``edit`` for each picture that is drawn."""
     events: dict[str, list[str]] = {edit: [] for edit in EDITS}
 
-    def spied(step: Step, image: torch.Tensor, *, stride: float) -> Callable[[Step], torch.Tensor]:
-        events[step.edit].append("filter")
-        edit = prepare(step, image, stride=stride)
-        return lambda other: events[step.edit].append("edit") or edit(other)  # type: ignore[func-returns-value]
+    class Spied(PreparedStep):
+        begun = False
 
-    monkeypatch.setattr("nlfilter_torch.photo.app.preview.prepare", spied)
+        def __call__(self, step: Step) -> torch.Tensor:
+            events[step.edit] += ["edit"] if self.begun else ["filter", "edit"]
+            self.begun = True
+            return super().__call__(step)
+
+    monkeypatch.setattr("nlfilter_torch.photo.app.preview.PreparedStep", Spied)
     return events
 
 

@@ -14,12 +14,12 @@ from nlfilter_torch.photo.picture.in_memory import InMemory
 from nlfilter_torch.photo.picture.source import luminance
 from nlfilter_torch.photo.selections import local_values
 from nlfilter_torch.photo.selections.local_values import ABSOLUTE, RELATIVE, Links, LocalValues
-from nlfilter_torch.photo.tiled import stream_colorize
 from nlfilter_torch.photo.tiled.pictures import Picture
 from nlfilter_torch.photo.tiled.source import Tiled
 from nlfilter_torch.photo.tiled.tiles import Passes
 from tests.problems import box, colour
 from tests.problems import luminance as grey_of
+from tests.streams import stream_colorize
 from tests.strokes import SIZE, dots, groups_of
 
 
