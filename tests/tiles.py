@@ -11,7 +11,7 @@ from torch import Tensor
 
 from nlfilter_torch import nonlocal_operator, polynomial_filter
 from nlfilter_torch.photo.picture.colour import edit_luminance
-from nlfilter_torch.photo.tiled import stream_detail
+from tests.streams import stream_detail
 
 Array = NDArray[Any]
 ALPHA = torch.tensor([3.0, 3.0, 4.0, 1.05])

@@ -11,9 +11,9 @@ from nlfilter_torch.photo.cli import main
 from nlfilter_torch.photo.io.photographs import Photograph, read_photograph, write_photograph
 from nlfilter_torch.photo.picture.resizing import resize
 from nlfilter_torch.photo.picture.viewing import enlarged_and_reduced, viewed_size
-from nlfilter_torch.photo.tiled import stream_detail
 from tests.brightness import ALPHA, EDITS
 from tests.problems import cat, colour, luminance
+from tests.streams import stream_detail
 
 
 @pytest.mark.parametrize("residual", [None, 1.0])

@@ -8,16 +8,13 @@ import pytest
 import torch
 
 from nlfilter_torch import region_mask
-from nlfilter_torch.photo.picture.drawn import Drawn
 from nlfilter_torch.photo.picture.in_memory import InMemory
 from nlfilter_torch.photo.selections import mask as masks
-from nlfilter_torch.photo.selections.mask import RegionMask
 from nlfilter_torch.photo.tiled import sampling
 from nlfilter_torch.photo.tiled.pictures import Picture
 from nlfilter_torch.photo.tiled.source import Tiled
 from nlfilter_torch.photo.tiled.tiles import Passes
 from tests.problems import box, colour, noise, seeded
-from tests.streams import settings_of
 
 SIZE = (40, 48)
 
@@ -128,7 +125,7 @@ def test_tiles_are_as_in_memory(tile_rows: int, monkeypatch: pytest.MonkeyPatch)
     wanted = region_mask(image, front, back, num_landmarks=40)
     rows: list[Any] = [t[0].permute(1, 2, 0).numpy() for t in (image, front, back)]
     tiled = Tiled(Picture(rows[0]), Passes("float32", "full", tile_rows=tile_rows))
-    fitted = region_mask.fit(tiled, rows[1], rows[2], num_landmarks=40)
+    fitted = settings_of(RegionMask, num_landmarks=40).fit(tiled, Drawn({"scribbles": rows[1], "background": rows[2]}))
     mask = np.concatenate([values for _, values in tiled.rows(fitted)])
     np.testing.assert_allclose(mask[..., 0], wanted[0, 0].numpy(), atol=1e-5)
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from nlfilter_torch.photo.tiled import stream_detail
+from tests.streams import stream_detail
 from tests.tiles import ALPHA, FEW, PLAIN, Rows, Shrinking, cat, streamed
 
 

@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 from nlfilter_torch import colorize, recolor
 from nlfilter_torch.photo.picture.colour import split_luminance
 from nlfilter_torch.photo.picture.painting import cover, mask_of, paint
-from nlfilter_torch.photo.tiled import sampling, stream_colorize, stream_detail, stream_recolor, tiles
+from nlfilter_torch.photo.tiled import sampling, tiles
 from nlfilter_torch.photo.tiled.pictures import Picture
 from nlfilter_torch.photo.tiled.scribbles import read_scribbles
 from tests import problems
 from tests.recipes import BLUE, rows_of
+from tests.streams import stream_colorize, stream_detail, stream_recolor
 from tests.tiles import FEW, LEVEL, Rows, Shrinking, cat
 
 

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import torch
 
-from nlfilter_torch.photo.tiled import stream_detail
 from nlfilter_torch.photo.tiled.pictures import Picture
 from nlfilter_torch.photo.tiled.source import Tiled
 from nlfilter_torch.photo.tiled.tiles import Passes
+from tests.streams import stream_detail
 from tests.tiles import ALPHA, cat, streamed
 
 

@@ -1,6 +1,6 @@
 """Values in the messages of a declaration."""
 
-from nlfilter_torch.photo.declared.declaration import shown
+from nlfilter_torch.photo.declared.json_values import shown
 
 
 def test_values_in_messages_are_short() -> None:
