@@ -14,8 +14,8 @@ from nlfilter_torch import (
     polynomial_filter,
 )
 from nlfilter_torch.operator.sinkhorn import sinkhorn_in_graph
-from nlfilter_torch.photo.tiled import stream_detail
 from tests.problems import noise, picture, seeded
+from tests.streams import stream_detail
 
 FLOATS = (torch.float32, torch.float64)
 
