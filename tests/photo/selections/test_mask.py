@@ -8,13 +8,16 @@ import pytest
 import torch
 
 from nlfilter_torch import region_mask
+from nlfilter_torch.photo.picture.drawn import Drawn
 from nlfilter_torch.photo.picture.in_memory import InMemory
 from nlfilter_torch.photo.selections import mask as masks
+from nlfilter_torch.photo.selections.mask import RegionMask
 from nlfilter_torch.photo.tiled import sampling
 from nlfilter_torch.photo.tiled.pictures import Picture
 from nlfilter_torch.photo.tiled.source import Tiled
 from nlfilter_torch.photo.tiled.tiles import Passes
 from tests.problems import box, colour, noise, seeded
+from tests.streams import settings_of
 
 SIZE = (40, 48)
 
