@@ -30,7 +30,7 @@ from nlfilter_torch.photo.edits.recolor import Recoloring, with_room
 from nlfilter_torch.photo.picture.colour import hundredths_of_lab, merge_luminance, split_luminance
 from nlfilter_torch.photo.picture.resizing import resize
 from nlfilter_torch.photo.picture.viewing import viewed_size
-from nlfilter_torch.photo.selections.matting import colours_beside
+from nlfilter_torch.photo.selections.border_colours import colours_beside
 
 TINTS = ((0.8, 0.2, 0.15), (0.2, 0.35, 0.8), (0.2, 0.6, 0.25), (0.85, 0.7, 0.15))
 COLOURS = ((0.1, 0.3, 0.9), (0.9, 0.5, 0.1), (0.7, 0.15, 0.7), (0.15, 0.6, 0.3))  # of the scribbles, for each tint

@@ -16,8 +16,8 @@ from nlfilter_torch.photo.picture.edit import PhotoEdit
 from nlfilter_torch.photo.picture.in_memory import edit_image
 from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles
 from nlfilter_torch.photo.picture.source import Fitted, Pixels, Source
+from nlfilter_torch.photo.selections.border_colours import Sides, colours_beside, refine_mask
 from nlfilter_torch.photo.selections.mask import RegionMask, Regions, background_of, fit_regions
-from nlfilter_torch.photo.selections.matting import Sides, colours_beside, refine_mask
 
 EPSILON = 1e-12  # keeps the derivative of a root finite
 END_MARGIN = 0.1  # masks closer to 0 or 1 are set to 0 or 1: a faint tint far away is visible, a less soft edge is not

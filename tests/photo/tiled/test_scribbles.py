@@ -294,7 +294,9 @@ def test_what_cannot_be_used_is_named(edit: Any, change: Any, options: dict[str,
 
 def test_what_only_one_of_them_takes_is_named() -> None:
     picture, (strokes, mask, keep) = cat(40, 50), paint_rows(40, 50)
-    with pytest.raises(ValueError, match="recolor needs a colour photograph, got a grey one; use colorize for grey photographs"):
+    with pytest.raises(
+        ValueError, match="recolor needs a colour photograph, got a grey one; use colorize for grey photographs"
+    ):
         recoloured(grey(picture), strokes, mask)
     with pytest.raises(ValueError, match="keep must have the height and width of source"):
         recoloured(picture, strokes, mask, keep=keep[1:])
