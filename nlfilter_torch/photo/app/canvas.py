@@ -8,6 +8,7 @@ from torch import Tensor
 
 from nlfilter_torch.photo.app import drawing
 from nlfilter_torch.photo.app.brush import BRUSHES, Brush
+from nlfilter_torch.photo.declared.parameters import DETAIL, EDITS
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.declared.strokes import Stroke
 
@@ -50,7 +51,7 @@ class Canvas:
         self._frame = 0
         self._flashes = 0
         self._mask_shown: bytes | None = None  # the mask that was shown last
-        self._step = "detail"  # the step whose strokes are shown
+        self._step = DETAIL.name  # the step whose strokes are shown
         self._line: list[tuple[float, float]] = []  # of the stroke that is being drawn
         with ui.element("div").classes("canvas"):
             self._build_welcome(show_error)
@@ -147,7 +148,7 @@ class Canvas:
 
     def draw_mask(self, *, moving: bool = False) -> None:
         """Show the mask, except while a slider is moving; for a second, if it is new and not to be kept in sight."""
-        mask = self.pictures.get("mask") if self._step == "detail" else None
+        mask = self.pictures.get("mask") if EDITS[self._step].regional else None
         new = mask != self._mask_shown
         keep = bool(self._show_mask.value)
         if not mask or moving or not (keep or new):

@@ -10,11 +10,17 @@ from PIL import Image
 from torch import Tensor
 
 from nlfilter_torch.filtering.filters import polynomial_response
+from nlfilter_torch.photo.declared.parameters import EDITS
 from nlfilter_torch.photo.declared.strokes import Stroke
 
 QUALITY = 95
 TINT, OPACITY = (255, 40, 80), 120  # of the mask
-WORDS = {"in": "#22c55e", "out": "#ef4444", "keep": "#9ca3af"}  # colours of strokes with a meaning
+#: Colours of strokes with a meaning, by its word: green on objects, red on the background, grey on what stays as it is.
+WORDS = {
+    scribble.word: "#22c55e" if scribble.role == "object" else "#ef4444"
+    for edit in EDITS.values()
+    for scribble in edit.scribbles
+} | {"keep": "#9ca3af"}
 WHITE_TINT, BLACK_TINT = (255, 60, 60, 255), (60, 120, 255, 255)  # where a picture is clipped
 BINS = 64  # of a histogram
 
