@@ -87,20 +87,20 @@ def facts(path: Path) -> dict[str, Any]:
     with av.open(str(path)) as file:
         stream = file.streams.video[0]
         context = stream.codec_context
-        found: dict[str, Any] = {name: getattr(context, name) for name in (*TAGS, "pix_fmt", "width", "height")}
-        found |= {"codec": context.name, "rate": stream.average_rate, "shape": context.sample_aspect_ratio}
-        found |= {
+        properties: dict[str, Any] = {name: getattr(context, name) for name in (*TAGS, "pix_fmt", "width", "height")}
+        properties |= {"codec": context.name, "rate": stream.average_rate, "shape": context.sample_aspect_ratio}
+        properties |= {
             "title": file.metadata.get("title"),
             "languages": [s.metadata.get("language") for s in file.streams.audio],
         }
         frames = list(file.decode(video=0))
-        found["matrix"] = display_matrix(frames[0])
-        found["times"] = [f.pts * f.time_base for f in frames]
-        found["length"] = stream.duration * stream.time_base
+        properties["matrix"] = display_matrix(frames[0])
+        properties["times"] = [f.pts * f.time_base for f in frames]
+        properties["length"] = stream.duration * stream.time_base
     with av.open(str(path)) as file:
         packets = (p for p in file.demux(*file.streams.audio) if p.dts is not None) if file.streams.audio else ()
-        found["sound"] = [(p.pts * p.time_base, p.duration * p.time_base, bytes(p)) for p in packets]
-    return found
+        properties["sound"] = [(p.pts * p.time_base, p.duration * p.time_base, bytes(p)) for p in packets]
+    return properties
 
 
 def pan(count: int, step: int, height: int = 100, width: int = 120) -> list[torch.Tensor]:

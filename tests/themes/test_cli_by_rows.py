@@ -78,12 +78,12 @@ def test_detail_by_rows_is_detail(photo: Path, tmp_path: Path, suffix: str, opti
     whole, rows = tmp_path / f"whole{suffix}", tmp_path / f"rows{suffix}"
     assert detail(source, whole, *options) == 0
     assert detail(source, rows, *options, "--memory", LITTLE, "--full") == 0
-    one, other = read_photograph(whole), read_photograph(rows)
-    assert (one.pixels - other.pixels).abs().max() < (1.1 / 255 if "8" in options else 1e-4)
-    assert one.alpha is not None
-    assert other.alpha is not None
-    assert torch.equal(one.alpha, other.alpha)
-    assert (one.depth, one.icc) == (other.depth, other.icc)
+    whole_result, rows_result = read_photograph(whole), read_photograph(rows)
+    assert (whole_result.pixels - rows_result.pixels).abs().max() < (1.1 / 255 if "8" in options else 1e-4)
+    assert whole_result.alpha is not None
+    assert rows_result.alpha is not None
+    assert torch.equal(whole_result.alpha, rows_result.alpha)
+    assert (whole_result.depth, whole_result.icc) == (rows_result.depth, rows_result.icc)
 
 
 def test_detail_by_rows_happens_by_itself(photo: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -101,8 +101,8 @@ def test_a_mask_of_the_picture_is_read_by_rows(photo: Path, tmp_path: Path, caps
     options = ("--alpha", "0,1,1,1", "--memory", LITTLE)
     assert detail(photo, tmp_path / "mask.tif", "--mask", tmp_path / "mask.png", *options) == 0
     assert detail(photo, tmp_path / "region.tif", "--region", "40,60,20,20", *options) == 0
-    one, other = (read_photograph(tmp_path / name).pixels for name in ("mask.tif", "region.tif"))
-    assert torch.equal(one, other)
+    whole_result, rows_result = (read_photograph(tmp_path / name).pixels for name in ("mask.tif", "region.tif"))
+    assert torch.equal(whole_result, rows_result)
     Image.fromarray(mask[1:]).save(tmp_path / "small.png")
     assert detail(photo, tmp_path / "out.tif", "--mask", tmp_path / "small.png", "--memory", LITTLE) == 2
     assert "small.png must be as large as the photograph, 300x200, but is 300x199" in capsys.readouterr().err

@@ -61,10 +61,10 @@ def test_by_rows_as_whole(photo: Path, verb: str, source: str, options: tuple[st
         assert run(verb, folder / source, folder / name, *options, *more) == 0
     with tifffile.TiffFile(folder / "rows.tif") as file:
         assert file.pages.first.is_tiled  # what is written by rows is
-    one, other = (read_photograph(folder / name) for name in ("whole.tif", "rows.tif"))
-    assert one.depth == other.depth
-    assert (one.pixels - read_photograph(folder / source).pixels).abs().max() > 0.01
-    assert (one.pixels - other.pixels).abs().max() < (
+    whole, by_rows = (read_photograph(folder / name) for name in ("whole.tif", "rows.tif"))
+    assert whole.depth == by_rows.depth
+    assert (whole.pixels - read_photograph(folder / source).pixels).abs().max() > 0.01
+    assert (whole.pixels - by_rows.pixels).abs().max() < (
         1.1 / 255 if "8" in options else 1e-3 if verb == "recolor" else 1e-4
     )
 

@@ -237,7 +237,8 @@ def edit_file(
             return
     with ExitStack() as stack:
         picture = stack.enter_context(open_picture(Path(source), allowed))
-        stored = kind or check_depth(source, picture.rows.dtype)
+        own_depth = check_depth(source, picture.rows.dtype)  # refuses other dtypes whatever the output is
+        stored = kind or own_depth
         written = picture.in_colour() if edit.coloured else picture
         check_place(Path(target), stored, written, allowed)
         processes = processes_for(workers, cluster, stack)

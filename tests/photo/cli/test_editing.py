@@ -65,11 +65,11 @@ def test_alpha_of_ones_gives_the_file_back(
     original = Photograph(pixels, depth, transparency, PROFILE, exif.tobytes())
     write_photograph(original, tmp_path / f"in{suffix}")
     assert detail(tmp_path / f"in{suffix}", tmp_path / f"out{suffix}", "--alpha", "1,1,1,1") == 0
-    stored, found = read_photograph(tmp_path / f"in{suffix}"), read_photograph(tmp_path / f"out{suffix}")
-    assert (found.pixels - stored.pixels).abs().max() <= (1e-5 if depth == "float32" else 0)
-    assert (found.alpha is None) == (stored.alpha is None)
-    assert found.alpha is None or torch.equal(found.alpha, stored.alpha)
-    assert (found.depth, found.icc, found.exif) == (depth, PROFILE, stored.exif)
+    stored, edited = read_photograph(tmp_path / f"in{suffix}"), read_photograph(tmp_path / f"out{suffix}")
+    assert (edited.pixels - stored.pixels).abs().max() <= (1e-5 if depth == "float32" else 0)
+    assert (edited.alpha is None) == (stored.alpha is None)
+    assert edited.alpha is None or torch.equal(edited.alpha, stored.alpha)
+    assert (edited.depth, edited.icc, edited.exif) == (depth, PROFILE, stored.exif)
 
 
 def test_options_change_the_picture(photo: Path, tmp_path: Path) -> None:

@@ -90,10 +90,10 @@ def test_a_film_by_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str
         edit = FilmEdit(steps, samples, PASSES)
         with open_film(target) as film:
             for frame, rows in zip(film.frames(), before, strict=True):
-                wanted, found = edit(rows).clip(0, 1), film.pixels(frame)
+                wanted, decoded = edit(rows).clip(0, 1), film.pixels(frame)
                 # Chroma has half the resolution in the file, so only brightness can agree.
-                assert np.abs(_grey(found) - _grey(wanted)).mean() < 3 / 255
-                assert np.abs(_grey(wanted) - _grey(rows)).mean() > np.abs(_grey(found) - _grey(wanted)).mean()
+                assert np.abs(_grey(decoded) - _grey(wanted)).mean() < 3 / 255
+                assert np.abs(_grey(wanted) - _grey(rows)).mean() > np.abs(_grey(decoded) - _grey(wanted)).mean()
         assert facts(target)["sound"] == facts(source)["sound"]
 
 
@@ -150,9 +150,9 @@ def test_frames_as_a_command(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     recipe = Recipe((Step("detail", alpha=(3.0, 3.0, 1.0), landmarks=40),))
     edit = FilmEdit(recipe.steps, [rows_of(stored[0]), rows_of(stored[3])], Passes("float32"))
     for path, frame in zip(edited, stored, strict=True):
-        found = read_photograph(path)
-        assert np.abs(rows_of(found.pixels) - edit(rows_of(frame)).clip(0, 1)).max() < 0.6 / 255
-        assert found.depth == ("uint16" if path.suffix == ".tif" else "uint8")
+        photograph = read_photograph(path)
+        assert np.abs(rows_of(photograph.pixels) - edit(rows_of(frame)).clip(0, 1)).max() < 0.6 / 255
+        assert photograph.depth == ("uint16" if path.suffix == ".tif" else "uint8")
 
 
 @pytest.mark.parametrize("name", list(PRESETS))

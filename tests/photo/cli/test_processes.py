@@ -131,8 +131,8 @@ def write_negative(source: Path, processes: ZarrProcesses) -> None:
 
 def check_negative(source: Path) -> None:
     assert source.with_name("died").exists()
-    one, other = (zarr.open_array(source.with_name(name), mode="r")[:] for name in ("in.zarr", "out.zarr"))
-    assert np.array_equal(one, 255 - other)
+    picture, negative = (zarr.open_array(source.with_name(name), mode="r")[:] for name in ("in.zarr", "out.zarr"))
+    assert np.array_equal(picture, 255 - negative)
     assert sorted(path.name for path in source.parent.iterdir()) == ["died", "in.zarr", "out.zarr"]
 
 

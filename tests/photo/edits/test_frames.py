@@ -27,11 +27,11 @@ def test_ten_frames_of_a_pan_do_not_flicker() -> None:
     assert flicker(film, step) == 0
     alpha = ALPHA.float()
     together = list(filter_frames(film, alpha, references=[film[0], film[5], film[9]]))
-    each = [next(filter_frames([frame], alpha, references=[frame])) for frame in film]
-    assert flicker(together, step) <= flicker(each, step) / 5
+    apart_edited = [next(filter_frames([frame], alpha, references=[frame])) for frame in film]
+    assert flicker(together, step) <= flicker(apart_edited, step) / 5
     # The edit is the same: frames differ from frames edited alone by less than the edit changes them.
-    change = torch.stack([(a - b).abs().mean() for a, b in zip(each, film, strict=True)]).mean()
-    apart = torch.stack([(a - b).abs().mean() for a, b in zip(each, together, strict=True)]).mean()
+    change = torch.stack([(a - b).abs().mean() for a, b in zip(apart_edited, film, strict=True)]).mean()
+    apart = torch.stack([(a - b).abs().mean() for a, b in zip(apart_edited, together, strict=True)]).mean()
     assert apart < change / 3
 
 
@@ -39,9 +39,9 @@ def test_equal_areas_of_frames_are_edited_equally_whatever_else_they_show() -> N
     first = picture("coffee", 40, 60).float().expand(-1, 3, -1, -1)
     second = first.clone()
     second[..., 40:] = 1  # brighter, which must not change the brightness of the rest
-    found = list(filter_frames([first, second], ALPHA.float(), references=[first], num_landmarks=40))
-    torch.testing.assert_close(found[0][..., :30], found[1][..., :30], atol=1e-6, rtol=0)
-    assert (found[0] - first)[..., :30].abs().max() > 0.01
+    edited = list(filter_frames([first, second], ALPHA.float(), references=[first], num_landmarks=40))
+    torch.testing.assert_close(edited[0][..., :30], edited[1][..., :30], atol=1e-6, rtol=0)
+    assert (edited[0] - first)[..., :30].abs().max() > 0.01
 
 
 def test_each_frame_has_a_gradient_of_its_own() -> None:
@@ -59,8 +59,8 @@ def test_one_reference_is_the_usual_filter_on_luminance() -> None:
     grey = reduce_channels(frame, "luminance")
     operator = nonlocal_operator(grey)
     expected = edit_luminance(frame, lambda planes: polynomial_filter(operator, planes, ALPHA.float()))
-    found = next(filter_frames([frame], ALPHA.float(), references=[frame], **PLAIN))
-    torch.testing.assert_close(found, expected, atol=2e-4, rtol=0)
+    edited = next(filter_frames([frame], ALPHA.float(), references=[frame], **PLAIN))
+    torch.testing.assert_close(edited, expected, atol=2e-4, rtol=0)
 
 
 def test_all_channels_on_request() -> None:
@@ -68,8 +68,8 @@ def test_all_channels_on_request() -> None:
     operator = nonlocal_operator(reduce_channels(frame, "luminance"), num_landmarks=60)
     wanted = polynomial_filter(operator, frame, ALPHA.float())
     options = {"channels": "all", "num_landmarks": 60} | PLAIN
-    found = next(filter_frames([frame], ALPHA.float(), references=[frame], **options))
-    torch.testing.assert_close(found, wanted, atol=2e-4, rtol=0)
+    edited = next(filter_frames([frame], ALPHA.float(), references=[frame], **options))
+    torch.testing.assert_close(edited, wanted, atol=2e-4, rtol=0)
     with pytest.raises(ValueError, match="channels must be one of"):
         filter_frames([frame], ALPHA.float(), references=[frame], channels="red")
 

@@ -40,12 +40,12 @@ def test_a_film_keeps_all_but_its_pixels(name: str, options: dict[str, Any], tmp
     source, target = write(tmp_path / name, **options), tmp_path / f"out{Path(name).suffix}"
     seen: list[np.ndarray] = []
     assert copy(source, target, lambda frame: seen.append(frame) or frame) == 10
-    found, wanted = facts(target), facts(source)
+    written, wanted = facts(target), facts(source)
     if options.get("varying"):  # the mean gap between frames in storage order, which is not their display order
-        assert abs(found.pop("rate") / wanted.pop("rate") - 1) < 0.1
-    for each in (found, wanted):
-        each["length"] = round(float(each["length"]), 2)  # the file counts thousandths of a second
-    assert found == wanted
+        assert abs(written.pop("rate") / wanted.pop("rate") - 1) < 0.1
+    for properties in (written, wanted):
+        properties["length"] = round(float(properties["length"]), 2)  # the file counts thousandths of a second
+    assert written == wanted
     assert [path.name for path in tmp_path.iterdir() if path.suffix == ".part"] == []
     with open_film(target) as film:
         for i, (frame, before) in enumerate(zip(film.frames(), seen, strict=True)):
@@ -79,8 +79,8 @@ def test_colours_are_those_that_the_tags_say(tmp_path: Path) -> None:
             stream.codec_context.colorspace = tag
             file.mux([*stream.encode(frame), *stream.encode(None)])
         with open_film(tmp_path / "flat.mp4") as film:
-            found = film.pixels(next(film.frames())).mean((0, 1))
-        np.testing.assert_allclose(found, colour, atol=2.5 / 255)
+            pixels = film.pixels(next(film.frames())).mean((0, 1))
+        np.testing.assert_allclose(pixels, colour, atol=2.5 / 255)
 
 
 def test_samples_are_spread_over_the_film(tmp_path: Path) -> None:

@@ -34,17 +34,17 @@ def edited(step: Step, frame: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("step", STEPS, ids=lambda step: step.edit)
 def test_fitted_to_one_frame_it_is_the_edit_of_that_frame(step: Step) -> None:
     frame = crop(90, 190)
-    found, wanted = FilmEdit((step,), [frame], PASSES)(frame), edited(step, frame)
+    filmed, wanted = FilmEdit((step,), [frame], PASSES)(frame), edited(step, frame)
     assert np.abs(wanted - frame).mean() > 0.1 / 255
-    np.testing.assert_allclose(found, wanted, atol=0.05 / 255)
+    np.testing.assert_allclose(filmed, wanted, atol=0.05 / 255)
 
 
 def test_distance_does_not_count_unless_asked_for() -> None:
     frame = crop(90, 190)
     for edit, far in (("tone", "none"), ("denoise", UNLIMITED_BANDWIDTH)):
         values: dict[str, Any] = {"noise_level": 12.0} if edit == "denoise" else {}
-        found = FilmEdit((Step(edit, **values, **FEW),), [frame], PASSES)(frame)
-        np.testing.assert_allclose(found, edited(Step(edit, spatial_bandwidth=far, **values, **FEW), frame), atol=1e-4)
+        filmed = FilmEdit((Step(edit, **values, **FEW),), [frame], PASSES)(frame)
+        np.testing.assert_allclose(filmed, edited(Step(edit, spatial_bandwidth=far, **values, **FEW), frame), atol=1e-4)
 
 
 def test_equal_frames_count_as_one(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -52,8 +52,8 @@ def test_equal_frames_count_as_one(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("nlfilter_torch.operator.build.choose_landmarks", lambda features, *_: features[:, :, :1900:48])
     frame = crop(90, 190)
     for step in STEPS:
-        one, three = (FilmEdit((step,), [frame] * count, PASSES)(frame) for count in (1, 3))
-        np.testing.assert_allclose(one, three, atol=0.1 / 255, err_msg=step.edit)
+        single, three = (FilmEdit((step,), [frame] * count, PASSES)(frame) for count in (1, 3))
+        np.testing.assert_allclose(single, three, atol=0.1 / 255, err_msg=step.edit)
 
 
 @pytest.mark.parametrize("step", [STEPS[0], STEPS[3]], ids=lambda step: step.edit)
@@ -70,8 +70,8 @@ def test_a_pan_does_not_flicker(step: Step) -> None:
 
 def test_steps_follow_each_other() -> None:
     frame, steps = crop(90, 190), (STEPS[3], STEPS[0])
-    found = FilmEdit(steps, [frame], PASSES)(frame)
-    apart = np.abs(found - edited(steps[1], edited(steps[0], frame).clip(0, 1)))
+    filmed = FilmEdit(steps, [frame], PASSES)(frame)
+    apart = np.abs(filmed - edited(steps[1], edited(steps[0], frame).clip(0, 1)))
     assert apart.mean() < 0.02 / 255
     assert apart.max() < 2 / 255  # candidates for landmarks depend on rounding
 

@@ -97,10 +97,10 @@ def test_only_what_a_change_affects_is_fitted_again(monkeypatch: pytest.MonkeyPa
         fitted.clear()
         parts.fit(steps, passes)
         assert fitted == wanted
-        found = parts.edited(place)
+        part = parts.edited(place)
         fresh = Parts(source, "scan.tif")
         fresh.fit(steps, passes)
-        assert torch.equal(found, fresh.edited(place))
+        assert torch.equal(part, fresh.edited(place))
     fitted.clear()
     parts.fit((recolor,), replace(passes, statistics="sample"))  # a sample gives other sums
     assert fitted == ["recolor"]

@@ -55,8 +55,8 @@ def test_an_edit_by_rows_is_the_one_in_memory(recipe: Recipe, tmp_path: Path) ->
     edited = by_rows(recipe, rows_of(image), tmp_path, tile_rows=17)
     # Differences of 1e-5 before recolouring may change its landmarks, so its input is that of the steps by rows.
     before, last = recipe.steps[:-1], recipe.steps[-1:]
-    given = from_rows(by_rows(Recipe(before), rows_of(image), tmp_path, tile_rows=17)) if before else image
-    wanted = rows_of(apply_recipe(Recipe(last), given))
+    image_before = from_rows(by_rows(Recipe(before), rows_of(image), tmp_path, tile_rows=17)) if before else image
+    wanted = rows_of(apply_recipe(Recipe(last), image_before))
     # In memory the balancing stops at 1e-5.
     assert np.abs(edited - wanted).max() < (1e-4 if RECOLOR in last else 2e-5)
     assert not list(tmp_path.iterdir())
@@ -76,8 +76,8 @@ def test_grey_becomes_colour_and_transparency_stays(tmp_path: Path) -> None:
     detail, colorize = Step("detail", alpha=(2.0, 1.0), landmarks=30), Step("colorize", (BLUE,))
     edited = by_rows(Recipe((detail, colorize)), source, tmp_path)
     # Differences of 1e-5 before colorizing may change its landmarks, so its input is that of the first step by rows.
-    given = from_rows(by_rows(Recipe((detail,)), rows_of(grey), tmp_path))
-    assert np.abs(edited[..., :3] - rows_of(apply_recipe(Recipe((colorize,)), given))).max() < 2e-5
+    image_before = from_rows(by_rows(Recipe((detail,)), rows_of(grey), tmp_path))
+    assert np.abs(edited[..., :3] - rows_of(apply_recipe(Recipe((colorize,)), image_before))).max() < 2e-5
     np.testing.assert_allclose(edited[..., 3], source[..., 1], atol=1e-7)
 
 

@@ -28,8 +28,8 @@ def test_strokes_cover_the_same_by_rows(rows: slice) -> None:
     strokes, size = (BLUE, replace(BLUE, points=((-0.1, 0.9), (1.2, 0.1)), paint="#ff0000")), (48, 64)
     assert torch.equal(cover(BLUE, size, rows), cover(BLUE, size)[rows])
     assert torch.equal(mask_of(strokes, size, rows), mask_of(strokes, size)[..., rows, :])
-    for some, whole in zip(paint(strokes, size, rows), paint(strokes, size), strict=True):
-        assert torch.equal(some, whole[..., rows, :])
+    for part, whole in zip(paint(strokes, size, rows), paint(strokes, size), strict=True):
+        assert torch.equal(part, whole[..., rows, :])
 
 
 def test_negative_regions_come_with_regions_of_their_number() -> None:
@@ -116,8 +116,8 @@ def test_full_passes_recolour_as_in_memory(
         **held,
         **options,
     )
-    given = {"keep": keep} if kept else {}
-    edited = recoloured(picture, strokes, mask, statistics="full", tile_rows=17, **given, **options)
+    background = {"keep": keep} if kept else {}
+    edited = recoloured(picture, strokes, mask, statistics="full", tile_rows=17, **background, **options)
     assert np.abs(rows_of(whole) - picture).max() > 0.1
     assert np.abs(edited - rows_of(whole)).max() < (1e-5 if dtype == np.float32 else 1e-12)
 
@@ -167,7 +167,7 @@ def test_tiles_of_any_size_give_the_same(statistics: Any) -> None:
         for rows in (1, 16, 64, 4096)
     )
     for other in others:
-        assert max(np.abs(one - two).max() for one, two in zip(first, other, strict=True)) < 1e-6
+        assert max(np.abs(a - b).max() for a, b in zip(first, other, strict=True)) < 1e-6
 
 
 def test_a_guide_that_is_kept_changes_nothing() -> None:
@@ -199,9 +199,9 @@ def test_strokes_may_be_integers_with_transparency() -> None:
     layer = np.concatenate([np.rint(strokes * 255), np.rint(mask * 255)], axis=2).astype(np.uint8)
     opaque = layer[..., 3:] / np.float32(255)
     for edit in (recoloured, coloured):
-        one = edit(picture, layer)
-        np.testing.assert_array_equal(one, edit(picture, layer[..., :3], opaque))
-        np.testing.assert_array_equal(one, edit(picture, layer[..., :3] / np.float32(255), layer[..., 3]))
+        edited = edit(picture, layer)
+        np.testing.assert_array_equal(edited, edit(picture, layer[..., :3], opaque))
+        np.testing.assert_array_equal(edited, edit(picture, layer[..., :3] / np.float32(255), layer[..., 3]))
     np.testing.assert_array_equal(
         recoloured(picture, layer, keep=keep > 0), recoloured(picture, layer, keep=np.ceil(keep))
     )

@@ -41,11 +41,11 @@ def test_regions_are_those_in_memory(alpha: Tensor) -> None:
 def test_regions_of_a_sample_are_close(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sampling, "PILOT", 1 << 13)
     picture, regions = cat(200, 260), spots(200, 260)
-    full, some = (
+    full, sampled = (
         streamed(picture, regions=regions, statistics=statistics, sample=1 << 15, num_landmarks=30)
         for statistics in ("full", "sample")
     )
-    assert 0 < np.abs(full - some).max() < 3 * LEVEL  # with a thirtieth of the sample of a large picture
+    assert 0 < np.abs(full - sampled).max() < 3 * LEVEL  # with a thirtieth of the sample of a large picture
     assert np.abs(full - picture).max() > 10 * LEVEL
 
 

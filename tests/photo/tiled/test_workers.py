@@ -26,12 +26,12 @@ def of_new_thread() -> int:
         return pool.submit(torch.get_num_threads).result()
 
 
-@pytest.mark.parametrize(("workers", "each"), [(1, 6), (2, 3), (4, 1), (9, 1)])
-def test_workers_share_the_threads_and_leave_those_of_others(workers: int, each: int) -> None:
-    found = in_order(lambda k: (k, torch.get_num_threads(), torch.is_grad_enabled()), range(20), workers)
-    assert next(found) == (0, each, False)
+@pytest.mark.parametrize(("workers", "threads"), [(1, 6), (2, 3), (4, 1), (9, 1)])
+def test_workers_share_the_threads_and_leave_those_of_others(workers: int, threads: int) -> None:
+    results = in_order(lambda k: (k, torch.get_num_threads(), torch.is_grad_enabled()), range(20), workers)
+    assert next(results) == (0, threads, False)
     assert (torch.get_num_threads(), of_new_thread()) == (6, 6)
-    assert list(found) == [(k, each, False) for k in range(1, 20)]
+    assert list(results) == [(k, threads, False) for k in range(1, 20)]
     assert (torch.get_num_threads(), of_new_thread()) == (6, 6)
 
 
@@ -67,8 +67,8 @@ def test_the_pool_serves_several_callers_at_once_and_a_forked_process() -> None:
 
         def many(_: int) -> bool:
             torch.set_num_threads(6)
-            found = [(spread(rows, factor), moment(factor, exact)) for _ in range(20)]
-            return all(torch.equal(first, exact) and torch.equal(second, sums) for first, second in found)
+            pairs = [(spread(rows, factor), moment(factor, exact)) for _ in range(20)]
+            return all(torch.equal(first, exact) and torch.equal(second, sums) for first, second in pairs)
 
         with ThreadPoolExecutor(4) as callers:
             assert all(callers.map(many, range(8)))
