@@ -258,7 +258,7 @@ class Preview:
         return result.clamp(0, 1)
 
     def _is_of_layers(self, step: Step) -> bool:
-        """Whether a step only weighs layers of luminance, which are cached; such edits have sliders for regions, too."""
+        """Whether a step only weighs layers of luminance, which are cached; such edits take regions, too."""
         if step.declared.regional is None or step["residual"] is not None or step["channels"] != "luminance":
             return False
         return self._viewed(step) >= self.size
