@@ -306,29 +306,27 @@ def _assemble(
     if features.shape[0] == 0:
         return _empty(features, size, count, method.completion, recipe)
     in_graph = torch.compiler.is_compiling()  # never with a generator, weights or a group
-    if chosen is None:
-        chosen = (
-            choose_in_graph(features, size, count, method.landmarks)
-            if in_graph
-            else choose_landmarks(features, whole, count, method.landmarks, method.generator, communicator, weights)
-        )
+    if chosen is None and in_graph:
+        chosen = choose_in_graph(features, size, count, method.landmarks)
+    elif chosen is None:
+        chosen = choose_landmarks(features, whole, count, method.landmarks, method.generator, communicator, weights)
     kernel = Kernel(chosen, inverse_cholesky(chosen), method.completion, features=recipe)
     factor, diagonal = kernel.factor(features)
     completed, watched = method.completion == "diagonal", not is_hidden(factor)
     bound = is_bounded(method.landmarks, points, count)
 
-    balanced = partial(
-        _balanced,
-        tolerance=tolerance,
-        completed=completed,
-        communicator=communicator,
-        weights=weights,
-        watched=watched,
-    )
     if in_graph:
         worst, goal = 0.0, tolerance or TOLERANCE[factor.dtype]
         factor, diagonal, balancing, before = sinkhorn_in_graph(factor, diagonal, goal, completed, bound)
     else:
+        balanced = partial(
+            _balanced,
+            tolerance=tolerance,
+            completed=completed,
+            communicator=communicator,
+            weights=weights,
+            watched=watched,
+        )
         rounds = sinkhorn_in_rounds(
             factor, diagonal, balanced, completed=completed and watched, communicator=communicator, weights=weights
         )
@@ -342,9 +340,7 @@ def _assemble(
         limit = limiter(gram, KernelMatrix(factor, diagonal, weights, communicator).moment(scaling), allowed)
         factor, kernel = limit.to(factor) @ factor, replace(kernel, limiter=limit.to(factor))
         before = tuple(torch.linalg.solve(limit.detach(), total) for total in before)  # preserves u . total
-        limited = KernelMatrix(factor.detach(), diagonal.detach(), weights, communicator)
-        sums = limited.row_sums(scaling.detach(), limited.moment(scaling.detach()))
-        residual = communicator.max((sums - 1).abs().amax(1))
+        residual = _residual(KernelMatrix(factor.detach(), diagonal.detach(), weights, communicator), scaling.detach())
         warn_of_residual(residual, tolerance, factor.dtype, completed=completed)
     least = None if weights is None else -communicator.max(-weights.amin(1, keepdim=True))
     return NonlocalOperator(
@@ -360,6 +356,12 @@ def _assemble(
         weights=weights,
         communicator=communicator,
     )
+
+
+def _residual(matrix: KernelMatrix, scaling: Tensor) -> Tensor:
+    """Largest deviation of a row sum of W from 1, (B,)."""
+    sums = matrix.row_sums(scaling, matrix.moment(scaling))
+    return matrix.communicator.max((sums - 1).abs().amax(1))
 
 
 def _balanced(

@@ -2,8 +2,17 @@
 
 import pytest
 import torch
+from torch import Tensor
 
-from nlfilter_torch.operator.scaling import LARGEST, KernelMatrix, Solution, damped, scaling_from_moment
+from nlfilter_torch.core.communicator import ALONE
+from nlfilter_torch.operator.scaling import (
+    LARGEST,
+    KernelMatrix,
+    Solution,
+    conjugate_gradients,
+    damped,
+    scaling_from_moment,
+)
 from nlfilter_torch.operator.sinkhorn import sinkhorn_balance
 from tests.problems import noise
 
@@ -55,3 +64,28 @@ def test_damped_steps_balance_weighted_points() -> None:
     torch.testing.assert_close(sums, torch.ones_like(sums), atol=1e-11, rtol=0)
     total = factor @ (weights * found.scaling).unsqueeze(2)
     torch.testing.assert_close(found.moment, total, atol=1e-9, rtol=0)
+
+
+def system(steepness: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Factor, weights and right side of a linear system, and its solution; the spectrum grows with the steepness."""
+    generator = torch.Generator().manual_seed(0)
+    factor = torch.linalg.qr(torch.randn(1, 60, 30, generator=generator, dtype=torch.float64)).Q.mT.contiguous()
+    weight = torch.logspace(0, steepness, 60, dtype=torch.float64).expand(1, -1) - 1
+    right = torch.randn(1, 30, 1, generator=generator, dtype=torch.float64)
+    matrix = torch.eye(30, dtype=torch.float64) + (factor * weight.unsqueeze(1)) @ factor.mT
+    return factor, weight, right, torch.linalg.solve(matrix, right)
+
+
+def test_conjugate_gradients_solve_systems_with_the_spectrum_of_balancing() -> None:
+    factor, weight, right, expected = system(0.3)
+    identity = torch.eye(30, dtype=torch.float64).expand(1, -1, -1)
+    solution = conjugate_gradients(factor, weight, right, identity, ALONE)
+    torch.testing.assert_close(solution, expected, atol=1e-12, rtol=0)
+
+
+def test_conjugate_gradients_that_run_out_of_steps_say_so() -> None:
+    factor, weight, right, expected = system(12.0)
+    identity = torch.eye(30, dtype=torch.float64).expand(1, -1, -1)
+    with pytest.warns(UserWarning, match="balancing left a linear system unsolved"):
+        solution = conjugate_gradients(factor, weight, right, identity, ALONE)
+    assert float((solution - expected).norm() / expected.norm()) > 0.01

@@ -22,6 +22,8 @@ PHOTO_ROOMS = (
     "app",
     "cli",
 )
+LONG = 60  # lines of a module that must have a test file of its name
+STILL_TO_COME: tuple[str, ...] = ("photo",)  # rooms whose modules do not all have one yet
 DEEPEST = 18  # levels of imports
 Imports = dict[str, set[str]]
 
@@ -113,6 +115,33 @@ def test_the_library_does_not_import_the_application() -> None:
 
 def test_imports_have_no_cycles_and_are_not_deep() -> None:
     assert depth(package()) <= DEEPEST
+
+
+def without_a_test(root: Path, tests: Path) -> list[str]:
+    """Modules of :data:`LONG` lines and more without ``test_MODULE.py`` at the same place in the tree of the tests."""
+    return [
+        str(path)
+        for path in (path.relative_to(root) for path in sorted(root.rglob("*.py")))
+        if path.name not in ("__init__.py", "__main__.py")
+        and len((root / path).read_text(encoding="utf-8").splitlines()) >= LONG
+        and not (tests / path.parent / f"test_{path.name}").exists()
+    ]
+
+
+def test_every_module_has_tests_of_its_name_beside_it() -> None:
+    missing = without_a_test(Path(nlfilter_torch.__file__).parent, Path(__file__).parents[1])
+    assert not [path for path in missing if not path.startswith(STILL_TO_COME)]
+
+
+def test_a_module_without_tests_is_noticed(tmp_path: Path) -> None:
+    for name, lines in (("core/long.py", 60), ("core/short.py", 59), ("core/tested.py", 60), ("core/__init__.py", 99)):
+        path = tmp_path / "package" / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text("pass\n" * lines)
+    (tmp_path / "tests" / "core").mkdir(parents=True)
+    (tmp_path / "tests" / "core" / "test_tested.py").touch()
+    (tmp_path / "tests" / "test_long.py").touch()  # not beside it
+    assert without_a_test(tmp_path / "package", tmp_path / "tests") == ["core/long.py"]
 
 
 def test_an_upward_import_is_noticed() -> None:
