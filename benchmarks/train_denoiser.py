@@ -299,6 +299,17 @@ def read_options(arguments: Sequence[str] | None) -> argparse.Namespace:
     )
     parser.add_argument("--out", type=Path, default=Path("out/denoiser"), help="folder; default %(default)s")
     options = parser.parse_args(arguments)
+    check_steps(parser, options)
+    check_crops(parser, options)
+    if options.start is not None and not options.start.is_file():
+        parser.error(f"--start must be a file of weights, got {options.start}, which is not there; train one first")
+    if options.out.exists() and not options.out.is_dir():
+        parser.error(f"--out must be a folder, got the file {options.out}; name another")
+    return options
+
+
+def check_steps(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
+    """End with an error if the steps of the training cannot be taken."""
     if options.steps < 1:
         parser.error(f"--steps must be at least 1, got {options.steps}; 2000 give a first impression")
     if not 16 <= options.side <= 128:
@@ -309,6 +320,10 @@ def read_options(arguments: Sequence[str] | None) -> argparse.Namespace:
         parser.error(f"--rate must be between 0 and 1, got {options.rate}; {RATE} does well")
     if not 0 < options.fall <= 1:
         parser.error(f"--fall must be above 0 and at most 1, got {options.fall}; {FALL} does well")
+
+
+def check_crops(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
+    """End with an error if crops cannot be made, or not used."""
     for name in ("textured", "misstated"):
         if not 0 <= getattr(options, name) <= 1:
             parser.error(f"--{name} must be 0 to 1, got {getattr(options, name)}; it is a share of the crops")
@@ -318,11 +333,6 @@ def read_options(arguments: Sequence[str] | None) -> argparse.Namespace:
         parser.error(f"--rim must be at least 0 and less than half of --side, got {options.rim}; 8 does well")
     if options.passes < 1:
         parser.error(f"--passes must be at least 1, got {options.passes}; {PASSES} are what the package has")
-    if options.start is not None and not options.start.is_file():
-        parser.error(f"--start must be a file of weights, got {options.start}, which is not there; train one first")
-    if options.out.exists() and not options.out.is_dir():
-        parser.error(f"--out must be a folder, got the file {options.out}; name another")
-    return options
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
