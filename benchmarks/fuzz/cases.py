@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from benchmarks.photographs import photograph
-from nlfilter_torch.operator.landmarks import Sampling
+from nlfilter_torch.operator.options import Sampling
 
 SIDE = 64
 CROPPED = ("astronaut", "camera", "chelsea", "coffee", "moon", "page", "rocket", "text")

@@ -15,7 +15,7 @@ from skimage.util import img_as_float64
 from benchmarks.fuzz.cases import SAMPLINGS
 from benchmarks.fuzz.checks import Findings, check_operator, judged
 from nlfilter_torch import nonlocal_operator
-from nlfilter_torch.operator.landmarks import Sampling
+from nlfilter_torch.operator.options import Sampling
 
 # All pictures that load without a download.
 PICTURES = (

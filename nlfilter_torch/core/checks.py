@@ -4,18 +4,15 @@ Only public functions validate; internal functions trust their arguments.
 """
 
 import math
-import sys
-import warnings
 from collections.abc import Callable, Sequence
 from functools import partial
-from itertools import takewhile
-from traceback import walk_stack
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from nlfilter_torch.core.values import is_hidden
+from nlfilter_torch.core.warning import warn
 
 FLOATING = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
 Response = Callable[[Tensor], Tensor]
@@ -384,11 +381,3 @@ def check_weights(weights: Tensor, features: Tensor) -> Tensor:
         allowed, actual = f"{LEAST_WEIGHT:g} to {1 / LEAST_WEIGHT:g}", "{:g} to {:g}".format(*weights.aminmax())
         raise ValueError(f"weights must be from {allowed}, got {actual}; drop points of negligible weight")
     return weights
-
-
-def warn(message: str) -> None:
-    """Warn with the location of the line that called this package, through any number of wrappers and modules."""
-    frames = walk_stack(sys._getframe())
-    packages = (str(frame.f_globals.get("__name__", "")).partition(".")[0] for frame, _ in frames)
-    inside = list(takewhile(lambda package: package in ("nlfilter_torch", "torch"), packages))
-    warnings.warn(message, stacklevel=1 + len(inside))

@@ -11,11 +11,10 @@ from nlfilter_torch.core.checks import check_choice
 from nlfilter_torch.core.communicator import check_group
 from nlfilter_torch.nn.parameters import Learnable, UnitWindow, check_learn, positive_option
 from nlfilter_torch.operator.build import nonlocal_operator
-from nlfilter_torch.operator.features import GuideChannels, unit_window
-from nlfilter_torch.operator.landmarks import Sampling
-from nlfilter_torch.operator.nystrom import Completion
+from nlfilter_torch.operator.features import unit_window
 from nlfilter_torch.operator.operator import NonlocalOperator
-from nlfilter_torch.operator.options import AUTO, OperatorOptions
+from nlfilter_torch.operator.option_checks import check_options
+from nlfilter_torch.operator.options import AUTO, Completion, GuideChannels, OperatorOptions, Sampling
 
 
 class NonlocalAffinity(Learnable):
@@ -73,14 +72,16 @@ class NonlocalAffinity(Learnable):
     ) -> None:
         super().__init__()
         names = check_learn(learn, tuple(self.learnable))
-        OperatorOptions(
-            num_landmarks=num_landmarks,
-            landmarks=landmarks,
-            completion=completion,
-            guide_channels=guide_channels,
-            tolerance=tolerance,
-            generator=generator,
-        ).check()
+        check_options(
+            OperatorOptions(
+                num_landmarks=num_landmarks,
+                landmarks=landmarks,
+                completion=completion,
+                guide_channels=guide_channels,
+                tolerance=tolerance,
+                generator=generator,
+            )
+        )
         check_group(group)
         window = unit_window(patch_size, patch_weights).detach()  # learned only with learn=("patch_weights",)
         self.patch_size = patch_size

@@ -18,11 +18,8 @@ from nlfilter_torch.core.checks import (
 from nlfilter_torch.filtering.filters import filter_regions, polynomial_filter, weigh_layers
 from nlfilter_torch.nn.affinity import NonlocalAffinity
 from nlfilter_torch.nn.parameters import check_learn
-from nlfilter_torch.operator.features import GuideChannels
-from nlfilter_torch.operator.landmarks import Sampling
-from nlfilter_torch.operator.nystrom import Completion
 from nlfilter_torch.operator.operator import NonlocalOperator
-from nlfilter_torch.operator.options import AUTO, OperatorOptions
+from nlfilter_torch.operator.options import AUTO, Completion, GuideChannels, OperatorOptions, Sampling
 
 LEARNABLE = ("alpha", "residual")
 

@@ -21,19 +21,25 @@ from nlfilter_torch.core.precision import full_precision, uncompiled, uncompiled
 from nlfilter_torch.core.values import is_hidden, refuse_transforms
 from nlfilter_torch.operator.eigenvalue_bound import exceeds, is_bounded, limiter, shifted_gram, slack
 from nlfilter_torch.operator.features import (
-    GuideChannels,
     GuideFeatures,
-    SpatialBandwidth,
     bandwidth_of_rows,
-    bandwidths_of,
     estimate_bandwidth,
     reduce_channels,
     unit_window,
 )
-from nlfilter_torch.operator.landmarks import Sampling, choose_in_graph, choose_landmarks
-from nlfilter_torch.operator.nystrom import Completion, inverse_cholesky
+from nlfilter_torch.operator.landmarks import choose_in_graph, choose_landmarks
+from nlfilter_torch.operator.nystrom import inverse_cholesky
 from nlfilter_torch.operator.operator import Kernel, NonlocalOperator
-from nlfilter_torch.operator.options import Construction, OperatorOptions, check_bandwidths
+from nlfilter_torch.operator.option_checks import check_bandwidths, check_construction, check_options, landmark_count
+from nlfilter_torch.operator.options import (
+    Completion,
+    Construction,
+    GuideChannels,
+    OperatorOptions,
+    Sampling,
+    SpatialBandwidth,
+    bandwidths_of,
+)
 from nlfilter_torch.operator.scaling import Balancing, KernelMatrix, PixelScaling
 from nlfilter_torch.operator.sinkhorn import (
     TOLERANCE,
@@ -159,7 +165,7 @@ def _check_guide(guide: Tensor, options: OperatorOptions) -> None:
     spatial = bandwidths_of(options.spatial_bandwidth)
     refuse_transforms("guide", guide, options.photometric_bandwidth, *spatial, options.patch_weights)
     check_image(guide, "guide", empty=True)
-    options.check()
+    check_options(options)
     check_bandwidths(options.photometric_bandwidth, options.spatial_bandwidth, guide.shape[0])
 
 
@@ -242,7 +248,7 @@ def operator_from_features(
         generator=generator,
         group=group,
     )
-    method.check()
+    check_construction(method)
     shape = check_size(size, features.shape[2])
     features = features.to(working_dtype(features))
     if weights is not None:
@@ -274,7 +280,7 @@ def sampled_operator(
     picture. The images of the operator have the size (1, n).
     """
     method = Construction(num_landmarks=num_landmarks, landmarks=landmarks, generator=generator)
-    method.check()
+    check_construction(method)
     if isinstance(photometric_bandwidth, str):
         photometric_bandwidth = estimate_bandwidth(guide)
     window = unit_window(patch_size, None).to(guide)
@@ -302,7 +308,7 @@ def _assemble(
     """
     whole = communicator.whole(size)
     points, tolerance = whole[0] * whole[1], method.tolerance
-    count = method.count(points)
+    count = landmark_count(method, points)
     if features.shape[0] == 0:
         return _empty(features, size, count, method.completion, recipe)
     in_graph = torch.compiler.is_compiling()  # never with a generator, weights or a group

@@ -6,7 +6,7 @@ Also the estimate of the photometric bandwidth. Paper: Appendix A, eq. (20).
 import math
 from dataclasses import dataclass
 from itertools import product
-from typing import Any, Literal
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -24,11 +24,9 @@ from nlfilter_torch.core.communicator import Communicator, all_gather_shapes
 from nlfilter_torch.core.kernels.columns import large_empty
 from nlfilter_torch.core.precision import Gradients, full_precision, once_differentiable, per_image, working_dtype
 from nlfilter_torch.core.values import is_hidden
+from nlfilter_torch.operator.options import GuideChannels, SpatialBandwidth, bandwidths_of
 
 FAINT_WEIGHT = 1e-12  # in place of patch weights of 0
-
-GuideChannels = Literal["luminance", "all"]
-SpatialBandwidth = float | Tensor | tuple[float | Tensor, ...] | list[float | Tensor]
 
 
 def patch_window(patch_size: int) -> Tensor:
@@ -138,11 +136,6 @@ class GuideFeatures:
         """Features (1 or B, 2, N) of rows and columns (2, N) of pixels; there must be a spatial bandwidth."""
         bandwidths = [per_image(bandwidth, places, 2) for bandwidth in bandwidths_of(self.spatial_bandwidth)]
         return places / torch.stack(torch.broadcast_tensors(*bandwidths), dim=1)
-
-
-def bandwidths_of(spatial: SpatialBandwidth | None) -> tuple[Any, ...]:
-    """The bandwidth of all distances, or those of vertical and of horizontal ones."""
-    return tuple(spatial) if isinstance(spatial, tuple | list) else (spatial,)
 
 
 def _strided_patches(padded: Tensor, scale: Tensor, stride: int) -> Tensor:

@@ -1,7 +1,6 @@
 """Landmarks: the few points whose affinities to all pixels determine the kernel. Paper: Sec. II-C, set A."""
 
 from functools import partial
-from typing import Literal
 
 import torch
 from torch import Tensor
@@ -10,8 +9,7 @@ from nlfilter_torch.core.blocks import stratified
 from nlfilter_torch.core.communicator import ALONE, Communicator
 from nlfilter_torch.core.kernels.clusters import affinities_between, chance, draw_pivots, lloyd, pick, pivots
 from nlfilter_torch.core.kernels.library import register
-
-Sampling = Literal["kmeans", "uniform", "random"]
+from nlfilter_torch.operator.options import Sampling
 
 CAPTURED = 1e-4  # a point whose residual on the unit diagonal is below this counts as captured
 # Candidates per landmark. More candidates or iterations move the centroids by less than their sampling error: at

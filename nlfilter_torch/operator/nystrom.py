@@ -9,7 +9,7 @@ and one vector of length M. Tiles of a large image, rows on another machine and 
 exact columns, without seams or flicker, if they share landmarks and moments.
 """
 
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -18,8 +18,7 @@ from nlfilter_torch.core.kernels.columns import columns, columns_backward
 from nlfilter_torch.core.kernels.library import register
 from nlfilter_torch.core.precision import factors_of, once_differentiable
 from nlfilter_torch.core.values import is_hidden
-
-Completion = Literal["diagonal", "none"]
+from nlfilter_torch.operator.options import Completion
 
 CANCELLATION = 1e-7  # error of a squared distance above which distances are not computed from matrix products
 LARGEST_SQUARE = 60.0  # distance: smaller affinities would become denormal numbers of float32, which are slow

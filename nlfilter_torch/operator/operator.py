@@ -19,7 +19,8 @@ from nlfilter_torch.core.kernels.tall_skinny import moment
 from nlfilter_torch.core.precision import as_given, full_precision, uncompiled
 from nlfilter_torch.operator.eigenvalue_bound import largest_eigenvalue, shifted_gram
 from nlfilter_torch.operator.features import GuideFeatures
-from nlfilter_torch.operator.nystrom import Completion, nystrom_factor
+from nlfilter_torch.operator.nystrom import nystrom_factor
+from nlfilter_torch.operator.options import Completion
 from nlfilter_torch.operator.products import Columns, apply_powers
 from nlfilter_torch.operator.scaling import KernelMatrix, PixelScaling
 from nlfilter_torch.operator.spectrum import Spectrum, compute_spectrum

@@ -23,11 +23,11 @@ from nlfilter_torch.operator.landmarks import (
     ITERATIONS,
     LARGEST,
     TIE,
-    Sampling,
     candidate_pixels,
     draw_few,
 )
 from nlfilter_torch.operator.nystrom import JITTER
+from nlfilter_torch.operator.options import Sampling
 from nlfilter_torch.operator.sinkhorn import LARGEST_SCALING, SMALLEST_SUM, TRUSTED, Rounds, chebyshev_weights
 
 SWEEPS = 16

@@ -21,11 +21,11 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.core.blocks import stratified, weighted
-from nlfilter_torch.core.checks import warn
 from nlfilter_torch.core.communicator import ALONE, Communicator
 from nlfilter_torch.core.kernels.grams import gram, sum_grams
 from nlfilter_torch.core.kernels.tall_skinny import gather, moment, positive_root, spread, sweep, weigh
 from nlfilter_torch.core.values import is_hidden
+from nlfilter_torch.core.warning import warn
 
 EXCESS = {torch.float32: 1e-5, torch.float64: 1e-10}  # amount by which d of a pixel may exceed 1 through rounding
 PER_LANDMARK = (8, 32, 160)  # sampled pixels: minimum, usual, maximum; the Jacobian is then within 35, 18 or 8 %

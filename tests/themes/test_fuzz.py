@@ -17,7 +17,8 @@ from benchmarks.fuzz.functions import FUNCTIONS, check_call, random_call
 from benchmarks.fuzz.pictures import check_picture, pictures
 from benchmarks.fuzz.truth import Exact
 from nlfilter_torch import NonlocalOperator, nonlocal_operator
-from nlfilter_torch.core.checks import check_positive, warn
+from nlfilter_torch.core.checks import check_positive
+from nlfilter_torch.core.warning import warn
 from tests.problems import noise
 
 # Hypothesis draws every choice, so that it can simplify a failing case.

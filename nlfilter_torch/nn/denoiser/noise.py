@@ -8,7 +8,8 @@ from torch import Tensor
 
 from nlfilter_torch.core.checks import check_image, check_same_size, check_values
 from nlfilter_torch.core.precision import full_precision, per_image, working_dtype
-from nlfilter_torch.operator.features import GuideChannels, reduce_channels
+from nlfilter_torch.operator.features import reduce_channels
+from nlfilter_torch.operator.options import GuideChannels
 
 WINDOW_SIZE = 9  # side of a window in pixels
 NUM_WINDOWS = 6144

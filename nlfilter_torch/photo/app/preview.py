@@ -20,14 +20,9 @@ from torch import Tensor
 
 from nlfilter_torch.filtering.filters import detail_layers, weigh_layers
 from nlfilter_torch.operator.build import operator_from_features
-from nlfilter_torch.operator.features import (
-    GuideChannels,
-    GuideFeatures,
-    estimate_bandwidth,
-    reduce_channels,
-    unit_window,
-)
+from nlfilter_torch.operator.features import GuideFeatures, estimate_bandwidth, reduce_channels, unit_window
 from nlfilter_torch.operator.operator import NonlocalOperator
+from nlfilter_torch.operator.options import GuideChannels
 from nlfilter_torch.photo.declared.declaration import Edit
 from nlfilter_torch.photo.declared.parameters import DETAIL, MASK
 from nlfilter_torch.photo.declared.presets import Recipe

@@ -12,9 +12,8 @@ from torch import Tensor
 
 from nlfilter_torch.core.checks import check_count, check_reach
 from nlfilter_torch.core.inner import Inner
-from nlfilter_torch.operator.features import GuideChannels, blur, blur_margin
-from nlfilter_torch.operator.landmarks import Sampling
-from nlfilter_torch.operator.nystrom import Completion
+from nlfilter_torch.operator.features import blur, blur_margin
+from nlfilter_torch.operator.options import Completion, GuideChannels, Sampling
 from nlfilter_torch.operator.products import Columns
 from nlfilter_torch.photo.declared.declaration import Edit
 from nlfilter_torch.photo.declared.parameters import ABSTRACT

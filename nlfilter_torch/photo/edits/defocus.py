@@ -10,8 +10,7 @@ from torch import Tensor
 
 from nlfilter_torch.core.checks import check_reach
 from nlfilter_torch.core.inner import Inner
-from nlfilter_torch.operator.landmarks import Sampling
-from nlfilter_torch.operator.nystrom import Completion
+from nlfilter_torch.operator.options import Completion, Sampling
 from nlfilter_torch.photo.declared.declaration import Edit
 from nlfilter_torch.photo.declared.parameters import DEFOCUS
 from nlfilter_torch.photo.picture.drawn import Drawn, M

@@ -18,9 +18,7 @@ from nlfilter_torch.filtering.filters import weigh_layers
 from nlfilter_torch.nn.denoiser.network import NonlocalDenoiser
 from nlfilter_torch.nn.denoiser.noise import Noise, noise_map
 from nlfilter_torch.nn.denoiser.tiles import STEP
-from nlfilter_torch.operator.features import GuideChannels
-from nlfilter_torch.operator.landmarks import Sampling
-from nlfilter_torch.operator.nystrom import Completion
+from nlfilter_torch.operator.options import Completion, GuideChannels, Sampling
 from nlfilter_torch.photo.declared.declaration import Edit
 from nlfilter_torch.photo.declared.parameters import DENOISE
 from nlfilter_torch.photo.edits.noise import noise_of

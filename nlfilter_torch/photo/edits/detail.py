@@ -18,9 +18,8 @@ from nlfilter_torch.core.checks import (
     check_shape,
 )
 from nlfilter_torch.core.inner import Inner
-from nlfilter_torch.operator.features import GuideChannels, blur_margin
-from nlfilter_torch.operator.landmarks import Sampling
-from nlfilter_torch.operator.nystrom import Completion
+from nlfilter_torch.operator.features import blur_margin
+from nlfilter_torch.operator.options import Completion, GuideChannels, Sampling
 from nlfilter_torch.photo.declared.declaration import Edit
 from nlfilter_torch.photo.declared.parameters import DETAIL, MASK
 from nlfilter_torch.photo.edits.synthesis import Polynomial

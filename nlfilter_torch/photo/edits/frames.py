@@ -12,10 +12,8 @@ from nlfilter_torch.core.inner import Inner
 from nlfilter_torch.core.precision import working_dtype
 from nlfilter_torch.filtering.fitted import FittedFilter, fit_filter
 from nlfilter_torch.operator.build import operator_from_guide
-from nlfilter_torch.operator.features import SpatialBandwidth, reduce_channels
-from nlfilter_torch.operator.landmarks import Sampling
-from nlfilter_torch.operator.nystrom import Completion
-from nlfilter_torch.operator.options import OperatorOptions
+from nlfilter_torch.operator.features import reduce_channels
+from nlfilter_torch.operator.options import Completion, OperatorOptions, Sampling, SpatialBandwidth
 from nlfilter_torch.photo.declared.parameters import DETAIL
 from nlfilter_torch.photo.edits.detail import Channels
 from nlfilter_torch.photo.picture.changes import activity, limit_by_activity, split_sliders

@@ -9,9 +9,8 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.core.inner import EVERYWHERE, Inner
-from nlfilter_torch.operator.features import GuideChannels, reduce_channels
-from nlfilter_torch.operator.landmarks import Sampling
-from nlfilter_torch.operator.nystrom import Completion
+from nlfilter_torch.operator.features import reduce_channels
+from nlfilter_torch.operator.options import Completion, GuideChannels, Sampling
 from nlfilter_torch.photo.declared.declaration import Edit
 from nlfilter_torch.photo.declared.shared_parameters import LOOK
 from nlfilter_torch.photo.edits.synthesis import Polynomial

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.nn.denoiser.noise import Noise, measured_noise, window_places
-from nlfilter_torch.operator.features import GuideChannels
+from nlfilter_torch.operator.options import GuideChannels
 from nlfilter_torch.photo.picture.drawn import M
 from nlfilter_torch.photo.picture.source import Source
 

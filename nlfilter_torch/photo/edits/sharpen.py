@@ -11,8 +11,7 @@ from nlfilter_torch.core.checks import check_reach
 from nlfilter_torch.core.inner import Inner
 from nlfilter_torch.nn.denoiser.noise import Noise
 from nlfilter_torch.operator.features import blur, blur_margin, reduce_channels
-from nlfilter_torch.operator.landmarks import Sampling
-from nlfilter_torch.operator.nystrom import Completion
+from nlfilter_torch.operator.options import Completion, Sampling
 from nlfilter_torch.photo.declared.declaration import Edit
 from nlfilter_torch.photo.declared.parameters import SHARPEN
 from nlfilter_torch.photo.edits.noise import noise_of

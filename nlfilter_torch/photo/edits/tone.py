@@ -9,9 +9,7 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.core.checks import check_count, check_order
-from nlfilter_torch.operator.features import GuideChannels
-from nlfilter_torch.operator.landmarks import Sampling
-from nlfilter_torch.operator.nystrom import Completion
+from nlfilter_torch.operator.options import Completion, GuideChannels, Sampling
 from nlfilter_torch.photo.declared.declaration import Edit
 from nlfilter_torch.photo.declared.parameters import TONE
 from nlfilter_torch.photo.edits.synthesis import Polynomial

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from nlfilter_torch.core.checks import warn
+from nlfilter_torch.core.warning import warn
 from nlfilter_torch.photo.io import tiff
 
 # Numbers of ITU-T H.273 (CICP).

@@ -16,7 +16,7 @@ import tifffile
 from numpy.typing import NDArray
 from PIL import Image, PngImagePlugin
 
-from nlfilter_torch.core.checks import warn
+from nlfilter_torch.core.warning import warn
 from nlfilter_torch.photo.io import exif as exif_tags
 from nlfilter_torch.photo.io import tiff
 

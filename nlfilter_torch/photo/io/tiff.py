@@ -13,7 +13,7 @@ import numpy as np
 import tifffile
 from PIL import ExifTags, Image, TiffImagePlugin
 
-from nlfilter_torch.core.checks import warn
+from nlfilter_torch.core.warning import warn
 from nlfilter_torch.photo.io import exif as exif_tags
 from nlfilter_torch.photo.io.decoded import Channels, CheckSize, Decoded
 

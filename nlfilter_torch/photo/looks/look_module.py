@@ -13,11 +13,9 @@ from nlfilter_torch.core.precision import as_given, working_dtype
 from nlfilter_torch.filtering.filters import polynomial_filter
 from nlfilter_torch.nn.parameters import check_learn
 from nlfilter_torch.operator.build import operator_from_guide
-from nlfilter_torch.operator.features import GuideChannels, SpatialBandwidth, reduce_channels
-from nlfilter_torch.operator.landmarks import Sampling
-from nlfilter_torch.operator.nystrom import Completion
+from nlfilter_torch.operator.features import reduce_channels
 from nlfilter_torch.operator.operator import NonlocalOperator
-from nlfilter_torch.operator.options import AUTO, OperatorOptions
+from nlfilter_torch.operator.options import AUTO, Completion, GuideChannels, OperatorOptions, Sampling, SpatialBandwidth
 from nlfilter_torch.photo.declared.shading import LANDMARKS, LEVELS, NEAR
 from nlfilter_torch.photo.looks.histogram import KINDS, STRENGTHS
 from nlfilter_torch.photo.looks.look_filter import BLURS, NAMES, acts, check_part, filter_look

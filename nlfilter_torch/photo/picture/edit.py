@@ -8,10 +8,7 @@ from typing import Any, ClassVar, Self
 import torch
 from torch import Tensor
 
-from nlfilter_torch.operator.features import GuideChannels
-from nlfilter_torch.operator.landmarks import Sampling
-from nlfilter_torch.operator.nystrom import Completion
-from nlfilter_torch.operator.options import OperatorOptions
+from nlfilter_torch.operator.options import Completion, GuideChannels, OperatorOptions, Sampling
 from nlfilter_torch.photo.declared.declaration import Edit
 from nlfilter_torch.photo.picture.drawn import Drawn, M
 from nlfilter_torch.photo.picture.pixels import Fitted

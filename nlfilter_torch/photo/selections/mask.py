@@ -19,10 +19,7 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.core.checks import check_count, check_positive
-from nlfilter_torch.operator.features import SpatialBandwidth
-from nlfilter_torch.operator.landmarks import Sampling
-from nlfilter_torch.operator.nystrom import Completion
-from nlfilter_torch.operator.options import OperatorOptions
+from nlfilter_torch.operator.options import Completion, OperatorOptions, Sampling, SpatialBandwidth
 from nlfilter_torch.photo.declared.declaration import Edit
 from nlfilter_torch.photo.declared.parameters import MASK
 from nlfilter_torch.photo.declared.shared_parameters import VIEWING_SIZE

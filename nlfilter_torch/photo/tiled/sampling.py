@@ -17,19 +17,18 @@ from torch import Tensor
 from nlfilter_torch.core.blocks import stratified
 from nlfilter_torch.core.checks import check_choice
 from nlfilter_torch.operator.features import (
-    GuideChannels,
     GuideFeatures,
-    SpatialBandwidth,
     bandwidth_of_gradient,
     gradients,
     pad_border,
     reduce_channels,
     unit_window,
 )
-from nlfilter_torch.operator.landmarks import Sampling, candidate_pixels, condense
-from nlfilter_torch.operator.nystrom import Completion, inverse_cholesky
+from nlfilter_torch.operator.landmarks import candidate_pixels, condense
+from nlfilter_torch.operator.nystrom import inverse_cholesky
 from nlfilter_torch.operator.operator import Kernel
-from nlfilter_torch.operator.options import Construction, check_bandwidths
+from nlfilter_torch.operator.option_checks import check_bandwidths, check_construction, landmark_count
+from nlfilter_torch.operator.options import Completion, Construction, GuideChannels, Sampling, SpatialBandwidth
 from nlfilter_torch.operator.products import Columns
 from nlfilter_torch.operator.sinkhorn import sinkhorn_balance
 from nlfilter_torch.photo.picture.source import Guide
@@ -253,10 +252,10 @@ def take_pilot(
     """
     check_choice(guide_channels, "guide_channels", ("luminance", "all"))
     method = Construction(num_landmarks=num_landmarks, landmarks=landmarks, completion=completion, generator=generator)
-    method.check()
+    check_construction(method)
     window = unit_window(patch_size, None).to(picture.dtype)
     check_bandwidths(photometric_bandwidth, spatial_bandwidth)
-    num_landmarks = method.count(picture.pixels)
+    num_landmarks = landmark_count(method, picture.pixels)
 
     generator = torch.Generator().manual_seed(0) if generator is None else generator
     candidates = candidate_pixels(picture.size, num_landmarks, landmarks, generator).cpu()
