@@ -226,9 +226,7 @@ class Colorize(PhotoEdit):
         ratio = viewed.measured(bandwidth_ratio)
         mean = per_image(COLORIZE["spatial_bandwidth"].distance(self.spatial_bandwidth, small), ratio, 1)
         operators = Operators(self, viewed, (mean / ratio.sqrt(), mean * ratio.sqrt()))
-        if scribbles.colours is None:  # no scribbles were painted, which the source refuses
-            raise ValueError("strokes must hold a painted pixel, got none; paint at least one")
-        wanted = split_luminance(scribbles.colours.unsqueeze(2))[1].squeeze(2)  # (B, 3, n)
+        wanted = split_luminance(scribbles.shown.unsqueeze(2))[1].squeeze(2)  # (B, 3, n)
         if self.method == "kmeans":
             return _coloured(source, viewed, self._segments(operators, scribbles, wanted))
         return _coloured(source, viewed, Estimates.of(operators, scribbles, wanted[:, ::2], self.strength))

@@ -178,8 +178,7 @@ def with_room(chroma: Tensor, brightness: Tensor) -> Tensor:
 
 def _grouped(scribbles: Scribbles) -> tuple[Tensor, Tensor, Tensor]:
     """Return the chroma (B, K, 3) of scribbles, their regions (B, K, n), and which of them are valid, (B, K)."""
-    assert scribbles.colours is not None  # for mypy
-    chroma = split_luminance(scribbles.colours.unsqueeze(2))[1]
+    chroma = split_luminance(scribbles.shown.unsqueeze(2))[1]
     regions, colours, valid = group_colours(chroma, scribbles.weights.unsqueeze(2))
     return colours, regions.squeeze(2), valid
 

@@ -64,7 +64,7 @@ class InMemory:
         if colours is not None:
             check_tensor(colours, "strokes")
         if mask is None:
-            raise TypeError(f"{name} must be a tensor (B, 1, H, W), got None; pass the mask of the scribbles")
+            raise TypeError(f"{name} must be a torch.Tensor, got NoneType; convert it with torch.as_tensor")
         check_image(mask, name, channels=1, batch=self.batch)
         check_same_size(mask, self.size, name, "image")
         if colours is not None:

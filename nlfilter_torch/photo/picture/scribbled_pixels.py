@@ -25,6 +25,17 @@ class Scribbles:
     image: Tensor
     colours: Tensor | None = None
 
+    @property
+    def shown(self) -> Tensor:
+        """The colours of the scribbles.
+
+        Raises:
+            TypeError: if they have none.
+        """
+        if self.colours is None:
+            raise TypeError("strokes must be a torch.Tensor, got NoneType; pass the colours of the scribbles")
+        return self.colours
+
     def joined(self, other: "Scribbles") -> "Scribbles":
         """Append the regions of other scribbles; where both cover a pixel, the other scribbles have weight 0."""
         places, back = torch.cat([self.places, other.places]).unique(return_inverse=True)
