@@ -3,6 +3,7 @@
 import secrets
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Protocol
@@ -15,6 +16,7 @@ from torch import Tensor
 from nlfilter_torch.core.progress import Progress
 from nlfilter_torch.photo.app import drawing
 from nlfilter_torch.photo.app.access import LARGEST
+from nlfilter_torch.photo.app.assets import SCRIPTS, STATIC
 from nlfilter_torch.photo.app.at_rest import AtRest
 from nlfilter_torch.photo.app.brush import Brush
 from nlfilter_torch.photo.app.canvas import Canvas
@@ -32,11 +34,6 @@ Save = Callable[[str, Report], Path]  # name and progress
 LARGEST_PRESET = 20_000_000  # bytes
 INSIDE, OUTSIDE = "#4ade80", "#60a5fa"  # colours of the sliders' response in the region, and elsewhere
 EDITORS: dict[str, "Editor"] = {}  # open pages by the token in the addresses of their pictures
-STATIC = Path(__file__).with_name("static")  # the script and the style sheet of the page
-STATIC_ADDRESS = "/static"
-SCRIPTS = "".join(
-    f'<script type="module" src="{STATIC_ADDRESS}/{name}"></script>\n' for name in ("page.js", "closeup.js")
-)
 
 
 class Photographs(Protocol):
@@ -318,6 +315,23 @@ class Editor:
         self._show_state()
         with self._client:
             ui.notify(f"Saved {path.resolve()}", type="positive", position="bottom-left", timeout=6000)
+
+
+@dataclass(frozen=True)
+class Pages:
+    """The pages of the editor, which begin with an image, if there is one."""
+
+    photographs: Photographs
+    image: Path | None
+
+    def build(self, photo: str = "") -> None:
+        """Build a page, for the photograph of an address that a page had before, if there is one."""
+        Editor(self.photographs).build(self.image, photo)
+
+    def picture(self, token: str, kind: str, place: str) -> bytes | None:
+        """A picture of the page with a token, by its kind; of the original at a place."""
+        editor = EDITORS.get(token)
+        return None if editor is None else editor.picture(kind, place)
 
 
 def _button(

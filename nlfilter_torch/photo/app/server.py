@@ -9,43 +9,45 @@ import socket
 import sys
 import threading
 import time
-from dataclasses import dataclass
-from pathlib import Path
+from typing import Protocol
 
 from fastapi import Response
 from nicegui import app, binding, ui
 
 from nlfilter_torch.photo.app.access import Guard
-from nlfilter_torch.photo.app.library import Library
-from nlfilter_torch.photo.app.page import EDITORS, STATIC, STATIC_ADDRESS, Editor
+from nlfilter_torch.photo.app.assets import STATIC, STATIC_ADDRESS
 
 TITLE = "nlfilter-torch"
 STARTING, PAUSE = 30.0, 0.05  # seconds for the server to accept connections, and between two attempts
 
 
-@dataclass(frozen=True)
-class Pages:
-    """What the server answers: pages that begin with an image, if there is one, and their pictures."""
+class Pages(Protocol):
+    """The pages that the server offers."""
 
-    library: Library
-    image: Path | None
+    def build(self, photo: str = "") -> None:
+        """Build a page, for the photograph of an address that a page had before, if there is one."""
 
-    def picture(self, token: str, kind: str, at: str = "") -> Response:
+    def picture(self, token: str, kind: str, place: str) -> bytes | None:
         """A picture of the page with a token, by its kind; of the original at a place."""
-        editor = EDITORS.get(token)
-        content = None if editor is None else editor.picture(kind, at)
+
+
+class Pictures:
+    """Answers requests for the pictures of pages: JPEG files of the whole photograph, PNG files of all else."""
+
+    def __init__(self, pages: Pages) -> None:
+        self._pages = pages
+
+    def answer(self, token: str, kind: str, at: str = "") -> Response:
+        """The picture, or status 404."""
+        content = self._pages.picture(token, kind, at)
         if not content:
             return Response(status_code=404)
         media_type = "image/jpeg" if kind in ("before", "after") else "image/png"
         return Response(content, media_type=media_type, headers={"Cache-Control": "no-store"})
 
-    def page(self, photo: str = "") -> None:
-        """Build a page, for the photograph of an address that a page had before, if there is one."""
-        Editor(self.library).build(self.image, photo)
 
-
-def serve(image: Path | None, folder: Path, *, host: str, port: int, open_page: bool) -> None:
-    """Run the editor until it is interrupted; it opens an image, if there is one, and saves into the folder.
+def serve(pages: Pages, *, host: str, port: int, open_page: bool) -> None:
+    """Run the editor until it is interrupted.
 
     Raises:
         ValueError: if it cannot listen on that address; port 0 is a free one.
@@ -53,11 +55,10 @@ def serve(image: Path | None, folder: Path, *, host: str, port: int, open_page: 
     port = _check_address(host, port)
     binding.MAX_PROPAGATION_TIME = 1.0  # otherwise NiceGUI warns, on standard error, whenever the machine is busy
     app.add_middleware(Guard, host=host)
-    pages = Pages(Library(folder, None if image is None else image.parent), image)
     app.config.quasar_config["loadingBar"] = {"skipHijack": True}  # the page shows what it is doing itself
     app.add_static_files(STATIC_ADDRESS, STATIC, max_cache_age=0)  # another version must not find old files
-    app.get("/picture/{token}/{kind}")(pages.picture)
-    ui.page("/", title=TITLE, language="en-US")(pages.page)
+    app.get("/picture/{token}/{kind}")(Pictures(pages).answer)
+    ui.page("/", title=TITLE, language="en-US")(pages.build)
     app.on_startup(threading.Thread(target=_tell_when_ready, args=(host, port), daemon=True).start)
     ui.run(
         host=host,

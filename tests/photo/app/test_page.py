@@ -11,8 +11,9 @@ import pytest
 from nicegui import Client, background_tasks, ui
 
 from nlfilter_torch.photo.app import drawing
+from nlfilter_torch.photo.app.assets import SCRIPTS, STATIC, STATIC_ADDRESS
 from nlfilter_torch.photo.app.library import Library
-from nlfilter_torch.photo.app.page import EDITORS, SCRIPTS, STATIC, STATIC_ADDRESS, Editor
+from nlfilter_torch.photo.app.page import EDITORS, Editor
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.io.photographs import Photograph, write_photograph
 from tests.pages import ROOT

@@ -10,8 +10,8 @@ from nicegui import Client, background_tasks
 from nlfilter_torch.__main__ import main
 from nlfilter_torch.photo.app import server
 from nlfilter_torch.photo.app.library import Library
-from nlfilter_torch.photo.app.page import EDITORS
-from nlfilter_torch.photo.app.server import Pages
+from nlfilter_torch.photo.app.page import EDITORS, Pages
+from nlfilter_torch.photo.app.server import Pictures
 
 
 @pytest.fixture
@@ -21,17 +21,18 @@ def pages(client: Client, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Pa
 
 
 def test_pictures_are_for_those_who_know_their_address(pages: Pages) -> None:
-    pages.page()
+    pages.build()
+    answer_of = Pictures(pages).answer
     ((token, editor),) = EDITORS.items()
     try:
-        assert pages.picture(token, "after").status_code == 404  # there is none
-        assert pages.picture(token, "original", "0,0,10,10").status_code == 404
+        assert answer_of(token, "after").status_code == 404  # there is none
+        assert answer_of(token, "original", "0,0,10,10").status_code == 404
         editor._canvas.pictures.update(after=b"JPEG", mask=b"PNG")
-        answer = pages.picture(token, "mask")
+        answer = answer_of(token, "mask")
         assert (answer.status_code, answer.body, answer.media_type) == (200, b"PNG", "image/png")
-        answer = pages.picture(token, "after")
+        answer = answer_of(token, "after")
         assert (answer.media_type, answer.headers["Cache-Control"]) == ("image/jpeg", "no-store")
-        assert pages.picture("another", "after").status_code == 404
+        assert answer_of("another", "after").status_code == 404
     finally:
         EDITORS.clear()
 
