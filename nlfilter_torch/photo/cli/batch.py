@@ -71,7 +71,7 @@ def batch(
     workers: Workers = None,
     cluster: Cluster = None,
     memory: options.Memory = None,
-    **given: Any,
+    **values: Any,
 ) -> None:
     """Edit all photographs of a folder: their details, as `nlfilter-torch detail` does, or by any file of edits.
 
@@ -82,7 +82,7 @@ def batch(
 
     On several machines that share the folders: `nlfilter-torch batch shots edited --cluster tcp://host:8786`
     """
-    step_of(EDITS["detail"], given)
+    step_of(EDITS["detail"], values)
 
     from nlfilter_torch.photo.cli.editing import allowed_memory, check_workers
     from nlfilter_torch.photo.cli.folders import Tally, edit_folder, left_out, pictures, prepare
@@ -93,7 +93,7 @@ def batch(
     if cluster is not None:  # whose workers run in other folders
         folder, target = folder.absolute(), target.absolute()
     shared = free_memory() if memory is None else allowed_memory(memory)
-    settings = {**given, "seed": seed}
+    settings = {**values, "seed": seed}
     edit: Callable[..., object] = partial(edit_photograph, EDITS["detail"], **settings)
     if preset is not None and (recipe := other_recipe(context, preset, settings)) is not None:
         settings, edit = {"recipe": recipe.to_json()}, partial(apply, preset=[str(Path(preset).absolute())])

@@ -158,7 +158,7 @@ class Abstract(FilteredEdit):
             mean,
             captured=synthesize(operator, torch.ones_like, coefficients),
             smoothed=synthesize(operator, partial(torch.pow, exponent=exponent), coefficients),
-            residual_gain=operator.each(partial(_residual_gain, residual_exponent)),
+            residual_gain=operator.of_columns(partial(_residual_gain, residual_exponent)),
         )
 
 

@@ -437,7 +437,7 @@ def extended(
             before - torch.cat(blocks, dim=2)
             for before, blocks in zip(residuals, zip(*explained, strict=True), strict=True)
         ]
-        planes.append(operator.each(partial(_of_factor, fits[0])))
+        planes.append(operator.of_columns(partial(_of_factor, fits[0])))
         del operator  # frees its factor before the next one is computed
     return planes, residuals
 

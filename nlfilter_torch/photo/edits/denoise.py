@@ -245,7 +245,7 @@ def _noise_in_layers(operator: Operator, pixels: int) -> Tensor:
     ritz, support = operator.pairs.ritz, operator.pairs.support
     inside = [ritz.apply(partial(_clamped_gain, order), support) for order in range(ORDER)]
     traces = torch.stack([matrix.diagonal(dim1=1, dim2=2).sum(1) for matrix in inside], dim=1) / pixels
-    outside = operator.mean(partial(_gains, operator.each(remainder)))
+    outside = operator.mean(partial(_gains, operator.of_columns(remainder)))
     return traces.to(outside) + (1 - support.sum(1, keepdim=True) / pixels) * outside
 
 

@@ -15,7 +15,7 @@ from nlfilter_torch.photo.picture.source import Operator, Pixels, Planes
 def synthesize(operator: Operator, response: Response, coefficients: Tensor) -> Planes:
     """Compute ``V f(S) V^T y`` for a response f and coefficients (B, C, M) of y."""
     total = coefficients @ operator.pairs.gain(response).mT
-    return operator.each(lambda columns: spread(total.to(columns.factor), columns.factor, columns.scaling))
+    return operator.of_columns(lambda columns: spread(total.to(columns.factor), columns.factor, columns.scaling))
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +43,7 @@ class Polynomial:
         if residual is None:
             return Polynomial(planes, layers)
         captured = synthesize(operator, torch.ones_like, operator.coefficients(planes))
-        return Polynomial(planes, layers, residual, captured, operator.each(remainder))
+        return Polynomial(planes, layers, residual, captured, operator.of_columns(remainder))
 
     def __call__(self, pixels: Pixels, alpha: Tensor, weight: float | Tensor | None = None) -> Tensor:
         """Filter pixels by sliders; ``weight`` of the residual, if given, replaces :attr:`residual`."""

@@ -189,7 +189,7 @@ class InMemoryOperator:
         columns = Columns(operator.factor[:, :, places], operator.scaling[:, places], operator.remainder[:, places])
         return sampled_pairs([columns], count, operator.factor.dtype)
 
-    def each(self, function: Callable[[Columns], Tensor]) -> Planes:
+    def of_columns(self, function: Callable[[Columns], Tensor]) -> Planes:
         """Apply a function to the columns of all pixels."""
         planes = function(Columns(self.operator.factor, self.operator.scaling, self.operator.remainder))
         return part_of(planes.unflatten(2, self.source.size))

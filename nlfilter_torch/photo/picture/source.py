@@ -80,7 +80,7 @@ class Operator(Protocol):
     def pairs(self) -> RitzPairs:
         """Spectrum of W, without the values of the eigenvectors at pixels."""
 
-    def each(self, function: Callable[[Columns], Tensor]) -> Planes:
+    def of_columns(self, function: Callable[[Columns], Tensor]) -> Planes:
         """Apply a function, which returns (B, C, n), to the columns of the pixels."""
 
     def layers(self, planes: Planes, order: int) -> Planes:

@@ -147,7 +147,7 @@ class RoughMasks:
         )
         known.append((self.frame.columns, unlike * max(1.0, pixels / FRAME_PIXELS), frame_links))
         known.append((self.grid.columns, grid_links, torch.ones_like(grid_links)))
-        return self.operator.each(partial(_of_columns, fit(partial(scribbled_blocks, known), strength=1.0)))
+        return self.operator.of_columns(partial(_of_columns, fit(partial(scribbled_blocks, known), strength=1.0)))
 
 
 def _of_columns(regression: Callable[[Tensor], Tensor], columns: Columns) -> Tensor:

@@ -355,7 +355,7 @@ class TiledOperator:
         sums = next(iter(self._sums.values()), None) or self.sums(first_plane, 1)
         return RitzPairs.of_sums(sums.grams[:, :2] + self._grams, sums.dtype)
 
-    def each(self, function: Callable[[Columns], Tensor]) -> Planes:
+    def of_columns(self, function: Callable[[Columns], Tensor]) -> Planes:
         """Planes computed by a function of columns."""
         return ColumnPlanes(self, function)
 

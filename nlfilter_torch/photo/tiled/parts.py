@@ -1,4 +1,4 @@
-"""Any rectangle of a picture, edited as part of the whole picture.
+"""A rectangle of a picture, edited as part of the whole picture.
 
 Each step is fitted to the whole picture as in :mod:`nlfilter_torch.photo.tiled.recipe`; after that only the columns of
 the rectangle's own pixels are needed. This is how the editor shows a part of a large photograph at full size.

@@ -49,6 +49,30 @@ def _call(compute: Callable[[], Tensor]) -> Tensor:
     return compute()
 
 
+class WeightReader:
+    """Reads rows (H, W, K) or (H, W) of weights, and notes the least and largest value of each plane.
+
+    Interpolation may exceed them, but must not hide an invalid weight.
+    """
+
+    def __init__(self, weights: RowSource) -> None:
+        self._weights = weights
+        self._least: list[Tensor] = []
+        self._largest: list[Tensor] = []
+
+    def __call__(self, start: int, stop: int) -> Tensor:
+        """The rows (1, K, h, W) from ``start`` to ``stop``."""
+        rows = torch.from_numpy(np.atleast_3d(np.array(self._weights[start:stop], np.float32)))
+        rows = rows.permute(2, 0, 1)[None]
+        self._least.append(rows.amin((2, 3), keepdim=True))
+        self._largest.append(rows.amax((2, 3), keepdim=True))
+        return rows
+
+    def clamp(self, planes: Tensor) -> Tensor:
+        """Limit planes (1, K, h, w) to the values that were read."""
+        return planes.clamp(torch.cat(self._least).amin(0), torch.cat(self._largest).amax(0))
+
+
 class TileFeatures:
     """Features of the parts of a tile, computed for the whole tile at once."""
 
@@ -168,7 +192,7 @@ class Tiled:
                 scribbles are ``needed`` and cover no pixel.
             MemoryError: if there are too many scribbled pixels.
         """
-        found = read_scribbles(
+        scribbles = read_scribbles(
             self.picture,
             mask,
             colours,
@@ -177,11 +201,11 @@ class Tiled:
             memory=self.passes.memory,
             report=self.passes.report,
         )
-        if needed and len(found.places) == 0:
+        if needed and len(scribbles.places) == 0:
             called = self.strokes if mask is None else name
             raise ValueError(f"{called} must hold a painted pixel, got none; paint at least one")
-        self.scribbled_pixels += len(found.places)
-        return found
+        self.scribbled_pixels += len(scribbles.places)
+        return scribbles
 
     def regions(self, masks: RowSource, name: str) -> list[Scribbles]:
         """Read the scribbles of K regions from rows (H, W, K) in [0, 1].
@@ -230,20 +254,9 @@ class Tiled:
                 f"{name} must have the height and width of the picture, {self.size}, got {tuple(weights.shape[:2])}; "
                 "resize them"
             )
-        # Extremes of each plane; interpolation may exceed them, but must not hide an invalid weight.
-        lowest: list[Tensor] = []
-        highest: list[Tensor] = []
-
-        def read(start: int, stop: int) -> Tensor:
-            rows = torch.from_numpy(np.atleast_3d(np.array(weights[start:stop], np.float32)))
-            rows = rows.permute(2, 0, 1)[None]
-            lowest.append(rows.amin((2, 3), keepdim=True))
-            highest.append(rows.amax((2, 3), keepdim=True))
-            return rows
-
-        found = resized(read, self.size, size)  # fills the lists
-        found = found.clamp(torch.cat(lowest).amin(0), torch.cat(highest).amax(0))
-        return found[0].permute(1, 2, 0).contiguous().numpy()
+        reader = WeightReader(weights)
+        planes = reader.clamp(resized(reader, self.size, size))
+        return planes[0].permute(1, 2, 0).contiguous().numpy()
 
     def _resized(self, planes: Callable[[Tile], Tensor], size: tuple[int, int]) -> Tensor:
         """Resize planes of tiles, which are computed by several threads."""
