@@ -122,7 +122,7 @@ def chosen_recipe(context: typer.Context, name: str, preset: str | None, values:
     if name not in {edit.name for edit in EDITS_WITHOUT_STROKES}:
         names = ", ".join(edit.name for edit in EDITS_WITHOUT_STROKES)
         raise ValueError(f"--edit must be one of {names}, got {name!r}; choose one of these")
-    if preset is not None and name != "detail":
+    if preset is not None and not EDITS[name].presets:
         raise ValueError(f"--edit must not be given together with --preset, got {name} and {preset}; drop one of them")
     own, declared = typed_options(context, values), {parameter.name for parameter in EDITS[name]}
     other = next((option for option in own if option not in declared), None)
@@ -131,7 +131,7 @@ def chosen_recipe(context: typer.Context, name: str, preset: str | None, values:
         raise ValueError(
             f"--{other.replace('_', '-')} must be used with --edit {edits}, got --edit {name}; drop it or change --edit"
         )
-    edit_values = values if name == "detail" else {option: values[option] for option in own}
+    edit_values = values if EDITS[name].presets else {option: values[option] for option in own}
     return Recipe((step_of(EDITS[name], edit_values),))
 
 
