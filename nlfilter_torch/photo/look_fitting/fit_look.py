@@ -38,6 +38,7 @@ SLIDERS_ONLY = 0.98  # share of the change from which on an edit counts as one b
 LIKELY = 0.95  # share that the layers of a sample of the pixels explain of such an edit
 ALIKE = 0.5  # least correlation of the luminance of a photograph with that of its edit
 SHADES = 256
+KINDS_OF_CURVES = {"tone": "curves"}  # a tone curve for all channels is a part of this name
 
 
 @dataclass(frozen=True)
@@ -145,7 +146,7 @@ def _choices(names: Collection[str]) -> list[Parts]:
     Raises:
         ValueError: if there are none.
     """
-    choices = [tuple(name for name in parts if ("curves" if name == "tone" else name) in names) for parts in CHOICES]
+    choices = [tuple(part for part in parts if KINDS_OF_CURVES.get(part, part) in names) for parts in CHOICES]
     choices = [parts for parts in dict.fromkeys(choices) if parts]
     if not choices:
         raise ValueError(f"parts must name one of {', '.join(NAMES)}, got none; leave them out for all")
