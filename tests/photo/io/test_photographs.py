@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+from collections.abc import Callable
 import itertools
 from pathlib import Path
 
@@ -85,46 +86,53 @@ def test_with_pixels_detaches_and_keeps_the_dtype() -> None:
     assert not edited.pixels.requires_grad
 
 
+NOISE = np.random.default_rng(0).integers(0, 255, (64, 64, 3), np.uint8)
+#: Write each kind of file that must be refused.
+BAD_FILES: dict[str, Callable[[Path], object]] = {
+    "missing": lambda path: None,
+    "empty": lambda path: path.touch(),
+    "folder": lambda path: path.mkdir(),
+    "text": lambda path: path.write_text("not an image at all, but long enough to have a header"),
+    "headless TIFF": lambda path: path.write_bytes(b"II*\0\x08\0\0\0"),
+    "gif": lambda path: Image.fromarray(NOISE).save(path, format="GIF"),
+    "animation": lambda path: Image.fromarray(NOISE).save(
+        path, format="WEBP", save_all=True, append_images=[Image.fromarray(NOISE).rotate(90)]
+    ),
+    "cmyk": lambda path: Image.fromarray(NOISE).convert("CMYK").save(path, format="JPEG"),
+    "cmyk TIFF": lambda path: tifffile.imwrite(path, stored_values(4, "uint8"), photometric="separated"),
+    "int16 TIFF": lambda path: tifffile.imwrite(path, stored_values(3, "uint8").astype(np.int16), photometric="rgb"),
+    "12 bit TIFF": lambda path: tifffile.imwrite(
+        path, stored_values(3, "uint8")[..., 0].astype(np.uint16), photometric="minisblack", bitspersample=12
+    ),
+    "five channel TIFF": lambda path: tifffile.imwrite(
+        path, np.zeros((4, 4, 5), np.uint8), photometric="rgb", planarconfig="contig", extrasamples=[0, 0]
+    ),
+    "volume TIFF": lambda path: tifffile.imwrite(
+        path, np.zeros((32, 32, 32), np.uint8), volumetric=True, tile=(16, 16, 16)
+    ),
+    "nan TIFF": lambda path: tifffile.imwrite(path, np.full((4, 4), np.nan, np.float32)),
+}
+
+
+def truncated(kind: str) -> bytes:
+    """Two thirds of a file of a type."""
+    whole = io.BytesIO()
+    if kind == "16 bit PNG":
+        whole.write(imagecodecs.png_encode(NOISE.astype(np.uint16) * 257))
+    elif kind == "packed TIFF":
+        tifffile.imwrite(whole, NOISE, photometric="rgb", compression="zlib")
+    else:
+        Image.fromarray(NOISE).save(whole, format=kind)
+    return whole.getvalue()[: len(whole.getvalue()) * 2 // 3]
+
+
 def bad_file(folder: Path, kind: str) -> Path:
     """A file that must be refused."""
-    values, path = stored_values(3, "uint8"), folder / f"{kind.replace(' ', '_')}.png"
-    whole = io.BytesIO()
-    image = Image.fromarray(np.random.default_rng(0).integers(0, 255, (64, 64, 3), np.uint8))
-    if kind == "empty":
-        path.touch()
-    elif kind == "folder":
-        path.mkdir()
-    elif kind == "text":
-        path.write_text("not an image at all, but long enough to have a header")
-    elif kind.startswith("truncated"):
-        if kind.endswith("16 bit PNG"):
-            whole.write(imagecodecs.png_encode(np.asarray(image).astype(np.uint16) * 257))
-        elif kind.endswith("packed TIFF"):
-            tifffile.imwrite(whole, np.asarray(image), photometric="rgb", compression="zlib")
-        else:
-            image.save(whole, format=kind.split()[-1])
-        path.write_bytes(whole.getvalue()[: len(whole.getvalue()) * 2 // 3])
-    elif kind == "headless TIFF":
-        path.write_bytes(b"II*\0\x08\0\0\0")
-    elif kind == "gif":
-        image.save(path, format="GIF")
-    elif kind == "animation":
-        image.save(path, format="WEBP", save_all=True, append_images=[image.rotate(90)])
-    elif kind == "cmyk":
-        image.convert("CMYK").save(path, format="JPEG")
-    elif kind == "cmyk TIFF":
-        tifffile.imwrite(path, stored_values(4, "uint8"), photometric="separated")
-    elif kind == "int16 TIFF":
-        tifffile.imwrite(path, values.astype(np.int16), photometric="rgb")
-    elif kind == "12 bit TIFF":
-        tifffile.imwrite(path, values[..., 0].astype(np.uint16), photometric="minisblack", bitspersample=12)
-    elif kind == "five channel TIFF":
-        five = np.zeros((4, 4, 5), np.uint8)
-        tifffile.imwrite(path, five, photometric="rgb", planarconfig="contig", extrasamples=[0, 0])
-    elif kind == "volume TIFF":
-        tifffile.imwrite(path, np.zeros((32, 32, 32), np.uint8), volumetric=True, tile=(16, 16, 16))
-    elif kind == "nan TIFF":
-        tifffile.imwrite(path, np.full((4, 4), np.nan, np.float32))
+    path = folder / f"{kind.replace(' ', '_')}.png"
+    if kind.startswith("truncated "):
+        path.write_bytes(truncated(kind.removeprefix("truncated ")))
+    else:
+        BAD_FILES[kind](path)
     return path
 
 

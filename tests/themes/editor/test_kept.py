@@ -4,7 +4,7 @@ import signal
 from pathlib import Path
 
 import pytest
-from playwright.sync_api import Browser, Dialog, expect
+from playwright.sync_api import Browser, Dialog, Page, expect
 
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.io.photographs import Photograph, write_photograph
@@ -28,6 +28,22 @@ def shown(tab: Tab) -> None:
     tab.wait_until_ready()
 
 
+def leaving_is_asked_for(page: Page) -> None:
+    """Try to leave a page, and stay."""
+    dialogs: list[str] = []
+
+    def stay(dialog: Dialog) -> None:
+        dialogs.append(dialog.type)
+        dialog.dismiss()
+
+    page.on("dialog", stay)
+    page.evaluate("() => { location.href = 'about:blank'; }")
+    page.wait_for_timeout(500)
+    assert dialogs == ["beforeunload"]
+    assert page.url.endswith("?photo=cat.png")
+    page.remove_listener("dialog", stay)
+
+
 def test_reload_second_tab_and_new_start(browser: Browser, shots: Path) -> None:
     editor = Editor(shots, "cat.png")
     kept = shots / "cat.png.edit.json"
@@ -40,18 +56,7 @@ def test_reload_second_tab_and_new_start(browser: Browser, shots: Path) -> None:
         tab.paint((0.2, 0.9), (0.3, 0.9))
         expect(page.get_by_text("In the region")).to_be_visible()
         expect(undo).to_be_enabled()
-        asked: list[str] = []
-
-        def stay(dialog: Dialog) -> None:
-            asked.append(dialog.type)
-            dialog.dismiss()
-
-        page.on("dialog", stay)
-        page.evaluate("() => { location.href = 'about:blank'; }")
-        page.wait_for_timeout(500)
-        assert asked == ["beforeunload"]
-        assert page.url.endswith("?photo=cat.png")
-        page.remove_listener("dialog", stay)
+        leaving_is_asked_for(page)
 
         page.reload()
         expect(page.locator("path.stroke")).to_have_count(1)
