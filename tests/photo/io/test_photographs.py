@@ -2,8 +2,8 @@
 
 import contextlib
 import io
-from collections.abc import Callable
 import itertools
+from collections.abc import Callable
 from pathlib import Path
 
 import imagecodecs
