@@ -20,6 +20,9 @@ ALPHA, INSIDE = (0.5, 1.0, 1.0, 1.0), (3.0, 3.0, 2.0, 1.0)
 DETAIL = Step("detail", (IN, OUT), alpha=ALPHA, inside=INSIDE, reach=0.5, landmarks=40)
 RECOLOR = Step("recolor", (BLUE, KEEP), reach=0.5, tolerance=20.0)
 COLORIZE = Step("colorize", (BLUE,), strength=0.5)
+DEFOCUS = Step("defocus", (IN,), radius=4.0)
+ABSTRACT = Step("abstract", power=0.2, edges=0.5, edge_width=0.3, tones=5)
+WHOLE = Recipe((DETAIL, COLORIZE, RECOLOR, DEFOCUS, ABSTRACT))
 
 
 def rows_of(image: torch.Tensor) -> NDArray[Any]:

@@ -11,10 +11,11 @@ from nlfilter_torch.photo.picture.colour import (
     group_colours,
     hundredths_of_lab,
     merge_luminance,
+    region_means,
     split_luminance,
     with_green,
 )
-from tests.problems import cat, colour, luminance, noise
+from tests.problems import box, cat, colour, luminance, noise
 
 
 def test_an_edit_of_luminance_keeps_the_differences_of_the_channels() -> None:
@@ -85,3 +86,28 @@ def test_edit_luminance_keeps_colour() -> None:
     torch.testing.assert_close(edit_luminance(image, lambda y: y + 0.1), image + 0.1)
     grey = image[:, :1]
     assert torch.equal(edit_luminance(grey, lambda y: 2 * y), 2 * grey)
+
+
+def test_a_colour_is_the_same_to_the_last_bit_wherever_it_stands() -> None:
+    image = colour("astronaut", 61, 83)
+    guide = colour_guide(image)
+    for rows in (slice(0, 1), slice(3, 10), slice(20, 61)):
+        assert torch.equal(colour_guide(image[:, :, rows]), guide[:, :, rows])
+
+
+def test_groups_of_colours_are_kept_apart_image_by_image() -> None:
+    chroma = torch.zeros(2, 3, 1, 40)
+    chroma[0, 0] = torch.arange(40) * 0.1  # forty colours
+    regions, means, counts = group_colours(chroma, torch.ones(2, 1, 1, 40))
+    assert regions.shape == (2, 16, 1, 40)
+    assert counts[0].all()
+    assert counts[1].tolist() == [True] + [False] * 15
+    torch.testing.assert_close(regions[0].sum(0), torch.ones(1, 40))  # the remaining colours joined the nearest group
+    assert torch.equal(means[1], torch.zeros(16, 3))
+
+
+def test_means_of_regions_are_exact_on_large_images() -> None:
+    mask = box(300, 300, 600, 600, size=(1400, 1400)) * 0.7
+    image = 0.9 + 0.1 * noise(1, 3, 1400, 1400, dtype=torch.float32)
+    wanted = (image.double() * mask.double()).sum((2, 3)) / mask.double().sum()
+    torch.testing.assert_close(region_means(image, mask)[:, 0].double(), wanted, rtol=0, atol=1e-7)

@@ -1,6 +1,7 @@
 """Brush strokes as masks and colours."""
 
 import math
+from dataclasses import replace
 from itertools import pairwise
 
 import pytest
@@ -10,6 +11,9 @@ from nlfilter_torch.photo.declared.strokes import Stroke
 from nlfilter_torch.photo.picture.painting import colour_of, cover, mask_of, paint
 
 SIZE = (40, 60)
+HORIZONTAL = Stroke(((0.25, 0.25), (0.5, 0.25)), 0.05, "in")
+BLUE = replace(HORIZONTAL, paint="#2040e0")
+SMALL = (48, 64)
 LINE = Stroke(((0.2, 0.3), (0.8, 0.3), (0.8, 0.9)), 0.05, "in")
 
 
@@ -57,3 +61,32 @@ def test_later_strokes_cover_earlier_ones() -> None:
     assert torch.equal(colours[0, :, 20, 22], colour_of("#ff0000"))
     assert torch.equal(painted, mask_of([red], SIZE))
     assert not colours[:, :, painted[0, 0] == 0].any()
+
+
+def test_a_stroke_covers_what_is_nearer_than_its_radius() -> None:
+    covered = cover(HORIZONTAL, SMALL)
+    y, x = torch.meshgrid(torch.arange(48) + 0.5, torch.arange(64) + 0.5, indexing="ij")
+    across = torch.maximum((16 - x).clamp(min=0), (x - 32).clamp(min=0))
+    assert torch.equal(covered, torch.hypot(across, y - 12) <= 0.05 * 48)
+    dot = cover(Stroke(((0.5, 0.5),), 1e-6, "in"), (49, 65))
+    assert dot.sum() == 1
+    assert dot[24, 32]
+
+
+def test_strokes_that_leave_the_picture_cover_what_is_in_it() -> None:
+    crossing = cover(Stroke(((-0.5, 0.5), (1.5, 0.5)), 0.05, "in"), SMALL)
+    assert torch.equal(crossing.any(1).nonzero().flatten(), torch.arange(22, 26))
+    assert crossing[22:26].all()
+    assert not cover(Stroke(((1.5, 1.5),), 0.05, "in"), SMALL).any()
+
+
+def test_a_larger_picture_is_painted_alike() -> None:
+    small, large = mask_of([HORIZONTAL], SMALL), mask_of([HORIZONTAL], (480, 640))
+    assert (torch.nn.functional.avg_pool2d(large, 10) - small).abs().mean() < 0.01
+
+
+def test_later_paint_covers_earlier() -> None:
+    colours, painted = paint([BLUE, replace(BLUE, paint="#ff0000", points=BLUE.points[:1])], SMALL)
+    assert torch.equal(colours[0, :, 12, 16], torch.tensor([1.0, 0.0, 0.0]))
+    assert torch.allclose(colours[0, :, 12, 30], torch.tensor([0x20, 0x40, 0xE0]) / 255)
+    assert torch.equal(painted, mask_of([BLUE], SMALL))

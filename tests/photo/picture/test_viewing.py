@@ -7,24 +7,11 @@ import pytest
 import torch
 
 from nlfilter_torch import enhance
-from nlfilter_torch.photo.cli import main
-from nlfilter_torch.photo.io.photographs import Photograph, read_photograph, write_photograph
 from nlfilter_torch.photo.picture.resizing import resize
 from nlfilter_torch.photo.picture.viewing import enlarged_and_reduced, viewed_size
 from tests.brightness import ALPHA, EDITS
 from tests.problems import cat, colour, luminance
 from tests.streams import stream_detail
-
-
-@pytest.mark.parametrize("residual", [None, 1.0])
-def test_sliders_at_1_change_no_bit(residual: float | None) -> None:
-    image, region = colour("coffee", 40, 60), torch.zeros(1, 1, 40, 60)
-    region[..., 10:20, 10:20] = 1
-    for options in ({}, {"viewing_size": 0.001}, {"limits": "none"}, {"threshold": 0.0}):
-        edited = enhance(image, torch.ones(4), residual=residual, num_landmarks=40, **options)
-        assert torch.equal(edited, image)
-        edited = enhance(image, torch.ones(4), region, outside=torch.ones(4), num_landmarks=40, **options)
-        assert torch.equal(edited, image)
 
 
 def test_the_viewing_size_of_a_picture() -> None:
@@ -105,23 +92,6 @@ def test_regions_of_another_size_are_told_at_the_viewing_size_too() -> None:
             enhance(image, ALPHA, torch.ones(1, 1, 40, 50), viewing_size=size, num_landmarks=20)
         with pytest.raises(ValueError, match=r"regions must be in \[0, 1\]"):
             enhance(image, ALPHA, -torch.ones(1, 1, 40, 60), viewing_size=size, num_landmarks=20)
-
-
-def test_distance_counts_unless_told_otherwise(tmp_path: Any, capsys: pytest.CaptureFixture[str]) -> None:
-    image = colour("coffee", 48, 72)
-    near, explicit, far = (enhance(image, ALPHA, num_landmarks=60, spatial_bandwidth=h) for h in (None, 4.0, "none"))
-    assert torch.equal(near, explicit)  # a twelfth of 48
-    assert (far - near).abs().max() > 0.02
-    with pytest.raises(ValueError, match="spatial_bandwidth must be one of 'none', got 'far'"):
-        enhance(image, ALPHA, spatial_bandwidth="far")
-    write_photograph(Photograph(image), tmp_path / "in.png")
-    arguments = ["detail", str(tmp_path / "in.png"), str(tmp_path / "out.png"), "--landmarks", "60"]
-    assert main([*arguments, "--alpha", "2.2,2.2,2.2,1", "--spatial-bandwidth", "none"]) == 0
-    stored = read_photograph(tmp_path / "in.png").pixels
-    wanted = enhance(stored, ALPHA, num_landmarks=60, spatial_bandwidth="none")
-    assert (read_photograph(tmp_path / "out.png").pixels - wanted.clamp(0, 1)).abs().max() < 0.6 / 255
-    assert main([*arguments, "--spatial-bandwidth", "far"]) == 2
-    assert "--spatial-bandwidth must be a positive number of pixels, such as 20, or none" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("stride", [2, 2.7])

@@ -16,11 +16,8 @@ from nlfilter_torch import (
     region_mask,
     sharpen,
 )
-from nlfilter_torch.operator.options import OperatorOptions
-from nlfilter_torch.photo.picture.in_memory import InMemory
-from nlfilter_torch.photo.picture.pixels import Fitted, strips_of
-from nlfilter_torch.photo.picture.source import Guide
-from tests.problems import box, noise, paint
+from nlfilter_torch.operator.build import nonlocal_operator
+from tests.problems import box, colour, noise, paint
 
 GREY = 0.2 + 0.6 * noise(2, 1, 20, 22, dtype=torch.float32)
 RGB = 0.2 + 0.6 * noise(2, 3, 20, 22, dtype=torch.float32)
@@ -101,40 +98,6 @@ def test_edits_of_a_picture_in_strips_are_those_of_the_whole(name: str, monkeypa
     monkeypatch.setattr("nlfilter_torch.photo.picture.pixels._rows_at_once", rows)
     torch.testing.assert_close(edit(image), wanted, atol=1e-12, rtol=0)
     assert pieces
-
-
-def test_pictures_are_divided_if_they_are_large(monkeypatch: pytest.MonkeyPatch) -> None:
-    image = torch.rand(1, 3, 40, 50)
-    source = InMemory(image)
-    assert strips_of(source) == [source]
-    monkeypatch.setattr("nlfilter_torch.photo.picture.pixels.STRIP", 300 // torch.get_num_threads())
-    parts = strips_of(source)
-    assert torch.equal(torch.cat([part.image for part in parts], dim=2), image)
-    assert [(part.first, part.width) for part in parts] == [(300 * i, 50) for i in range(7)]
-    assert torch.equal(
-        source.mean_of(Fitted(lambda part: part.image), torch.mul), image.square().mean((2, 3), keepdim=True)
-    )
-
-
-def test_the_last_operator_with_the_same_options_is_cached() -> None:
-    source = InMemory(torch.rand(1, 1, 12, 13), {})
-    learned, written = torch.tensor([3.0], requires_grad=True), torch.tensor([3.0])
-
-    def operator(*bandwidths: float | torch.Tensor) -> object:
-        return source.operator(Guide(OperatorOptions(spatial_bandwidth=bandwidths, num_landmarks=20)))
-
-    def tensors(*bandwidths: float) -> object:
-        return operator(*(torch.tensor([bandwidth]) for bandwidth in bandwidths))
-
-    assert tensors(3.0, 5.0) is tensors(3.0, 5.0)
-    assert tensors(3.0, 5.0) is not tensors(5.0, 3.0)
-    assert operator(3.0, 5.0) is operator(3.0, 5.0)
-    assert operator(written, 5.0) is not operator(written, 3.0)
-    assert operator(learned, learned) is not operator(learned, learned)
-    before = operator(written, written)
-    written += 1
-    assert operator(written, written) is not before
-    assert len(source.cache or {}) == 4
 
 
 @each_edit
@@ -247,26 +210,19 @@ def test_wrong_types(edit: Callable[..., torch.Tensor], image: torch.Tensor, arg
         edit(image, **arguments)
 
 
-def test_the_amount_of_sharpening_is_not_rounded_to_float32() -> None:
-    exact = torch.tensor(3.3, dtype=torch.float64)
-    options = {"limits": "none", "num_landmarks": 20}
-    close, far = (sharpen(RGB.double(), amount=amount, **options) for amount in (3.3, exact.float().double()))
-    assert torch.equal(sharpen(RGB.double(), amount=exact, **options), close)
-    assert not torch.equal(close, far)
-
-
-def test_a_threshold_of_zero_in_a_tensor_is_no_threshold() -> None:
-    image = torch.full((2, 1, 40, 40), 0.5)
-    image[..., 20:] = 0.7
-    image[..., 20:, :] += 0.1
-    options = {"photometric_bandwidth": 0.2, "num_landmarks": 50, "limits": "none"}
-    alpha = torch.tensor([3.0, 3.0, 4.0, 1.0])
-    expected = enhance(image, alpha, threshold=0.0, **options)
-    torch.testing.assert_close(enhance(image, alpha, threshold=torch.tensor(0.0), **options), expected)
-    each = enhance(image, alpha, threshold=torch.tensor([0.0, 5 / 255]), **options)
-    torch.testing.assert_close(each[:1], expected[:1])
-
-
-def test_sliders_for_more_images_than_there_are_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"alpha must have shape \(k\+1,\), or \(1, k\+1\)"):
-        enhance(torch.rand(1, 3, 24, 24), torch.ones(3, 4) * 2)
+def test_numbers_do_not_take_the_default_dtype() -> None:
+    image = colour("coffee", 30, 40)
+    edits = (
+        lambda: adjust_tone(image, contrast=1.4, num_landmarks=40),
+        lambda: abstract(image, num_landmarks=40),
+        lambda: nonlocal_operator(image, num_landmarks=40) @ image,
+    )
+    expected = [edit() for edit in edits]
+    for dtype in (torch.bfloat16, torch.float64):
+        torch.set_default_dtype(dtype)
+        try:
+            found = [edit() for edit in edits]
+        finally:
+            torch.set_default_dtype(torch.float32)
+        for a, b in zip(found, expected, strict=True):
+            assert torch.equal(a, b)

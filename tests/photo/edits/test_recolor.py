@@ -5,7 +5,7 @@ import torch
 import torch.nn.functional as F
 
 from nlfilter_torch import recolor
-from nlfilter_torch.photo.picture.colour import colour_guide, group_colours, region_means, split_luminance
+from nlfilter_torch.photo.picture.colour import group_colours, split_luminance
 from tests.problems import BACKGROUND, SUIT, box, colour, luminance, noise, paint
 
 
@@ -118,24 +118,6 @@ def test_a_grey_stroke_takes_colour_away() -> None:
     )
 
 
-def test_a_colour_is_the_same_to_the_last_bit_wherever_it_stands() -> None:
-    image = colour("astronaut", 61, 83)
-    guide = colour_guide(image)
-    for rows in (slice(0, 1), slice(3, 10), slice(20, 61)):
-        assert torch.equal(colour_guide(image[:, :, rows]), guide[:, :, rows])
-
-
-def test_groups_of_colours_are_kept_apart_image_by_image() -> None:
-    chroma = torch.zeros(2, 3, 1, 40)
-    chroma[0, 0] = torch.arange(40) * 0.1  # forty colours
-    regions, means, counts = group_colours(chroma, torch.ones(2, 1, 1, 40))
-    assert regions.shape == (2, 16, 1, 40)
-    assert counts[0].all()
-    assert counts[1].tolist() == [True] + [False] * 15
-    torch.testing.assert_close(regions[0].sum(0), torch.ones(1, 40))  # the remaining colours joined the nearest group
-    assert torch.equal(means[1], torch.zeros(16, 3))
-
-
 def test_a_batch_is_recoloured_like_its_images_where_only_one_has_a_background() -> None:
     image = noise(2, 3, 20, 24, dtype=torch.float64)
     dot, other = box(4, 4, 5, 5, size=(20, 24)), box(13, 15, 4, 4, size=(20, 24))
@@ -160,10 +142,3 @@ def test_a_background_under_the_strokes_is_refused() -> None:
             recolor(image, strokes, stroke, keep=keep, num_landmarks=20)
     # A keep that reaches beyond the stroke, and none in one image, are valid.
     recolor(image, strokes, stroke, keep=torch.cat([under + beside, 0 * under]), num_landmarks=20)
-
-
-def test_means_of_regions_are_exact_on_large_images() -> None:
-    mask = box(300, 300, 600, 600, size=(1400, 1400)) * 0.7
-    image = 0.9 + 0.1 * noise(1, 3, 1400, 1400, dtype=torch.float32)
-    wanted = (image.double() * mask.double()).sum((2, 3)) / mask.double().sum()
-    torch.testing.assert_close(region_means(image, mask)[:, 0].double(), wanted, rtol=0, atol=1e-7)

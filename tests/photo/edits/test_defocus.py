@@ -5,7 +5,7 @@ import torch
 import torch.nn.functional as F
 
 from nlfilter_torch import defocus
-from nlfilter_torch.photo.edits.defocus import REACH, ROWS, convolve
+from nlfilter_torch.photo.edits.defocus import ROWS, convolve
 from tests.problems import box, colour
 
 
@@ -78,7 +78,7 @@ def test_convolution_in_parts_is_that_of_the_whole(height: int, radius: int) -> 
 
 def test_reach_is_an_option_of_the_mask() -> None:
     image, region = colour("chelsea"), box(24, 24)
-    found = [defocus(image, region, reach=reach, num_landmarks=20) for reach in (0.5, REACH)]
+    found = [defocus(image, region, reach=reach, num_landmarks=20) for reach in (0.5, 0.72)]
     torch.testing.assert_close(found[1], defocus(image, region, num_landmarks=20), rtol=0, atol=0)
     assert not torch.equal(found[0], found[1])
 
