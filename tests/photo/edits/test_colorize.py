@@ -8,7 +8,8 @@ from torch import Tensor
 
 from nlfilter_torch import colorize
 from nlfilter_torch.photo.edits.colorize import (
-    Stage,
+    Colorize,
+    Operators,
     bandwidth_ratio,
     colorize_guide,
     compared,
@@ -18,7 +19,6 @@ from nlfilter_torch.photo.edits.colorize import (
 )
 from nlfilter_torch.photo.picture.colour import merge_luminance, split_luminance
 from nlfilter_torch.photo.picture.in_memory import InMemory
-from nlfilter_torch.photo.picture.source import Guide, Operator
 from nlfilter_torch.photo.picture.source import luminance as luminance_of
 from nlfilter_torch.photo.selections.local_values import RELATIVE, LocalValues
 from tests.problems import box, colour, luminance, noise, paint
@@ -203,13 +203,20 @@ def test_neither_estimate_predicts_a_stroke_from_itself() -> None:
     groups, places = groups_of(mask)
     weights, source = torch.ones(1, 1, len(places)), InMemory(image)
 
-    def operator_of(stage: Stage) -> Operator:
-        scale = {"photometric_bandwidth": 0.2 * stage.photometric, "spatial_bandwidth": 9 * stage.spatial}
-        return source.operator(Guide({"num_landmarks": 30, "patch_size": 1, **scale}, colorize_guide, spectral=True))
+    settings = Colorize(
+        method="regression",
+        strength=1.0,
+        photometric_bandwidth=0.2,
+        spatial_bandwidth=None,
+        patch_size=1,
+        num_landmarks=30,
+        viewing_size=0,
+    )
+    operators = Operators(settings, source, (torch.tensor([9.0]), torch.tensor([9.0])))
 
     def predictions(values: Tensor) -> tuple[Tensor, Tensor]:
         sets = [weights, *groups.weights_without_each(weights)]
-        (far, near), residuals = extended(operator_of, places, sets, values, SIZE[0] * SIZE[1], 1.0)
+        (far, near), residuals = extended(operators, places, sets, values, 1.0)
         whole = (far(source) + near(source))[:, :2].flatten(2)[:, :, places]
         torch.testing.assert_close(values - residuals[0], whole, rtol=1e-4, atol=1e-5)
         guide = source.reduced(luminance_of, 1)
