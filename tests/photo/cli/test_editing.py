@@ -2,8 +2,11 @@
 
 from pathlib import Path
 
+import numpy as np
 import psutil
 import pytest
+import skimage.data
+import tifffile
 import torch
 from PIL import ExifTags, Image, ImageCms
 
@@ -176,3 +179,80 @@ def test_memory_of_large_patches_is_asked_for(
     monkeypatch.setattr("nlfilter_torch.photo.cli.editing.read_photograph", read)
     refused(capsys, "apply", photo, tmp_path / "out.png", "--preset", preset)
     assert asked[0] > 4 * 2 * 99**2
+
+
+def test_depth_and_transparency_are_kept(tmp_path: Path, cat: torch.Tensor) -> None:
+    alpha = cat[:, :1].flip(-1)
+    write_photograph(Photograph(cat, "uint16", alpha), tmp_path / "deep.png")
+    assert main(["tone", str(tmp_path / "deep.png"), str(tmp_path / "out.png"), "--landmarks", "40"]) == 0
+    stored, edited = read_photograph(tmp_path / "deep.png"), read_photograph(tmp_path / "out.png")
+    assert edited.depth == "uint16"
+    assert torch.equal(edited.alpha, stored.alpha)
+    assert (
+        main(["tone", str(tmp_path / "deep.png"), str(tmp_path / "out.tif"), "--depth", "float", "--landmarks", "40"])
+        == 0
+    )
+    assert read_photograph(tmp_path / "out.tif").depth == "float32"
+
+
+def test_damaged_files_are_refused(photo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pixels, target = skimage.data.chelsea()[:64, :96], tmp_path / "out.png"
+    data = bytearray(photo.read_bytes())
+    data[len(data) // 2 : len(data) // 2 + 20] = bytes(20)
+    photo.write_bytes(data)
+    assert "in.png is damaged or cut short" in refused(capsys, "tone", photo, target)
+    tif = tmp_path / "in.tif"
+    tifffile.imwrite(tif, pixels, compression="jpeg", photometric="rgb")
+    with tifffile.TiffFile(tif) as file:
+        end = file.pages.first.dataoffsets[-1] + file.pages.first.databytecounts[-1]
+    assert tif.stat().st_size == end  # the pixels come last
+    tif.write_bytes(tif.read_bytes()[:-30])
+    assert "in.tif is damaged or cut short (it ends too early)" in refused(capsys, "tone", tif, target)
+    assert not target.exists()
+
+
+@pytest.mark.usefixtures("tiled")
+def test_transparency_must_be_finite(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    values = np.ones((60, 90, 4))
+    values[5, 7, 3] = np.nan
+    source = tmp_path / "in.tif"
+    tifffile.imwrite(source, values.astype(np.float32), photometric="rgb", extrasamples=["unassalpha"])
+    assert main(["tone", str(source), str(tmp_path / "out.tif"), "--contrast", "1.2"]) == 2
+    assert "NaN" in capsys.readouterr().err
+    assert not (tmp_path / "out.tif").exists()
+
+
+@pytest.mark.parametrize(
+    ("verb", "option"),
+    [
+        (["recolor", "--region", "24,32:blue"], "--show"),
+        (["mask", "--region", "24,32"], "--show"),
+        (["denoise"], "--map"),
+    ],
+)
+def test_the_photograph_is_not_replaced(
+    verb: list[str], option: str, photo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before, out = photo.read_bytes(), tmp_path / "out.png"
+    for path, what in ((photo, "photograph"), (out, "output")):
+        assert main([*verb, str(photo), str(out), option, str(path)]) == 2
+        assert f"{option} must be another file than the {what}, got" in capsys.readouterr().err
+    assert photo.read_bytes() == before
+    assert not out.exists()
+
+
+def test_channels_of_unsupported_types_in_tiles(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    signed, plain, preset = tmp_path / "signed.tif", tmp_path / "plain.tif", tmp_path / "look.json"
+    tifffile.imwrite(signed, np.full((64, 80), 9, np.int16))
+    tifffile.imwrite(plain, np.full((64, 80), 9, np.uint16))
+    preset.write_text('{"version": 1, "steps": [{"edit": "detail", "alpha": [2, 1]}]}')
+    tiles = ("--memory", "0.001")
+    for arguments in (
+        ("mask", signed, tmp_path / "out.png", "--region", "30,30,12,8", *tiles),
+        ("apply", plain, tmp_path / "out.png", "--preset", preset, "--mask", signed, *tiles),
+        ("detail", plain, tmp_path / "out.png", "--mask", signed, *tiles),
+    ):
+        assert main([str(argument) for argument in arguments]) == 2
+        told = capsys.readouterr().err
+        assert f"{signed} stores its channels as int16, which is not supported; convert it" in told
+        assert not (tmp_path / "out.png").exists()

@@ -1,144 +1,34 @@
-"""The command ``mask``: files of masks, in memory and in tiles, and its errors."""
+"""The command ``mask``: its help and its errors."""
 
-import re
 from pathlib import Path
 
-import numpy as np
 import pytest
-import tifffile
-from PIL import Image
 
-from nlfilter_torch import region_mask
 from nlfilter_torch.photo.cli import main
-from nlfilter_torch.photo.declared.parameters import MASK
-from nlfilter_torch.photo.picture.source import seeded
-from tests.problems import box, colour
 
-SIZE = (64, 80)
-REGION, GROUND = "30,30,12,8", "4,4,10,8"
+REGION = "30,30,12,8"
 
 
-@pytest.fixture
-def photograph(tmp_path: Path) -> Path:
-    path = tmp_path / "in.tif"
-    pixels = (colour("coffee", *SIZE)[0].permute(1, 2, 0).numpy() * 255).round().astype(np.uint8)
-    tifffile.imwrite(path, pixels, photometric="rgb")
-    return path
-
-
-def expected(path: Path) -> np.ndarray:
-    image = tifffile.imread(path).astype(np.float32) / 255
-    front, back = box(30, 30, 8, 12, size=SIZE), box(4, 4, 8, 10, size=SIZE)
-    options = {p.keyword: p.argument_of(p.default, SIZE) for p in MASK}
-    import torch
-
-    planes = torch.from_numpy(image).permute(2, 0, 1)[None]
-    return region_mask(planes, front, back, **options, generator=seeded())[0, 0].numpy()
-
-
-def run(source: Path, target: Path, *more: str) -> int:
-    return main(["mask", str(source), str(target), "--region", REGION, "--background", GROUND, *more])
-
-
-def floats(path: Path) -> np.ndarray:
-    """The plane in a PFM file."""
-    head, size, scale, values = path.read_bytes().split(b"\n", 3)
-    assert (head, size, scale) == (b"Pf", b"80 64", b"-1.0")
-    return np.frombuffer(values, "<f4").reshape(SIZE)[::-1]
-
-
-@pytest.mark.parametrize("memory", [[], ["--memory", "0.05"]], ids=["in memory", "in tiles"])
-def test_it_prints_how_much_is_selected(
-    photograph: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], memory: list[str]
-) -> None:
-    assert run(photograph, tmp_path / "out.pfm", *memory) == 0
-    printed = capsys.readouterr()
-    told = re.search(r"selected: (\d+) % of the picture", printed.out)
-    assert told is not None
-    assert int(told[1]) == pytest.approx(100 * floats(tmp_path / "out.pfm").mean(), abs=1)
-    assert "nearly all" not in printed.err
-    even = tmp_path / "even.tif"
-    tifffile.imwrite(even, np.full((*SIZE, 3), 120, np.uint8), photometric="rgb")
-    assert main(["mask", str(even), str(tmp_path / "all.png"), "--region", REGION, *memory]) == 0
-    printed = capsys.readouterr()
-    assert "selected: 100 % of the picture" in printed.out
-    assert "nearly all of the picture's borders are selected" in printed.err
-
-
-def test_files_of_every_kind(photograph: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    wanted = expected(photograph)
-    assert run(photograph, tmp_path / "out.png") == 0
-    assert f"--background {GROUND}: 80 pixels" in capsys.readouterr().out
-    with Image.open(tmp_path / "out.png") as opened:
-        assert opened.mode == "L"
-        np.testing.assert_allclose(np.asarray(opened) / 255, wanted, atol=1 / 255)
-    assert run(photograph, tmp_path / "out.tif") == 0
-    sixteen = tifffile.imread(tmp_path / "out.tif")
-    assert sixteen.dtype == np.uint16
-    np.testing.assert_allclose(sixteen / 65535, wanted, atol=1e-4)
-    assert run(photograph, tmp_path / "out.pfm") == 0
-    np.testing.assert_allclose(floats(tmp_path / "out.pfm"), wanted, atol=1e-5)
-
-
-def test_a_rough_mask_becomes_a_soft_one(photograph: Path, tmp_path: Path) -> None:
-    rough = np.zeros(SIZE, np.uint8)
-    rough[20:50, 20:60] = 255
-    Image.fromarray(rough).save(tmp_path / "rough.png")
-    assert main(["mask", str(photograph), str(tmp_path / "out.png"), "--mask", str(tmp_path / "rough.png")]) == 0
-    with Image.open(tmp_path / "out.png") as opened:
-        assert np.asarray(opened)[20:50, 20:60].min() > 240
-
-
-def test_tiles(photograph: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("nlfilter_torch.photo.cli.editing.read_if_it_fits", lambda *_: None)
-    assert run(photograph, tmp_path / "out.tif") == 0
-    mask = tifffile.imread(tmp_path / "out.tif")
-    assert mask.shape == SIZE
-    np.testing.assert_allclose(mask / 65535, expected(photograph), atol=0.02)
-    assert run(photograph, tmp_path / "out.pfm") == 0
-    np.testing.assert_allclose(floats(tmp_path / "out.pfm"), mask / 65535, atol=1e-4)
+def test_help_of_the_mask_says_what_is_written(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["mask", "--help"]) == 0
+    shown = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    assert "a grey picture of the photograph's size, white in the selected area" in shown
+    assert ".tif (16 bits), .png, .jpg, .webp, .avif (8 bits) or .pfm (floats)" in shown
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
         ([], "give --region X,Y,W,H or --mask FILE to mark part of the object"),
-        (["--region", "70,60,20,20"], "--region must lie within the photograph"),
+        (["--region", "80,50,20,20"], "--region must lie within the photograph"),
         (["--region", REGION, "--background", REGION], "background must hold a painted pixel outside the scribbles"),
         (["--region", REGION, "--depth", "float"], "cannot hold this picture: PNG has no floats per channel"),
         (["--region", REGION, "--background", "0,0,0,0"], "--background must be at least 1 pixel wide and high"),
     ],
 )
 def test_errors(
-    photograph: Path, tmp_path: Path, options: list[str], message: str, capsys: pytest.CaptureFixture[str]
+    photo: Path, tmp_path: Path, options: list[str], message: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["mask", str(photograph), str(tmp_path / "out.png"), *options]) == 2
+    assert main(["mask", str(photo), str(tmp_path / "out.png"), *options]) == 2
     assert message in capsys.readouterr().err
     assert not (tmp_path / "out.png").exists()
-
-
-@pytest.mark.usefixtures("tiled")
-def test_depths_of_floats(photograph: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for depth in ("8", "16"):
-        assert run(photograph, tmp_path / "out.pfm", "--depth", depth) == 2
-        told = capsys.readouterr().err
-        assert f"--depth must be float for a .pfm file, got {depth}; leave it out, or write a .tif or .png file" in told
-        assert not (tmp_path / "out.pfm").exists()
-    assert run(photograph, tmp_path / "out.pfm", "--depth", "float") == 0
-
-
-def test_channels_of_unsupported_types_in_tiles(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    signed, plain, preset = tmp_path / "signed.tif", tmp_path / "plain.tif", tmp_path / "look.json"
-    tifffile.imwrite(signed, np.full(SIZE, 9, np.int16))
-    tifffile.imwrite(plain, np.full(SIZE, 9, np.uint16))
-    preset.write_text('{"version": 1, "steps": [{"edit": "detail", "alpha": [2, 1]}]}')
-    tiles = ("--memory", "0.001")
-    for arguments in (
-        ("mask", signed, tmp_path / "out.png", "--region", REGION, *tiles),
-        ("apply", plain, tmp_path / "out.png", "--preset", preset, "--mask", signed, *tiles),
-        ("detail", plain, tmp_path / "out.png", "--mask", signed, *tiles),
-    ):
-        assert main([str(argument) for argument in arguments]) == 2
-        told = capsys.readouterr().err
-        assert f"{signed} stores its channels as int16, which is not supported; convert it" in told
-        assert not (tmp_path / "out.png").exists()

@@ -1,5 +1,7 @@
-"""Messages and pictures of scribbles on the command line: colours, notes, positions in per cent, and `--show`."""
+"""What commands print about scribbles, the pictures that ``--show`` writes, and notes on edits without effect."""
 
+import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +10,6 @@ import torch
 from PIL import Image
 
 from nlfilter_torch.photo.cli import main
-from nlfilter_torch.photo.cli.scribbles import Rectangle
 from nlfilter_torch.photo.io.photographs import Photograph, read_photograph, write_photograph
 
 
@@ -29,34 +30,6 @@ def rgb(path: Path) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    ("text", "wanted"),
-    [
-        ("25%,50%,10%,25%", "24,32,9,16"),
-        ("24,50%,9,16", "24,32,9,16"),
-        ("0%,0%,100%,100%", "0,0,96,64"),
-        ("50%,50%", "47,31,2,2"),
-        ("0,0", "0,0,2,2"),
-        ("100%,100%", "94,62,2,2"),
-        ("95,63", "94,62,2,2"),
-    ],
-)
-def test_shares_and_points(text: str, wanted: str) -> None:
-    assert str(Rectangle.parse(text, "--region", (64, 96))) == wanted
-
-
-@pytest.mark.parametrize("text", ["50%", "1,2,3", "a%,2", "nan%,2,3,4", "50%,50%,60%,10%", "0,0,0%,5", "1.5,2,3,4"])
-def test_shares_that_are_none(text: str) -> None:
-    with pytest.raises(ValueError, match="--region must"):
-        Rectangle.parse(text, "--region", (64, 96))
-
-
-@pytest.mark.parametrize("text", ["97,20", "20,65", "-1,20", "101%,50%", "50%,-1%"])
-def test_points_outside(text: str) -> None:
-    with pytest.raises(ValueError, match="--region must be a point in the photograph, which is 96 pixels wide and 64 "):
-        Rectangle.parse(text, "--region", (64, 96))
-
-
-@pytest.mark.parametrize(
     "options",
     [["defocus", "--region", "20,20,20,20", "--background"], ["recolor", "--region", "20,20,20,20:blue", "--keep"]],
 )
@@ -66,13 +39,6 @@ def test_background_is_not_shown_under_the_scribbles(options: list[str], photo: 
     for background, path in zip(("35,24,10,5", "40,24,5,5"), shown, strict=True):
         assert main([verb, str(photo), str(out), *rest, background, "--show", str(path)]) == 0
     assert (rgb(shown[0]) == rgb(shown[1])).all()
-
-
-def test_a_share_does_what_pixels_do(photo: Path, tmp_path: Path) -> None:
-    one, other = tmp_path / "one.png", tmp_path / "other.png"
-    assert main(["recolor", str(photo), str(one), "--region", "25%,50%,9,16:blue"]) == 0
-    assert main(["recolor", str(photo), str(other), "--region", "24,32,9,16:blue"]) == 0
-    np.testing.assert_array_equal(rgb(one), rgb(other))
 
 
 @pytest.mark.parametrize("memory", [(), ("--memory", "0.01")])
@@ -124,9 +90,24 @@ def test_colorize_shows_scribbles_alone(photo: Path, tmp_path: Path) -> None:
     assert (
         main(["colorize", str(tmp_path / "grey.png"), str(tmp_path / "o.png"), *scribbles, "--show", str(shown)]) == 0
     )
-    found = rgb(shown)
-    assert found[32, 29, 0] > 200
-    assert (found[50, 60] == found[50, 60, 0]).all()
+    picture = rgb(shown)
+    assert picture[32, 29, 0] > 200
+    assert (picture[50, 60] == picture[50, 60, 0]).all()
+
+
+@pytest.mark.parametrize("shape", [(1001, 501), (3, 200_000), (200_000, 1)])
+def test_scribbles_in_the_last_row_are_shown(tmp_path: Path, shape: tuple[int, int]) -> None:
+    picture = np.zeros((*shape, 3), np.uint8)
+    picture[..., 0] = np.arange(shape[1]) % 200
+    Image.fromarray(picture).save(tmp_path / "in.png")
+    place = f"{shape[1] - 1},{shape[0] - 1},1,1"
+    shown = tmp_path / "shown.png"
+    assert (
+        main(["mask", str(tmp_path / "in.png"), str(tmp_path / "out.png"), "--region", place, "--show", str(shown)])
+        == 0
+    )
+    green = 255 * np.array([0.1, 0.8, 0.3])
+    assert np.abs(rgb(shown)[-1, -1] - green).max() < 0.3 * 255
 
 
 def test_nothing_to_show(photo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -135,20 +116,15 @@ def test_nothing_to_show(photo: Path, tmp_path: Path, capsys: pytest.CaptureFixt
     assert not (tmp_path / "shown.png").exists()
 
 
-@pytest.mark.parametrize(
-    ("verb", "option"),
-    [
-        (["recolor", "--region", "24,32:blue"], "--show"),
-        (["mask", "--region", "24,32"], "--show"),
-        (["denoise"], "--map"),
-    ],
-)
-def test_the_photograph_is_not_replaced(
-    verb: list[str], option: str, photo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    before, out = photo.read_bytes(), tmp_path / "out.png"
-    for path, what in ((photo, "photograph"), (out, "output")):
-        assert main([*verb, str(photo), str(out), option, str(path)]) == 2
-        assert f"{option} must be another file than the {what}, got" in capsys.readouterr().err
-    assert photo.read_bytes() == before
-    assert not out.exists()
+def test_notes_of_a_folder_and_of_frames(photo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = tmp_path / "in"
+    folder.mkdir()
+    for name in ("a.png", "b.png"):
+        shutil.copy(photo, folder / name)
+    idle = tmp_path / "idle.json"
+    idle.write_text(json.dumps({"version": 1, "steps": []}))
+    assert main(["batch", str(folder), str(tmp_path / "out"), "--preset", str(idle)]) == 0
+    printed = capsys.readouterr()
+    assert "holds no step that changes anything" in printed.out + printed.err
+    assert main(["frames", str(folder), str(tmp_path / "frames"), "--alpha", "1,1,1,1"]) == 0
+    assert "holds no step that changes anything" in capsys.readouterr().err
