@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nlfilter_torch.core.values import is_hidden
+from nlfilter_torch.core.torch_internals import is_hidden
 from nlfilter_torch.core.warning import warn
 
 FLOATING = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
@@ -81,7 +81,7 @@ def check_image(
 
 
 def check_finite(tensor: Tensor, name: str) -> None:
-    """Raise if ``tensor`` holds NaN or infinity; skipped if :func:`~nlfilter_torch.core.values.is_hidden`."""
+    """Raise if ``tensor`` holds NaN or infinity; skipped if :func:`~nlfilter_torch.core.torch_internals.is_hidden`."""
     if is_hidden(tensor):
         return
     values = tensor.detach()
@@ -93,7 +93,7 @@ def check_finite(tensor: Tensor, name: str) -> None:
 
 
 def check_unit_range(tensor: Tensor, name: str) -> None:
-    """Raise unless all values are in [0, 1]; skipped if :func:`~nlfilter_torch.core.values.is_hidden`."""
+    """Raise unless all values are in [0, 1]; skipped if :func:`~nlfilter_torch.core.torch_internals.is_hidden`."""
     if is_hidden(tensor) or tensor.numel() == 0:
         return
     low, high = tensor.detach().aminmax()
@@ -110,8 +110,8 @@ def check_photograph(image: Tensor, name: str, *, channels: int | None = None, b
 def warn_of_scale(image: Tensor, name: str) -> bool:
     """Warn if an image of 1 or 3 channels has values above 16: probably 8-bit pixels converted to floats.
 
-    Skipped if :func:`~nlfilter_torch.core.values.is_hidden`. Images with other numbers of channels are feature maps,
-    which may have any values; HDR pictures stay below 16. Returns whether it warned.
+    Skipped if :func:`~nlfilter_torch.core.torch_internals.is_hidden`. Images with other numbers of channels are feature
+    maps, whose values are not limited; HDR pictures stay below 16. Returns whether it warned.
     """
     if is_hidden(image) or image.shape[1] not in (1, 3) or len(image) == 0:
         return False
@@ -176,7 +176,7 @@ def check_positive(value: float | Tensor, name: str, batch: int | None = None) -
 def check_values(value: object, name: str, domain: str, batch: int | None = None, remedy: str = "") -> None:
     """Raise unless ``value`` is a number, or a tensor of shape () or (batch,), in a domain named in :data:`DOMAINS`.
 
-    The values of a tensor are not checked if :func:`~nlfilter_torch.core.values.is_hidden`.
+    The values of a tensor are not checked if :func:`~nlfilter_torch.core.torch_internals.is_hidden`.
     """
     wanted, inside, usual = DOMAINS[domain]
     remedy = remedy or usual
@@ -222,7 +222,7 @@ def check_reach(value: float, name: str, size: tuple[int, int]) -> None:
 def check_scale(bandwidth: float | Tensor, name: str, largest: Tensor, what: str) -> None:
     """Raise if squares of features overflow; features have magnitudes up to ``largest`` (B,) over the bandwidth.
 
-    Skipped if :func:`~nlfilter_torch.core.values.is_hidden`.
+    Skipped if :func:`~nlfilter_torch.core.torch_internals.is_hidden`.
     """
     bandwidths = bandwidth.detach() if isinstance(bandwidth, Tensor) else torch.tensor(bandwidth, dtype=torch.float64)
     if is_hidden(largest) or is_hidden(bandwidths):

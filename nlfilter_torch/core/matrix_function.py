@@ -13,9 +13,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nlfilter_torch.core.kernels.library import are_derived
 from nlfilter_torch.core.precision import once_differentiable, uncompiled
-from nlfilter_torch.core.torch_internals import is_transformed
+from nlfilter_torch.core.torch_internals import are_derived, is_transformed
 
 # For eigenvalues with a relative distance below MEETING, f' at their midpoint is used: the truncation error, in f''',
 # and the cancellation error are then both near 1e-10. For eigenvalues below FLOOR the distance is relative to FLOOR,

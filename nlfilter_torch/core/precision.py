@@ -9,12 +9,10 @@ run in full precision, too, return low-rank gradients as two factors, and raise 
 import functools
 from collections.abc import Callable
 from threading import Lock
-from typing import Any, ParamSpec, TypeVar, cast
+from typing import Any, ParamSpec, Protocol, TypeVar, runtime_checkable
 
 import torch
 from torch import Tensor
-
-from nlfilter_torch.core.torch_internals import is_transformed, replace_instances, without_memory
 
 Gradients = tuple[Tensor | None, ...]
 P = ParamSpec("P")
@@ -29,18 +27,6 @@ def working_dtype(tensor: Tensor) -> torch.dtype:
 def per_image(value: float | Tensor, like: Tensor, dimensions: int) -> Tensor:
     """A number or a tensor of shape () or (B,), as (1 or B, 1, ...) in the dtype and on the device of ``like``."""
     return torch.as_tensor(value, dtype=like.dtype, device=like.device).reshape(-1, *[1] * (dimensions - 1))
-
-
-def as_given(result: Tensor, image: Tensor) -> Tensor:
-    """Convert a result (B, C, H, W) to the dtype of ``image``, and to channels-last if ``image`` is."""
-    result = result.to(image.dtype)
-    if image.is_contiguous():
-        return result
-    # Dynamo cannot trace the question, and has no wrapped tensors.
-    if not torch.compiler.is_compiling() and any(map(is_transformed, (image, result))):
-        return result
-    channels_last = image.is_contiguous(memory_format=torch.channels_last)
-    return result.contiguous(memory_format=torch.channels_last) if channels_last else result
 
 
 class _WithoutTF32:
@@ -125,54 +111,17 @@ def uncompiled_with(*options: str) -> Callable[[Callable[P, R]], Callable[P, R]]
     return decorate
 
 
-class OuterProduct(Tensor):
-    """A low-rank gradient ``left @ right`` of the factor, evaluated only when needed.
-
-    The gradients of products with W and of balancing are low-rank matrices (B, M, N). When autograd adds them, their
-    factors are concatenated, and the backward pass of the Nystrom factor evaluates the sum block by block. This saves
-    three copies of the factor. Any other operation sees an ordinary tensor.
-
-    Attributes:
-        left: (B, M, r).
-        right: (B, r, N).
-    """
-
-    left: Tensor
-    right: Tensor
-
-    @staticmethod
-    def __new__(cls, left: Tensor, right: Tensor) -> "OuterProduct":
-        """Create a tensor that has the shape of the product but owns no memory."""
-        shape = (left.shape[0], left.shape[1], right.shape[2])
-        product = cast(OuterProduct, without_memory(cls, shape, left))
-        product.left, product.right = left, right
-        return product
+@runtime_checkable
+class Unformed(Protocol):
+    """A gradient that is stored as something smaller, such as the factors of a product."""
 
     def formed(self) -> Tensor:
-        """The product as an ordinary tensor, (B, M, N)."""
-        return torch.bmm(self.left, self.right)
-
-    @classmethod
-    def __torch_dispatch__(cls, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:  # type: ignore[override]
-        if func is torch.ops.aten.detach.default:
-            return args[0]
-        if func is torch.ops.aten.add.Tensor and not kwargs and all(isinstance(a, OuterProduct) for a in args):
-            left = torch.cat([a.left for a in args], dim=2)
-            return OuterProduct(left, torch.cat([a.right for a in args], dim=1))
-        args, kwargs = replace_instances(OuterProduct, OuterProduct.formed, (args, kwargs or {}))
-        return func(*args, **kwargs)
+        """The gradient as an ordinary tensor."""
 
 
-def outer_product(left: Tensor, right: Tensor) -> Tensor:
-    """``left @ right``, stored as its two factors if they are smaller than the product."""
-    if left.shape[2] >= left.shape[1] or torch.compiler.is_compiling():
-        return torch.bmm(left, right)
-    return OuterProduct(left, right)
-
-
-def factors_of(gradient: Tensor) -> tuple[Tensor, ...]:
-    """Factors (B, M, r) and (B, r, N) of a low-rank gradient, or the gradient itself as a tuple of one."""
-    return (gradient.left, gradient.right) if isinstance(gradient, OuterProduct) else (gradient,)
+def as_ordinary(gradient: Tensor) -> Tensor:
+    """A gradient as an ordinary tensor."""
+    return gradient.formed() if isinstance(gradient, Unformed) else gradient
 
 
 def once_differentiable(backward: Callable[..., Gradients]) -> Callable[..., Gradients]:
@@ -190,7 +139,7 @@ def once_differentiable(backward: Callable[..., Gradients]) -> Callable[..., Gra
             results = exact(ctx, *gradients)
         if not torch.is_grad_enabled() or torch.compiler.is_compiling():
             return results
-        formed = [g.formed() if isinstance(g, OuterProduct) else g for g in results if g is not None]
+        formed = [as_ordinary(g) for g in results if g is not None]
         # Connected to everything the gradients depend on: autograd visits only nodes on a path to a requested tensor.
         causes = [t for t in (*ctx.saved_tensors, *gradients) if t is not None and t.requires_grad]
         refused = iter(_Refusal.apply(len(formed), *formed, *causes))  # type: ignore[no-untyped-call]

@@ -1,12 +1,19 @@
-"""All private parts of torch that this package uses, each with the reason for it; elsewhere only public ones are used.
+"""All private parts of torch that this package uses, each with the reason for it, and what is built directly on them.
 
-A new version of torch may rename or remove any of them. ``make test-oldest`` runs the tests with the oldest supported
-version of torch, ``make test`` with the one in ``constraints.txt``.
+Other modules use only public parts of torch. A new version of torch may rename or remove private ones at any time:
+``make test-oldest`` runs the tests with the oldest supported version, ``make test`` with that of ``constraints.txt``.
+
+Built on them are the tests whether values of tensors can be read, the refusal of transforms under which no operator
+can be built, and the registration of operators. Reading a value (``float(tensor)``, ``if tensor``) makes the CPU wait
+for an accelerator, and is impossible for tensors without data: on the device "meta", as fake tensors, under
+``torch.compile`` and ``torch.export``. In these cases checks of values are skipped, and iterations run a fixed number
+of steps.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
-from typing import Any
+from functools import lru_cache, wraps
+from typing import Any, ParamSpec, TypeVar, cast
 
 import torch
 import torch.distributed as dist
@@ -17,6 +24,11 @@ from torch.autograd import forward_ad
 from torch.utils._python_dispatch import _disable_current_modes
 from torch.utils._pytree import tree_map_only
 
+P = ParamSpec("P")
+R = TypeVar("R")
+Definition = TypeVar("Definition", bound=Callable[..., Any])
+
+OPERATORS = torch.library.Library("nlfilter", "DEF")
 _FAKE = torch._C._TorchDispatchModeKey.FAKE
 
 # An operator that sees the dispatch keys of a call can call its own kernel for CPUs. Without private parts it would
@@ -84,3 +96,118 @@ def replace_instances(cls: type, function: Callable[[Any], Any], values: Any) ->
 def default_store() -> Any:
     """The store through which the processes of the default group met; only it tells which of them still answer."""
     return dist.distributed_c10d._get_default_store()
+
+
+def is_hidden(tensor: Tensor) -> bool:
+    """Whether reading values would wait (accelerators) or is impossible (fake, compiling, in ``torch.func``)."""
+    return tensor.device.type != "cpu" or torch.compiler.is_compiling() or is_transformed(tensor) or is_fake(tensor)
+
+
+def cached_constants(function: Callable[P, R]) -> Callable[P, R]:
+    """Cache tensors that a function computes from hashable arguments, for later calls in any mode.
+
+    Tensors are created on the CPU and are ordinary ones, even in inference mode or with another default device. Fake
+    tensors are not cached.
+    """
+    cached = cast(Callable[P, R], lru_cache(maxsize=8)(function))
+
+    @wraps(function)
+    def wrapper(*args: P.args, **kwargs: P.kwargs) -> R:
+        with torch.inference_mode(False), torch.device("cpu"):
+            return (function if in_fake_mode() else cached)(*args, **kwargs)
+
+    return wrapper
+
+
+def is_fake(tensor: Tensor) -> bool:
+    """Whether a tensor is fake (has a shape but no data), or fake tensor mode is active."""
+    return is_fake_tensor(tensor) or in_fake_mode()
+
+
+def refuse_transforms(name: str, *values: object) -> None:
+    """Raise if one of ``values``, the first called ``name``, is transformed in a way that operators cannot be built."""
+    if torch.compiler.is_compiling():
+        return
+    # These three checks take less than a microsecond.
+    if is_traced():
+        raise TypeError(
+            f"{name} must not be traced by torch.jit.trace while an operator is built, got a traced tensor; "
+            "use torch.export.export, or trace only the application of an operator built before"
+        )
+    if not in_forward_mode() and not in_transform():
+        return
+    transformed = any(is_transformed(value) for value in values if isinstance(value, Tensor))
+    if transformed:
+        raise TypeError(
+            f"{name} must not be transformed by torch.func (vmap, grad, jvp) while an operator is built, got a "
+            "transformed tensor; pass a batch, and take derivatives with torch.autograd.grad"
+        )
+    if in_transform():
+        raise TypeError(
+            f"{name} must not be used to build an operator inside torch.func (vmap, grad, jvp), got a call in it; "
+            "build the operator before, and transform a function of its application"
+        )
+    for value in values:
+        if not isinstance(value, Tensor):
+            continue
+        if forward_ad.unpack_dual(value).tangent is not None:
+            raise TypeError(
+                f"{name} must have no forward-mode derivative while an operator is built, got a tensor with a tangent; "
+                "use reverse mode, with torch.autograd.grad"
+            )
+
+
+def register(
+    schema: str,
+    compiled: Callable[..., Any] | None,
+    fake: Callable[..., Any],
+    *,
+    differentiable: bool = False,
+) -> Callable[[Definition], Definition]:
+    """Register a function as the definition of an operator of ``torch.ops.nlfilter``, for all dtypes and devices.
+
+    Args:
+        schema: name and signature of the operator.
+        compiled: the same computation by a kernel in C, for tensors on CPUs; may return None to leave it to the
+            definition. None if there is no kernel.
+        fake: returns uninitialised results for the shapes of the arguments.
+        differentiable: whether the definition consists of differentiable operations. Autograd, in reverse and forward
+            mode and of any order, and the transforms of ``torch.func`` then see these operations.
+    """
+    name = schema.partition("(")[0]
+
+    def decorate(definition: Definition) -> Definition:
+        def on_processors(*arguments: Any) -> Any:
+            result = None if compiled is None else compiled(*arguments)
+            return definition(*arguments) if result is None else result
+
+        def under_autograd(keys: Any, *arguments: Any) -> Any:
+            if are_derived(arguments):
+                return definition(*arguments)
+            keys = keys & BELOW_AUTOGRAD
+            if is_on_cpu(keys):  # same as redispatching, but saves 4 us
+                return on_processors(*arguments)
+            return operator.redispatch(keys, *arguments)
+
+        OPERATORS.define(schema)
+        OPERATORS.impl(name, definition, "CompositeExplicitAutograd")
+        OPERATORS.impl(name, on_processors, "CPU")
+        torch.library.register_fake(f"nlfilter::{name}", fake, lib=OPERATORS)
+        operator = getattr(torch.ops.nlfilter, name).default
+        if differentiable:
+            OPERATORS.impl(name, under_autograd, "Autograd", with_keyset=True)
+            OPERATORS.impl(name, definition, "FuncTorchBatched")
+        return cast(Definition, operator)
+
+    return decorate
+
+
+def are_derived(arguments: Sequence[Any]) -> bool:
+    """Whether one of the arguments requires a gradient or has a forward-mode derivative."""
+    if torch.is_grad_enabled():
+        for argument in arguments:  # before every product; a loop takes half the time of a generator
+            if isinstance(argument, Tensor) and argument.requires_grad:
+                return True
+    if not in_forward_mode():
+        return False
+    return any(isinstance(t, Tensor) and forward_ad.unpack_dual(t).tangent is not None for t in arguments)

@@ -19,7 +19,8 @@ from nlfilter_torch.core.checks import (
     checked_response,
 )
 from nlfilter_torch.core.kernels.tall_skinny import spread
-from nlfilter_torch.core.precision import as_given, full_precision, per_image
+from nlfilter_torch.core.layouts import as_given
+from nlfilter_torch.core.precision import full_precision, per_image
 from nlfilter_torch.operator.operator import NonlocalOperator
 from nlfilter_torch.operator.products import Columns
 from nlfilter_torch.operator.spectrum import Response, Spectrum

@@ -7,7 +7,7 @@ from nlfilter_torch.core.blocks import CACHED, block_length, weighted
 from nlfilter_torch.core.checks import check_image, check_instance, check_positive, check_same_size
 from nlfilter_torch.core.kernels.tall_skinny import moment, spread
 from nlfilter_torch.core.precision import full_precision, per_image
-from nlfilter_torch.core.values import is_hidden
+from nlfilter_torch.core.torch_internals import is_hidden
 from nlfilter_torch.core.warning import warn
 from nlfilter_torch.operator.spectrum import Spectrum
 

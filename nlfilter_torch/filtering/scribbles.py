@@ -24,10 +24,9 @@ from nlfilter_torch.core.checks import (
     check_values,
 )
 from nlfilter_torch.core.communicator import ALONE, Communicator
-from nlfilter_torch.core.kernels.library import are_derived
 from nlfilter_torch.core.kernels.tall_skinny import moment, spread
 from nlfilter_torch.core.precision import full_precision, per_image
-from nlfilter_torch.core.values import is_hidden
+from nlfilter_torch.core.torch_internals import are_derived, is_hidden
 from nlfilter_torch.operator.spectrum import RitzPairs, Spectrum
 
 DAB = 25 / 38400  # area of a brush dab, relative to the image: 5x5 pixels of 160x240

@@ -18,7 +18,7 @@ from nlfilter_torch.core.checks import (
 )
 from nlfilter_torch.core.communicator import ALONE, Communicator, all_gather_shapes
 from nlfilter_torch.core.precision import full_precision, uncompiled, uncompiled_with, working_dtype
-from nlfilter_torch.core.values import is_hidden, refuse_transforms
+from nlfilter_torch.core.torch_internals import is_hidden, refuse_transforms
 from nlfilter_torch.operator.eigenvalue_bound import exceeds, is_bounded, limiter, shifted_gram, slack
 from nlfilter_torch.operator.features import (
     GuideFeatures,

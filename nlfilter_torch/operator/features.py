@@ -23,7 +23,7 @@ from nlfilter_torch.core.checks import (
 from nlfilter_torch.core.communicator import Communicator, all_gather_shapes
 from nlfilter_torch.core.kernels.columns import large_empty
 from nlfilter_torch.core.precision import Gradients, full_precision, once_differentiable, per_image, working_dtype
-from nlfilter_torch.core.values import is_hidden
+from nlfilter_torch.core.torch_internals import is_hidden
 from nlfilter_torch.operator.options import GuideChannels, SpatialBandwidth, bandwidths_of
 
 FAINT_WEIGHT = 1e-12  # in place of patch weights of 0

@@ -8,7 +8,7 @@ from torch import Tensor
 from nlfilter_torch.core.blocks import stratified
 from nlfilter_torch.core.communicator import ALONE, Communicator
 from nlfilter_torch.core.kernels.clusters import affinities_between, chance, draw_pivots, lloyd, pick, pivots
-from nlfilter_torch.core.kernels.library import register
+from nlfilter_torch.core.torch_internals import register
 from nlfilter_torch.operator.options import Sampling
 
 CAPTURED = 1e-4  # a point whose residual on the unit diagonal is below this counts as captured

@@ -16,7 +16,8 @@ from nlfilter_torch.core.checks import (
 from nlfilter_torch.core.communicator import ALONE, Communicator
 from nlfilter_torch.core.containers import Target, loadable, moved
 from nlfilter_torch.core.kernels.tall_skinny import moment
-from nlfilter_torch.core.precision import as_given, full_precision, uncompiled
+from nlfilter_torch.core.layouts import as_given
+from nlfilter_torch.core.precision import full_precision, uncompiled
 from nlfilter_torch.operator.eigenvalue_bound import largest_eigenvalue, shifted_gram
 from nlfilter_torch.operator.features import GuideFeatures
 from nlfilter_torch.operator.nystrom import nystrom_factor

@@ -9,7 +9,8 @@ from torch import Tensor
 from nlfilter_torch.core.blocks import weighted
 from nlfilter_torch.core.communicator import ALONE, Communicator
 from nlfilter_torch.core.kernels.tall_skinny import moment, spread
-from nlfilter_torch.core.precision import once_differentiable, outer_product
+from nlfilter_torch.core.low_rank import outer_product
+from nlfilter_torch.core.precision import once_differentiable
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,7 +24,7 @@ from nlfilter_torch.core.blocks import stratified, weighted
 from nlfilter_torch.core.communicator import ALONE, Communicator
 from nlfilter_torch.core.kernels.grams import gram, sum_grams
 from nlfilter_torch.core.kernels.tall_skinny import gather, moment, positive_root, spread, sweep, weigh
-from nlfilter_torch.core.values import is_hidden
+from nlfilter_torch.core.torch_internals import is_hidden
 from nlfilter_torch.core.warning import warn
 
 EXCESS = {torch.float32: 1e-5, torch.float64: 1e-10}  # amount by which d of a pixel may exceed 1 through rounding

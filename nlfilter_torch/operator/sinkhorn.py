@@ -29,10 +29,10 @@ from torch import Tensor
 
 from nlfilter_torch.core.blocks import SWEPT, pixel_blocks, weighted
 from nlfilter_torch.core.communicator import ALONE, Communicator
-from nlfilter_torch.core.kernels.library import register
 from nlfilter_torch.core.kernels.tall_skinny import gather, spread
-from nlfilter_torch.core.precision import once_differentiable, outer_product
-from nlfilter_torch.core.values import is_hidden
+from nlfilter_torch.core.low_rank import outer_product
+from nlfilter_torch.core.precision import once_differentiable
+from nlfilter_torch.core.torch_internals import is_hidden, register
 from nlfilter_torch.core.warning import warn
 from nlfilter_torch.operator.eigenvalue_bound import exceeds, shifted_gram, slack
 from nlfilter_torch.operator.scaling import (

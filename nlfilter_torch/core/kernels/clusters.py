@@ -6,7 +6,8 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from nlfilter_torch.core.kernels.library import contiguous, register, run
+from nlfilter_torch.core.kernels.library import contiguous, kernel, run
+from nlfilter_torch.core.torch_internals import register
 
 CACHED_SCORES = 1 << 20  # scores of points and centres; on CPUs a batch is divided into parts with at most this many
 
@@ -73,7 +74,7 @@ def _fake_pivots(points: Tensor, draws: Tensor, captured: float) -> Tensor:
     return points.new_empty(points.shape[0], draws.shape[0], dtype=torch.long)
 
 
-@register("pivots(Tensor points, Tensor draws, float captured) -> Tensor", _compiled_pivots, _fake_pivots)
+@register("pivots(Tensor points, Tensor draws, float captured) -> Tensor", kernel(_compiled_pivots), _fake_pivots)
 def pivots(points: Tensor, draws: Tensor, captured: float) -> Tensor:
     """Pivots (B, M) of a randomly pivoted Cholesky decomposition of the affinities of points (B, D, S).
 
@@ -99,7 +100,9 @@ def _fake_lloyd(points: Tensor, start: Tensor, iterations: int, margin: float) -
     return points.new_empty(points.shape[0], points.shape[2], dtype=torch.long)
 
 
-@register("lloyd(Tensor points, Tensor start, int iterations, float margin) -> Tensor", _compiled_lloyd, _fake_lloyd)
+@register(
+    "lloyd(Tensor points, Tensor start, int iterations, float margin) -> Tensor", kernel(_compiled_lloyd), _fake_lloyd
+)
 def lloyd(points: Tensor, start: Tensor, iterations: int, margin: float) -> Tensor:
     """Run Lloyd's iteration from centres (B, D, M); return the index (B, S) of the nearest centre of points (B, D, S).
 

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.core.blocks import buffered_blocks, strip_count, strips
-from nlfilter_torch.core.kernels.library import by_rows, contiguous, place, pointer, register, run, threads
-from nlfilter_torch.core.values import is_hidden
+from nlfilter_torch.core.kernels.library import by_rows, contiguous, kernel, place, pointer, run, threads
+from nlfilter_torch.core.torch_internals import is_hidden, register
 
 # Compared with a completed diagonal exp(-40) is negligible. Smaller affinities would become denormal floats, which are
 # six times slower, and their squares would underflow in float32, so that pixels unlike all landmarks would be zero in
@@ -114,7 +114,7 @@ def _compiled_columns(
 
 @register(
     "columns(Tensor features, Tensor landmarks, Tensor inverse_cholesky, bool limited) -> (Tensor, Tensor)",
-    _compiled_columns,
+    kernel(_compiled_columns),
     _fake_columns,
 )
 def columns(features: Tensor, landmarks: Tensor, inverse_cholesky: Tensor, limited: bool) -> tuple[Tensor, Tensor]:
@@ -183,7 +183,7 @@ def _compiled_backward(
 @register(
     "columns_backward(Tensor features, Tensor landmarks, Tensor inverse_cholesky, bool limited, Tensor factor, "
     "Tensor scale, Tensor[] gradient, Tensor diagonal) -> (Tensor, Tensor, Tensor)",
-    _compiled_backward,
+    kernel(_compiled_backward),
     _fake_backward,
 )
 def columns_backward(

@@ -4,7 +4,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from nlfilter_torch.core.kernels.library import pointer, register, run, threads
+from nlfilter_torch.core.kernels.library import kernel, pointer, run, threads
+from nlfilter_torch.core.torch_internals import register
 
 SLOPE = 0.1  # of negative features; not 0, so that units do not die
 LANES = 16  # channels of the kernel in C are a multiple of this, the largest register size
@@ -63,7 +64,7 @@ def _fake_convolve(features: Tensor, weight: Tensor, *_: object) -> Tensor:
 
 @register(
     "convolve(Tensor features, Tensor weight, Tensor? bias=None, int dilation=1, Tensor? added=None) -> Tensor",
-    _compiled_convolve,
+    kernel(_compiled_convolve),
     _fake_convolve,
     differentiable=True,
 )

@@ -6,8 +6,9 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.core.blocks import SWEPT, buffered_blocks, pixel_blocks, strip_count, strips
-from nlfilter_torch.core.kernels.library import by_rows, register, run_on_factor
+from nlfilter_torch.core.kernels.library import by_rows, kernel, run_on_factor
 from nlfilter_torch.core.precision import once_differentiable
+from nlfilter_torch.core.torch_internals import register
 
 NEGLIGIBLE = 1e-15  # entries of F in float32 that count as zero: their products would be denormal, which is slow
 
@@ -25,7 +26,9 @@ def _compiled_grams(factor: Tensor, scaling: Tensor, remainder: Tensor | None, c
     return out
 
 
-@register("grams(Tensor factor, Tensor scaling, Tensor? remainder, int count) -> Tensor", _compiled_grams, _fake_grams)
+@register(
+    "grams(Tensor factor, Tensor scaling, Tensor? remainder, int count) -> Tensor", kernel(_compiled_grams), _fake_grams
+)
 def sum_grams(factor: Tensor, scaling: Tensor, remainder: Tensor | None, count: int) -> Tensor:
     """Compute ``F diag(r^j) F^T`` for j = 0 to count - 1 and F = factor diag(d), (B, J, M, M) in float64.
 
@@ -57,7 +60,7 @@ def _compiled_gram(factor: Tensor, weights: Tensor) -> Tensor:
     return _compiled_grams(factor, weights.sqrt(), None, 1)[:, 0].to(factor.dtype)
 
 
-@register("gram(Tensor factor, Tensor weights) -> Tensor", _compiled_gram, _fake_gram)
+@register("gram(Tensor factor, Tensor weights) -> Tensor", kernel(_compiled_gram), _fake_gram)
 def gram(factor: Tensor, weights: Tensor) -> Tensor:
     """``factor diag(weights) factor^T``, (B, M, M) in the precision of the factor, for weights (B, N) >= 0."""
     return (factor * weights.unsqueeze(1)) @ factor.mT

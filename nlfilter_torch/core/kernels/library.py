@@ -1,4 +1,4 @@
-"""The kernels in C, and their registration with torch's dispatcher.
+"""The library of the kernels in C: its functions, instruction set and threads.
 
 They are compiled when the package is installed (``hatch_build.py``) or its wheel is built, for Linux on x86-64 and
 AArch64, by GCC or Clang; never at run time. Each belongs to an operator of ``torch.ops.nlfilter``, whose definition in
@@ -8,19 +8,16 @@ torch computes the same in all other cases: on other devices, in other dtypes, u
 import ctypes
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
+from functools import wraps
 from pathlib import Path
 from threading import Lock
-from typing import Any, TypeVar, cast
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
-from torch.autograd import forward_ad
-
-from nlfilter_torch.core.torch_internals import BELOW_AUTOGRAD, in_forward_mode, is_on_cpu
 
 SMALL = 1 << 15  # elements of a factor below which starting a second thread takes longer than it saves
-OPERATORS = torch.library.Library("nlfilter", "DEF")
-Definition = TypeVar("Definition", bound=Callable[..., Any])
+Result = TypeVar("Result")
 
 _POINTER, _LONG, _INT, _FLOAT = ctypes.c_void_p, ctypes.c_long, ctypes.c_int, ctypes.c_float
 _library: ctypes.CDLL | None = None
@@ -98,64 +95,19 @@ def definitions_only() -> AbstractContextManager[None]:
     return _definitions
 
 
-def register(
-    schema: str,
-    compiled: Callable[..., Any] | None,
-    fake: Callable[..., Any],
-    *,
-    differentiable: bool = False,
-    dtype: torch.dtype = torch.float32,
-) -> Callable[[Definition], Definition]:
-    """Register a function as the definition of an operator of ``torch.ops.nlfilter``, for all dtypes and devices.
+def kernel(compiled: Callable[..., Result], dtype: torch.dtype = torch.float32) -> Callable[..., Result | None]:
+    """Let a kernel in C return None where there is none or it is not to be used; see :func:`definitions_only`.
 
     Args:
-        schema: name and signature of the operator.
-        compiled: the same computation by a kernel in C, for non-empty tensors of ``dtype`` on CPUs; may return None to
-            leave it to the definition. None if there is no kernel.
-        fake: returns uninitialised results for the shapes of the arguments.
-        differentiable: whether the definition consists of differentiable operations. Autograd, in reverse and forward
-            mode and of any order, and the transforms of ``torch.func`` then see these operations.
+        compiled: calls the kernel, for non-empty tensors on CPUs.
         dtype: of all tensors that the kernel takes.
     """
-    name = schema.partition("(")[0]
 
-    def decorate(definition: Definition) -> Definition:
-        def on_processors(*arguments: Any) -> Any:
-            result = None
-            if compiled is not None and level and not _definitions.used and _suit(arguments, dtype):
-                result = compiled(*arguments)
-            return definition(*arguments) if result is None else result
+    @wraps(compiled)
+    def wrapper(*arguments: Any) -> Result | None:
+        return compiled(*arguments) if level and not _definitions.used and _suit(arguments, dtype) else None
 
-        def under_autograd(keys: Any, *arguments: Any) -> Any:
-            if are_derived(arguments):
-                return definition(*arguments)
-            keys = keys & BELOW_AUTOGRAD
-            if is_on_cpu(keys):  # same as redispatching, but saves 4 us
-                return on_processors(*arguments)
-            return operator.redispatch(keys, *arguments)
-
-        OPERATORS.define(schema)
-        OPERATORS.impl(name, definition, "CompositeExplicitAutograd")
-        OPERATORS.impl(name, on_processors, "CPU")
-        torch.library.register_fake(f"nlfilter::{name}", fake, lib=OPERATORS)
-        operator = getattr(torch.ops.nlfilter, name).default
-        if differentiable:
-            OPERATORS.impl(name, under_autograd, "Autograd", with_keyset=True)
-            OPERATORS.impl(name, definition, "FuncTorchBatched")
-        return cast(Definition, operator)
-
-    return decorate
-
-
-def are_derived(arguments: Sequence[Any]) -> bool:
-    """Whether one of the arguments requires a gradient or has a forward-mode derivative."""
-    if torch.is_grad_enabled():
-        for argument in arguments:  # before every product; a loop takes half the time of a generator
-            if isinstance(argument, Tensor) and argument.requires_grad:
-                return True
-    if not in_forward_mode():
-        return False
-    return any(isinstance(t, Tensor) and forward_ad.unpack_dual(t).tangent is not None for t in arguments)
+    return wrapper
 
 
 def _suit(arguments: Sequence[Any], dtype: torch.dtype) -> bool:

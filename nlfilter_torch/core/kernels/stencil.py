@@ -10,8 +10,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from nlfilter_torch.core.kernels.library import pointer, register, run, threads
+from nlfilter_torch.core.kernels.library import kernel, pointer, run, threads
 from nlfilter_torch.core.precision import full_precision
+from nlfilter_torch.core.torch_internals import register
 
 
 @full_precision
@@ -99,10 +100,9 @@ def _compiled_solve(stencil: Tensor, right: Tensor) -> Tensor:
 
 @register(
     "solve(Tensor stencil, Tensor right) -> Tensor",
-    _compiled_solve,
+    kernel(_compiled_solve, torch.float64),
     lambda stencil, right: torch.empty_like(right),
     differentiable=True,
-    dtype=torch.float64,
 )
 def solve(stencil: Tensor, right: Tensor) -> Tensor:
     """:func:`solve_stencil` in float64.

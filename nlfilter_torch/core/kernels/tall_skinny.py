@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.core.blocks import SWEPT, block_length, pixel_blocks, strip_count, strips
-from nlfilter_torch.core.kernels.library import by_rows, place, pointer, register, repeated, run_on_factor
+from nlfilter_torch.core.kernels.library import by_rows, kernel, place, pointer, repeated, run_on_factor
+from nlfilter_torch.core.torch_internals import register
 
 FEW = range(1, 9)  # numbers of rows for which the kernels in C are fastest
 MOST_SPREAD = 9  # with more rows than this, undivided products are no slower
@@ -34,7 +35,7 @@ def _fake_spread(rows: Tensor, factor: Tensor, scaling: Tensor | None = None) ->
 
 @register(
     "spread(Tensor rows, Tensor factor, Tensor? scaling=None) -> Tensor",
-    _compiled_spread,
+    kernel(_compiled_spread),
     _fake_spread,
     differentiable=True,
 )
@@ -84,7 +85,7 @@ def _fake_moment(factor: Tensor, images: Tensor) -> Tensor:
     return factor.new_empty(factor.shape[0], factor.shape[1], images.shape[1], dtype=torch.float64)
 
 
-@register("moment(Tensor factor, Tensor images) -> Tensor", _compiled_moment, _fake_moment, differentiable=True)
+@register("moment(Tensor factor, Tensor images) -> Tensor", kernel(_compiled_moment), _fake_moment, differentiable=True)
 def moment(factor: Tensor, images: Tensor) -> Tensor:
     """``factor @ images^T``, (B, M, C) in float64, for a factor (B, M, N) and images (B, C, N): sums over pixels.
 
@@ -150,7 +151,7 @@ def _compiled_sweep(
 
 @register(
     "sweep(Tensor factor, Tensor diagonal, Tensor half, float most, Tensor? weights=None) -> (Tensor, Tensor)",
-    _compiled_sweep,
+    kernel(_compiled_sweep),
     lambda factor, *_: _empty(factor),
 )
 def sweep(
@@ -178,7 +179,7 @@ def _compiled_weigh(factor: Tensor, weights: Tensor, vector: Tensor) -> Tensor:
 
 @register(
     "weigh(Tensor factor, Tensor weights, Tensor vector) -> Tensor",
-    _compiled_weigh,
+    kernel(_compiled_weigh),
     lambda factor, *_: _empty(factor)[1],
 )
 def weigh(factor: Tensor, weights: Tensor, vector: Tensor) -> Tensor:

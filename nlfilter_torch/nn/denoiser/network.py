@@ -15,8 +15,9 @@ from nlfilter_torch.core.checks import (
 )
 from nlfilter_torch.core.inner import EVERYWHERE, Inner
 from nlfilter_torch.core.kernels.convolution import SLOPE, channels_last, convolve
-from nlfilter_torch.core.precision import as_given, full_precision
-from nlfilter_torch.core.values import refuse_transforms
+from nlfilter_torch.core.layouts import as_given
+from nlfilter_torch.core.precision import full_precision
+from nlfilter_torch.core.torch_internals import refuse_transforms
 from nlfilter_torch.filtering.filters import detail_layers
 from nlfilter_torch.nn.denoiser.colours import join_colours, split_colours
 from nlfilter_torch.nn.denoiser.noise import noise_map

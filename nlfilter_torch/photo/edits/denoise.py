@@ -13,7 +13,7 @@ from torch import Tensor
 from nlfilter_torch.core.checks import check_count
 from nlfilter_torch.core.inner import Inner
 from nlfilter_torch.core.precision import per_image
-from nlfilter_torch.core.values import cached_constants
+from nlfilter_torch.core.torch_internals import cached_constants
 from nlfilter_torch.filtering.filters import weigh_layers
 from nlfilter_torch.nn.denoiser.network import NonlocalDenoiser
 from nlfilter_torch.nn.denoiser.noise import Noise, noise_map

@@ -12,7 +12,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from nlfilter_torch.core.values import is_hidden
+from nlfilter_torch.core.torch_internals import is_hidden
 from nlfilter_torch.operator.features import reduce_channels
 from nlfilter_torch.photo.picture.colour import split_luminance
 

@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from nlfilter_torch.core.values import cached_constants
+from nlfilter_torch.core.torch_internals import cached_constants
 
 Read = Callable[[int, int], Tensor]  # returns the rows (B, C, n, W) of a picture from start to stop
 BLOCK = 64  # rows resized at once

@@ -22,7 +22,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from nlfilter_torch.core.values import cached_constants
+from nlfilter_torch.core.torch_internals import cached_constants
 from nlfilter_torch.operator.features import pad_border
 from nlfilter_torch.photo.picture.drawn import M
 from nlfilter_torch.photo.picture.limits import Balance, Limits, balance_of, balanced, clamped, limit, move_luminance

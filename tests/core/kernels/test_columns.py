@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from nlfilter_torch.core.precision import OuterProduct
+from nlfilter_torch.core.low_rank import OuterProduct
 from nlfilter_torch.operator.nystrom import inverse_cholesky, nystrom_factor
 from tests.native import by_torch, random
 
