@@ -11,7 +11,7 @@ from torch import Tensor
 
 from nlfilter_torch.photo.cli import editing, options
 from nlfilter_torch.photo.cli.changes import ChangeMeter, squared_difference, write_map
-from nlfilter_torch.photo.cli.editing import Job
+from nlfilter_torch.photo.cli.editing import Job, pixels_of, rows_of
 from nlfilter_torch.photo.cli.scribbles import Open, Overlay, ScribbleOptions, at_once, of_edit
 from nlfilter_torch.photo.cli.showing import Scribbled
 from nlfilter_torch.photo.declared.steps import Step
@@ -141,17 +141,6 @@ class Opener:
     def __call__(self, path: Path) -> StoredPicture:
         """Open a picture."""
         return self.files.enter_context(open_picture(path, self.memory))
-
-
-def pixels_of(picture: Picture, rows: slice) -> Tensor:
-    """Some rows (1, C, h, W) of a picture that is read by rows."""
-    return picture.tile(rows.start, rows.stop, 0).pixels
-
-
-def rows_of(photograph: Photograph, name: str) -> Rows:
-    """The rows of a photograph in memory."""
-    pixels = photograph.pixels
-    return Rows(name, photograph.size, pixels.shape[1], lambda rows: pixels[..., rows, :])
 
 
 def as_rows(drawn: Drawn[Overlay]) -> Drawn[RowSource]:

@@ -34,8 +34,9 @@ from nlfilter_torch.photo.io.rows import (
     usual_memory,
     write_picture,
 )
+from nlfilter_torch.photo.picture.edit import Rows
 from nlfilter_torch.photo.picture.viewing import viewed_size
-from nlfilter_torch.photo.tiled.pictures import mask_plane
+from nlfilter_torch.photo.tiled.pictures import Picture, mask_plane
 from nlfilter_torch.photo.tiled.sampling import Report
 from nlfilter_torch.photo.tiled.tiles import Passes, Processes, Statistics, Tiling
 
@@ -181,6 +182,17 @@ def processes_for(workers: int | None, cluster: str | None, stack: ExitStack) ->
     from nlfilter_torch.photo.cli.processes import zarr_processes
 
     return stack.enter_context(zarr_processes(workers, cluster))
+
+
+def pixels_of(picture: Picture, rows: slice) -> Tensor:
+    """Some rows (1, C, h, W) of a picture that is read by rows."""
+    return picture.tile(rows.start, rows.stop, 0).pixels
+
+
+def rows_of(photograph: Photograph, name: str) -> Rows:
+    """The rows of a photograph in memory."""
+    pixels = photograph.pixels
+    return Rows(name, photograph.size, pixels.shape[1], lambda rows: pixels[..., rows, :])
 
 
 class FileEdit(Protocol):

@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from nlfilter_torch.photo.cli import editing, options
-from nlfilter_torch.photo.cli.edit_job import Opener, as_rows, pixels_of, rows_of
+from nlfilter_torch.photo.cli.edit_job import Opener, as_rows
+from nlfilter_torch.photo.cli.editing import pixels_of, rows_of
 from nlfilter_torch.photo.cli.progress import stages, steps
 from nlfilter_torch.photo.cli.scribbles import Open, Overlay, ScribbleOptions, at_once, of_edit
 from nlfilter_torch.photo.cli.showing import Scribbled, tell_selected

@@ -9,8 +9,7 @@ from pathlib import Path
 from torch import Tensor
 
 from nlfilter_torch.photo.cli import editing, options
-from nlfilter_torch.photo.cli.edit_job import pixels_of, rows_of
-from nlfilter_torch.photo.cli.editing import Job
+from nlfilter_torch.photo.cli.editing import Job, pixels_of, rows_of
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.edits.applying import apply_recipe, edit_of
 from nlfilter_torch.photo.io.photographs import Photograph
