@@ -216,8 +216,8 @@ LOOK = Edit(
         sliders(
             "saturation",
             (1.0,) * SATURATIONS,
-            "How many times as far red, green and blue are to be from the largest of them, as saturation in HSV: a "
-            "factor for each of five equal steps from grey to pure colours. 1 leaves them as they are.",
+            "Factors of saturation as in HSV, which multiply the distances of red, green and blue from the largest of "
+            "them: one factor for each of five equal steps from grey to pure colours. 1 leaves colours as they are.",
             idle=(1.0,) * SATURATIONS,
             metavar="A,B,...,E",
         ),
