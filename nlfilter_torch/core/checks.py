@@ -149,7 +149,7 @@ def check_patch_size(patch_size: int) -> None:
         )
 
 
-def check_choice(value: str, name: str, choices: Sequence[str], remedy: str = "choose one of these") -> None:
+def check_choice(value: object, name: str, choices: Sequence[str], remedy: str = "choose one of these") -> None:
     """Raise unless ``value`` is one of ``choices``."""
     if not isinstance(value, str) or value not in choices:
         raise ValueError(f"{name} must be one of {', '.join(map(repr, choices))}, got {described(value)}; {remedy}")
@@ -240,7 +240,7 @@ def check_scale(bandwidth: float | Tensor, name: str, largest: Tensor, what: str
         )
 
 
-def check_count(value: int, name: str, *, least: int = 1, most: int | None = None) -> None:
+def check_count(value: object, name: str, *, least: int = 1, most: int | None = None) -> None:
     """Raise unless ``value`` is an integer from ``least`` (default 1) to ``most``."""
     if isinstance(value, bool) or not isinstance(value, int):
         raise TypeError(f"{name} must be an int, got {type(value).__name__}; pass a positive integer")

@@ -7,10 +7,11 @@ from nicegui import ui
 
 from nlfilter_torch.photo.declared import declaration
 from nlfilter_torch.photo.declared.declaration import Parameter
+from nlfilter_torch.photo.declared.json_values import Value
 from nlfilter_torch.photo.declared.parameters import EDITS
 from nlfilter_torch.photo.declared.presets import Recipe
 
-Change = Callable[[str, Mapping[str, object], bool], None]  # step, values, whether the change is complete
+Change = Callable[[str, Mapping[str, Value], bool], None]  # step, values, whether the change is complete
 UNITS = {"gain": "\u00d7", "%": "%"}
 
 
@@ -47,7 +48,7 @@ class Control:
         numbers: tuple[float, ...] = step[self.parameter.name]
         return step.sliders_inside if self.parameter.name == "inside" else numbers
 
-    def entries(self, recipe: Recipe, value: float) -> dict[str, object]:
+    def entries(self, recipe: Recipe, value: float) -> dict[str, Value]:
         """The values of the step's parameters for a value of the slider."""
         name = self.parameter.name
         if self.slider.none is not None:

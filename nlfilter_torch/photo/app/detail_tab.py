@@ -5,6 +5,7 @@ from nicegui import ui
 from nlfilter_torch.photo.app import controls
 from nlfilter_torch.photo.app.controls import Slider
 from nlfilter_torch.photo.app.tabs import EditTab, Link
+from nlfilter_torch.photo.declared.json_values import Value
 from nlfilter_torch.photo.declared.parameters import EDITS
 from nlfilter_torch.photo.declared.presets import PRESETS, PURPOSES
 from nlfilter_torch.photo.declared.steps import NONE, Step
@@ -109,7 +110,7 @@ class DetailTab(EditTab):
             self._link.change(self._edit, {"bandwidth": value}, True)
 
 
-def entries_of(name: str) -> dict[str, object]:
+def entries_of(name: str) -> dict[str, Value]:
     """The values that a preset sets."""
     detail = PRESETS[name].steps[0]
     return {entry: detail[entry] for entry in ("alpha", "bandwidth", "spatial_bandwidth", "landmarks")}

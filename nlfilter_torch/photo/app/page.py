@@ -27,6 +27,7 @@ from nlfilter_torch.photo.app.session import Session
 from nlfilter_torch.photo.app.tabs import Link
 from nlfilter_torch.photo.app.tasks import EXPECTED, Tasks
 from nlfilter_torch.photo.app.uploads import Upload
+from nlfilter_torch.photo.declared.json_values import Value
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.tiled.sampling import Report
 
@@ -127,7 +128,7 @@ class Editor:
 
     # Changes
 
-    def _change(self, step: str, values: Mapping[str, object], complete: bool) -> None:
+    def _change(self, step: str, values: Mapping[str, Value], complete: bool) -> None:
         """Change parameters of a step; ``complete`` when the pointer is released."""
         if self.session.opened is None:  # it would be lost when one is opened
             self._panel.follow()

@@ -38,7 +38,7 @@ from nlfilter_torch.photo.picture.source import seeded
 from nlfilter_torch.photo.picture.viewing import MEGAPIXEL, viewed_size, within_limits
 
 Key = tuple[object, ...]  # the settings on which a cached result depends
-PIXELS = round(VIEWING_SIZE.default * MEGAPIXEL)  # of a preview, at most
+PIXELS = round(VIEWING_SIZE.default_number * MEGAPIXEL)  # of a preview, at most
 
 
 def reduce(image: Tensor, stride: int) -> Tensor:

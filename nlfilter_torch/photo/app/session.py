@@ -10,6 +10,7 @@ from torch import Tensor
 
 from nlfilter_torch.photo.app.preview import PIXELS, Preview
 from nlfilter_torch.photo.app.sidecar import Sidecar
+from nlfilter_torch.photo.declared.json_values import Value
 from nlfilter_torch.photo.declared.parameters import EDITS
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.declared.steps import Step
@@ -163,7 +164,7 @@ class Session:
         """Whether the preview has fewer pixels than the photograph; raises ValueError if none is open."""
         return self.preview.stride > 1
 
-    def set(self, edit: str, *, strokes: tuple[Stroke, ...] | None = None, **values: object) -> None:
+    def set(self, edit: str, *, strokes: tuple[Stroke, ...] | None = None, **values: Value) -> None:
         """Change the last step with that edit, or add such a step; :meth:`commit` completes the change."""
         self.recipe = self.recipe.with_last(self.recipe.last(edit).changed(strokes=strokes, **values))
 

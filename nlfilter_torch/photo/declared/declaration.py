@@ -6,9 +6,13 @@ Does not import torch, so that the command line prints help and lists without de
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Literal
+from types import EllipsisType
+from typing import TYPE_CHECKING, Any, Literal, TypeGuard, cast
 
-from nlfilter_torch.photo.declared.json_values import is_within
+from nlfilter_torch.photo.declared.json_values import Value, is_within
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 # Values outside these ranges give no useful result, and numbers overflow.
 GAINS = (-1e6, 1e6)  # sliders
@@ -94,7 +98,7 @@ class Parameter:
 
     name: str
     kind: Kind
-    default: Any
+    default: Value
     help: str
     low: float = 0.0
     high: float = 0.0
@@ -104,7 +108,7 @@ class Parameter:
     optional: bool = False
     words: tuple[str, ...] = ()
     choices: tuple[str, ...] = ()
-    idle: Any = ...
+    idle: Value | EllipsisType = ...
     argument: str = ""
     share: float = 0.0
     min_pixels: float = 0.0
@@ -119,6 +123,16 @@ class Parameter:
     def keyword(self) -> str:
         """Name of the function's argument."""
         return self.argument or self.name
+
+    @property
+    def default_number(self) -> float:
+        """The default of a number that has one."""
+        return cast(float, self.default)
+
+    @property
+    def idle_number(self) -> float:
+        """The number that changes nothing, for parameters that have one."""
+        return cast(float, self.idle)
 
     @property
     def wanted(self) -> str:
@@ -142,7 +156,7 @@ class Parameter:
         alternatives = [f'"{word}"' for word in self.words] + ["null"] * self.optional
         return ", or ".join([text, *alternatives])
 
-    def is_valid(self, value: Any) -> bool:
+    def is_valid(self, value: object) -> TypeGuard[Value | list[float]]:
         """Whether a value read from JSON is valid for this parameter."""
         if value is None:
             return self.optional
@@ -160,13 +174,13 @@ class Parameter:
             isinstance(value, int) and is_within(value, self.low, self.high) and (self.kind != "odd" or value % 2 == 1)
         )
 
-    def is_idle(self, value: Any) -> bool:
+    def is_idle(self, value: Value) -> bool:
         """Whether a value, or all numbers of a list, equal :attr:`idle`; False for parameters without an idle value."""
         if isinstance(self.idle, tuple):
             return bool(value == self.idle)
         return all(v == self.idle for v in value) if isinstance(value, tuple) else bool(value == self.idle)
 
-    def argument_of(self, value: Any, size: tuple[int, int], stride: float = 1) -> Any:
+    def argument_of(self, value: Value, size: tuple[int, int], stride: float = 1) -> Value:
         """Convert a value to the function's argument: grey levels to [0, 1], and lengths to pixels.
 
         Args:
@@ -177,7 +191,7 @@ class Parameter:
         >>> Parameter("radius", "number", 2.5, "", 0.1, 20, "%").argument_of(2.5, (400, 600))
         10.0
         """
-        if value is None or isinstance(value, str):
+        if value is None or isinstance(value, str | tuple):
             return value
         if self.unit == "levels":
             return value / 255
@@ -189,9 +203,9 @@ class Parameter:
 
     def pixels(self, value: float | None, size: tuple[int, int]) -> float:
         """Return a length in pixels for an image of that size: the one given to the function, or the default."""
-        return float(self.argument_of(self.default, size) if value is None else value)
+        return cast(float, self.argument_of(self.default, size)) if value is None else float(value)
 
-    def distance(self, value: Any, size: Sequence[int]) -> Any:
+    def distance(self, value: "float | Tensor | str | None", size: Sequence[int]) -> "float | Tensor | None":
         """Return a distance in pixels for a picture (H, W): the function's argument, or for None :attr:`share` if any.
 
         It is relative so that a preview and the photograph agree. The word ``"none"`` gives None, for no limit.
@@ -204,9 +218,11 @@ class Parameter:
 
             check_choice(value, self.keyword, self.words)
             return None
-        return self.share * min(size) if value is None and self.share else value
+        if value is None and self.share:
+            return self.share * min(size)
+        return cast("float | Tensor | None", value)  # checks of the filter refuse a word where none is allowed
 
-    def check_argument(self, value: Any, batch: int | None = None) -> None:
+    def check_argument(self, value: object, batch: int | None = None) -> None:
         """Check that a function can take ``value``; with ``batch``, if :attr:`per_image`, also shape () or (batch,).
 
         Raises:
@@ -323,7 +339,7 @@ class Edit:
         """Defaults of the function's arguments, in its units; None for lengths that depend on the image."""
         return {p.keyword: None if p.unit == "%" else p.argument_of(p.default, (0, 0)) for p in self}
 
-    def check(self, batch: int | None = None, **arguments: Any) -> None:
+    def check(self, batch: int | None = None, **arguments: object) -> None:
         """Check arguments of the function, in the order given; see :meth:`Parameter.check_argument`."""
         for name, value in arguments.items():
             self[name].check_argument(value, batch)

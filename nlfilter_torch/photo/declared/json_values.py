@@ -2,10 +2,13 @@
 
 import json
 import reprlib
-from typing import Any
+from typing import TypeGuard
+
+#: The value of a parameter of an edit; JSON has lists in place of tuples.
+Value = float | str | tuple[float, ...] | None
 
 
-def parse_json(text: str | bytes, name: str, remedy: str) -> Any:
+def parse_json(text: str | bytes, name: str, remedy: str) -> object:
     """Parse the content of the file ``name``, in UTF-8, UTF-16 or UTF-32 if it is given as bytes.
 
     Raises:
@@ -13,24 +16,24 @@ def parse_json(text: str | bytes, name: str, remedy: str) -> Any:
     """
     twice: list[str] = []
 
-    def entries(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        found = dict(pairs)
-        if len(found) < len(pairs):
+    def entries(pairs: list[tuple[str, object]]) -> dict[str, object]:
+        unique = dict(pairs)
+        if len(unique) < len(pairs):
             names = [key for key, _ in pairs]
             twice.append(next(key for key in names if names.count(key) > 1))
-        return found
+        return unique
 
     try:
-        found = json.loads(text, object_pairs_hook=entries)
+        content: object = json.loads(text, object_pairs_hook=entries)
     except (ValueError, RecursionError) as error:
         reason = "it is nested too deeply" if isinstance(error, RecursionError) else f"it is not JSON ({error})"
         raise ValueError(f"{name} is not a preset: {reason}; {remedy}") from error
     if twice:
         raise ValueError(f"{name} must have each entry once, got {shown(twice[0])} twice; remove one of them")
-    return found
+    return content
 
 
-def shown(value: Any) -> str:
+def shown(value: object) -> str:
     """Format a JSON value for a message, shortened if it is long or deeply nested.
 
     >>> shown({"a": None}), shown([0] * 100)
@@ -44,6 +47,6 @@ def shown(value: Any) -> str:
     return text if len(text) <= 80 else short
 
 
-def is_within(value: Any, low: float, high: float) -> bool:
+def is_within(value: object, low: float, high: float) -> TypeGuard[float]:
     """Whether a JSON value is a number in a closed, finite range; NaN is not."""
     return isinstance(value, int | float) and not isinstance(value, bool) and low <= value <= high

@@ -16,9 +16,8 @@ that an edit made on a preview applies to the photograph. Does not import torch.
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-from nlfilter_torch.photo.declared.json_values import parse_json, shown
+from nlfilter_torch.photo.declared.json_values import Value, parse_json, shown
 from nlfilter_torch.photo.declared.parameters import EDITS
 from nlfilter_torch.photo.declared.steps import VERSION, Step, acting_steps, json_of
 
@@ -109,7 +108,7 @@ class Recipe:
         return Recipe(tuple(_read_steps(entries, name)))
 
 
-def _read_steps(entries: dict[str, Any], name: str) -> list[Step]:
+def _read_steps(entries: dict[str, object], name: str) -> list[Step]:
     """Parse the steps of a file."""
     unknown = entries.keys() - {"version", "steps"}
     if unknown:
@@ -133,9 +132,9 @@ def _read_steps(entries: dict[str, Any], name: str) -> list[Step]:
     return steps
 
 
-def _detail(**values: Any) -> Recipe:
+def _detail(**values: Value) -> Recipe:
     """A recipe of a single step of ``detail``."""
-    return Recipe((Step("detail", **values),))
+    return Recipe((Step("detail", (), **values),))
 
 
 #: The named presets. Chosen by eye on astronaut, chelsea and rocket of scikit-image and seven photographs of
@@ -151,7 +150,7 @@ PRESETS: dict[str, Recipe] = {
     "smooth": _detail(alpha=(0.0, 0.0, 0.0, 1.0), bandwidth=12.0, spatial_bandwidth="none", landmarks=100),
 }
 
-#: Short description of each of :data:`PRESETS`.
+#: Short descriptions of the :data:`PRESETS`.
 PURPOSES: dict[str, str] = {
     "crisp": "stronger detail of all sizes",
     "clear": "slightly stronger detail of all sizes",

@@ -1,6 +1,6 @@
 """Parameters shared by several edits, functions that declare common kinds of parameters, and the look."""
 
-from typing import Any
+from typing import TypedDict, Unpack
 
 from nlfilter_torch.photo.declared.declaration import (
     BANDWIDTHS,
@@ -9,31 +9,62 @@ from nlfilter_torch.photo.declared.declaration import (
     GAINS,
     MAX_LANDMARKS,
     MAX_PATCH,
+    Domain,
     Edit,
     Parameter,
     Slider,
     Unit,
 )
+from nlfilter_torch.photo.declared.json_values import Value
 from nlfilter_torch.photo.declared.shading import LANDMARKS, LEVELS, NEAR
+
+
+class Presentation(TypedDict, total=False):
+    """Attributes of :class:`Parameter` for gains, all with a default."""
+
+    optional: bool
+    idle: Value
+    slider: Slider
+    panel: str
+
+
+class Further(Presentation, total=False):
+    """Attributes of :class:`Parameter` for numbers and lists of numbers, all with a default."""
+
+    domain: Domain
+    words: tuple[str, ...]
+    zero_meaning: str
+    argument: str
+    share: float
+    min_pixels: float
+    metavar: str
+    is_option: bool
+    length: int
+    per_image: bool
+
 
 ALIKE = "How much two places may differ and still count as similar"
 #: Arguments of the filter of an edit.
 FILTER = ("photometric_bandwidth", "spatial_bandwidth", "patch_size", "num_landmarks", "landmarks")
 
 
-def number(name: str, default: Any, help: str, ends: tuple[float, float], unit: Unit = "", **more: Any) -> Parameter:
+def number(
+    name: str, default: Value, help: str, ends: tuple[float, float], unit: Unit = "", **further: Unpack[Further]
+) -> Parameter:
     """Declare a number within a range."""
-    return Parameter(name, "number", default, help, *ends, unit, **more)
+    return Parameter(name, "number", default, help, *ends, unit, **further)
 
 
-def gain(name: str, default: float | None, help: str, **more: Any) -> Parameter:
+def gain(name: str, default: float | None, help: str, **further: Unpack[Presentation]) -> Parameter:
     """Declare a factor."""
-    return number(name, default, help, GAINS, "gain", domain="finite", per_image=True, **more)
+    return number(name, default, help, GAINS, "gain", domain="finite", per_image=True, **further)
 
 
-def sliders(name: str, default: tuple[float, ...] | None, help: str, unit: Unit = "gain", **more: Any) -> Parameter:
+def sliders(
+    name: str, default: tuple[float, ...] | None, help: str, unit: Unit = "gain", **further: Unpack[Further]
+) -> Parameter:
     """Declare a list of numbers."""
-    return Parameter(name, "sliders", default, help, *GAINS, unit, **more)
+    return Parameter(name, "sliders", default, help, *GAINS, unit, **further)
 
 
 def choice(name: str, choices: tuple[str, ...], help: str) -> Parameter:
@@ -43,7 +74,7 @@ def choice(name: str, choices: tuple[str, ...], help: str) -> Parameter:
 
 def filter_parameters(
     *,
-    bandwidth: Any = None,
+    bandwidth: float | str | None = None,
     share: float = 0.0,
     patch_size: int = 5,
     landmarks: int = 100,

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from nlfilter_torch.photo.declared.declaration import Edit
-from nlfilter_torch.photo.declared.json_values import shown
+from nlfilter_torch.photo.declared.json_values import Value, shown
 from nlfilter_torch.photo.declared.parameters import EDITS
 from nlfilter_torch.photo.declared.shared_parameters import FILTER
 
@@ -37,9 +37,9 @@ class Step:
 
     edit: str
     strokes: tuple["Stroke", ...]
-    values: tuple[tuple[str, Any], ...]
+    values: tuple[tuple[str, Value], ...]
 
-    def __init__(self, edit: str, strokes: tuple["Stroke", ...] = (), **values: Any) -> None:
+    def __init__(self, edit: str, strokes: tuple["Stroke", ...] = (), **values: Value) -> None:
         """Create a step; omitted parameters have their defaults."""
         declared = EDITS[edit]
         unknown = values.keys() - {parameter.name for parameter in declared}
@@ -47,23 +47,23 @@ class Step:
             raise TypeError(
                 f"{edit} has no parameter {min(unknown)}; its parameters are {', '.join(p.name for p in declared)}"
             )
-        given = [(p.name, values[p.name]) for p in declared if p.name in values and values[p.name] != p.default]
-        for name, value in (("edit", edit), ("strokes", strokes), ("values", tuple(given))):
+        changed = [(p.name, values[p.name]) for p in declared if p.name in values and values[p.name] != p.default]
+        for name, value in (("edit", edit), ("strokes", strokes), ("values", tuple(changed))):
             object.__setattr__(self, name, value)
 
     @staticmethod
     def idle(edit: str) -> "Step":
         """Return the step that changes nothing, from which the editor starts."""
-        values: dict[str, Any] = {
+        values: dict[str, Value] = {
             p.name: NONE if p.kind == "sliders" and p.idle == 1 else p.idle for p in EDITS[edit] if p.idle is not ...
         }
-        return Step(edit, **values)
+        return Step(edit, (), **values)
 
     def __getitem__(self, name: str) -> Any:
         """Return the value of a parameter."""
         return dict(self.values).get(name, EDITS[self.edit][name].default)
 
-    def changed(self, *, strokes: tuple["Stroke", ...] | None = None, **values: Any) -> "Step":
+    def changed(self, *, strokes: tuple["Stroke", ...] | None = None, **values: Value) -> "Step":
         """Return a copy with other strokes or parameters."""
         return Step(self.edit, self.strokes if strokes is None else strokes, **{**dict(self.values), **values})
 
@@ -116,9 +116,9 @@ class Step:
 
     def filter_options(self, size: tuple[int, int]) -> dict[str, Any]:
         """Return the options of :func:`nonlocal_operator` for an image of size (H, W), the viewing size."""
-        found = {name: value for name, value in self.arguments(size).items() if name in FILTER}
-        distance = self.declared["spatial_bandwidth"].distance(found["spatial_bandwidth"], size)
-        return found | {"spatial_bandwidth": distance}
+        options = {name: value for name, value in self.arguments(size).items() if name in FILTER}
+        distance = self.declared["spatial_bandwidth"].distance(options["spatial_bandwidth"], size)
+        return options | {"spatial_bandwidth": distance}
 
     def to_json(self, indent: str = "", *, complete: bool = False) -> str:
         """Format the step as a JSON object, with one line for each entry and each stroke.
@@ -140,7 +140,7 @@ class Step:
         return f"{indent}{{\n{lines}\n{indent}}}"
 
     @staticmethod
-    def from_entries(edit: str, entries: dict[str, Any], place: str) -> "Step":
+    def from_entries(edit: str, entries: dict[str, object], place: str) -> "Step":
         """Create a step from parsed JSON.
 
         Args:
@@ -151,7 +151,7 @@ class Step:
         Raises:
             ValueError: if an entry is unknown or invalid.
         """
-        declared, values = EDITS[edit], dict[str, Any]()
+        declared, values = EDITS[edit], dict[str, Value]()
         parameters = {parameter.name: parameter for parameter in declared}
         strokes: tuple[Stroke, ...] = ()
         for entry, value in entries.items():
@@ -194,7 +194,7 @@ def working_bytes(landmarks: int, patch_size: int, *, factors: int = 1) -> int:
     return 4 * (factors * landmarks + 2 * patch_size**2 + 40)
 
 
-def _read_strokes(value: Any, declared: Edit, place: str) -> tuple["Stroke", ...]:
+def _read_strokes(value: object, declared: Edit, place: str) -> tuple["Stroke", ...]:
     from nlfilter_torch.photo.declared.strokes import Stroke
 
     if not isinstance(value, list):

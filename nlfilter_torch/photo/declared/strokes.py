@@ -8,7 +8,7 @@ import re
 import reprlib
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any
+from typing import TypeGuard
 
 from nlfilter_torch.photo.declared.json_values import is_within, shown
 
@@ -29,12 +29,12 @@ class Stroke:
     radius: float
     paint: str
 
-    def entries(self) -> dict[str, Any]:
+    def entries(self) -> dict[str, object]:
         """Return the stroke as a JSON object."""
         return {"paint": self.paint, "radius": self.radius, "points": [list(point) for point in self.points]}
 
     @staticmethod
-    def from_entries(value: Any, words: tuple[str, ...], place: str) -> "Stroke":
+    def from_entries(value: object, words: tuple[str, ...], place: str) -> "Stroke":
         """Create a stroke from a JSON value; ``words`` are the allowed paints, of which ``colour`` allows any colour.
 
         Raises:
@@ -61,7 +61,7 @@ class Stroke:
         return Stroke(tuple((float(x), float(y)) for x, y in points), float(radius), paint)
 
 
-def _is_point(value: Any) -> bool:
+def _is_point(value: object) -> TypeGuard[list[float]]:
     return isinstance(value, list) and len(value) == 2 and all(is_within(v, -2, 2) for v in value)
 
 

@@ -145,9 +145,7 @@ class Abstract(FilteredEdit):
 
     def flattened(self, source: Source[M]) -> "Flattened":
         """Compute ``W^k y``."""
-        options = self.filter_options(
-            source.size, num_landmarks=min(self.num_landmarks, source.size[0] * source.size[1])
-        )
+        options = self.filter_options(source.size, fewer_landmarks=True)
         operator = source.operator(Guide(options, spectral=True))
         # W preserves constants, but the span of the factor need not contain them: filter without the mean.
         mean = source.mean(whole_image)

@@ -224,7 +224,8 @@ class Colorize(PhotoEdit):
             steps = (source.size[0] / small[0], source.size[1] / small[1])
             scribbles = blocks_of(scribbles, viewed, source.size, steps)
         ratio = viewed.measured(bandwidth_ratio)
-        mean = per_image(COLORIZE["spatial_bandwidth"].distance(self.spatial_bandwidth, small), ratio, 1)
+        distance = COLORIZE["spatial_bandwidth"].distance(self.spatial_bandwidth, small)
+        mean = per_image(cast(float | Tensor, distance), ratio, 1)  # not None, whose place a share of the size takes
         operators = Operators(self, viewed, (mean / ratio.sqrt(), mean * ratio.sqrt()))
         wanted = split_luminance(scribbles.shown.unsqueeze(2))[1].squeeze(2)  # (B, 3, n)
         if self.method == "kmeans":

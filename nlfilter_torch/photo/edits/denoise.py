@@ -141,11 +141,9 @@ class Denoise(FilteredEdit):
 
     def _fit_rule(self, source: Source[M], level: Tensor) -> Fitted:
         assumed, pixels = level.clamp(min=NEGLIGIBLE_NOISE), source.size[0] * source.size[1]
-        options = self.filter_options(
-            source.size,
-            photometric_bandwidth=assumed if self.photometric_bandwidth is None else self.photometric_bandwidth,
-            num_landmarks=min(self.num_landmarks, pixels),
-        )
+        options = self.filter_options(source.size, fewer_landmarks=True)
+        if self.photometric_bandwidth is None:
+            options = replace(options, photometric_bandwidth=assumed)
         operator = source.operator(Guide(options, blur=GUIDE_BLUR))
         layers = operator.layers(whole_image, ORDER)  # (B, ORDER+1, C, H, W)
         energy = operator.layers(partial(_energy, layers), 1)  # of planes (B, ORDER, H, W)

@@ -1,6 +1,5 @@
 """Detail sliders for the whole image, or for everything similar to painted regions. Paper: Figs. 12, 13."""
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -202,7 +201,7 @@ class Detail(FilteredEdit):
 
     def _filtered(self, viewed: Source[M], order: int) -> Polynomial:
         """The filter of a picture, which gives changes by sliders less 1."""
-        options = self.filter_options(viewed.size, num_landmarks=min(self.num_landmarks, math.prod(viewed.size)))
+        options = self.filter_options(viewed.size, fewer_landmarks=True)
         residual = None if self.residual is None else self.residual - 1
         operator = viewed.operator(Guide(options, exact=residual is not None))
         return Polynomial.of(operator, self.planes, order, residual)

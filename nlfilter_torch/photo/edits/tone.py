@@ -1,6 +1,5 @@
 """Contrast and local contrast around the mean by the last two sliders. Paper: Figs. 6(a), 7(b) to 10(b)."""
 
-import math
 from dataclasses import dataclass
 from functools import partial
 from typing import ClassVar
@@ -24,8 +23,8 @@ from nlfilter_torch.photo.picture.viewing import fit_change
 def adjust_tone(
     image: Tensor,
     *,
-    contrast: float | Tensor = TONE["contrast"].idle,
-    clarity: float | Tensor = TONE["clarity"].idle,
+    contrast: float | Tensor = TONE["contrast"].idle_number,
+    clarity: float | Tensor = TONE["clarity"].idle_number,
     order: int = 3,
     limits: Limits = TONE.defaults["limits"],
     viewing_size: float = TONE.defaults["viewing_size"],
@@ -115,7 +114,7 @@ class Tone(FilteredEdit):
 
     def _change(self, viewed: Source[M]) -> Fitted:
         """The change of luminance of a picture at the viewing size."""
-        options = self.filter_options(viewed.size, num_landmarks=min(self.num_landmarks, math.prod(viewed.size)))
+        options = self.filter_options(viewed.size, fewer_landmarks=True)
         operator, mean = viewed.operator(Guide(options)), viewed.mean(luminance)
         filtered = Polynomial.of(operator, partial(_without, mean), self.order, None)
         return Fitted(partial(filtered, alpha=self._sliders(viewed.batch, viewed.dtype)))

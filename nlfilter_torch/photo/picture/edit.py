@@ -1,9 +1,10 @@
 """An edit with its settings, as functions, commands, files and the editor use it."""
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, Literal, Self, cast
 
 import torch
 from torch import Tensor
@@ -104,16 +105,20 @@ class FilteredEdit(PhotoEdit):
     guide_channels: GuideChannels = "luminance"
     generator: torch.Generator | None = None
 
-    def filter_options(self, size: tuple[int, int], **replaced: Any) -> OperatorOptions:
-        """Options of the filter of a picture (H, W); ``replaced`` are used in place of the fields of these names."""
-        options = {
-            "photometric_bandwidth": self.photometric_bandwidth,
-            "spatial_bandwidth": self.declared["spatial_bandwidth"].distance(self.spatial_bandwidth, size),
-            "patch_size": self.patch_size,
-            "num_landmarks": self.num_landmarks,
-            "landmarks": self.landmarks,
-            "completion": self.completion,
-            "guide_channels": self.guide_channels,
-            "generator": self.generator,
-        }
-        return OperatorOptions(**(options | replaced))
+    def filter_options(self, size: tuple[int, int], *, fewer_landmarks: bool = False) -> OperatorOptions:
+        """Options of the filter of a picture (H, W).
+
+        With ``fewer_landmarks``, a picture with fewer pixels than landmarks has as many landmarks as pixels; without,
+        there is a warning when the operator is built.
+        """
+        return OperatorOptions(
+            # Other words than "auto", and None, are refused when the operator is built.
+            photometric_bandwidth=cast(float | Tensor | Literal["auto"], self.photometric_bandwidth),
+            spatial_bandwidth=self.declared["spatial_bandwidth"].distance(self.spatial_bandwidth, size),
+            patch_size=self.patch_size,
+            num_landmarks=min(self.num_landmarks, math.prod(size)) if fewer_landmarks else self.num_landmarks,
+            landmarks=self.landmarks,
+            completion=self.completion,
+            guide_channels=self.guide_channels,
+            generator=self.generator,
+        )

@@ -36,7 +36,7 @@ from nlfilter_torch.photo.selections.random_walker import solve_mask
 from nlfilter_torch.photo.selections.rough_mask import RoughMasks
 
 SOLVED = 1 << 17  # pixels
-VIEWED = VIEWING_SIZE.default  # megapixels; larger pictures are first reduced to this size
+VIEWED = VIEWING_SIZE.default_number  # megapixels; larger pictures are first reduced to this size
 FLOATS_PER_PIXEL = 80  # estimated working memory per pixel of the reduced picture, in addition to its operator
 ROUGH_CONFIDENCE, SCRIBBLE_CONFIDENCE = 0.02, 1000.0  # confidence in the rough mask, and in scribbles
 ODDS, STEEPNESS = 1.5, 1.4  # of the curve from the solution along borders, too low halfway, to masks
