@@ -1,6 +1,7 @@
 """Functions of the spectrum and polynomials of an operator, for planes of a picture from any source."""
 
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -15,7 +16,11 @@ from nlfilter_torch.photo.picture.source import Operator, Pixels, Planes
 def synthesize(operator: Operator, response: Response, coefficients: Tensor) -> Planes:
     """Compute ``V f(S) V^T y`` for a response f and coefficients (B, C, M) of y."""
     total = coefficients @ operator.pairs.gain(response).mT
-    return operator.of_columns(lambda columns: spread(total.to(columns.factor), columns.factor, columns.scaling))
+    return operator.of_columns(partial(_spread, total))
+
+
+def _spread(total: Tensor, columns: Columns) -> Tensor:
+    return spread(total.to(columns.factor), columns.factor, columns.scaling)
 
 
 @dataclass(frozen=True, eq=False)
