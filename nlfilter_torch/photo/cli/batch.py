@@ -76,9 +76,9 @@ def batch(
     """Edit all photographs of a folder: their details, as `nlfilter-torch detail` does, or by any file of edits.
 
     A file that cannot be edited is reported and the others are done; the exit status is 1 then. After an interruption
-    the same command does what is left. The workers share --memory; those of a cluster have as much each.
+    the same command does what is left. The workers share --memory; on a cluster, every worker may use that much.
 
-    All like one: `nlfilter-torch batch shots edited --preset look.json`
+    By a saved edit: `nlfilter-torch batch shots edited --preset look.json`
 
     On several machines that share the folders: `nlfilter-torch batch shots edited --cluster tcp://host:8786`
     """
@@ -103,7 +103,7 @@ def batch(
         _tell(f"left out {others}; convert them to PNG, JPEG, TIFF, WebP or AVIF if they are photographs")
     tally, interrupted = Tally(), False
     count = min(workers or _cores(), len(paths))
-    room = memory  # of each; None is as much as the command of an edit uses
+    room = memory  # of a worker; None is as much as the command of an edit uses
     if cluster is None and (memory is not None or shared < count * WHOLE):
         room = shared / count / 1e9
     try:

@@ -32,13 +32,17 @@ Preview = Annotated[
     Path | None,
     typer.Option(
         metavar="FILE",
-        help="A picture of the first pair at the viewing size: before, after, the look, and what is left, amplified, "
-        "around grey.",
+        help="A picture of the first pair at the viewing size: before, after, the look, and the remaining difference, "
+        "amplified, around grey.",
     ),
 ]
 Map = Annotated[
     Path | None,
-    typer.Option("--map", metavar="FILE", help="A grey picture of what the look leaves of the first pair's edit."),
+    typer.Option(
+        "--map",
+        metavar="FILE",
+        help="A grey picture of the part of the first pair's edit that the look does not explain.",
+    ),
 ]
 PAIR_BYTES = 140  # per pixel of a pair at its full size, while it is read and compared
 ENOUGH = 0.8  # share that is to be explained
@@ -69,10 +73,10 @@ def fit(
     left: Map = None,
     **values: object,
 ) -> None:
-    """Find the look that turns one photograph into another, or a folder of them, whatever program made the edit.
+    """Find the look that turns a photograph into an edited one, or a folder of them, whatever program made the edit.
 
-    A look has sliders, tone curves, colours and sharpness, as far as they explain the edit of photographs left out of
-    the fit, too. Prints how much that is, and saves the look in a file for other photographs:
+    A look has sliders, tone curves, colours and sharpness, but only those that also explain photographs left out of
+    the fit. Prints how much of the change it explains, and saves it in a file for other photographs:
 
     `nlfilter-torch fit before.jpg after.jpg look.json --preview seen.png`
 

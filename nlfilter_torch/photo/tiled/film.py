@@ -32,7 +32,7 @@ from nlfilter_torch.photo.tiled.source import Tiled
 from nlfilter_torch.photo.tiled.statistics import Block, Sums
 from nlfilter_torch.photo.tiled.tiles import Passes
 
-# Pixels of all references together; twice or half as many approximate all pixels equally well.
+# Pixels of all references together; half or twice as many would be as accurate.
 REFERENCE_PIXELS = 1 << 16
 UNLIMITED_BANDWIDTH = 1e6  # spatial bandwidth in pixels at which distance has no effect
 Cached = TypeVar("Cached")
@@ -142,7 +142,7 @@ class Frame(Tiled):
         return References([Tiled.resized(frame, size).picture for frame in self.reference_frames()])
 
     def cached(self, fitted: Fitted) -> Fitted:
-        """Return the edit unchanged: stored planes would be those of the frame, but means are over the references."""
+        """Return the edit unchanged: means are taken over the references, not over this frame."""
         return fitted
 
     def mean(self, planes: Planes) -> Tensor:
@@ -178,8 +178,8 @@ def average(values: Sequence[Tensor]) -> Tensor:
 def learn_filter(pictures: Sequence[Picture], guide: Guide) -> LearntFilter:
     """Fit one filter to several pictures of one size, from an even sample of the pixels of each.
 
-    Coordinates of a pixel are those in its own picture. The weights of all pictures together sum to the number of
-    pixels of one.
+    The coordinates of a pixel are relative to its own picture. The weights of the pixels of all pictures sum to the
+    number of pixels of a single picture.
     """
     options = dict(vars(guide.options))
     channels, bandwidth = options.pop("guide_channels", "luminance"), options.pop("photometric_bandwidth", "auto")

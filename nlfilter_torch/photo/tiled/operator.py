@@ -52,7 +52,7 @@ class TilePixels:
 
     Attributes:
         image: their colours, (1, C, h, W).
-        features: computes their features (1, D, h W), those that an operator compares.
+        features: computes the features (1, D, h W) that an operator compares.
         first: row-major index of the first pixel in the picture.
         width: W of the picture.
     """
@@ -76,7 +76,7 @@ class TilePixels:
         return self._columns[operator]
 
     def layers(self, planes: "LayerPlanes") -> Tensor:
-        """The detail layers of the pixels, cached until those of other planes are asked for."""
+        """The detail layers of the pixels, cached until the layers of other planes are requested."""
         if self._layers is None or self._layers[0] is not planes:
             self._layers = planes, planes.compute(self)
         return self._layers[1]
@@ -134,7 +134,7 @@ class ColumnPlanes:
     function: Callable[[Columns], Tensor]
 
     def __call__(self, pixels: Pixels) -> Tensor:
-        """The planes (1, C, h, w) at some pixels."""
+        """The planes (1, C, h, w) at the pixels."""
         height, width = pixels.image.shape[-2:]
         return self.function(with_columns(pixels).columns(self.operator)).unflatten(2, (height, width))
 
@@ -148,11 +148,11 @@ class LayerPlanes:
     coefficients: Tensor
 
     def __call__(self, pixels: Pixels) -> Tensor:
-        """The layers (1, k+1, C, h, w) at some pixels."""
+        """The layers (1, k+1, C, h, w) at the pixels."""
         return with_columns(pixels).layers(self)
 
     def compute(self, pixels: Pixels) -> Tensor:
-        """The layers at some pixels, without a cache."""
+        """The layers at the pixels, without a cache."""
         image = self.planes(pixels)
         layers = layers_of_columns(with_columns(pixels).columns(self.operator), self.coefficients, image.flatten(2))
         return layers.unflatten(-1, image.shape[-2:])
@@ -191,7 +191,7 @@ class SampleDraw:
 class TiledOperator:
     """The filter of a picture, represented by the sums over pixels that define it.
 
-    The sums are computed on first use, those for balancing together with those of the filtered planes.
+    The sums are computed on first use; the passes for balancing also yield the sums of the filtered planes.
 
     Attributes:
         guide: guide of the picture.
@@ -217,7 +217,7 @@ class TiledOperator:
     _pixel_scaling: PixelScaling | None = None
     _sample: list[Block] | None = None
     _sums: dict[Planes, Sums] = field(default_factory=dict)
-    _grams: Tensor | float = 0.0  # added to those of the sample
+    _grams: Tensor | float = 0.0  # correction of the Gram matrices of the sample
 
     def __getstate__(self) -> dict[str, object]:
         """The operator in another process: without columns that can be computed again."""
@@ -328,8 +328,8 @@ class TiledOperator:
     def sums(self, planes: Planes, order: int) -> Sums:
         """Sums for the first ``order`` powers of W and the given planes.
 
-        Sums of planes other than those given to :meth:`prepare` are over all pixels: the sample is drawn for balancing,
-        and is off by several grey levels for planes that are large at a few pixels.
+        Sums of other planes than the argument of :meth:`prepare` are taken over all pixels: the sample is drawn for
+        balancing, and is off by several grey levels for planes that are large at a few pixels.
         """
         self.prepare(planes, order)
         known = self._sums.get(planes)

@@ -49,7 +49,9 @@ def edit_tiling(passes: Passes, source: RowSource, steps: Sequence[Step], name: 
 def edit_regions(
     passes: Passes, source: RowSource, edits: Sequence[Sequence[Step]], masks: Sequence[RowSource], name: str
 ) -> Iterator[Tiling]:
-    """The rows of the picture under one edit for each mask, whose rows are of a grey picture of the same size.
+    """Yield the rows of the picture with an edit of its own in the region of each mask, not yet computed.
+
+    A mask is a grey picture of the same size.
 
     Raises:
         ValueError, OSError: as :func:`edit_tiling`.
@@ -89,7 +91,7 @@ def step_tiling(step: Step, passes: Passes, source: RowSource, name: str) -> Ite
 
 
 def tile_by_tile(passes: Passes, picture: Picture, edit: TileEdit) -> Tiling:
-    """An edit that computes each pixel from that of the picture."""
+    """The rows of an edit that computes each pixel from the same pixel of the picture."""
     return Tiling(passes, picture, edit, 0, passes.tile_rows or max(1, TILE_PIXELS // picture.size[1]))
 
 

@@ -337,7 +337,7 @@ class Draws:
     """
 
     def __init__(self, pilot: Pilot, columns: Columns, count: int, pixels: int) -> None:
-        """``columns`` are those of the pilot's sample."""
+        """``columns`` are the columns of the pilot's sample."""
         self.completed, self.seed, self.even = pilot.completed, pilot.seed, EVEN_SHARE * count / pixels
         weight = float(pilot.sample.weights[0, 0])
         self.rate = _rate(self.leverage(pilot.sample, columns), weight, self.even, count)
@@ -384,7 +384,7 @@ def draw(rates: Tensor, generator: np.random.Generator) -> tuple[Tensor, Tensor]
 
 
 def _rate(leverage: Tensor, weight: float, even: float, count: int) -> float:
-    """Find the factor of leverage scores at which about ``count`` pixels are drawn, given those of an even sample."""
+    """Find the factor at which about ``count`` pixels are drawn, given the leverage scores of an even sample."""
     low, high = 0.0, 1 / max(float(leverage.min()), 1e-12)
     for _ in range(60):
         middle = (low + high) / 2

@@ -379,7 +379,7 @@ class Tiled:
 
     @property
     def num_landmarks(self) -> int:
-        """The most landmarks of a filter that an edit has fitted to the picture; 0 without one."""
+        """Largest number of landmarks of the filters fitted to the picture; 0 without a filter."""
         return max((operator.kernel.landmarks.shape[2] for operator in self.operators), default=0)
 
     @property
@@ -434,7 +434,7 @@ class Tiled:
         """Rows per tile and number of workers for ``finish``.
 
         A tile has at least as many rows as the margin, or several times as many if ``tile_rows`` is None, as far as
-        memory allows. There is only one worker unless memory allows such a tile for each of them.
+        memory allows. Several workers are used only if memory allows such a tile for each.
 
         Raises:
             MemoryError: if no tile fits.

@@ -214,7 +214,7 @@ class Guess:
         """The columns of a block, and its contribution to the sums."""
         factor, (order, _, count) = block.factor, self.coefficients.shape[1:]
         rows = torch.cat([(self.moment / 2).mT, self.coefficients.transpose(2, 3).flatten(1, 2)], dim=1)
-        products = spread(rows.to(factor), factor)  # in one read of the factor
+        products = spread(rows.to(factor), factor)  # the factor is read once
         columns = self.columns(block, products[:, 0])
         powers = [self.values(block, columns)]
         for product in products[:, 1:].unflatten(1, (order, count)).unbind(1):

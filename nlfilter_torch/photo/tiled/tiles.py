@@ -1,4 +1,4 @@
-"""Shared by all tiled edits: the rows that fit in memory, and the loop over tiles from a source to a target."""
+"""Tiles of rows: how many rows fit in memory, and the loop over tiles from a source to a target."""
 
 import math
 from collections.abc import Callable, Iterator
@@ -31,7 +31,7 @@ from nlfilter_torch.photo.tiled.workers import in_order
 
 SAMPLE = 1 << 16  # pixels; docs/scale.md shows the effect of more or fewer
 TILE_PIXELS = 1 << 17  # longer tiles are no faster
-# Pixels that are computed together, for speed, with columns of a filter and without, if that many bytes may be used.
+# Pixels that are computed together for speed, with a filter and without, if LARGE_MEMORY bytes or more may be used.
 CHUNK_PIXELS, PLAIN_CHUNK_PIXELS, LARGE_MEMORY = 1 << 14, 1 << 16, 1 << 28
 Statistics = Literal["sample", "full"]
 TileEdit = Callable[[Tile], Tensor]  # computes the colours (1, C, h, W) of its rows
@@ -116,7 +116,7 @@ class Tiling:
         together: number of rows that are always computed together; tiles begin at multiples of it.
         workers: number of threads of this process, with a tile each.
         transparent: whether the output has the transparency of the picture.
-        stage: name for the progress.
+        stage: its name for the progress.
         compare: compares rows before and after the edit, both as they are stored.
         compared: called with each of these comparisons, in this process.
     """
