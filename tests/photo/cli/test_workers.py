@@ -10,9 +10,10 @@ from pathlib import Path
 import psutil
 import pytest
 
-from nlfilter_torch.photo.cli import workers
-from nlfilter_torch.photo.cli.folders import RECORD
-from tests.folders import fill, plain_files, refused
+from nlfilter_torch.photo.cli import interrupts, workers
+from nlfilter_torch.photo.cli.folders import RECORD, pictures
+from nlfilter_torch.photo.io.writing import open_beside
+from tests.folders import fill, plain_files, refused, tally_of
 
 ROOT = Path(__file__).parents[3]
 PATIENCE = 120  # seconds, on a machine that is busy with other things
@@ -30,6 +31,18 @@ def test_a_cluster_that_does_not_answer(
     if "--workers" in more:
         wanted = "--workers must not be combined with --cluster"
     assert wanted in sentence
+
+
+def wait_for_ever(source: str, target: str) -> None:
+    with open_beside(Path(target)):
+        Path(source).with_suffix(".begun").touch()
+        time.sleep(1000)
+
+
+def run_for_ever(folder: str, target: str) -> None:
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # background jobs of a shell inherit that it is ignored
+    with interrupts.handled():  # as the command does; an interrupt during a callback would be lost
+        tally_of(pictures(Path(folder)), Path(target), wait_for_ever)
 
 
 @pytest.mark.slow
