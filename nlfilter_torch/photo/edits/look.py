@@ -63,8 +63,8 @@ def apply_look(
         green: likewise, as many.
         blue: likewise.
         matrix: 9 numbers or (B, 9), the rows of the matrix that colours are multiplied by.
-        saturation: how many times as far each channel is to be from the largest one of its pixel, (K,) or (B, K), for
-            colours whose saturation in HSV is at equal steps from 0 to 1.
+        saturation: factors of the saturation in HSV, (K,) or (B, K), for colours whose saturation is at equal steps
+            from 0 to 1; the largest channel of a pixel stays as it is.
         stretch: how much of the change that stretches brightness, from the darkest to the lightest pixel of the picture
             to the range from 0 to 1, is added: of luminance, for all channels alike; of the largest channel, which
             scales colours; and of each channel for itself, (3,) or (B, 3); 0 is none.

@@ -1,5 +1,6 @@
 """Steps: values, strokes, effect, memory."""
 
+import json
 from typing import Any
 
 import pytest
@@ -7,7 +8,7 @@ import torch
 
 from nlfilter_torch.photo.declared.parameters import EDITS
 from nlfilter_torch.photo.declared.presets import Recipe
-from nlfilter_torch.photo.declared.steps import Step, working_bytes
+from nlfilter_torch.photo.declared.steps import Step, acting_steps, json_of, working_bytes
 from nlfilter_torch.photo.edits.applying import apply_recipe
 from tests.recipes import BLUE, COLORIZE, DEFOCUS, DETAIL, IN, RECOLOR, WHOLE
 
@@ -26,3 +27,60 @@ def test_more_memory_is_asked_for_by_hungrier_steps() -> None:
     assert Recipe((DETAIL,)).bytes_per_pixel == working_bytes(DETAIL["landmarks"], 5, factors=2)
     assert Recipe((Step("denoise", method="rule", patch_size=9),)).bytes_per_pixel == working_bytes(200, 9)
     assert WHOLE.bytes_per_pixel == max(step.bytes_per_pixel() for step in WHOLE.acting)
+
+
+def test_a_step_holds_what_differs_from_the_defaults() -> None:
+    step = Step("tone", clarity=2.0, contrast=1.2)  # the default
+    assert step.values == (("clarity", 2.0),)
+    assert step["contrast"] == 1.2
+    assert step == Step("tone", clarity=2.0)
+    assert step.changed(clarity=3.0)["clarity"] == 3.0
+    assert step["clarity"] == 2.0
+    with pytest.raises(TypeError, match="tone has no parameter power; its parameters are contrast, clarity"):
+        Step("tone", power=1.0)
+
+
+def test_strokes_belong_to_the_scribbles_of_the_edit() -> None:
+    assert RECOLOR.painted("colour") == (BLUE,)
+    assert RECOLOR.painted("keep") == RECOLOR.strokes[1:]
+    assert RECOLOR.is_drawn()
+    assert not RECOLOR.has_region()
+    assert RECOLOR.changed(strokes=()).painted("colour") == ()
+    assert not RECOLOR.changed(strokes=RECOLOR.strokes[1:]).changes()  # nothing has a colour
+
+
+def test_a_region_has_sliders_of_its_own() -> None:
+    assert DETAIL.has_region()
+    assert DETAIL.sliders_inside == DETAIL["inside"]
+    plain = Step("detail", (IN,), alpha=(1.0, 1.0))
+    assert plain.sliders_inside == (1.0, 1.0)
+    assert not plain.changes()
+    assert plain.changed(inside=(2.0, 1.0)).changes()
+    assert not plain.changed(inside=(2.0, 1.0), strokes=()).changes()
+
+
+def test_arguments_of_the_function_and_of_its_filter() -> None:
+    step = Step("detail", bandwidth=51.0, tolerance=20.0, spatial_bandwidth=30.0)
+    arguments = step.arguments((120, 200), stride=2)
+    assert arguments["photometric_bandwidth"] == 0.2
+    assert arguments["mask_bandwidth"] == 0.2
+    assert arguments["spatial_bandwidth"] == 15.0
+    assert "inside" not in arguments  # it comes with the strokes
+    options = step.filter_options((120, 200))
+    assert sorted(options) == [
+        "landmarks", "num_landmarks", "patch_size", "photometric_bandwidth", "spatial_bandwidth",
+    ]  # fmt: skip
+    assert options["spatial_bandwidth"] == 30.0
+    assert Step("detail").filter_options((120, 200))["spatial_bandwidth"] == 10.0  # a twelfth of the short side
+
+
+def test_files_of_steps_have_defaults_only_on_request() -> None:
+    step = Step("abstract", edges=0.5)
+    assert json.loads(step.to_json()) == {"edit": "abstract", "power": 0.1, "edges": 0.5}
+    complete = json.loads(step.to_json(complete=True))
+    assert complete["tones"] is None
+    assert set(complete) == {"edit", *(parameter.name for parameter in step.declared)}
+    entries = {name: value for name, value in complete.items() if name != "edit"}
+    assert Step.from_entries("abstract", entries, "abstract") == step
+    assert acting_steps([step, Step.idle("tone")]) == (step,)
+    assert json.loads(json_of([])) == {"version": 1, "steps": []}

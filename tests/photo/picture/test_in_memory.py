@@ -1,10 +1,17 @@
 """An image in memory as the source of an edit."""
 
+import pytest
 import torch
 
+from nlfilter_torch.filtering.filters import detail_layers
+from nlfilter_torch.operator.build import nonlocal_operator
 from nlfilter_torch.operator.options import OperatorOptions
-from nlfilter_torch.photo.picture.in_memory import InMemory
-from nlfilter_torch.photo.picture.source import Guide
+from nlfilter_torch.photo.picture.drawn import Drawn, M
+from nlfilter_torch.photo.picture.edit import PhotoEdit
+from nlfilter_torch.photo.picture.in_memory import Cache, InMemory, edit_image, kept_in, tensors_in, without_tensors
+from nlfilter_torch.photo.picture.pixels import Fitted, whole_image
+from nlfilter_torch.photo.picture.source import Guide, Source
+from tests.problems import box, noise
 
 
 def test_the_last_operator_with_the_same_options_is_cached() -> None:
@@ -26,3 +33,115 @@ def test_the_last_operator_with_the_same_options_is_cached() -> None:
     written += 1
     assert operator(written, written) is not before
     assert len(source.cache or {}) == 4
+
+
+def test_results_are_kept_as_long_as_what_they_depend_on() -> None:
+    cache: Cache = {}
+    calls: list[int] = []
+
+    def compute() -> int:
+        calls.append(len(calls))
+        return calls[-1]
+
+    first, other = torch.ones(2), torch.zeros(2)
+    assert kept_in(cache, "a", [first], compute) == 0
+    assert kept_in(cache, "a", [first.clone()], compute) == 0
+    assert kept_in(cache, "b", [first], compute) == 1
+    assert kept_in(cache, "a", [other], compute) == 2
+    assert kept_in(cache, "a", [first], compute) == 3  # only the last is kept
+    assert kept_in(None, "a", [first], compute) == 4
+
+
+def test_tensors_are_replaced_by_their_type_in_the_name_of_an_operator() -> None:
+    tensor = torch.ones(1)
+    assert tensors_in((1.0, tensor)) == [tensor]
+    assert tensors_in("auto") == []
+    assert without_tensors((1.0, tensor, "auto")) == (1.0, torch.Tensor, "auto")
+    assert without_tensors(tensor) is torch.Tensor
+
+
+def test_statistics_are_over_all_pixels() -> None:
+    image = noise(2, 3, 12, 15)
+    source = InMemory(image)
+    assert (source.batch, source.channels, source.size, source.width) == (2, 3, (12, 15), 15)
+    torch.testing.assert_close(source.mean(whole_image), image.mean((2, 3), keepdim=True))
+    least, most = source.ends(whole_image)
+    assert torch.equal(least, image.amin((2, 3), keepdim=True))
+    assert torch.equal(most, image.amax((2, 3), keepdim=True))
+    assert source.reduced(whole_image, 4).shape == (2, 3, 3, 4)
+    torch.testing.assert_close(source.reduced(whole_image, 4)[..., 0, 0], image[..., :4, :4].mean((2, 3)))
+    assert source.measured(lambda picture: picture.mean(whole_image)).shape == (2, 3, 1, 1)
+    assert torch.equal(source.colours(torch.tensor([3, 20])), image.flatten(2)[:, :, [3, 20]])
+
+
+def test_smaller_pictures() -> None:
+    image = noise(1, 3, 12, 15)
+    source = InMemory(image, {})
+    assert source.resized((12, 15)) is source
+    assert source.resized((4, 5)).size == (4, 5)
+    assert source.blocks(1, 1) is source
+    assert source.blocks(3, 1).size == (4, 5)
+    assert source.blocks(3, 1) is source.blocks(3, 1)  # kept
+    torch.testing.assert_close(source.blocks(3, 1).image, source.reduced(whole_image, 3))
+    weights = (noise(1, 2, 12, 15) > 0.5).double()
+    resized = source.resized_weights(weights, (4, 5), "regions")
+    assert resized.shape == (1, 2, 4, 5)
+    assert resized.min() >= 0
+    assert resized.max() <= 1
+    with pytest.raises(ValueError, match="regions must have the height and width of the image"):
+        source.resized_weights(weights[..., :9], (4, 5), "regions")
+
+
+def test_scribbles_are_read_from_masks() -> None:
+    image = noise(2, 3, 12, 15)
+    source, mask = InMemory(image), box(2, 3, size=(12, 15)).double()
+    scribbles = source.scribbles(mask, None, "mask")
+    assert scribbles.weights.shape == (2, 1, 16)
+    assert scribbles.colours is None
+    learned = (0.5 * mask).requires_grad_()
+    assert len(source.scribbles(learned, None, "mask").places) == 12 * 15  # also where the weight is 0
+    assert len(source.regions(torch.cat([mask, mask], dim=1), "regions")) == 2
+    assert source.num_regions(torch.cat([mask, mask], dim=1), "regions") == 2
+    assert len(source.scribbles(0 * mask, None, "mask", needed=False).places) == 0
+    for wrong, kind, sentence in (
+        (None, TypeError, "mask must be a torch.Tensor, got NoneType"),
+        (0 * mask, ValueError, "mask must hold a painted pixel"),
+        (2 * mask, ValueError, r"mask must be in \[0, 1\]"),
+        (mask[..., :9], ValueError, "mask must have the height and width of the image"),
+    ):
+        with pytest.raises(kind, match=sentence):
+            source.scribbles(wrong, None, "mask")
+
+
+def test_an_operator_in_memory_computes_planes_of_the_whole_picture() -> None:
+    image = noise(1, 2, 12, 13)
+    source = InMemory(image, {})
+    fitted = source.operator(Guide(OperatorOptions(num_landmarks=20)))
+    operator = nonlocal_operator(image, num_landmarks=20)
+    layers = fitted.layers(whole_image, 2)(source)
+    torch.testing.assert_close(layers, detail_layers(operator, image, order=2))
+    coefficients = fitted.coefficients(whole_image)
+    torch.testing.assert_close(coefficients.abs(), operator.spectrum().coefficients(image).abs())
+    torch.testing.assert_close(fitted.mean(whole_image), image.mean((2, 3)))
+    places = torch.tensor([0, 7, 100])
+    (columns,) = fitted.at(places)()
+    assert torch.equal(columns, operator.factor[:, :, places])
+    shares = fitted.of_columns(lambda columns: columns.remainder.unsqueeze(1))(source)
+    assert torch.equal(shares, operator.remainder.reshape(1, 1, 12, 13))
+
+
+class Halved(PhotoEdit):
+    """An edit that halves all values."""
+
+    def fit(self, source: Source[M], drawn: Drawn[M]) -> Fitted:
+        return Fitted(lambda pixels: pixels.image / 2)
+
+
+def test_images_are_edited_in_a_working_precision_and_keep_their_dtype() -> None:
+    for dtype in (torch.float16, torch.bfloat16, torch.float32, torch.float64):
+        image = noise(1, 3, 8, 9).to(dtype)
+        edited = edit_image(Halved(), image)
+        assert edited.dtype == dtype
+        assert torch.equal(edited, image / 2)
+    with pytest.raises(ValueError, match=r"grey must have 1 channel\(s\), got 3"):
+        edit_image(Halved(), noise(1, 3, 8, 9), name="grey", channels=1)
