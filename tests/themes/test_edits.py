@@ -44,13 +44,13 @@ each_edit = pytest.mark.parametrize("name", EDITS)
 @pytest.mark.parametrize("dtype", [torch.float16, torch.float64])
 def test_edits_keep_dtype_and_input(name: str, dtype: torch.dtype) -> None:
     image, edit = EDITS[name]
-    given = image.to(dtype)
-    before = given.clone()
-    found = edit(given)
-    assert found.dtype == dtype
-    assert found.shape == (2, 3, 20, 22)
-    assert torch.isfinite(found).all()
-    assert torch.equal(given, before)
+    converted = image.to(dtype)
+    before = converted.clone()
+    edited = edit(converted)
+    assert edited.dtype == dtype
+    assert edited.shape == (2, 3, 20, 22)
+    assert torch.isfinite(edited).all()
+    assert torch.equal(converted, before)
 
 
 @pytest.mark.parametrize(
@@ -111,12 +111,12 @@ def test_edits_are_repeatable_and_leave_the_global_generator_alone(name: str) ->
 @pytest.mark.parametrize("name", [name for name in EDITS if name != "kmeans"])
 def test_edits_have_finite_gradients(name: str) -> None:
     image, edit = EDITS[name]
-    given = image.double().requires_grad_()
+    converted = image.double().requires_grad_()
     weights = noise(2, 3, 20, 22, seed=3)
-    (edit(given) * weights).sum().backward()
-    assert given.grad is not None
-    assert given.grad.isfinite().all()
-    assert given.grad.abs().max() > 0
+    (edit(converted) * weights).sum().backward()
+    assert converted.grad is not None
+    assert converted.grad.isfinite().all()
+    assert converted.grad.abs().max() > 0
 
 
 @each_edit
@@ -221,8 +221,8 @@ def test_numbers_do_not_take_the_default_dtype() -> None:
     for dtype in (torch.bfloat16, torch.float64):
         torch.set_default_dtype(dtype)
         try:
-            found = [edit() for edit in edits]
+            edited = [edit() for edit in edits]
         finally:
             torch.set_default_dtype(torch.float32)
-        for a, b in zip(found, expected, strict=True):
+        for a, b in zip(edited, expected, strict=True):
             assert torch.equal(a, b)

@@ -22,6 +22,8 @@ MAX_SLIDERS = 100
 MAX_PATCH = 99  # pixels
 MAX_LANDMARKS = 10_000
 
+#: Arguments of a function by their names, of the types that the declaration of an edit tells.
+Arguments = dict[str, Any]
 Kind = Literal["number", "count", "odd", "choice", "sliders"]
 Unit = Literal["", "levels", "lab", "px", "%", "gain"]
 Domain = Literal["positive", "not negative", "share", "below 1", "finite", "count", "choice"]
@@ -335,7 +337,7 @@ class Edit:
         return next(p for p in self if name in (p.name, p.keyword))
 
     @cached_property
-    def defaults(self) -> dict[str, Any]:
+    def defaults(self) -> Arguments:
         """Defaults of the function's arguments, in its units; None for lengths that depend on the image."""
         return {p.keyword: None if p.unit == "%" else p.argument_of(p.default, (0, 0)) for p in self}
 

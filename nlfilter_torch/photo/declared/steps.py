@@ -9,7 +9,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from nlfilter_torch.photo.declared.declaration import Edit
+from nlfilter_torch.photo.declared.declaration import Arguments, Edit
 from nlfilter_torch.photo.declared.json_values import Value, shown
 from nlfilter_torch.photo.declared.parameters import EDITS
 from nlfilter_torch.photo.declared.shared_parameters import FILTER
@@ -110,11 +110,11 @@ class Step:
         patch_size = max(self["patch_size"], 5) if "patch_size" in names else 0
         return working_bytes(landmarks, patch_size, factors=2 if masked or self.has_region() else 1)
 
-    def arguments(self, size: tuple[int, int], stride: float = 1) -> dict[str, Any]:
+    def arguments(self, size: tuple[int, int], stride: float = 1) -> Arguments:
         """Return the arguments of the edit's function for an image of that size; see :meth:`Parameter.argument_of`."""
         return {p.keyword: p.argument_of(self[p.name], size, stride) for p in self.declared if p.is_option}
 
-    def filter_options(self, size: tuple[int, int]) -> dict[str, Any]:
+    def filter_options(self, size: tuple[int, int]) -> Arguments:
         """Return the options of :func:`nonlocal_operator` for an image of size (H, W), the viewing size."""
         options = {name: value for name, value in self.arguments(size).items() if name in FILTER}
         distance = self.declared["spatial_bandwidth"].distance(options["spatial_bandwidth"], size)

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, ClassVar, Literal, Self
+from typing import ClassVar, Literal, Self
 
 import torch
 from torch import Tensor
@@ -19,7 +19,7 @@ from nlfilter_torch.core.checks import (
 from nlfilter_torch.core.inner import Inner
 from nlfilter_torch.operator.features import blur_margin
 from nlfilter_torch.operator.options import Completion, GuideChannels, Sampling
-from nlfilter_torch.photo.declared.declaration import Edit
+from nlfilter_torch.photo.declared.declaration import Arguments, Edit
 from nlfilter_torch.photo.declared.parameters import DETAIL, MASK
 from nlfilter_torch.photo.edits.synthesis import Polynomial
 from nlfilter_torch.photo.picture.changes import (
@@ -151,7 +151,7 @@ class Detail(FilteredEdit):
     declared: ClassVar[Edit] = DETAIL
 
     @classmethod
-    def of(cls, arguments: Mapping[str, Any]) -> Self:
+    def of(cls, arguments: Arguments) -> Self:
         """Create the edit from :meth:`Step.arguments`."""
         return cls(**{**arguments, "alpha": torch.as_tensor(arguments["alpha"])})
 

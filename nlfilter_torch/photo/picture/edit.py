@@ -2,15 +2,15 @@
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal, Self, cast
+from typing import ClassVar, Literal, Self, cast
 
 import torch
 from torch import Tensor
 
 from nlfilter_torch.operator.options import Completion, GuideChannels, OperatorOptions, Sampling
-from nlfilter_torch.photo.declared.declaration import Edit
+from nlfilter_torch.photo.declared.declaration import Arguments, Edit
 from nlfilter_torch.photo.picture.drawn import Drawn, M
 from nlfilter_torch.photo.picture.pixels import Fitted
 from nlfilter_torch.photo.picture.source import Source
@@ -46,7 +46,7 @@ class PhotoEdit(ABC):
     reports_change: ClassVar[bool] = False
 
     @classmethod
-    def of(cls, arguments: Mapping[str, Any]) -> Self:
+    def of(cls, arguments: Arguments) -> Self:
         """Create the edit from :meth:`Step.arguments`, which were read from options or JSON."""
         return cls(**arguments)
 

@@ -20,10 +20,10 @@ def test_what_is_like_nothing_else_is_not_blackened() -> None:
     image = torch.full((1, 1, 40, 60), 0.4)
     image[..., 30:] = 0.9
     image[..., 29] = 0.65
-    found = abstract(image, num_landmarks=100)
-    torch.testing.assert_close(found[..., 29], image[..., 29], atol=0.01, rtol=0)
-    assert found.min() > 0.34
-    assert found.max() < 0.98
+    edited = abstract(image, num_landmarks=100)
+    torch.testing.assert_close(edited[..., 29], image[..., 29], atol=0.01, rtol=0)
+    assert edited.min() > 0.34
+    assert edited.max() < 0.98
 
 
 def test_tones_and_lines() -> None:
@@ -53,6 +53,6 @@ def test_flat_images_leave_the_gradient_of_a_batch_alone() -> None:
 
 def test_channels_of_the_guide_can_be_chosen() -> None:
     image = colour("chelsea", 24, 32)
-    found = [abstract(image, num_landmarks=20, guide_channels=channels) for channels in ("all", "luminance")]
-    torch.testing.assert_close(found[0], abstract(image, num_landmarks=20), rtol=0, atol=0)
-    assert not torch.equal(found[0], found[1])
+    edited = [abstract(image, num_landmarks=20, guide_channels=channels) for channels in ("all", "luminance")]
+    torch.testing.assert_close(edited[0], abstract(image, num_landmarks=20), rtol=0, atol=0)
+    assert not torch.equal(edited[0], edited[1])

@@ -38,7 +38,7 @@ def test_detail(pixels: torch.Tensor) -> None:
 
 def test_detail_in_a_region_and_elsewhere(pixels: torch.Tensor) -> None:
     plain = DETAIL.changed(limits="none", threshold=0.0)
-    found = apply_recipe(Recipe((plain,)), pixels)
+    edited = apply_recipe(Recipe((plain,)), pixels)
     regions = mask_of([IN], SIZE), mask_of([OUT], SIZE)
     mask = region_mask(pixels, *regions, reach=0.7, generator=seeded())
     operator = nonlocal_operator(
@@ -53,7 +53,7 @@ def test_detail_in_a_region_and_elsewhere(pixels: torch.Tensor) -> None:
         inside, outside = (polynomial_filter(operator, luminance, torch.tensor(a)) for a in (INSIDE, ALPHA))
         return mask * inside + (1 - mask) * outside
 
-    assert torch.allclose(found, edit_luminance(pixels, edit), atol=1e-5)
+    assert torch.allclose(edited, edit_luminance(pixels, edit), atol=1e-5)
     # With the same sliders inside and outside, the edit is that of the whole picture.
     same = apply_recipe(Recipe((plain.changed(inside=ALPHA),)), pixels)
     whole = Step("detail", alpha=ALPHA, bandwidth=30.0, limits="none", threshold=0.0)

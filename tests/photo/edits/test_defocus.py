@@ -78,9 +78,9 @@ def test_convolution_in_parts_is_that_of_the_whole(height: int, radius: int) -> 
 
 def test_reach_is_an_option_of_the_mask() -> None:
     image, region = colour("chelsea"), box(24, 24)
-    found = [defocus(image, region, reach=reach, num_landmarks=20) for reach in (0.5, 0.72)]
-    torch.testing.assert_close(found[1], defocus(image, region, num_landmarks=20), rtol=0, atol=0)
-    assert not torch.equal(found[0], found[1])
+    edited = [defocus(image, region, reach=reach, num_landmarks=20) for reach in (0.5, 0.72)]
+    torch.testing.assert_close(edited[1], defocus(image, region, num_landmarks=20), rtol=0, atol=0)
+    assert not torch.equal(edited[0], edited[1])
 
 
 def test_background_scribbles_are_blurred_with_what_resembles_them() -> None:

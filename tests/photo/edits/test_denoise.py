@@ -11,9 +11,9 @@ from tests.problems import colour
 def test_denoising_brings_the_photograph_closer(level: int) -> None:
     clean = colour("chelsea", 64, 96)
     noisy = clean + level / 255 * torch.randn(clean.shape, generator=torch.Generator().manual_seed(0))
-    for given in (level / 255, None):
+    for noise_level in (level / 255, None):
         gain = 10 * torch.log10(
-            (noisy - clean).square().mean() / (denoise(noisy, noise_level=given) - clean).square().mean()
+            (noisy - clean).square().mean() / (denoise(noisy, noise_level=noise_level) - clean).square().mean()
         )
         assert gain > (2.0 if level == 10 else 5.0)
 
@@ -23,9 +23,9 @@ def test_no_noise_means_no_change() -> None:
     assert torch.equal(denoise(image, noise_level=0.0), image)
     flat = torch.full((1, 1, 20, 20), 0.5)
     assert torch.equal(denoise(flat), flat)
-    each = denoise(torch.cat([image, image]), noise_level=torch.tensor([0.0, 0.1]))
-    assert torch.equal(each[:1], image)
-    assert not torch.equal(each[1:], image)
+    denoised = denoise(torch.cat([image, image]), noise_level=torch.tensor([0.0, 0.1]))
+    assert torch.equal(denoised[:1], image)
+    assert not torch.equal(denoised[1:], image)
 
 
 def test_noise_is_estimated() -> None:

@@ -62,8 +62,8 @@ def test_a_threshold_of_zero_in_a_tensor_is_no_threshold() -> None:
     alpha = torch.tensor([3.0, 3.0, 4.0, 1.0])
     expected = enhance(image, alpha, threshold=0.0, **options)
     torch.testing.assert_close(enhance(image, alpha, threshold=torch.tensor(0.0), **options), expected)
-    each = enhance(image, alpha, threshold=torch.tensor([0.0, 5 / 255]), **options)
-    torch.testing.assert_close(each[:1], expected[:1])
+    edited = enhance(image, alpha, threshold=torch.tensor([0.0, 5 / 255]), **options)
+    torch.testing.assert_close(edited[:1], expected[:1])
 
 
 def test_sliders_for_more_images_than_there_are_are_refused() -> None:

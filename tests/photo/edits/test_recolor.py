@@ -95,8 +95,8 @@ def test_the_shading_of_an_object_stays_in_a_colour_that_is_too_strong_for_it() 
         1, 3, 40, 40
     )
     dot = box(10, 10, 20, 20, size=(40, 40))
-    found = recolor(image, paint(0.0, 0.0, 1.0, dot), dot, num_landmarks=40)
-    brightness, chroma = split_luminance(found)
+    edited = recolor(image, paint(0.0, 0.0, 1.0, dot), dot, num_landmarks=40)
+    brightness, chroma = split_luminance(edited)
     assert (brightness - split_luminance(image)[0]).abs().max() < 1e-5
     saturation = chroma[0, 2, 20] / brightness[0, 0, 20]
     assert saturation[5:35].min() > 0.8 * saturation[5:35].max() > 1
@@ -106,8 +106,8 @@ def test_a_stroke_on_the_black_part_of_an_object_colours_its_lighter_parts() -> 
     image = torch.full((1, 3, 40, 40), 0.75)
     image[..., 8:32, 8:32] = torch.linspace(0.0, 0.25, 24)
     dark = box(14, 8, 12, 3, size=(40, 40))
-    found = recolor(image, paint(1.0, 1.0, 0.0, dark), dark, num_landmarks=40)
-    assert (found[:, 0] - found[:, 2])[0, 20, 26] > 0.15
+    edited = recolor(image, paint(1.0, 1.0, 0.0, dark), dark, num_landmarks=40)
+    assert (edited[:, 0] - edited[:, 2])[0, 20, 26] > 0.15
 
 
 def test_a_grey_stroke_takes_colour_away() -> None:
