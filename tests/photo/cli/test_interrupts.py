@@ -7,11 +7,12 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from importlib.machinery import SourceFileLoader
 from pathlib import Path
 
 import pytest
 
-from nlfilter_torch.photo.cli import main
+from nlfilter_torch.photo.cli import interrupts, main
 from nlfilter_torch.photo.io.photographs import read_photograph
 from tests.commands import small_photo
 
@@ -137,3 +138,35 @@ def test_other_errors_of_destructors_are_told_as_ever(
     )
     assert main(["tone", str(photo), str(tmp_path / "out.png")]) == 0
     assert [str(error) for error in told] == ["of its own"]
+
+
+def test_a_program_that_is_run_by_an_import_is_interrupted_as_ever(photo: Path, tmp_path: Path) -> None:
+    """Only modules that the command line imports itself count as being imported."""
+    (tmp_path / "runs_it.py").write_text(
+        "import os, signal\n"
+        "from nlfilter_torch.photo.cli import editing, main\n"
+        "def interrupt(*_, **__):\n"
+        "    os.kill(os.getpid(), signal.SIGINT)\n"
+        "editing.read_photograph = interrupt\n"
+        f"status = main(['tone', {str(photo)!r}, {str(tmp_path / 'out.png')!r}])\n"
+    )
+    program = (
+        "import signal, sys\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        f"sys.path.insert(0, {str(tmp_path)!r})\n"
+        "import runs_it\n"
+        "print('returned', runs_it.status)\n"
+    )
+    finished = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False, timeout=50)
+    assert (finished.returncode, finished.stdout) == (0, "returned 130\n")
+    assert finished.stderr == "nlfilter-torch: interrupted; no file is half written\n"
+
+
+def test_modules_are_loaded_as_before_afterwards() -> None:
+    before = SourceFileLoader.exec_module
+    with interrupts.handled():
+        assert SourceFileLoader.exec_module is not before
+        with interrupts.handled():  # the program may run itself
+            pass
+        assert SourceFileLoader.exec_module is not before
+    assert SourceFileLoader.exec_module is before
