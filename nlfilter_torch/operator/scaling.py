@@ -181,7 +181,7 @@ class JacobianSample(KernelMatrix):
 
     def residual(self, total: Tensor, actual: Tensor) -> Tensor:
         """Largest deviation of a row sum of the sample from 1, (B,), if d(total) has the moment ``actual``."""
-        # As d is the root for the given total, row sums are 1 - d u . (total - found).
+        # As d is the root for the given total, row sums are 1 - d u . (total - actual).
         deficit = spread((total - actual).to(self.factor).mT, self.factor, self.scaling(total))
         return self.communicator.max(deficit.abs().amax((1, 2)))
 

@@ -183,7 +183,7 @@ class Rounds(Generic[Result]):
     Attributes:
         factor: (B, M, N), zero at the removed pixels.
         diagonal: (B, N), 1 at the removed pixels.
-        found: the balancing.
+        result: the balancing.
         residual: largest deviation of a row sum from 1; 0 if values are hidden.
         before: moments of the earlier rounds, in which isolated pixels were found.
         removed: the isolated pixels, (B, N) bool; None if there are none.

@@ -29,5 +29,5 @@ def test_one_guide_serves_a_batch_of_images_and_the_other_way_round() -> None:
 
 @pytest.mark.parametrize("threads", [2, 3, 7])
 def test_strips_of_pixels_for_several_cores_do_not_change_the_result(threads: int) -> None:
-    for found, alone in zip(_filtered_and_gradients(threads), _filtered_and_gradients(1), strict=True):
-        torch.testing.assert_close(found, alone, rtol=1e-9, atol=1e-9)
+    for result, alone in zip(_filtered_and_gradients(threads), _filtered_and_gradients(1), strict=True):
+        torch.testing.assert_close(result, alone, rtol=1e-9, atol=1e-9)

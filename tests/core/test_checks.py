@@ -145,18 +145,18 @@ def test_numbers_are_finite_and_one_for_each_image(function: str, value: str) ->
 @pytest.mark.parametrize("value", [0.5, torch.tensor(0.5), torch.tensor([0.5, 0.6]), torch.tensor(0.5).double()])
 @pytest.mark.parametrize("function", list(NUMBERS))
 def test_numbers_and_tensors_of_them_are_taken(function: str, value: float | Tensor) -> None:
-    found = NUMBERS[function][1](value)
-    assert isinstance(found, Tensor)
-    assert found.isfinite().all()
+    result = NUMBERS[function][1](value)
+    assert isinstance(result, Tensor)
+    assert result.isfinite().all()
 
 
 @pytest.mark.parametrize("response", list(RESPONSES))
 def test_responses_return_a_finite_gain_for_every_eigenvalue(response: str) -> None:
-    found = RESPONSES[response]
-    sentence(lambda: spectral_filter(SPECTRUM, IMAGE, found), "response")
-    sentence(lambda: spectral_filter(SPECTRUM, IMAGE, found, residual=0.5), "response")
-    sentence(lambda: SPECTRUM.gain(found), "response")
-    sentence(lambda: SPECTRUM.synthesize(found, SPECTRUM.coefficients(IMAGE)), "response")
+    result = RESPONSES[response]
+    sentence(lambda: spectral_filter(SPECTRUM, IMAGE, result), "response")
+    sentence(lambda: spectral_filter(SPECTRUM, IMAGE, result, residual=0.5), "response")
+    sentence(lambda: SPECTRUM.gain(result), "response")
+    sentence(lambda: SPECTRUM.synthesize(result, SPECTRUM.coefficients(IMAGE)), "response")
 
 
 def test_a_constant_response_may_be_learned() -> None:

@@ -90,19 +90,19 @@ def filtering(rows: slice, group: Any, dtype: torch.dtype) -> Results:
     share = (weights * filtered).sum() + (weights[:, :1] * mask).sum()
     share = share + energy.sum() / (1 if group is None else dist.get_world_size(group))
     share.backward()
-    found = {"rows filtered": filtered, "rows mask": mask, "rows guide": guide.grad, "rows image": image.grad}
-    found |= {name: leaf.grad for name, leaf in leaves.items()}
-    found |= {"energy": energy, "eigenvalues": spectrum.eigenvalues}
-    found["rows row sums"] = operator.row_sums()
-    found["rows map"] = diffusion_map(spectrum, time=1.0).square().sum(1, keepdim=True)
-    return {name: value.detach() for name, value in found.items() if value is not None}
+    result = {"rows filtered": filtered, "rows mask": mask, "rows guide": guide.grad, "rows image": image.grad}
+    result |= {name: leaf.grad for name, leaf in leaves.items()}
+    result |= {"energy": energy, "eigenvalues": spectrum.eigenvalues}
+    result["rows row sums"] = operator.row_sums()
+    result["rows map"] = diffusion_map(spectrum, time=1.0).square().sum(1, keepdim=True)
+    return {name: value.detach() for name, value in result.items() if value is not None}
 
 
 def options(rows: slice, group: Any, dtype: torch.dtype) -> Results:
     """Other options of the operator: automatic bandwidth, samplings, no completion, a batch, one landmark per pixel."""
     guide = torch.cat([picture(name, HEIGHT, WIDTH, dtype) for name in ("camera", "coffee")])
     exact = 1e-7 if dtype == torch.float32 else None
-    found = {}
+    result = {}
     for name, kwargs in {
         "auto": {},
         "uniform": {"landmarks": "uniform", "patch_size": 1},
@@ -116,11 +116,11 @@ def options(rows: slice, group: Any, dtype: torch.dtype) -> Results:
         operator = nonlocal_operator(own, generator=seeded(rank), **arguments)  # the choices of the first rank are used
         layers = detail_layers(operator, own, order=2)
         (layers * noise(2, 3, 1, HEIGHT, WIDTH, dtype=dtype)[..., rows, :]).sum().backward()
-        found[f"rows {name}"] = layers.flatten(1, 2)
+        result[f"rows {name}"] = layers.flatten(1, 2)
         assert own.grad is not None
-        found[f"rows gradient {name}"] = own.grad
-        found[f"bandwidth {name}"] = torch.as_tensor(operator.kernel.recipe.photometric_bandwidth)
-    return {name: value.detach() for name, value in found.items()}
+        result[f"rows gradient {name}"] = own.grad
+        result[f"bandwidth {name}"] = torch.as_tensor(operator.kernel.recipe.photometric_bandwidth)
+    return {name: value.detach() for name, value in result.items()}
 
 
 def fitted(rows: slice, group: Any, dtype: torch.dtype) -> Results:
@@ -176,13 +176,13 @@ def painting(rows: slice, group: Any, dtype: torch.dtype) -> Results:
     assert figures.pop("pixels") == HEIGHT * WIDTH
     figures.pop("balancing_steps")  # samples of the ranks differ from those of the whole image
     figures.pop("num_landmarks")
-    found = {"rows spread": spread, "rows guide": guide.grad, "rows values": values.grad}
-    found |= {name: leaf.grad for name, leaf in leaves.items()}
-    found |= {
+    result = {"rows spread": spread, "rows guide": guide.grad, "rows values": values.grad}
+    result |= {name: leaf.grad for name, leaf in leaves.items()}
+    result |= {
         "rows segments": segment_mask(spectrum, regions[:, :, rows]),
         "figures": torch.tensor(list(figures.values()), dtype=dtype),
     }
-    return {name: value.detach() for name, value in found.items() if value is not None}
+    return {name: value.detach() for name, value in result.items() if value is not None}
 
 
 def sliders(rows: slice, group: Any, dtype: torch.dtype) -> Results:
@@ -229,18 +229,18 @@ def refusals(group: Any, rank: int) -> dict[str, str]:
         "width": lambda: nonlocal_operator(rows[..., : 6 - rank], num_landmarks=5, group=group),
         "dtype": lambda: nonlocal_operator(rows if rank else rows.float(), num_landmarks=5, group=group),
     }
-    found = {}
+    result = {}
     for name, call in calls.items():
         try:
             call()
         except ValueError as error:
-            found[name] = str(error)
-    return found
+            result[name] = str(error)
+    return result
 
 
 def halos(communicator: RowCommunicator) -> list[tuple[Tensor, tuple[int, int], Tensor]]:
     """Rows with halos of several sizes, and the gradient of a function of them."""
-    found = []
+    result = []
     for margin in (0, 1, 3, 30):
         rows = noise(2, 2, HEIGHT, WIDTH)[:, :, communicator.first_row :][
             :, :, : communicator.rows[communicator.rank]
@@ -248,20 +248,20 @@ def halos(communicator: RowCommunicator) -> list[tuple[Tensor, tuple[int, int], 
         extended, halo = communicator.with_halo(rows, margin)
         extended.pow(3).sum().backward()
         assert rows.grad is not None
-        found.append((extended.detach(), halo, rows.grad))
-    return found
+        result.append((extended.detach(), halo, rows.grad))
+    return result
 
 
 def traffic(group: Any, rank: int) -> list[dict[str, int]]:
     """Bytes that a rank sends for images of three heights, balanced in one sweep."""
-    found = []
+    result = []
     for height in (12, 24, 96):
         rows = noise(1, 1, height, WIDTH, dtype=torch.float32).tensor_split(PROCESSES, 2)[rank]
         with watched() as sent:
             operator = nonlocal_operator(rows, num_landmarks=3, photometric_bandwidth=2.0, tolerance=1.0, group=group)
             polynomial_filter(operator, rows, torch.ones(4))
-        found.append(dict(sent.sent) | {"calls": sent.calls, "sweeps": operator.balancing_steps})
-    return found
+        result.append(dict(sent.sent) | {"calls": sent.calls, "sweeps": operator.balancing_steps})
+    return result
 
 
 def loss_of(call: Callable[[], object]) -> tuple[str, float]:
@@ -284,26 +284,26 @@ def work(rank: int, folder: str) -> None:
             continue
         place = members.index(rank)
         rows = slice(cuts[place], cuts[place + 1])
-        found: dict[str, Any] = {problem: solve(rows, group, dtype) for problem, (solve, dtype, _) in PROBLEMS.items()}
+        result: dict[str, Any] = {problem: solve(rows, group, dtype) for problem, (solve, dtype, _) in PROBLEMS.items()}
         communicator = all_gather_shapes(noise(2, 2, rows.stop - rows.start, WIDTH), group)
         assert isinstance(communicator, RowCommunicator)
-        found["halos"] = halos(communicator)
-        torch.save(found, f"{folder}/{name}{place}.pt")
+        result["halos"] = halos(communicator)
+        torch.save(result, f"{folder}/{name}{place}.pt")
     world = dist.group.WORLD
-    found = {"refusals": refusals(world, rank), "traffic": traffic(world, rank)}
+    result = {"refusals": refusals(world, rank), "traffic": traffic(world, rank)}
     impatient = dist.new_group(timeout=timedelta(seconds=3))
     if rank != 2:  # it is alive but does not take part
-        found["absent"] = loss_of(lambda: nonlocal_operator(noise(1, 1, 5, 6), num_landmarks=5, group=impatient))
+        result["absent"] = loss_of(lambda: nonlocal_operator(noise(1, 1, 5, 6), num_landmarks=5, group=impatient))
         Path(f"{folder}/{rank}.waited").touch()
     while not all(Path(f"{folder}/{other}.waited").exists() for other in range(2)):
         time.sleep(0.05)
     rows = noise(1, 1, 5, 6).requires_grad_()
     filtered = nonlocal_operator(rows, num_landmarks=5, group=world).matmul(rows)
     if rank == 2:
-        torch.save(found, f"{folder}/end2.pt")
+        torch.save(result, f"{folder}/end2.pt")
         os._exit(0)  # like a process killed between forward and backward
-    found["dead"] = loss_of(filtered.square().sum().backward)
-    torch.save(found, f"{folder}/end{rank}.pt")
+    result["dead"] = loss_of(filtered.square().sum().backward)
+    torch.save(result, f"{folder}/end{rank}.pt")
     os._exit(0)  # a group with a dead member cannot be shut down normally
 
 
@@ -325,7 +325,7 @@ def test_ranks_get_what_one_process_gets(folder: Path, problem: str) -> None:
     solve, dtype, tolerance = PROBLEMS[problem]
     alone = solve(slice(0, HEIGHT), None, dtype)
     for name in GROUPS:
-        parts = [found[problem] for found in load(folder, name)]
+        parts = [result[problem] for result in load(folder, name)]
         for key, expected in alone.items():
             values = [part[key] for part in parts]
             for value in [torch.cat(values, dim=2)] if key.startswith("rows") else values:
@@ -336,9 +336,9 @@ def test_ranks_get_what_one_process_gets(folder: Path, problem: str) -> None:
 def test_halos_are_the_rows_of_the_neighbours(folder: Path) -> None:
     whole = noise(2, 2, HEIGHT, WIDTH)
     for name, (members, cuts) in GROUPS.items():
-        for place, found in enumerate(load(folder, name)):
+        for place, result in enumerate(load(folder, name)):
             start, stop = cuts[place], cuts[place + 1]
-            for margin, (extended, halo, gradient) in zip((0, 1, 3, 30), found["halos"], strict=True):
+            for margin, (extended, halo, gradient) in zip((0, 1, 3, 30), result["halos"], strict=True):
                 first, last = max(0, start - margin), min(HEIGHT, stop + margin)
                 torch.testing.assert_close(extended, whole[:, :, first:last], atol=0, rtol=0)
                 assert halo == (start - first, last - stop)
@@ -351,8 +351,8 @@ def test_halos_are_the_rows_of_the_neighbours(folder: Path) -> None:
 
 
 def test_what_is_sent_does_not_grow_with_the_image(folder: Path) -> None:
-    for found in load(folder, "end"):
-        first, *others = found["traffic"]
+    for result in load(folder, "end"):
+        first, *others = result["traffic"]
         assert first["sweeps"] == 1
         assert others == [first, first]
         assert 0 < first["halo"] <= 2 * 2 * WIDTH * 4  # two rows of floats to each neighbour
@@ -360,8 +360,8 @@ def test_what_is_sent_does_not_grow_with_the_image(folder: Path) -> None:
 
 
 def test_refusals_for_rows_over_ranks(folder: Path) -> None:
-    for found in load(folder, "end"):
-        said = found["refusals"]
+    for result in load(folder, "end"):
+        said = result["refusals"]
         for name in ("to_dense", "a loss"):
             assert said[name].startswith(f"{name} needs the whole image on one rank, got one that is spread over 3")
         for name, got in (("width", "[1, 1, 5, 64] on rank 1"), ("dtype", "[1, 1, 6, 64] on rank 1")):
@@ -370,9 +370,9 @@ def test_refusals_for_rows_over_ranks(folder: Path) -> None:
 
 
 def test_a_rank_that_is_gone_is_named_in_time(folder: Path) -> None:
-    for place, found in enumerate(load(folder, "end")):
+    for place, result in enumerate(load(folder, "end")):
         for name in ("absent", "dead") if place < 2 else ():
-            said, seconds = found[name]
+            said, seconds = result[name]
             assert said == "rank 2 of 3 died or did not answer; start all ranks again"
             assert seconds < 60
 

@@ -40,13 +40,13 @@ def directional(
     """Return directional derivatives by backward and by central differences of fourth order."""
     at = at.detach().requires_grad_()
     gradient = torch.autograd.grad(function(at), at)[0]
-    found, expected = [], []
+    result, expected = [], []
     with torch.no_grad():
         for direction in directions:
             f = {k: function(at + k * step * direction) for k in (-2, -1, 1, 2)}
-            found.append((gradient * direction).sum())
+            result.append((gradient * direction).sum())
             expected.append((8 * (f[1] - f[-1]) - (f[2] - f[-2])) / (12 * step))
-    return torch.stack(found), torch.stack(expected)
+    return torch.stack(result), torch.stack(expected)
 
 
 @pytest.mark.parametrize("name", GUIDES)
@@ -70,5 +70,5 @@ def test_divided_differences_are_finite_differences(name: str, response: Callabl
         return weighted(symmetric.apply(response, torch.ones_like(symmetric.eigenvalues).bool()))
 
     directions = [torch.randn(matrix.shape, generator=seeded(seed), dtype=matrix.dtype) for seed in range(5)]
-    found, expected = directional(function, matrix, directions)
-    torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-7 * expected.abs().max().item())
+    result, expected = directional(function, matrix, directions)
+    torch.testing.assert_close(result, expected, rtol=1e-5, atol=1e-7 * expected.abs().max().item())

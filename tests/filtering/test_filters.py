@@ -39,8 +39,8 @@ def double(values: object) -> torch.Tensor:
 
 @given(alpha=sliders, eigenvalues=st.lists(st.floats(0, 1), min_size=1, max_size=8))
 def test_response_is_the_reference_response(alpha: list[float], eigenvalues: list[float]) -> None:
-    found = polynomial_response(double(eigenvalues), double(alpha))
-    np.testing.assert_allclose(found, reference.response(np.array(eigenvalues), np.array(alpha)), atol=1e-12)
+    result = polynomial_response(double(eigenvalues), double(alpha))
+    np.testing.assert_allclose(result, reference.response(np.array(eigenvalues), np.array(alpha)), atol=1e-12)
 
 
 @given(alpha=sliders)
@@ -70,10 +70,10 @@ def test_layers_are_the_reference_layers(order: int) -> None:
     operator = nonlocal_operator(
         torch.from_numpy(image.copy())[None, None], photometric_bandwidth=20 / 255, num_landmarks=480
     )
-    found = detail_layers(operator, torch.from_numpy(y.copy())[None, None], order=order)
-    assert found.shape == (1, order + 1, 1, 20, 24)
+    result = detail_layers(operator, torch.from_numpy(y.copy())[None, None], order=order)
+    assert result.shape == (1, order + 1, 1, 20, 24)
     expected = reference.layers(reference.filter_matrix(image, 5, 20 / 255), y.ravel(), order)
-    np.testing.assert_allclose(found.flatten(2)[0, :, :], expected, atol=1e-4)
+    np.testing.assert_allclose(result.flatten(2)[0, :, :], expected, atol=1e-4)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -105,9 +105,9 @@ def test_sliders_are_those_of_the_dense_paper(residual: float | None) -> None:
     operator = nonlocal_operator(
         torch.from_numpy(image.copy())[None, None], photometric_bandwidth=20 / 255, num_landmarks=480
     )
-    found = polynomial_filter(operator, torch.from_numpy(y.copy())[None, None], double(ALPHA), residual=residual)
+    result = polynomial_filter(operator, torch.from_numpy(y.copy())[None, None], double(ALPHA), residual=residual)
     w = reference.filter_matrix(image, 5, 20 / 255)
-    np.testing.assert_allclose(found.ravel(), reference.edited(w, y.ravel(), np.array(ALPHA)), atol=1e-3)
+    np.testing.assert_allclose(result.ravel(), reference.edited(w, y.ravel(), np.array(ALPHA)), atol=1e-3)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -118,8 +118,8 @@ def test_ones_give_the_image_back(
     operator = build(guide.to(dtype), **chosen)
     image = noise(guide.shape[0], channels, *guide.shape[2:], seed=1, dtype=dtype)
     for residual in (None, 1.0):
-        found = polynomial_filter(operator, image, torch.ones(order + 1), residual=residual)
-        torch.testing.assert_close(found, image, atol=1e-5, rtol=0)
+        result = polynomial_filter(operator, image, torch.ones(order + 1), residual=residual)
+        torch.testing.assert_close(result, image, atol=1e-5, rtol=0)
 
 
 @given(alpha=sliders)
@@ -150,10 +150,10 @@ def test_without_residual_it_is_eq_13_on_the_eigenvectors() -> None:
     image = picture("camera", 24, 30)
     operator = build(image, photometric_bandwidth=0.4, completion="none", num_landmarks=50)
     spectrum = operator.spectrum()
-    found = polynomial_filter(operator, image, double(ALPHA), residual=0.0)
+    result = polynomial_filter(operator, image, double(ALPHA), residual=0.0)
     v = spectrum.eigenvectors.flatten(2)[0].numpy().T
     expected = reference.polynomial_filter(spectrum.eigenvalues[0].numpy(), v, image.numpy().ravel(), np.array(ALPHA))
-    np.testing.assert_allclose(found.ravel(), expected, atol=1e-5)
+    np.testing.assert_allclose(result.ravel(), expected, atol=1e-5)
 
 
 @pytest.mark.parametrize("completion", ["diagonal", "none"])
@@ -166,16 +166,16 @@ def test_residual_is_the_weight_of_what_the_eigenvectors_miss(completion: str) -
     by_default = polynomial_filter(operator, image, double(ALPHA))
     gain = polynomial_response(operator.diagonal_share.flatten(1), double(ALPHA)).view_as(operator.diagonal_share)
     for weight in (0.0, 1.0, ALPHA[0]):
-        found = polynomial_filter(operator, image, double(ALPHA), residual=weight)
-        torch.testing.assert_close(found, by_default + (weight - gain) * missed, atol=1e-9, rtol=0)
+        result = polynomial_filter(operator, image, double(ALPHA), residual=weight)
+        torch.testing.assert_close(result, by_default + (weight - gain) * missed, atol=1e-9, rtol=0)
 
 
 def test_a_residual_of_one_moves_no_pixel_far() -> None:
     """Pixels that W keeps in part were weighed twice: at 3 by the sliders, and once more by their residual."""
     image = picture("rocket", 96, 96)
     operator = build(image)
-    found = polynomial_filter(operator, image, double((3.0, 3.0, 4.0, 1.05)), residual=1.0)
-    assert ((found - image).abs() > 0.5).float().mean() < 1e-3
+    result = polynomial_filter(operator, image, double((3.0, 3.0, 4.0, 1.05)), residual=1.0)
+    assert ((result - image).abs() > 0.5).float().mean() < 1e-3
 
 
 @pytest.mark.parametrize("residual", [None, 0.0, 1.0])
@@ -185,8 +185,8 @@ def test_a_pixel_like_no_other_is_neither_lifted_nor_dropped(residual: float | N
     operator = build(image, photometric_bandwidth=0.02, num_landmarks=10, landmarks="uniform", patch_size=1)
     alike = operator.diagonal_share < 0.999
     assert not alike[0, 0, 5, 7]
-    found = polynomial_filter(operator, image, double(ALPHA), residual=residual)
-    torch.testing.assert_close(found[~alike], ALPHA[-1] * image[~alike], atol=0.02, rtol=0)
+    result = polynomial_filter(operator, image, double(ALPHA), residual=residual)
+    torch.testing.assert_close(result[~alike], ALPHA[-1] * image[~alike], atol=0.02, rtol=0)
 
 
 def test_residual_may_be_a_parameter() -> None:
@@ -202,15 +202,15 @@ def test_sliders_for_every_image_and_every_pixel() -> None:
     guide, image = noise(3, 1, 9, 11), noise(3, 2, 9, 11, seed=1)
     operator = build(guide, photometric_bandwidth=0.3, num_landmarks=20)
     alpha = noise(3, 4, seed=2)
-    found = polynomial_filter(operator, image, alpha)
+    result = polynomial_filter(operator, image, alpha)
     for i in range(3):
         expected = polynomial_filter(operator, image, alpha[i])[i]
-        torch.testing.assert_close(found[i], expected, atol=1e-12, rtol=0)
+        torch.testing.assert_close(result[i], expected, atol=1e-12, rtol=0)
     spread = alpha[:, :, None, None].expand(3, 4, 9, 11)
-    torch.testing.assert_close(polynomial_filter(operator, image, spread), found, atol=1e-12, rtol=0)
+    torch.testing.assert_close(polynomial_filter(operator, image, spread), result, atol=1e-12, rtol=0)
     mask = (noise(3, 1, 9, 11, seed=3) > 0.5).double()
     blended = polynomial_filter(operator, image, 1 + mask * (spread - 1))
-    torch.testing.assert_close(blended, image + mask * (found - image), atol=1e-12, rtol=0)
+    torch.testing.assert_close(blended, image + mask * (result - image), atol=1e-12, rtol=0)
 
 
 @pytest.mark.parametrize("dtype", FLOATS)
@@ -218,18 +218,18 @@ def test_images_keep_their_dtype(dtype: torch.dtype) -> None:
     operator = build(noise(1, 1, 9, 11, dtype=torch.float32), photometric_bandwidth=0.3, num_landmarks=20)
     image = noise(1, 3, 9, 11, seed=1, dtype=dtype)
     alpha = torch.tensor(ALPHA)
-    for found in (
+    for result in (
         polynomial_filter(operator, image, alpha),
         polynomial_filter(operator, image, alpha, residual=0.5),
         detail_layers(operator, image),
         spectral_filter(operator.spectrum(), image, torch.sqrt),
     ):
-        assert found.dtype == dtype
-        assert found.isfinite().all()
+        assert result.dtype == dtype
+        assert result.isfinite().all()
     exact = polynomial_filter(operator, image.float(), alpha)
     tolerance = 4 * torch.finfo(dtype).eps if dtype.itemsize == 2 else 1e-5
-    found = polynomial_filter(operator, image, alpha).float()
-    torch.testing.assert_close(found, exact, atol=tolerance, rtol=tolerance)
+    result = polynomial_filter(operator, image, alpha).float()
+    torch.testing.assert_close(result, exact, atol=tolerance, rtol=tolerance)
 
 
 def test_batch_is_its_images() -> None:
@@ -276,12 +276,12 @@ def test_gradients_by_masks_are_right_where_all_are_0(count: int, painted: float
     given = masks.clone().requires_grad_()
     filtered = filter_regions(operator, image, given, alpha)
     assert torch.equal(filtered[..., 3:], image[..., 3:])
-    (found,) = torch.autograd.grad((filtered * weights).sum(), given)
+    (result,) = torch.autograd.grad((filtered * weights).sum(), given)
     for k in range(count):
         moved = masks.clone()
         moved[:, k] += 1e-6
         wanted = ((filter_regions(operator, image, moved, alpha) - filtered.detach()) * weights).sum() / 1e-6
-        assert float(found[:, k].sum()) == pytest.approx(float(wanted), rel=1e-4)
+        assert float(result[:, k].sum()) == pytest.approx(float(wanted), rel=1e-4)
 
 
 def test_numbers_are_as_exact_as_tensors_in_double_precision() -> None:
@@ -308,21 +308,21 @@ def test_half_precision_masks_do_not_round_the_sliders() -> None:
 def test_patch_weights_in_half_precision_do_not_overflow() -> None:
     image = noise(1, 1, 16, 16).float()
     options = {"photometric_bandwidth": 0.2, "num_landmarks": 20}
-    found, expected = (
+    result, expected = (
         nonlocal_operator(image, patch_weights=weights, **options) @ image
         for weights in (torch.full((5, 5), 3000.0).half(), torch.ones(5, 5))
     )
-    torch.testing.assert_close(found, expected, atol=1e-6, rtol=0)
+    torch.testing.assert_close(result, expected, atol=1e-6, rtol=0)
 
 
 @pytest.mark.parametrize("power", [0.1, 0.5, 1.0, 3.0])
 def test_spectral_filter_is_v_f_v(power: float) -> None:
     image = picture("coffee", 24, 30)
     spectrum = build(image, photometric_bandwidth=0.1, num_landmarks=50).spectrum()
-    found = spectral_filter(spectrum, image, lambda s: s**power)
+    result = spectral_filter(spectrum, image, lambda s: s**power)
     s, v = spectrum.eigenvalues[0].numpy(), spectrum.eigenvectors.flatten(2)[0].numpy().T
     np.testing.assert_allclose(
-        found.ravel(), reference.spectral_function(s, v, s**power, image.numpy().ravel()), atol=1e-6
+        result.ravel(), reference.spectral_function(s, v, s**power, image.numpy().ravel()), atol=1e-6
     )
 
 
@@ -333,8 +333,8 @@ def test_spectral_filter_against_the_dense_paper() -> None:
     )
     s, v = reference.eigenpairs(reference.filter_matrix(image, 5, 20 / 255))
     for f in (lambda s: s, lambda s: (1 - s) * s**0.5, lambda s: s**3):
-        found = spectral_filter(operator.spectrum(), torch.from_numpy(y.copy())[None, None], f)
-        np.testing.assert_allclose(found.ravel(), reference.spectral_function(s, v, f(s), y.ravel()), atol=3e-3)
+        result = spectral_filter(operator.spectrum(), torch.from_numpy(y.copy())[None, None], f)
+        np.testing.assert_allclose(result.ravel(), reference.spectral_function(s, v, f(s), y.ravel()), atol=3e-3)
 
 
 def test_a_response_of_one_projects() -> None:
@@ -354,8 +354,8 @@ def test_coefficients_that_are_kept_change_nothing(guides: int, images: int) -> 
     held = spectrum.coefficients(image)
     assert held.shape == (max(guides, images), 3, 10)
     for power in (0.1, 2.0):
-        found = spectral_filter(spectrum, image, lambda s, p=power: s**p, residual=0.7, coefficients=held)
-        assert torch.equal(found, spectral_filter(spectrum, image, lambda s, p=power: s**p, residual=0.7))
+        result = spectral_filter(spectrum, image, lambda s, p=power: s**p, residual=0.7, coefficients=held)
+        assert torch.equal(result, spectral_filter(spectrum, image, lambda s, p=power: s**p, residual=0.7))
 
 
 def test_coefficients_of_another_image_are_refused() -> None:
@@ -383,10 +383,10 @@ def test_captured_energy_is_the_reference_beta() -> None:
     image = picture("coffee", 24, 30)
     spectrum = build(image, photometric_bandwidth=0.1, num_landmarks=20, landmarks="uniform").spectrum()
     v = spectrum.eigenvectors.flatten(2)[0].numpy().T
-    found = captured_energy(spectrum, image)
-    assert found.shape == (1,)
-    assert found.item() == pytest.approx(reference.captured_energy(v, image.numpy().ravel()), abs=1e-9)
-    assert 0.5 < found.item() < 1
+    result = captured_energy(spectrum, image)
+    assert result.shape == (1,)
+    assert result.item() == pytest.approx(reference.captured_energy(v, image.numpy().ravel()), abs=1e-9)
+    assert 0.5 < result.item() < 1
 
 
 @given(guide=guides(), chosen=options)
@@ -414,9 +414,9 @@ def test_a_response_may_be_a_condition() -> None:
     image = picture("coffee", 20, 24)
     spectrum = nonlocal_operator(image, num_landmarks=15).spectrum()
     for residual in (0.0, 1.0):
-        found = spectral_filter(spectrum, image, lambda values: values > 0.5, residual=residual)
+        result = spectral_filter(spectrum, image, lambda values: values > 0.5, residual=residual)
         wanted = spectral_filter(spectrum, image, lambda values: (values > 0.5).float(), residual=residual)
-        assert torch.equal(found, wanted)
+        assert torch.equal(result, wanted)
 
 
 GUIDE = noise(2, 1, 8, 9)
@@ -435,10 +435,10 @@ def raises(call: Callable[[], object], error: type[Exception], message: str) -> 
     """Check for ``<argument> must <requirement>, got <value>; <remedy>`` on one line that begins with ``message``."""
     with pytest.raises(error) as caught:
         call()
-    found = str(caught.value)
-    assert found.startswith(message), found
-    assert re.fullmatch(r"\w+ must .+, got .+; .+", found), found
-    assert not re.search(r"\n|[^.]\.$", found), found
+    result = str(caught.value)
+    assert result.startswith(message), result
+    assert re.fullmatch(r"\w+ must .+, got .+; .+", result), result
+    assert not re.search(r"\n|[^.]\.$", result), result
 
 
 TWO = "must have at least two entries, got 1"
@@ -501,15 +501,15 @@ def test_regions_are_filtered_each_by_its_own_sliders(residual: float | None) ->
         torch.testing.assert_close(edited[:, :, rows], whole[:, :, rows])
     layer = NonlocalFilter(sliders.tolist(), residual=residual, photometric_bandwidth=0.2, num_landmarks=60)
     single = image.float()
-    found = layer(single, mask=masks.float())
-    torch.testing.assert_close(found, edited.float(), atol=1e-3, rtol=0)
-    found.square().mean().backward()
+    result = layer(single, mask=masks.float())
+    torch.testing.assert_close(result, edited.float(), atol=1e-3, rtol=0)
+    result.square().mean().backward()
     assert layer.sliders.alpha.grad is not None
     assert (layer.sliders.alpha.grad != 0).all()
     called = NonlocalFilter(residual=residual, photometric_bandwidth=0.2, num_landmarks=60)
-    torch.testing.assert_close(called(single, mask=masks.float(), alpha=sliders.float()), found)
+    torch.testing.assert_close(called(single, mask=masks.float(), alpha=sliders.float()), result)
     one_for_all = called(single, mask=masks.float(), alpha=sliders[0].float())
-    torch.testing.assert_close(one_for_all[:, :, :8], found[:, :, :8])
+    torch.testing.assert_close(one_for_all[:, :, :8], result[:, :, :8])
     for wrong in (-masks, 2 * masks):
         with pytest.raises(ValueError, match=r"masks must be in \[0, 1\]"):
             filter_regions(operator, image, wrong, sliders)

@@ -33,10 +33,10 @@ def test_own_output_gives_its_sliders(name: str, alpha: tuple[float, ...]) -> No
     image = grey(name)
     operator = nonlocal_operator(image, num_landmarks=60)
     wanted = torch.tensor(alpha)
-    found = fit_alpha(operator, image, polynomial_filter(operator, image, wanted))
-    assert found.shape == (1, 4)
-    assert found.dtype == torch.float32
-    torch.testing.assert_close(found[0], wanted, atol=1e-4, rtol=0)
+    result = fit_alpha(operator, image, polynomial_filter(operator, image, wanted))
+    assert result.shape == (1, 4)
+    assert result.dtype == torch.float32
+    torch.testing.assert_close(result[0], wanted, atol=1e-4, rtol=0)
 
 
 @pytest.mark.parametrize("order", [1, 2, 5])
@@ -44,8 +44,8 @@ def test_own_output_of_another_order(order: int) -> None:
     image = grey("chelsea")
     operator = nonlocal_operator(image, num_landmarks=60)
     wanted = torch.linspace(2.0, 0.8, order + 1)
-    found = fit_alpha(operator, image, polynomial_filter(operator, image, wanted), order=order)
-    torch.testing.assert_close(found[0], wanted, atol=1e-4, rtol=0)
+    result = fit_alpha(operator, image, polynomial_filter(operator, image, wanted), order=order)
+    torch.testing.assert_close(result[0], wanted, atol=1e-4, rtol=0)
 
 
 @pytest.mark.parametrize("alpha", ALPHAS)
@@ -81,14 +81,14 @@ def test_clipped_pixels_tell_only_a_bound() -> None:
 def test_fit_is_the_least_squares_solution() -> None:
     image, target = grey("astronaut", dtype=torch.float64), picture("camera", 96, 96)
     operator = nonlocal_operator(image, num_landmarks=40)
-    found = fit_alpha(operator, image, target)
+    result = fit_alpha(operator, image, target)
 
     def error(alpha: torch.Tensor) -> float:
         return float((polynomial_filter(operator, image, alpha) - target).square().mean())
 
-    best = error(found)
+    best = error(result)
     for step in torch.cat([torch.eye(4), -torch.eye(4)]).double():
-        assert error(found + 1e-3 * step) > best
+        assert error(result + 1e-3 * step) > best
 
 
 def test_batch_is_fitted_image_by_image_or_together() -> None:
@@ -111,8 +111,8 @@ def test_colour_images_are_fitted_over_all_channels() -> None:
     image = 0.25 + 0.5 * noise(1, 3, 40, 40, dtype=torch.float32)
     operator = nonlocal_operator(image, num_landmarks=30)
     wanted = torch.tensor([1.5, 0.5, 2.0])
-    found = fit_alpha(operator, image, polynomial_filter(operator, image, wanted), order=2)
-    torch.testing.assert_close(found[0], wanted, atol=1e-4, rtol=0)
+    result = fit_alpha(operator, image, polynomial_filter(operator, image, wanted), order=2)
+    torch.testing.assert_close(result[0], wanted, atol=1e-4, rtol=0)
 
 
 def test_mask_keeps_the_rest_out() -> None:
@@ -170,8 +170,8 @@ def test_descent_on_the_squared_error_is_least_squares() -> None:
     mask = torch.zeros(1, 1, 64, 64, dtype=torch.float64)
     mask[..., 10:50, 5:60] = 1
     exact = fit_alpha(operator, image, other, mask=mask)
-    found = fit_alpha(operator, image, other, mask=mask, loss=torch.nn.functional.mse_loss)
-    torch.testing.assert_close(found, exact, atol=1e-6, rtol=0)
+    result = fit_alpha(operator, image, other, mask=mask, loss=torch.nn.functional.mse_loss)
+    torch.testing.assert_close(result, exact, atol=1e-6, rtol=0)
 
 
 def test_gradient_reaches_image_target_mask_and_guide() -> None:
@@ -246,9 +246,9 @@ def test_layers_that_are_tiny_multiples_of_others_rest(
     )
     image = noise(1, 3, 13, 9, seed=7, dtype=dtype)
     target = polynomial_filter(operator, image, torch.tensor([1.5, 1.2, 0.8, 1.1], dtype=dtype))
-    found = fit_alpha(operator, image, target)
-    torch.testing.assert_close(found, torch.tensor([[1.5, 1.0, 1.0, 1.1]], dtype=dtype), atol=1e-3, rtol=0)
-    assert (polynomial_filter(operator, image, found[0]) - target).abs().max() < 1e-5
+    result = fit_alpha(operator, image, target)
+    torch.testing.assert_close(result, torch.tensor([[1.5, 1.0, 1.0, 1.1]], dtype=dtype), atol=1e-3, rtol=0)
+    assert (polynomial_filter(operator, image, result[0]) - target).abs().max() < 1e-5
 
 
 def test_pixels_that_do_not_count_and_other_images_change_nothing() -> None:
@@ -291,9 +291,9 @@ def test_sliders_of_nearly_proportional_layers_stay_near_the_true_ones(name: str
     image = torch.rand(1, 2, 24, 30, generator=seeded(9)).double()
     operator = nonlocal_operator(guide, num_landmarks=10, photometric_bandwidth=bandwidth)
     target = polynomial_filter(operator, image, torch.tensor([3.0, 2.0, 0.5, 1.0]).double())
-    found = fit_alpha(operator, image, target)
-    assert found.abs().max() < 4
-    torch.testing.assert_close(polynomial_filter(operator, image, found), target, atol=1e-9, rtol=0)
+    result = fit_alpha(operator, image, target)
+    assert result.abs().max() < 4
+    torch.testing.assert_close(polynomial_filter(operator, image, result), target, atol=1e-9, rtol=0)
 
 
 def test_only_the_proportions_of_a_mask_count_for_a_loss() -> None:

@@ -24,11 +24,11 @@ def test_on_its_own_image_it_is_the_filter(completion: str, spatial_bandwidth: f
     torch.testing.assert_close(fitted.layers(image, guide), detail_layers(operator, image, order=4), atol=1e-7, rtol=0)
     alpha = torch.tensor([2.0, 0.5, 3.0, 1.0, 1.1], dtype=torch.float64)
     for residual in (None, 0.0, 1.0):
-        found, expected = (
+        result, expected = (
             fitted(image, alpha, guide, residual=residual),
             polynomial_filter(operator, image, alpha, residual=residual),
         )
-        torch.testing.assert_close(found, expected, atol=1e-6, rtol=0)
+        torch.testing.assert_close(result, expected, atol=1e-6, rtol=0)
 
 
 def test_a_tile_is_a_part_of_the_whole() -> None:
@@ -45,8 +45,8 @@ def test_equal_patches_are_edited_equally_whatever_is_around() -> None:
     fitted = fit_filter(build(image, num_landmarks=60, photometric_bandwidth=0.2), image)
     other = noise(1, 1, 30, 30)
     other[..., 5:25, 5:25] = image[..., 10:30, 12:32]
-    found = fitted(other, ALPHA)[..., 7:23, 7:23]
-    torch.testing.assert_close(found, fitted(image, ALPHA)[..., 12:28, 14:30], atol=1e-9, rtol=0)
+    result = fitted(other, ALPHA)[..., 7:23, 7:23]
+    torch.testing.assert_close(result, fitted(image, ALPHA)[..., 12:28, 14:30], atol=1e-9, rtol=0)
 
 
 def test_what_the_references_do_not_show_stays() -> None:

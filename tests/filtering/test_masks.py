@@ -57,10 +57,10 @@ def regions(count: int = 1, height: int = SIDE, width: int = SIDE) -> torch.Tens
 def test_distances_are_those_of_the_dense_map(spectrum, dense, time: float) -> None:
     s, v = dense
     expected = reference.diffusion_map(s, v, time)
-    found = diffusion_map(spectrum, time=time).flatten(2)[0]
+    result = diffusion_map(spectrum, time=time).flatten(2)[0]
     for pixel in (0, 100, 333):
         np.testing.assert_allclose(
-            (found - found[:, pixel : pixel + 1]).square().sum(0),
+            (result - result[:, pixel : pixel + 1]).square().sum(0),
             reference.diffusion_distance(expected, expected[pixel]),
             rtol=2e-3,
             atol=2e-2,  # for distances up to several hundred
@@ -72,16 +72,16 @@ def test_distances_are_those_of_the_dense_map(spectrum, dense, time: float) -> N
 def test_mask_is_that_of_the_dense_paper(spectrum, dense, time: float, width: float) -> None:
     s, v = dense
     region = regions(3)
-    found = diffusion_mask(spectrum, region, time=time, width=width)
+    result = diffusion_mask(spectrum, region, time=time, width=width)
     expected = [reference.diffusion_mask(s, v, r.numpy().ravel(), time, width) for r in region[0]]
-    np.testing.assert_allclose(found.flatten(2)[0], np.stack(expected), atol=5e-3)
+    np.testing.assert_allclose(result.flatten(2)[0], np.stack(expected), atol=5e-3)
 
 
 def test_partition_is_that_of_the_dense_paper(spectrum, dense) -> None:
     region = regions(3)
-    found = segment_mask(spectrum, region, time=1.0).flatten(2)[0].numpy()
+    result = segment_mask(spectrum, region, time=1.0).flatten(2)[0].numpy()
     expected = reference.segment_mask(*dense, region.flatten(2)[0].numpy(), 1.0, steps=20)
-    assert (found == expected).mean() > 0.99
+    assert (result == expected).mean() > 0.99
 
 
 @given(guide=guides(), chosen=options, time=st.floats(0.1, 10), width=st.floats(0.1, 100), seed=st.integers(0, 99))
@@ -249,8 +249,8 @@ def test_masks_are_worked_out_block_by_block(monkeypatch: pytest.MonkeyPatch) ->
 
     whole = mask_and_slope()
     monkeypatch.setattr("nlfilter_torch.filtering.masks.CACHED", 1)  # of 256 pixels
-    for found, wanted in zip(mask_and_slope(), whole, strict=True):
-        torch.testing.assert_close(found, wanted, atol=1e-10, rtol=1e-8)
+    for result, wanted in zip(mask_and_slope(), whole, strict=True):
+        torch.testing.assert_close(result, wanted, atol=1e-10, rtol=1e-8)
 
 
 def test_one_set_of_regions_serves_every_image() -> None:
@@ -326,10 +326,10 @@ def raises(call: Callable[[], object], error: type[Exception], message: str) -> 
     """Check for ``<argument> must <requirement>, got <value>; <remedy>`` on one line that begins with ``message``."""
     with pytest.raises(error) as caught:
         call()
-    found = str(caught.value)
-    assert found.startswith(message), found
-    assert re.fullmatch(r"\w+ must .+, got .+; .+", found), found
-    assert not re.search(r"\n|[^.]\.$", found), found
+    result = str(caught.value)
+    assert result.startswith(message), result
+    assert re.fullmatch(r"\w+ must .+, got .+; .+", result), result
+    assert not re.search(r"\n|[^.]\.$", result), result
 
 
 POSITIVE = "must be positive and finite, got"

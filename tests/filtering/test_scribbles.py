@@ -65,12 +65,12 @@ def spectrum_remainder(spectrum: Spectrum) -> np.ndarray:
 @pytest.mark.parametrize(("strength", "reach", "smoothness"), [(1.0, 0.9, 1.0), (0.3, 0.0, 5.0), (0.0, 0.99, 0.1)])
 def test_it_is_the_best_linear_estimate(spectrum: Spectrum, strength: float, reach: float, smoothness: float) -> None:
     strokes, mask = noise(1, 3, 20, 24), spots(*PLACES) * (0.5 + noise(1, 1, 20, 24, seed=1) / 2)
-    found = propagate_strokes(spectrum, strokes, mask, strength=strength, reach=reach, smoothness=smoothness)
+    result = propagate_strokes(spectrum, strokes, mask, strength=strength, reach=reach, smoothness=smoothness)
     for channel in range(3):
         expected = kriging(
             spectrum, strokes[0, channel].flatten().numpy(), mask.flatten().numpy(), strength, reach, smoothness
         )
-        np.testing.assert_allclose(found[0, channel].flatten(), expected, atol=2e-5)
+        np.testing.assert_allclose(result[0, channel].flatten(), expected, atol=2e-5)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -81,9 +81,9 @@ def test_pixels_that_the_landmarks_miss_do_not_run_away(bandwidth: float, dtype:
     strokes = torch.zeros_like(mask)
     strokes[..., 20:22, 20:22] = 1
     spectrum = nonlocal_operator(image, photometric_bandwidth=bandwidth).spectrum()
-    found = propagate_strokes(spectrum, strokes, mask)
-    assert found.min() > -0.5
-    assert found.max() < 1.5
+    result = propagate_strokes(spectrum, strokes, mask)
+    assert result.min() > -0.5
+    assert result.max() < 1.5
     constant = torch.full_like(mask, 0.7)
     torch.testing.assert_close(propagate_strokes(spectrum, constant, mask), constant, atol=1e-5, rtol=0)
 
@@ -95,8 +95,8 @@ def test_a_constant_stays_constant(guide: torch.Tensor, options: dict, data: st.
     mask[..., 0, 0] = 1
     spectrum = build(guide, **options).spectrum()
     for value in (0.0, 1.0, -3.0):
-        found = propagate_strokes(spectrum, torch.full_like(mask, value), mask)
-        torch.testing.assert_close(found, torch.full_like(mask, value), atol=1e-5, rtol=0)
+        result = propagate_strokes(spectrum, torch.full_like(mask, value), mask)
+        torch.testing.assert_close(result, torch.full_like(mask, value), atol=1e-5, rtol=0)
 
 
 def test_it_is_linear_in_the_strokes_and_reads_only_painted_ones(spectrum: Spectrum) -> None:
@@ -119,9 +119,9 @@ def test_values_go_to_their_likes_and_fade_on_request() -> None:
     strokes[..., 4:6, 2:4], strokes[..., 4:6, 14:16] = 1.0, 0.5
     full = propagate_strokes(spectrum, strokes, mask)
     none = propagate_strokes(spectrum, strokes, mask, strength=0.0)
-    for found in (full, none):  # away from the borders, where patches contain both sides
-        torch.testing.assert_close(found[..., 2:7], torch.ones(1, 1, 18, 5), atol=0.05, rtol=0)
-        torch.testing.assert_close(found[..., 13:17], torch.full((1, 1, 18, 4), 0.5), atol=0.05, rtol=0)
+    for result in (full, none):  # away from the borders, where patches contain both sides
+        torch.testing.assert_close(result[..., 2:7], torch.ones(1, 1, 18, 5), atol=0.05, rtol=0)
+        torch.testing.assert_close(result[..., 13:17], torch.full((1, 1, 18, 4), 0.5), atol=0.05, rtol=0)
     assert (none[..., 23:].abs() < 0.05).all()
     torch.testing.assert_close(full[..., 23:], torch.full((1, 1, 18, 7), 0.75), atol=0.1, rtol=0)
     half = propagate_strokes(spectrum, strokes, mask, strength=0.5)
@@ -137,15 +137,15 @@ def test_a_dot_counts_beside_broad_strokes() -> None:
     strokes, mask = torch.zeros(1, 1, side, side), torch.zeros(1, 1, side, side)
     mask[..., :100] = 1
     mask[..., 128, 200] = strokes[..., 128, 200] = 1
-    found = propagate_strokes(spectrum, strokes, mask)
-    assert found[..., 150:].min() > 0.85
-    assert found[..., :100].max() < 0.05
+    result = propagate_strokes(spectrum, strokes, mask)
+    assert result[..., 150:].min() > 0.85
+    assert result[..., :100].max() < 0.05
 
 
 def test_every_pixel_may_be_painted(spectrum: Spectrum) -> None:
     strokes = picture("coffee", 20, 24)
-    found = propagate_strokes(spectrum, strokes, torch.ones_like(strokes), smoothness=1e-3)
-    assert (found - strokes).abs().mean() < 0.05
+    result = propagate_strokes(spectrum, strokes, torch.ones_like(strokes), smoothness=1e-3)
+    assert (result - strokes).abs().mean() < 0.05
 
 
 def test_a_batch_is_its_images() -> None:
@@ -169,8 +169,8 @@ def test_one_operator_serves_several_strokes_and_one_stroke_several_operators(sp
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.float32, torch.float64])
 def test_strokes_keep_their_dtype(spectrum: Spectrum, dtype: torch.dtype) -> None:
-    found = propagate_strokes(spectrum, noise(1, 1, 20, 24, dtype=dtype), spots(*PLACES).to(dtype))
-    assert found.dtype == dtype
+    result = propagate_strokes(spectrum, noise(1, 1, 20, 24, dtype=dtype), spots(*PLACES).to(dtype))
+    assert result.dtype == dtype
 
 
 @pytest.mark.parametrize("degenerate", [False, True])
@@ -244,10 +244,10 @@ def test_isolated_pixels_do_not_make_values_nan(recorded: bool) -> None:
     alone[..., -40:] = True
     spectrum = replace(operator, factor=operator.factor * ~alone).spectrum()
     mask[..., :5], mask[..., -40:] = 1, 1 - recorded
-    found = propagate_strokes(spectrum, noise(1, 2, 1, 1700, seed=2), mask.requires_grad_(recorded))
-    assert found.isfinite().all()
+    result = propagate_strokes(spectrum, noise(1, 2, 1, 1700, seed=2), mask.requires_grad_(recorded))
+    assert result.isfinite().all()
     if recorded:
-        found.sum().backward()
+        result.sum().backward()
         assert mask.grad is not None
         assert mask.grad.isfinite().all()
 

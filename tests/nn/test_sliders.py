@@ -31,9 +31,9 @@ def test_filter_is_the_function(residual: float | None) -> None:
 @pytest.mark.parametrize("guide_channels", [1, 2, 3])
 def test_guide_may_be_another_picture(channels: int, guide_channels: int) -> None:
     guide, picture_ = noise(2, guide_channels, 12, 13, seed=1), noise(2, channels, 12, 13)
-    found = NonlocalFilter(ALPHA, **OPTIONS)(picture_, guide=guide)
+    result = NonlocalFilter(ALPHA, **OPTIONS)(picture_, guide=guide)
     expected = polynomial_filter(nonlocal_operator(guide, **OPTIONS), picture_, torch.tensor(ALPHA))
-    torch.testing.assert_close(found, expected)
+    torch.testing.assert_close(result, expected)
 
 
 def test_mask_blends() -> None:

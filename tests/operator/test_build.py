@@ -84,13 +84,13 @@ def test_points_of_weight_four_are_the_pixels_they_stand_for(
 @pytest.mark.parametrize("dtype", FLOATS)
 def test_what_a_weighted_operator_reports_is_true_of_the_pixels(dtype: torch.dtype) -> None:
     _, points, pixels = pair(dtype)
-    found, expected = points.diagnostics(), pixels.diagnostics()
-    assert found.pixels == expected.pixels == 16384
-    assert found.rank == expected.rank
+    result, expected = points.diagnostics(), pixels.diagnostics()
+    assert result.pixels == expected.pixels == 16384
+    assert result.rank == expected.rank
     for name in ("smallest_row_sum", "largest_eigenvalue", "diagonal_share"):
-        torch.testing.assert_close(getattr(found, name), getattr(expected, name), atol=1e-3, rtol=1e-4)
-    assert max(found.orthogonality) < 1e-3
-    assert max(found.eigenvector_residual) < max(expected.eigenvector_residual) + 1e-4
+        torch.testing.assert_close(getattr(result, name), getattr(expected, name), atol=1e-3, rtol=1e-4)
+    assert max(result.orthogonality) < 1e-3
+    assert max(result.eigenvector_residual) < max(expected.eigenvector_residual) + 1e-4
     assert max(points.certify().symmetry) < 1e-5
 
 
@@ -157,9 +157,9 @@ def test_evaluation_leaves_autocast() -> None:
     operator = operator_from_features(features.requires_grad_(), size=(60,), num_landmarks=20)
     expected = operator.at(points)
     with torch.autocast("cpu", torch.bfloat16):
-        found = operator.at(points)
-    assert torch.equal(found.factor, expected.factor)
-    assert torch.equal(found.scaling, expected.scaling)
+        result = operator.at(points)
+    assert torch.equal(result.factor, expected.factor)
+    assert torch.equal(result.scaling, expected.scaling)
 
 
 def test_arguments_may_be_changed_after_building() -> None:
@@ -259,8 +259,8 @@ def test_images_of_a_batch_have_totals_of_their_own() -> None:
         lambda spectrum: propagate_strokes(spectrum, strokes, painted),
     ):
         torch.testing.assert_close(compute(both.spectrum())[1:], compute(alone.spectrum()), rtol=0, atol=1e-6)
-    found, wanted = both.diagnostics(), alone.diagnostics()
-    assert found.diagonal_share[1:] == pytest.approx(wanted.diagonal_share)
+    result, wanted = both.diagnostics(), alone.diagnostics()
+    assert result.diagonal_share[1:] == pytest.approx(wanted.diagonal_share)
     assert wanted.pixels == round(float(weights[1].sum()))
 
 
@@ -281,8 +281,8 @@ def test_captured_energy_and_sliders_count_the_pixels_that_points_represent() ->
     generator = seeded(4)
     target = image + 0.1 * torch.randn(image.shape, generator=generator, dtype=torch.float64)
     target_of_all = target.repeat_interleave(counts, dim=3)
-    found = fit_alpha(few, image, target, order=2)
-    torch.testing.assert_close(found, fit_alpha(many, whole, target_of_all, order=2), rtol=0.02, atol=0.02)
+    result = fit_alpha(few, image, target, order=2)
+    torch.testing.assert_close(result, fit_alpha(many, whole, target_of_all, order=2), rtol=0.02, atol=0.02)
 
 
 @pytest.mark.parametrize("landmarks", SAMPLINGS)

@@ -118,13 +118,13 @@ def test_the_gradient_of_a_limited_operator_is_exact(landmarks: str) -> None:
     def loss(bandwidth: Tensor) -> Tensor:
         options = {"num_landmarks": 8, "patch_size": 1, "landmarks": landmarks}
         operator = nonlocal_operator(guide, photometric_bandwidth=bandwidth, **options)
-        found.append(operator.kernel.limiter is not None)
+        result.append(operator.kernel.limiter is not None)
         return (weights * (operator @ (operator @ guide))).sum()
 
-    found: list[bool] = []
+    result: list[bool] = []
     bandwidth = torch.tensor(0.05, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(loss, (bandwidth,), eps=1e-6, atol=1e-6)
-    assert all(found)
+    assert all(result)
 
 
 def test_a_loose_tolerance_bounds_the_eigenvalues_as_well() -> None:

@@ -34,9 +34,9 @@ def test_features_are_the_reference_features(
     size: tuple[int, int], patch_size: int, h_x: float | tuple[float, float] | None
 ) -> None:
     guides = np.stack([random_guide(2, *size, seed) for seed in (0, 1)])
-    found = GuideFeatures(patch_window(patch_size), 0.1, h_x, "all")(torch.from_numpy(guides))
+    result = GuideFeatures(patch_window(patch_size), 0.1, h_x, "all")(torch.from_numpy(guides))
     expected = [reference.features(guide, patch_size, 0.1, h_x).T for guide in guides]
-    np.testing.assert_allclose(found, np.stack(expected), rtol=1e-12)
+    np.testing.assert_allclose(result, np.stack(expected), rtol=1e-12)
 
 
 @given(height=st.integers(1, 9), width=st.integers(1, 9), margin=st.integers(0, 5))
@@ -95,9 +95,9 @@ def test_bandwidth_is_two_and_a_half_mean_gradients(name: str) -> None:
     padded = np.pad(image, 1, mode="edge")
     vertical, horizontal = (padded[2:, 1:-1] - padded[:-2, 1:-1]) / 2, (padded[1:-1, 2:] - padded[1:-1, :-2]) / 2
     expected = 2.5 * np.hypot(vertical, horizontal).mean()
-    found = estimate_bandwidth(torch.from_numpy(image.copy())[None, None])
-    assert found.shape == (1,)
-    assert found.item() == pytest.approx(expected, rel=1e-6)
+    result = estimate_bandwidth(torch.from_numpy(image.copy())[None, None])
+    assert result.shape == (1,)
+    assert result.item() == pytest.approx(expected, rel=1e-6)
 
 
 @given(scale=st.floats(0.1, 10), offset=st.floats(-1, 1))

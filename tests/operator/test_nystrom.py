@@ -140,8 +140,8 @@ def test_gradients_are_those_of_the_formula(completion: str) -> None:
     for factor, diagonal in (nystrom_factor(x, z, a, completion), formula()):
         loss = (factor * weights[:, :8]).sum() + (diagonal * weights[:, 8]).sum()
         gradients.append(torch.autograd.grad(loss, (x, z, a)))
-    for found, expected in zip(*gradients, strict=True):
-        torch.testing.assert_close(found, expected, atol=1e-9, rtol=1e-7)
+    for result, expected in zip(*gradients, strict=True):
+        torch.testing.assert_close(result, expected, atol=1e-9, rtol=1e-7)
 
 
 PRECISION = {torch.float32: 2e-5, torch.float64: 1e-11}

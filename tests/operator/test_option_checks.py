@@ -24,10 +24,10 @@ def raises(call: Callable[[], object], error: type[Exception], message: str) -> 
     """Check for ``<argument> must <requirement>, got <value>; <remedy>`` on one line that begins with ``message``."""
     with pytest.raises(error) as caught:
         call()
-    found = str(caught.value)
-    assert found.startswith(message), found
-    assert re.fullmatch(r"\w+ must .+, got .+; .+", found), found
-    assert not re.search(r"\n|[^.]\.$", found), found
+    result = str(caught.value)
+    assert result.startswith(message), result
+    assert re.fullmatch(r"\w+ must .+, got .+; .+", result), result
+    assert not re.search(r"\n|[^.]\.$", result), result
 
 
 TWO = "must be a number, or two for vertical and horizontal distances, got"

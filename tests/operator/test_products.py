@@ -22,13 +22,13 @@ def test_one_operator_evaluates_a_batch_of_points_and_several_operators_one_set(
     both = operator_from_features(features, size=(60,), num_landmarks=20)
     single = operator_from_features(features[:1], size=(60,), num_landmarks=20)
     many, one = single.at(points), both.at(points[:1])
-    for found, expected in (
+    for result, expected in (
         *((many.factor[i : i + 1], single.at(points[i : i + 1]).factor) for i in range(3)),
         *((many.scaling[i : i + 1], single.at(points[i : i + 1]).scaling) for i in range(3)),
         (one.factor, both.at(points[:1].repeat(2, 1, 1)).factor),
         (one.scaling, both.at(points[:1].repeat(2, 1, 1)).scaling),
     ):
-        torch.testing.assert_close(found, expected, atol=1e-6, rtol=0)
+        torch.testing.assert_close(result, expected, atol=1e-6, rtol=0)
     with pytest.raises(ValueError, match="features must have batch size 1 or 2, like the operator, got 3"):
         both.at(points)
 
@@ -61,12 +61,12 @@ def test_columns_are_differentiable_in_the_features_of_the_operator() -> None:
         return built.at(others).scaling.sum()
 
     given = points.clone().requires_grad_()
-    (found,) = torch.autograd.grad(total(given), given)
+    (result,) = torch.autograd.grad(total(given), given)
     for index in range(0, 30, 5):
         step = torch.zeros_like(points)
         step[0, 0, index] = 1e-5
         wanted = float(total(points + step) - total(points - step)) / 2e-5
-        assert float(found[0, 0, index]) == pytest.approx(wanted, rel=1e-4, abs=1e-7)
+        assert float(result[0, 0, index]) == pytest.approx(wanted, rel=1e-4, abs=1e-7)
 
 
 @given(guide=guides(), chosen=options, channels=st.integers(1, 4))

@@ -35,10 +35,10 @@ def test_the_damped_method_converges_from_any_start(start: float) -> None:
     scaling = torch.full((2, 60), start, dtype=torch.float64)
     infinite = torch.full((2,), torch.inf, dtype=torch.float64)
     begun = Solution(scaling, factor @ scaling.unsqueeze(2), infinite, 0, torch.eye(5).double().expand(2, -1, -1))
-    found = damped(KernelMatrix(factor, diagonal), begun, 1e-12)
-    sums = found.scaling * ((factor.mT @ found.moment).squeeze(2) + diagonal * found.scaling)
+    result = damped(KernelMatrix(factor, diagonal), begun, 1e-12)
+    sums = result.scaling * ((factor.mT @ result.moment).squeeze(2) + diagonal * result.scaling)
     torch.testing.assert_close(sums, torch.ones_like(sums), atol=1e-11, rtol=0)
-    assert found.residual.max() < 1e-11
+    assert result.residual.max() < 1e-11
 
 
 def test_damped_steps_take_over_where_sweeps_do_not_converge() -> None:
@@ -59,11 +59,11 @@ def test_damped_steps_balance_weighted_points() -> None:
     start = Solution(
         scaling, factor @ scaling.unsqueeze(2), torch.full((1,), torch.inf).double(), 0, torch.eye(4).double()
     )
-    found = damped(KernelMatrix(factor, diagonal, weights), start, 1e-12)
-    sums = found.scaling * ((factor.mT @ found.moment).squeeze(2) + diagonal * found.scaling)
+    result = damped(KernelMatrix(factor, diagonal, weights), start, 1e-12)
+    sums = result.scaling * ((factor.mT @ result.moment).squeeze(2) + diagonal * result.scaling)
     torch.testing.assert_close(sums, torch.ones_like(sums), atol=1e-11, rtol=0)
-    total = factor @ (weights * found.scaling).unsqueeze(2)
-    torch.testing.assert_close(found.moment, total, atol=1e-9, rtol=0)
+    total = factor @ (weights * result.scaling).unsqueeze(2)
+    torch.testing.assert_close(result.moment, total, atol=1e-9, rtol=0)
 
 
 def system(steepness: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:

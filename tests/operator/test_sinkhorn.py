@@ -99,8 +99,8 @@ def test_the_estimated_jacobian_leaves_the_gradient_exact() -> None:
         weights = torch.randn(2, 4000, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
         loss = (sinkhorn_balance(factor, diagonal, completed=completed).scaling * weights).sum()
         gradients.append(torch.autograd.grad(loss, (factor, diagonal)))
-    for found, expected in zip(*gradients, strict=True):
-        torch.testing.assert_close(found, expected, atol=1e-10, rtol=1e-8)
+    for result, expected in zip(*gradients, strict=True):
+        torch.testing.assert_close(result, expected, atol=1e-10, rtol=1e-8)
 
 
 @pytest.mark.parametrize("name", ["retina", "astronaut", "rocket"])
@@ -133,8 +133,8 @@ def test_implicit_gradient_is_the_unrolled_one(completed: bool) -> None:
     for _ in range(60):
         d = d * (d * ((factor.mT @ (factor @ d.unsqueeze(2))).squeeze(2) + diagonal * d)) ** (-2 / 3)
     unrolled = torch.autograd.grad((d * weights).sum(), (factor, diagonal))
-    for found, expected in zip(implicit, unrolled, strict=True):
-        torch.testing.assert_close(found, expected, atol=1e-9, rtol=1e-8)
+    for result, expected in zip(implicit, unrolled, strict=True):
+        torch.testing.assert_close(result, expected, atol=1e-9, rtol=1e-8)
 
 
 def lonely() -> tuple[Tensor, Tensor]:
@@ -145,7 +145,7 @@ def lonely() -> tuple[Tensor, Tensor]:
 
 @pytest.mark.parametrize("completed", [True, False])
 def test_balancing_in_a_graph_is_that_without_one(completed: bool) -> None:
-    found = []
+    actual = []
     for in_graph in (False, True):
         factor, diagonal = (tensor.clone().requires_grad_() for tensor in lonely())
         if in_graph:
@@ -159,9 +159,9 @@ def test_balancing_in_a_graph_is_that_without_one(completed: bool) -> None:
             whole = sinkhorn_in_rounds(factor, diagonal, balanced, completed=completed)
             kept, rest, result, rounds = whole.factor, whole.diagonal, whole.result, len(whole.before)
         gradients = torch.autograd.grad((result.scaling * kept[:, 0] + rest).square().sum(), [factor, diagonal])
-        found.append((kept, rest, result.scaling, result.moment, result.residual, *gradients, torch.tensor(rounds)))
-    assert int(found[0][-1]) == completed  # the lonely pixel is removed in one round
-    for ours, theirs in zip(*found, strict=True):
+        actual.append((kept, rest, result.scaling, result.moment, result.residual, *gradients, torch.tensor(rounds)))
+    assert int(actual[0][-1]) == completed  # the lonely pixel is removed in one round
+    for ours, theirs in zip(*actual, strict=True):
         torch.testing.assert_close(ours, theirs, atol=1e-6, rtol=1e-5)
 
 

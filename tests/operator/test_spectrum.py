@@ -88,12 +88,12 @@ def test_ritz_values_lie_where_they_must(name: str, bandwidth: int) -> None:
     """Each lies between the eigenvalue of W of the same rank and that of its low-rank part (Courant and Fischer)."""
     operator = build(picture(name, 24, 24), photometric_bandwidth=bandwidth / 255, num_landmarks=60)
     dense = operator.to_dense()
-    found = operator.spectrum().eigenvalues
-    rank = found.shape[1]
+    result = operator.spectrum().eigenvalues
+    rank = result.shape[1]
     above = torch.linalg.eigvalsh(dense).flip(-1)[:, :rank]
     below = torch.linalg.eigvalsh(dense - torch.diag_embed(operator.scaling**2 * operator.diagonal)).flip(-1)[:, :rank]
-    assert (found <= above + 1e-8).all()
-    assert (found >= below - 1e-8).all()
+    assert (result <= above + 1e-8).all()
+    assert (result >= below - 1e-8).all()
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

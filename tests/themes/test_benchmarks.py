@@ -187,9 +187,9 @@ def test_a_claim_is_judged_by_the_median_ratio_and_shows_its_quartiles(compared,
     def judged(median):
         ratio = {"lower": 0.5 * median, "median": median, "upper": 1.25 * median, "pairs": 5}
         records = [record | {"ratio": ratio} for record in compared if record["label"] == label]
-        found = claims({"quick": False, "results": records})
-        (claim,) = (claim for claim in found if claim.text.startswith(text))
-        assert [other.holds for other in found if other is not claim] == [None] * (len(found) - 1)
+        result = claims({"quick": False, "results": records})
+        (claim,) = (claim for claim in result if claim.text.startswith(text))
+        assert [other.holds for other in result if other is not claim] == [None] * (len(result) - 1)
         return claim
 
     limit = judged(1.0).limit

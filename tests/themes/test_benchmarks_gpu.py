@@ -13,9 +13,9 @@ def test_without_a_gpu_it_says_so(monkeypatch: pytest.MonkeyPatch, capsys: pytes
 
 
 def test_differences_are_those_of_float32() -> None:
-    found = gpu.differences("cpu", side=40)
-    assert found.pop("segment mask") in (0.0, 1.0)
-    for name, difference in found.items():
+    result = gpu.differences("cpu", side=40)
+    assert result.pop("segment mask") in (0.0, 1.0)
+    for name, difference in result.items():
         assert (
             0 < difference < (0.1 if name in ("region mask", "recolor", "strokes", "gradient by the guide") else 1e-2)
         ), name

@@ -165,11 +165,11 @@ def test_automatic_bandwidth_counts_as_constant() -> None:
     guide = small(1, seed=3)
     bandwidth = estimate_bandwidth(guide)
     assert not bandwidth.requires_grad
-    found, expected = (
+    result, expected = (
         torch.autograd.grad(weighted(build(guide, "diagonal", photometric_bandwidth=h) @ guide), guide)[0]
         for h in ("auto", bandwidth)
     )
-    torch.testing.assert_close(found, expected)
+    torch.testing.assert_close(result, expected)
 
 
 # Plain autograd -----------------------------------------------------------------------------------------------------
@@ -190,8 +190,8 @@ def test_gradient_is_that_of_plain_autograd_through_unrolled_balancing(completio
         lambda alpha: polynomial_filter(nonlocal_operator(guide, completion=completion, **options), guide, alpha)
     )
     unrolled = gradients(lambda alpha: plain_filter(guide, guide, alpha, completion=completion, steps=45, **options))
-    for found, expected in zip(implicit, unrolled, strict=True):
-        assert (found - expected).abs().max() <= 1e-6 * expected.abs().max()
+    for result, expected in zip(implicit, unrolled, strict=True):
+        assert (result - expected).abs().max() <= 1e-6 * expected.abs().max()
 
 
 # Repeated eigenvalues -----------------------------------------------------------------------------------------------
@@ -218,13 +218,13 @@ def directional(
     """Return directional derivatives by backward and by central differences of fourth order."""
     at = at.detach().requires_grad_()
     gradient = torch.autograd.grad(function(at), at)[0]
-    found, expected = [], []
+    result, expected = [], []
     with torch.no_grad():
         for direction in directions:
             f = {k: function(at + k * step * direction) for k in (-2, -1, 1, 2)}
-            found.append((gradient * direction).sum())
+            result.append((gradient * direction).sum())
             expected.append((8 * (f[1] - f[-1]) - (f[2] - f[-2])) / (12 * step))
-    return torch.stack(found), torch.stack(expected)
+    return torch.stack(result), torch.stack(expected)
 
 
 def spectral_sum(spectrum: Spectrum, image: Tensor) -> Tensor:
@@ -258,8 +258,8 @@ def test_gradient_in_a_degenerate_guide_is_the_finite_difference(
         )
         return function(operator.spectrum(), image)
 
-    found, expected = directional(loss, GUIDES[name], directions_that_keep_the_rank(GUIDES[name]))
-    torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-6)
+    result, expected = directional(loss, GUIDES[name], directions_that_keep_the_rank(GUIDES[name]))
+    torch.testing.assert_close(result, expected, rtol=1e-5, atol=1e-6)
 
 
 @pytest.mark.parametrize("name", GUIDES)
@@ -329,10 +329,10 @@ def test_patch_weights_of_0_have_a_gradient() -> None:
         return (operator @ image).square().sum()
 
     cross = torch.tensor([[0.0, 1, 0], [1, 2, 1], [0, 1, 0]], dtype=torch.float64, requires_grad=True)
-    (found,) = torch.autograd.grad(total(cross), cross)
+    (result,) = torch.autograd.grad(total(cross), cross)
     for index in range(9):
         step = torch.zeros_like(cross)
         step.view(-1)[index] = 1e-5
         with torch.no_grad():
             wanted = (total(cross + step) - total(cross)) / 1e-5
-        assert float(found.view(-1)[index]) == pytest.approx(float(wanted), abs=1e-6)
+        assert float(result.view(-1)[index]) == pytest.approx(float(wanted), abs=1e-6)

@@ -92,8 +92,8 @@ def test_frozen_parameters_stay_and_the_others_move(frozen: str) -> None:
     layer = everything()
     layer.get_parameter(frozen).requires_grad_(False)
     before = copy.deepcopy(layer.state_dict())
-    found = backward(layer, image())
-    assert frozen not in found
+    result = backward(layer, image())
+    assert frozen not in result
     torch.optim.SGD(layer.parameters(), lr=0.1).step()
     for name, value in layer.state_dict().items():
         assert torch.equal(value, before[name]) == (name == frozen), name
@@ -168,6 +168,6 @@ def test_autocast_does_not_reach_eigenvectors_sliders_of_regions_and_colours() -
 
     wanted = results()
     with torch.autocast("cpu", dtype=torch.bfloat16):
-        found = results()
-    for inside, outside in zip(found, wanted, strict=True):
+        result = results()
+    for inside, outside in zip(result, wanted, strict=True):
         torch.testing.assert_close(inside, outside, rtol=0, atol=0)

@@ -50,9 +50,9 @@ def test_compiled_layer_gives_the_same() -> None:
 
     fast = compiled(run)
     for seed in (0, 1):
-        expected, found = run(image(seed)), fast(image(seed))
-        torch.testing.assert_close(found, expected, atol=3e-6, rtol=0)  # its pixels are summed in another order
-        gradients = [torch.autograd.grad(y.square().mean(), parameters) for y in (found, expected)]
+        expected, result = run(image(seed)), fast(image(seed))
+        torch.testing.assert_close(result, expected, atol=3e-6, rtol=0)  # its pixels are summed in another order
+        gradients = [torch.autograd.grad(y.square().mean(), parameters) for y in (result, expected)]
         for ours, theirs in zip(*gradients, strict=True):
             torch.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-4 * theirs.abs().max().item())
 
@@ -71,10 +71,10 @@ def test_the_whole_layer_compiles_as_one_graph() -> None:
     torch.compiler.reset()
     fast = torch.compile(layer, backend="aot_eager", fullgraph=True)
     picture, second = (image(seed).to(memory_format=torch.channels_last).requires_grad_() for seed in (0, 1))
-    expected, found = layer(picture), fast(picture)
-    torch.testing.assert_close(found, expected, atol=1e-5, rtol=0)
-    assert found.stride() == expected.stride() == picture.stride()
-    gradients = [torch.autograd.grad(y.square().mean(), [picture, *layer.parameters()]) for y in (found, expected)]
+    expected, result = layer(picture), fast(picture)
+    torch.testing.assert_close(result, expected, atol=1e-5, rtol=0)
+    assert result.stride() == expected.stride() == picture.stride()
+    gradients = [torch.autograd.grad(y.square().mean(), [picture, *layer.parameters()]) for y in (result, expected)]
     for ours, theirs in zip(*gradients, strict=True):
         torch.testing.assert_close(ours, theirs, rtol=0, atol=1e-5 * theirs.abs().max().item())
     torch.testing.assert_close(fast(second), layer(second), atol=1e-5, rtol=0)
@@ -167,5 +167,5 @@ def test_jvp_and_hessian_in_image_and_sliders_of_a_fitted_operator() -> None:
     torch.testing.assert_close(derivative, product)
 
     layers = detail_layers(operator, picture).flatten(2)[0]
-    found = hessian(lambda a: polynomial_filter(operator, picture, a).square().sum() / 2)(alpha)
-    torch.testing.assert_close(found, layers @ layers.mT, atol=1e-4, rtol=1e-4)
+    result = hessian(lambda a: polynomial_filter(operator, picture, a).square().sum() / 2)(alpha)
+    torch.testing.assert_close(result, layers @ layers.mT, atol=1e-4, rtol=1e-4)

@@ -214,7 +214,7 @@ def test_the_benchmark_runs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     lines = page.read_text().splitlines()
     assert (lines[0], lines[-1]) == ("above", "below")
     row = next(line for line in lines if line.startswith("| ours"))
-    mean = sum(found["psnr"] for found in figures["grey, 25"]["ours"].values()) / 2
+    mean = sum(result["psnr"] for result in figures["grey, 25"]["ours"].values()) / 2
     assert f"{mean:.2f}" in row
 
 

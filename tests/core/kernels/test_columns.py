@@ -19,13 +19,13 @@ def test_columns(level: int, completion: Any, pixels: int, size: int, marks: int
     x = random(2, size, pixels) * 0.7
     x[:, :, : min(pixels, marks)] = z[:, :, : min(pixels, marks)]  # columns that rounding may make longer than 1
     arguments = (x, z, inverse_cholesky(z), completion)
-    found = nystrom_factor(*arguments)
+    result = nystrom_factor(*arguments)
     expected = nystrom_factor(*(part.double() for part in arguments[:3]), completion)
     plain = by_torch(nystrom_factor, *arguments)
-    for native_part, torch_part, exact in zip(found, plain, expected, strict=True):
+    for native_part, torch_part, exact in zip(result, plain, expected, strict=True):
         error, usual = (native_part - exact).abs().max(), (torch_part - exact).abs().max()
         assert error <= 2 * usual + 2e-6, (error, usual)
-    assert (found[0].square().sum(1) <= 1 + 1e-5).all() or completion == "none"
+    assert (result[0].square().sum(1) <= 1 + 1e-5).all() or completion == "none"
 
 
 def test_columns_of_a_whitening_without_a_triangle(level: int) -> None:
@@ -51,14 +51,14 @@ def test_derivatives_of_columns(
 
     def gradients(dtype: torch.dtype) -> list[Tensor]:
         inputs = [part.to(dtype).requires_grad_() for part in (x, z, inverse_cholesky(z))]
-        *found, whitening = torch.autograd.grad(
+        *result, whitening = torch.autograd.grad(
             nystrom_factor(*inputs, completion), inputs, [slope.to(dtype) for slope in slopes]
         )
-        return [*found, whitening.tril()]
+        return [*result, whitening.tril()]
 
-    found, plain = gradients(torch.float32), by_torch(gradients, torch.float32)
+    result, plain = gradients(torch.float32), by_torch(gradients, torch.float32)
     exact, size_of_terms = gradients(torch.float64), (inverse_cholesky(z).mT.abs() @ (0 + along).abs()).max()
-    for native_part, torch_part, part in zip(found, plain, exact, strict=True):
+    for native_part, torch_part, part in zip(result, plain, exact, strict=True):
         error, usual = (native_part - part).abs().max(), (torch_part - part).abs().max()
         assert error <= 4 * usual + 1e-6 * size_of_terms, (error, usual)
 
@@ -69,11 +69,11 @@ def test_derivatives_by_any_whitening_and_of_long_columns(level: int) -> None:
     shortened = nystrom_factor(*inputs, "diagonal")[1] == 0
     assert 100 < shortened.sum() < 400
     for completion in ("diagonal", "none"):
-        found, exact = (
+        result, exact = (
             torch.autograd.grad(nystrom_factor(*twins, completion), twins, [slope.to(twins[0]) for slope in slopes])
             for twins in ([t.to(dtype).requires_grad_() for t in inputs] for dtype in (torch.float32, torch.float64))
         )
-        for one, other in zip(found, exact, strict=True):
+        for one, other in zip(result, exact, strict=True):
             torch.testing.assert_close(one.double(), other, atol=1e-4, rtol=1e-5)
 
 

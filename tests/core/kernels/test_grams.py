@@ -12,15 +12,15 @@ from tests.native import by_torch, random, sizes
 @pytest.mark.parametrize("count", [1, 2, 4])
 def test_grams(level: int, pixels: int, marks: int, count: int) -> None:
     factor, scaling, remainder = random(2, marks, pixels), random(2, pixels, seed=1).exp(), random(2, pixels).sigmoid()
-    found = sum_grams(factor, scaling, remainder, count)
+    result = sum_grams(factor, scaling, remainder, count)
     plain = by_torch(sum_grams, factor, scaling, remainder, count)
     scaled = (factor * scaling.unsqueeze(1)).double()
     for j in range(count):
         exact = (scaled * remainder.double().unsqueeze(1) ** j) @ scaled.mT
         size = exact.diagonal(dim1=1, dim2=2).amax() * 3e-7
-        assert (found[:, j] - exact).abs().max() <= size
+        assert (result[:, j] - exact).abs().max() <= size
         assert (plain[:, j] - exact).abs().max() <= 10 * size
-    assert torch.equal(found, found.mT)
+    assert torch.equal(result, result.mT)
 
 
 def test_a_gram_matrix_of_weighted_columns() -> None:

@@ -124,8 +124,8 @@ def test_tensors_of_any_layout(level: int) -> None:
     arguments = (x, z, inverse_cholesky(z), "diagonal")
     torch.testing.assert_close(nystrom_factor(*arguments), by_torch(nystrom_factor, *arguments))
     arguments = (factor.sigmoid(), diagonal, random(1, 6, 2).double()[..., :1] ** 2)
-    found, expected = swept(*arguments), by_torch(swept, *arguments)
-    torch.testing.assert_close(found, expected, rtol=1e-5, atol=0)
+    result, expected = swept(*arguments), by_torch(swept, *arguments)
+    torch.testing.assert_close(result, expected, rtol=1e-5, atol=0)
 
 
 @pytest.mark.usefixtures("own_threads")
@@ -137,8 +137,8 @@ def test_any_number_of_threads(level: int, count: int, threads: Any) -> None:
 
     def results() -> list[Tensor]:
         factor, diagonal = nystrom_factor(features, marks, inverse_cholesky(marks), "diagonal")
-        scaling, found = swept(factor, diagonal, factor.double().sum(2, keepdim=True))
-        return [factor, scaling, found, sum_grams(factor, scaling, diagonal, 2)]
+        scaling, result = swept(factor, diagonal, factor.double().sum(2, keepdim=True))
+        return [factor, scaling, result, sum_grams(factor, scaling, diagonal, 2)]
 
     threads(1)
     alone, operator = results(), nonlocal_operator(guide, num_landmarks=30)
@@ -172,10 +172,10 @@ def test_which_tensors_the_dispatcher_sends_to_the_kernels(monkeypatch: pytest.M
 
     def in_c(rows: Tensor, factor: Tensor) -> bool:
         try:
-            found = spread(rows, factor)
+            result = spread(rows, factor)
         except MemoryError:
             return True
-        torch.testing.assert_close(found, rows @ factor)
+        torch.testing.assert_close(result, rows @ factor)
         return False
 
     leaf = rows.clone().requires_grad_()

@@ -32,19 +32,19 @@ def dense(stencil: Tensor) -> Tensor:
 @pytest.mark.parametrize("size", [(1, 1), (1, 7), (6, 1), (2, 2), (5, 8), (9, 4)])
 def test_a_dense_solve_gives_the_same(size: tuple[int, int]) -> None:
     stencil, right = problem(*size)
-    found = solve_stencil(stencil, right)
+    result = solve_stencil(stencil, right)
     for image in range(2):
         wanted = torch.linalg.solve(dense(stencil[image]), right[image].flatten(1).mT).mT
-        torch.testing.assert_close(found[image].flatten(1), wanted)
+        torch.testing.assert_close(result[image].flatten(1), wanted)
 
 
 def test_float32_is_as_good_and_stays_so_under_autocast() -> None:
     stencil, right = problem(40, 30, dtype=torch.float32)
     wanted = solve_stencil(stencil.double(), right.double())
     with torch.autocast("cpu", dtype=torch.bfloat16):
-        found = solve_stencil(stencil, right)
-    assert found.dtype == torch.float32
-    torch.testing.assert_close(found, wanted.float())
+        result = solve_stencil(stencil, right)
+    assert result.dtype == torch.float32
+    torch.testing.assert_close(result, wanted.float())
 
 
 @pytest.mark.filterwarnings("ignore:.*torch.jit.script.* is deprecated:DeprecationWarning")
@@ -63,8 +63,8 @@ def test_transforms_of_functions_and_compilation() -> None:
         return solve_stencil(stencil, right).square().sum()
 
     wanted = torch.autograd.grad(loss(stencil.requires_grad_(), right), stencil)
-    found = torch.func.grad(loss)(stencil.detach(), right)
-    torch.testing.assert_close(found, *wanted)
+    result = torch.func.grad(loss)(stencil.detach(), right)
+    torch.testing.assert_close(result, *wanted)
     each = torch.vmap(lambda one, side: solve_stencil(one[None], side[None])[0])(stencil.detach(), right)
     torch.testing.assert_close(each, solve_stencil(stencil.detach(), right))
     compiled = torch.compile(loss, fullgraph=True, backend="eager")
@@ -76,12 +76,12 @@ def test_systems_of_pixels(size: tuple[int, int]) -> None:
     coefficients = random(2, 3, 3, *size).double()
     coefficients[:, 1, 1] = coefficients.abs().sum((1, 2))
     right = random(2, 3, *size, seed=1).double()
-    found = stencil.solve_stencil(coefficients, right)
+    result = stencil.solve_stencil(coefficients, right)
     with definitions_only():
-        torch.testing.assert_close(stencil.solve_stencil(coefficients, right), found, rtol=1e-11, atol=1e-11)
+        torch.testing.assert_close(stencil.solve_stencil(coefficients, right), result, rtol=1e-11, atol=1e-11)
     threads = torch.get_num_threads()
     torch.set_num_threads(3)
     try:
-        assert torch.equal(stencil.solve_stencil(coefficients, right), found)
+        assert torch.equal(stencil.solve_stencil(coefficients, right), result)
     finally:
         torch.set_num_threads(threads)

@@ -65,10 +65,10 @@ def test_sweep(level: int, pixels: int, marks: int) -> None:
     diagonal = 1 - factor.square().sum(1).clamp(max=1)
     total = random(2, marks, 1, seed=1).abs().double() * pixels**0.5
     exact = swept(factor.double(), diagonal.double(), total)
-    found = swept(factor, diagonal, total)
+    result = swept(factor, diagonal, total)
     plain = by_torch(swept, factor, diagonal, total)
-    torch.testing.assert_close(found[0], exact[0].float(), rtol=1e-5, atol=0)
-    error, usual = (found[1] - exact[1]).abs().max(), (plain[1] - exact[1]).abs().max()
+    torch.testing.assert_close(result[0], exact[0].float(), rtol=1e-5, atol=0)
+    error, usual = (result[1] - exact[1]).abs().max(), (plain[1] - exact[1]).abs().max()
     assert error <= 2 * usual + 1e-5 * exact[1].abs().max(), (error, usual)
 
 
@@ -82,10 +82,10 @@ def test_products_with_few_rows(level: int, pixels: int, rows: int, marks: int) 
     torch.testing.assert_close(spread(vectors, factor), image, atol=1e-5, rtol=1e-6)
     scaling = random(batch, pixels, seed=1)
     torch.testing.assert_close(spread(vectors, factor, scaling), image * scaling.unsqueeze(1), atol=1e-4, rtol=1e-6)
-    found = moment(factor, images)
-    assert found.dtype == torch.float64
+    result = moment(factor, images)
+    assert result.dtype == torch.float64
     size = (factor.double().abs() @ images.double().mT.abs()) * 1e-6
-    assert ((found - factor.double() @ images.double().mT).abs() <= size).all()
+    assert ((result - factor.double() @ images.double().mT).abs() <= size).all()
 
 
 @pytest.mark.parametrize(("pixels", "marks"), sizes([1, 300, 8256, 40_000], [1, 3, 50, 900]))
@@ -93,9 +93,9 @@ def test_weighted_moments(level: int, pixels: int, marks: int) -> None:
     arguments = random(2, marks, pixels), random(2, pixels, seed=1).exp(), ALONE, random(2, marks, 1).double()
     factor, weights, total = (t.double() for t in arguments if isinstance(t, Tensor))
     exact = factor @ (weights.unsqueeze(2) * (factor.mT @ total.float().double()))
-    found = weighted_moment(*arguments)
+    result = weighted_moment(*arguments)
     plain = by_torch(weighted_moment, *arguments)
-    error, usual = (found - exact).abs().max(), (plain - exact).abs().max()
+    error, usual = (result - exact).abs().max(), (plain - exact).abs().max()
     assert error <= 2 * usual + 1e-6 * exact.abs().max(), (error, usual)
 
 
@@ -105,7 +105,7 @@ def test_weights_count_pixels() -> None:
     repeated = (part.repeat_interleave(copies, dim=-1) for part in (factor, diagonal))
     for context in (nullcontext(), definitions_only()):
         with context:
-            scaling, found = tall_skinny.sweep(factor, diagonal, half, 2.0, copies.expand(2, -1).float())
+            scaling, result = tall_skinny.sweep(factor, diagonal, half, 2.0, copies.expand(2, -1).float())
     many, expected = tall_skinny.sweep(*repeated, half, 2.0)
     torch.testing.assert_close(scaling.repeat_interleave(copies, dim=1), many)
-    torch.testing.assert_close(found, expected, rtol=1e-6, atol=0)
+    torch.testing.assert_close(result, expected, rtol=1e-6, atol=0)

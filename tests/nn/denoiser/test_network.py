@@ -21,9 +21,9 @@ def test_photographs_come_closer(channels: int, level: int, gain: float) -> None
     clean = CAT[:, :channels]
     image = noisy(clean, level / 255)
     with torch.no_grad():
-        found = TRAINED_ONE(image, level / 255)
-    assert decibels(found, clean) > decibels(image, clean) + gain
-    torch.testing.assert_close(denoise(image, noise_level=level / 255), found, rtol=0, atol=1e-6)
+        result = TRAINED_ONE(image, level / 255)
+    assert decibels(result, clean) > decibels(image, clean) + gain
+    torch.testing.assert_close(denoise(image, noise_level=level / 255), result, rtol=0, atol=1e-6)
 
 
 def test_it_is_better_than_the_rule() -> None:
@@ -36,9 +36,9 @@ def test_no_noise_changes_nothing() -> None:
     assert torch.equal(TRAINED_ONE(CAT, 0.0), CAT)
     half = torch.zeros(1, 1, *CAT.shape[-2:])
     half[..., 64:] = 0.1
-    found = TRAINED_ONE(CAT, half)
-    assert torch.equal(found[..., :64], CAT[..., :64])
-    assert not torch.equal(found[..., 64:], CAT[..., 64:])
+    result = TRAINED_ONE(CAT, half)
+    assert torch.equal(result[..., :64], CAT[..., :64])
+    assert not torch.equal(result[..., 64:], CAT[..., 64:])
     assert torch.equal(denoise(CAT, strength=0.0), CAT)
 
 
@@ -53,9 +53,9 @@ def test_the_level_is_not_rounded_to_the_precision_of_the_image() -> None:
 def test_every_size(size: tuple[int, int]) -> None:
     image = noisy(torch.full((1, 1, *size), 0.5), 0.1)
     with torch.no_grad():
-        found = TRAINED_ONE(image, 0.1)
-    assert found.shape == image.shape
-    assert found.isfinite().all()
+        result = TRAINED_ONE(image, 0.1)
+    assert result.shape == image.shape
+    assert result.isfinite().all()
 
 
 @pytest.mark.parametrize("size", [(40, 300), (300, 310)])
@@ -127,11 +127,11 @@ def test_images_of_a_batch_are_denoised_as_alone() -> None:
 def test_turns_are_averaged_and_better() -> None:
     image = noisy(CAT, 0.1)
     with torch.no_grad():
-        found = {turns: TRAINED_ONE(image, 0.1, turns=turns) for turns in (1, 2, 4)}
+        result = {turns: TRAINED_ONE(image, 0.1, turns=turns) for turns in (1, 2, 4)}
         half = TRAINED_ONE(image.rot90(2, (2, 3)), 0.1).rot90(2, (2, 3))
-    scores = [decibels(found[turns], CAT) for turns in (1, 2, 4)]
+    scores = [decibels(result[turns], CAT) for turns in (1, 2, 4)]
     assert scores == sorted(scores)
-    assert decibels((found[1] + half) / 2, CAT) == pytest.approx(scores[1], abs=0.1)  # the tiles differ
+    assert decibels((result[1] + half) / 2, CAT) == pytest.approx(scores[1], abs=0.1)  # the tiles differ
     with pytest.raises(ValueError, match="turns must be 1, 2 or 4, got 3"):
         TRAINED_ONE(image, 0.1, turns=3)
 
@@ -149,8 +149,8 @@ def test_numbers_and_maps_of_the_noise_agree() -> None:
 def test_other_channels_are_denoised_one_by_one(channels: int) -> None:
     image = noisy(CAT[:, :1].repeat(2, channels, 1, 1), 0.1)
     with torch.no_grad():
-        found = TRAINED_ONE(image, 0.1)
-        torch.testing.assert_close(found[1:, 1:2], TRAINED_ONE(image[1:, 1:2], 0.1), rtol=0, atol=1e-4)
+        result = TRAINED_ONE(image, 0.1)
+        torch.testing.assert_close(result[1:, 1:2], TRAINED_ONE(image[1:, 1:2], 0.1), rtol=0, atol=1e-4)
 
 
 def test_bright_pictures_are_denoised_as_their_scaled_selves() -> None:
@@ -165,10 +165,10 @@ def test_bright_pictures_are_denoised_as_their_scaled_selves() -> None:
 def test_levels_far_above_those_of_training_leave_the_contrast() -> None:
     image = CAT[..., :64, :64]
     with torch.no_grad():
-        found = [TRAINED_ONE(image, level / 255) for level in (100, 255)]
-    assert torch.equal(*found)
-    assert found[1].mean() > 0.9 * image.mean()
-    assert (found[1] - image).square().mean().sqrt() < 30 / 255
+        result = [TRAINED_ONE(image, level / 255) for level in (100, 255)]
+    assert torch.equal(*result)
+    assert result[1].mean() > 0.9 * image.mean()
+    assert (result[1] - image).square().mean().sqrt() < 30 / 255
 
 
 def test_gradients_reach_everything() -> None:
@@ -255,7 +255,7 @@ def test_the_edit_refuses_what_it_cannot_take() -> None:
         denoise(CAT, noise_level=torch.zeros_like(CAT), method="rule")
     with pytest.raises(ValueError, match="method must be one of 'network', 'rule', got 'luck'"):
         denoise(CAT, method="luck")  # type: ignore[arg-type]
-    with pytest.raises(TypeError, match="denoise has no argument landmark"):
+    with pytest.raises(TypeError, match=r"denoise\(\) got an unexpected keyword argument .landmark."):
         denoise(CAT, landmark=3)
 
 
@@ -284,8 +284,8 @@ def test_compiled() -> None:
     torch.compiler.reset()
     image = noisy(CAT[..., :20, :24], 0.1)
     with torch.no_grad():
-        found = torch.compile(TRAINED_ONE, backend="eager")(image, 0.1)
-        torch.testing.assert_close(found, TRAINED_ONE(image, 0.1), atol=1e-5, rtol=0)
+        result = torch.compile(TRAINED_ONE, backend="eager")(image, 0.1)
+        torch.testing.assert_close(result, TRAINED_ONE(image, 0.1), atol=1e-5, rtol=0)
 
 
 def test_transforms_are_refused() -> None:

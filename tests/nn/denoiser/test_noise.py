@@ -41,8 +41,8 @@ def test_noise_is_found_beside_texture(level: int) -> None:
     """Half of the picture is gravel, whose finest detail is as strong as noise of 20 grey levels."""
     gravel = picture("gravel", 160, 160, torch.float32)
     clean = torch.cat([gravel, torch.linspace(0.3, 0.7, 160).expand(1, 1, 160, 160)], dim=3)
-    found = 255 * estimate_noise(noisy(clean, level / 255))
-    assert float(found) == pytest.approx(level, rel=0.1)
+    result = 255 * estimate_noise(noisy(clean, level / 255))
+    assert float(result) == pytest.approx(level, rel=0.1)
 
 
 def test_clipped_pixels_do_not_hide_noise() -> None:
@@ -55,10 +55,10 @@ def test_clipped_pixels_do_not_hide_noise() -> None:
 @pytest.mark.parametrize("name", ["astronaut", "coffee"])
 def test_noise_in_8_bits_is_measured_where_clipping_does_not_truncate_it(name: str, level: int) -> None:
     """Both photographs have large dark areas; in 8 bits, 9 to 15 % of the noisy pixels are black or white."""
-    found = 255 * estimate_noise(
+    result = 255 * estimate_noise(
         (noisy(picture(name, 160, 160, torch.float32), level / 255).clamp(0, 1) * 255).round() / 255
     )
-    assert float(found) == pytest.approx(level, rel=0.1)
+    assert float(result) == pytest.approx(level, rel=0.1)
 
 
 def test_even_noise_has_one_level() -> None:

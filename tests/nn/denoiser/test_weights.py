@@ -115,5 +115,5 @@ def test_weights_of_ones_own_are_loaded(tmp_path: Path) -> None:
 def test_weights_in_half_precision_denoise_colours(dtype: torch.dtype) -> None:
     noisy = 0.5 + 0.1 * torch.randn(1, 3, 32, 32, generator=torch.Generator().manual_seed(0))
     with torch.no_grad():
-        found = NonlocalDenoiser.trained(dtype=dtype)(noisy, 0.1)
-    assert (found - 0.5).std() < 0.04
+        result = NonlocalDenoiser.trained(dtype=dtype)(noisy, 0.1)
+    assert (result - 0.5).std() < 0.04

@@ -134,8 +134,8 @@ def test_shapes_alone_are_enough(options: dict[str, Any], dtype: torch.dtype) ->
     with FakeTensorMode():
         fake = build_and_filter(torch.zeros(picture.shape, dtype=dtype, requires_grad=True), **options)
         fake.float().square().sum().backward()
-    for found in (meta, fake):
-        assert (found.shape, found.dtype) == (picture.shape, dtype)
+    for result in (meta, fake):
+        assert (result.shape, result.dtype) == (picture.shape, dtype)
 
 
 # --- empty batches and memory formats
@@ -167,7 +167,7 @@ def test_the_order_in_memory_is_kept(order: torch.memory_format) -> None:
     picture = image().contiguous(memory_format=order)
     layer, built = NonlocalFilter(ALPHA, **OPTIONS), operator()
     mask = torch.rand(2, 1, 12, 13, generator=torch.Generator().manual_seed(0))
-    found = [
+    actual = [
         layer(picture),
         layer(picture, mask=mask),
         built @ picture,
@@ -175,9 +175,9 @@ def test_the_order_in_memory_is_kept(order: torch.memory_format) -> None:
         spectral_filter(built.spectrum(), picture, torch.sqrt),
         spectral_filter(built.spectrum(), picture, torch.sqrt, residual=0.5),
     ]
-    for result in found:
+    for result in actual:
         assert result.is_contiguous(memory_format=order)
-    torch.testing.assert_close(found[0], layer(image()), atol=2e-6, rtol=0)
+    torch.testing.assert_close(actual[0], layer(image()), atol=2e-6, rtol=0)
 
 
 # --- transforms that building an operator refuses

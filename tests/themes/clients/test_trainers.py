@@ -80,5 +80,5 @@ class Filtered(Dataset[torch.Tensor]):
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
 def test_workers_of_a_loader_build_operators() -> None:
     pictures = Filtered()
-    found = list(DataLoader(pictures, num_workers=1, batch_size=None))
-    torch.testing.assert_close(torch.stack(found), torch.stack([pictures[0], pictures[1]]))
+    result = list(DataLoader(pictures, num_workers=1, batch_size=None))
+    torch.testing.assert_close(torch.stack(result), torch.stack([pictures[0], pictures[1]]))
