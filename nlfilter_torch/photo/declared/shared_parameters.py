@@ -194,13 +194,13 @@ STRAIGHT = tuple(i / (KNOTS - 1) for i in range(KNOTS))
 
 
 def _curve(channel: str) -> Parameter:
-    help = f"Tone curve of {channel}: what it becomes at equal steps from black to white, with commas between."
+    help = f"Tone curve of {channel}: its output at equal steps of the input from black to white, separated by commas."
     return sliders(channel, STRAIGHT, help, unit="", idle=STRAIGHT, metavar="V,V,...,V")
 
 
 LOOK = Edit(
     "look",
-    """Put a photograph under a look: tone curves, colours, contrast and details, as another edit had them.
+    """Apply a look to a photograph: tone curves, colours, contrast and details, like those of another edit.
 
     `nlfilter-torch fit` finds looks from photographs before and after an edit, and `nlfilter-torch apply` takes them.
 
@@ -210,15 +210,15 @@ LOOK = Edit(
         sliders(
             "alpha",
             (1.0, 1.0, 1.0, 1.0),
-            "One slider for each layer of detail, as those of `nlfilter-torch detail`. 1 leaves a layer as it is.",
+            "One slider for each layer of detail, like those of `nlfilter-torch detail`. 1 leaves a layer as it is.",
             idle=1.0,
             metavar="A,B,...,Z",
         ),
         sliders(
             "bands",
             (1.0,) * 7,
-            "Strength of what is finer than 1, 2, 5, 9, 18 and 37 pixels, edges too, and of the rest, around the mean "
-            "brightness. 1 leaves it as it is.",
+            "Strength of structures finer than 1, 2, 5, 9, 18 and 37 pixels, including edges, and of larger ones, "
+            "around the mean brightness. 1 leaves them as they are.",
             idle=(1.0,) * 7,
             metavar="A,B,...,G",
             length=7,
@@ -226,8 +226,8 @@ LOOK = Edit(
         sliders(
             "texture",
             (1.0,) * 6,
-            "Strength of what is finer than 1, 2, 5, 9, 18 and 37 pixels where brightness varies little: surfaces, not "
-            "edges. 1 leaves it as it is.",
+            "Strength of structures finer than 1, 2, 5, 9, 18 and 37 pixels on surfaces, where brightness varies "
+            "little, but not at edges. 1 leaves them as they are.",
             idle=(1.0,) * 6,
             metavar="A,B,...,F",
             length=6,
@@ -238,7 +238,7 @@ LOOK = Edit(
         sliders(
             "matrix",
             (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0),
-            "Three rows of three numbers: how much red, green and blue of the photograph goes into each.",
+            "Colour matrix, row by row: how much of the old red, green and blue makes up the new red, green and blue.",
             unit="",
             idle=(1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0),
             metavar="RR,RG,...,BB",
@@ -255,9 +255,9 @@ LOOK = Edit(
         sliders(
             "stretch",
             (0.0,) * 3,
-            "Automatic levels: how much of the change that stretches brightness from the darkest to the lightest pixel "
-            "to black and white is added: of luminance, of the largest channel with colours in proportion, and of each "
-            "channel for itself. 0 is none.",
+            "Automatic levels, which turn the darkest pixel black and the lightest one white: strengths of the change "
+            "of luminance, of that of the largest channel with the others in proportion, and of that of each channel "
+            "by itself. 0 is none.",
             unit="",
             idle=(0.0,) * 3,
             metavar="A,B,C",
@@ -266,9 +266,8 @@ LOOK = Edit(
         sliders(
             "local",
             (0.0,) * 8,
-            "Local contrast: how much of the change that equalises the histogram around each pixel is added, under "
-            "limits of contrast of 1.5, 2, 3 and 5: four numbers for luminance, four for colours in proportion. 0 is "
-            "none.",
+            "Local contrast by equalising the histogram around every pixel, with contrast limited to 1.5, 2, 3 and 5 "
+            "times: four strengths for luminance, then four for all channels in proportion. 0 is none.",
             unit="",
             idle=(0.0,) * 8,
             metavar="A,B,...,H",
@@ -284,5 +283,5 @@ LOOK = Edit(
         *WITHOUT_SHADING,
     ),
     function="apply_look",
-    hint="A look that was found by `nlfilter-torch fit`; load its file, and choose how much of it.",
+    hint="A look found by `nlfilter-torch fit`: load its file and choose its strength.",
 )

@@ -1,4 +1,4 @@
-"""A look: sliders of detail and blurs, tone curves, colours, levels, local contrast, as found by :func:`fit_look`."""
+"""A look, as found by :func:`fit_look`: sliders of detail, tone curves, colours, levels and local contrast."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -51,32 +51,32 @@ def apply_look(
     guide_channels: GuideChannels = "luminance",
     generator: torch.Generator | None = None,
 ) -> Tensor:
-    """Put a photograph under a look: the image plus what each part changes.
+    """Apply a look to a photograph: the changes by its parts are added to the image.
 
     Args:
         image: (B, C, H, W) in [0, 1]; with C = 3 it is RGB, and a grey one stays grey.
         alpha: sliders of the detail layers of luminance, (k+1,) or (B, k+1).
-        bands: gains of six bands of detail that blurs find, each twice as wide, and of the rest around its mean, (7,)
-            or (B, 7).
-        texture: gains of the six bands of luminance where it varies little, not at edges, (6,) or (B, 6).
-        red: what red becomes at equal steps from 0 to 1, (K,) or (B, K), in straight lines between.
+        bands: gains of six bands of luminance that blurs separate, each twice as wide as the one before, and of the
+            rest around its mean, (7,) or (B, 7).
+        texture: gains of these six bands on surfaces, where luminance varies little, but not at edges, (6,) or (B, 6).
+        red: tone curve of red: its output at equal steps of the input from 0 to 1, (K,) or (B, K), linear in between.
         green: likewise, as many.
         blue: likewise.
         matrix: 9 numbers or (B, 9), the rows of the matrix that colours are multiplied by.
         saturation: factors of the saturation in HSV, (K,) or (B, K), for colours whose saturation is at equal steps
             from 0 to 1; the largest channel of a pixel stays as it is.
-        stretch: how much of the change that stretches brightness, from the darkest to the lightest pixel of the picture
-            to the range from 0 to 1, is added: of luminance, for all channels alike; of the largest channel, which
-            scales colours; and of each channel for itself, (3,) or (B, 3); 0 is none.
-        local: how much of the change that equalises the histogram around each pixel is added, under limits of contrast
-            of 1.5, 2, 3 and 5: four strengths for luminance, and four for the largest channel, whose change scales
-            colours, (8,) or (B, 8); 0 is none. Histograms are those of 8 x 8 tiles of the picture.
+        stretch: strengths (3,) or (B, 3) of automatic levels, which map the range from the darkest to the lightest
+            pixel of the picture to [0, 1]: of the change of luminance, the same for all channels; of the change of the
+            largest channel, by which the pixel is scaled; and of the change of every channel by itself; 0 is none.
+        local: strengths (8,) or (B, 8) of adaptive histogram equalisation with contrast limited to 1.5, 2, 3 and 5
+            times: four of the change of luminance, then four of the change of the largest channel, by which the pixel
+            is scaled; 0 is none. Histograms are those of 8 x 8 tiles of the picture.
         amount: a number or a tensor of shape () or (B,); 1 is the look, 0 the image.
         viewing_size: in megapixels; the details of a larger image are those of its reduction to this size; 0 is the
             size of the image.
         photometric_bandwidth: h_y, or ``"auto"``.
-        spatial_bandwidth: h_x in pixels; None is a twelfth of the short side, ``"none"`` compares spots however far
-            apart they are.
+        spatial_bandwidth: h_x in pixels; None is a twelfth of the short side, ``"none"`` compares pixels regardless
+            of their distance.
         patch_size: width of the compared patches of the filter.
         num_landmarks: M.
         landmarks: how the landmarks are chosen, see :func:`nonlocal_operator`.
@@ -210,7 +210,7 @@ def _for_all_channels(planes: Planes, pixels: Pixels) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class Bands:
-    """Changes of the detail that blurs find, added to another change.
+    """Changes of the bands of luminance that blurs separate, added to another change.
 
     Attributes:
         gains: of the bands.
@@ -231,7 +231,7 @@ class Bands:
 
 @dataclass(frozen=True, eq=False)
 class UnderLook:
-    """A picture under a look.
+    """A picture to which a look is applied.
 
     Attributes:
         fitted: the picture with the change of its detail.

@@ -142,7 +142,7 @@ def _curve(mean: MeanOf, restraint: float | Tensor, brighter: float | Tensor) ->
 
 
 def _brightness(image: Tensor, moved: Tensor, restraint: float | Tensor) -> Tensor:
-    """Change of brightness under a restraint, brightness before it, and what the tone curve changes of the result."""
+    """Change of brightness under a restraint, the brightness before, and the change of the result by the tone curve."""
     before, moved = _before(image, moved), _restrained(image, moved, restraint)
     return torch.cat([moved, before, _bow(before + moved)], dim=1)
 
@@ -167,7 +167,7 @@ def _before(image: Tensor, change: Tensor) -> Tensor:
 
 
 def _kept(distance: Tensor) -> Tensor:
-    """Distance to white or black that is left at least, for a value at a distance from it."""
+    """Least distance from white or black that a value must keep, given its distance before a change."""
     return torch.minimum(((1 - HEADROOM_SHARE) * distance).clamp(min=LEVEL), distance)
 
 

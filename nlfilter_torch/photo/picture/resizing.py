@@ -59,7 +59,7 @@ def _part(rows: Callable[[], Tensor], weights: Tensor, across: tuple[slice, Tens
 
 @cached_constants  # strips of one picture have the same columns
 def interpolation(places: range, length: int, wanted: int) -> tuple[slice, Tensor]:
-    """Part of an axis that places on it, resized to ``wanted``, depend on, and weights (places, part) in float64."""
+    """Part of an axis that interpolation at places of the resized axis reads, and weights (places, part) in float64."""
     scale = length / wanted
     kernel_radius = 2 * max(scale, 1.0)
     first = max(0, math.floor((places.start + 0.5) * scale - kernel_radius))

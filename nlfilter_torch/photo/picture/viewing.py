@@ -31,7 +31,7 @@ from nlfilter_torch.photo.picture.resizing import interpolation, resized, rows_o
 from nlfilter_torch.photo.picture.source import Source
 
 MEGAPIXEL = 1_000_000
-ROUND_TRIP_RADIUS = 4  # radius in pixels of the kernel that enlarging and reducing again amounts to
+ROUND_TRIP_RADIUS = 4  # radius in pixels of the kernel that equals enlarging and reducing again
 RESTORED = 5  # terms of the Neumann series that inverts the smoothing by enlarging and reducing again
 FAINT_VARIANCE = (2 / 255) ** 2  # variance of brightness below which its slope is attenuated towards 0
 
@@ -57,7 +57,7 @@ def fit_change(
     *,
     brighter: float | Tensor | Balance | None = 0.0,
 ) -> Fitted:
-    """Fit an edit of a picture that is given by a change of its brightness at the viewing size.
+    """Fit an edit that changes the brightness of a picture, by a change computed at the viewing size.
 
     Args:
         source: the picture.
@@ -199,7 +199,7 @@ class EnlargedChange:
 
 
 def _restored(planes: Tensor, stride: float) -> Tensor:
-    """Planes that :func:`enlarged_and_reduced` turns into approximately these planes."""
+    """Approximate inverse of :func:`enlarged_and_reduced`."""
     estimate = planes
     for _ in range(RESTORED - 1):
         estimate = estimate + planes - enlarged_and_reduced(estimate, stride)
