@@ -135,7 +135,7 @@ def option(parameter: Parameter, panel: str | None = None) -> Any:
     return Annotated[kind | None if parameter.optional else kind, decorated]
 
 
-def _argument(name: str, annotation: Any, default: Any) -> inspect.Parameter:
+def _argument(name: str, annotation: object, default: object) -> inspect.Parameter:
     return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
 
 
@@ -143,7 +143,7 @@ def _declared(parameter: Parameter, panel: str | None = None) -> inspect.Paramet
     return _argument(parameter.name, option(parameter, panel), option_value(parameter, parameter.default))
 
 
-def signature(edit: Edit, *, target: Any = options.Target, depth: Any = options.OutputDepth) -> inspect.Signature:
+def signature(edit: Edit, *, target: object = options.Target, depth: object = options.OutputDepth) -> inspect.Signature:
     """The signature of an edit's command; ``target`` and ``depth`` annotate its output and the depth of that."""
     return inspect.Signature(
         [
@@ -162,11 +162,11 @@ def signature(edit: Edit, *, target: Any = options.Target, depth: Any = options.
 
 
 def with_options(*names: str, more: Iterable[Edit] = ()) -> Callable[[Command], Command]:
-    """Replace ``**given`` of a command with the named options of detail and all options of the edits in ``more``."""
+    """Replace the ``**values`` of a command by the named options of detail and all options of the edits in ``more``."""
 
     def decorate(function: Command) -> Command:
-        found = inspect.signature(function, eval_str=True).parameters.values()
-        own = [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in found if p.kind != p.VAR_KEYWORD]
+        parameters = inspect.signature(function, eval_str=True).parameters.values()
+        own = [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in parameters if p.kind != p.VAR_KEYWORD]
         added = {name: _declared(EDITS["detail"][name]) for name in names}
         for edit in more:
             for parameter in edit:
