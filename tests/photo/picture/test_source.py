@@ -6,7 +6,6 @@ from nlfilter_torch.operator.options import OperatorOptions
 from nlfilter_torch.operator.products import Columns
 from nlfilter_torch.photo.picture.in_memory import InMemory
 from nlfilter_torch.photo.picture.source import (
-    SAMPLE,
     Guide,
     luminance,
     sampled_pairs,
@@ -46,12 +45,12 @@ def test_a_guide_depends_on_pixels_within_its_margin() -> None:
 
 
 def test_the_same_pixels_are_sampled_in_every_call() -> None:
-    count = 3 * SAMPLE
+    count = 100_000
     before = torch.get_rng_state()
     places = sampled_places(count)
     assert torch.equal(places, sampled_places(count))
     assert torch.equal(torch.get_rng_state(), before)
-    assert places.shape == (SAMPLE,)
+    assert places.shape == (32_768,)
     assert (places.diff() > 0).all()
     assert 0 <= int(places[0]) < int(places[-1]) < count
     assert abs(float(places.double().mean()) / count - 0.5) < 0.01
@@ -71,7 +70,7 @@ def test_the_spectrum_of_a_sample_is_scaled_to_the_picture() -> None:
         Columns(factor[:, :, part], scaling[:, part], remainder[:, part])
         for part in (slice(0, 250), slice(250, 251), slice(251, 600))
     ]
-    pairs = sampled_pairs(blocks, SAMPLE, factor.dtype)
+    pairs = sampled_pairs(blocks, 32_768, factor.dtype)
     assert pairs.ritz.eigenvalues.dtype == factor.dtype
     torch.testing.assert_close(pairs.ritz.eigenvalues, operator.spectrum().ritz.eigenvalues, rtol=1e-6, atol=1e-8)
 
