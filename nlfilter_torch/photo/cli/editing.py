@@ -75,24 +75,24 @@ def read_if_it_fits(source: str, target: str, bytes_per_pixel: int, gigabytes: f
 
 def read_masks(paths: Sequence[Path], of: str | Path, size: tuple[int, int] | None = None) -> Tensor:
     """Masks (1, K, H, W), see :func:`mask_plane`, of files of the same size, or of the size (H, W)."""
-    found = [mask_plane(read.pixels, read.alpha) for read in map(read_photograph, paths)]
-    height, width = found[0].shape[-2:] if size is None else size
-    for path, one in zip(paths, found, strict=True):
-        if tuple(one.shape[-2:]) != (height, width):
+    masks = [mask_plane(read.pixels, read.alpha) for read in map(read_photograph, paths)]
+    height, width = masks[0].shape[-2:] if size is None else size
+    for path, mask in zip(paths, masks, strict=True):
+        if tuple(mask.shape[-2:]) != (height, width):
             like = paths[0] if size is None else of
             raise ValueError(
-                f"{path} must have the size of {like}, {width}x{height}, got {one.shape[-1]}x{one.shape[-2]}; "
+                f"{path} must have the size of {like}, {width}x{height}, got {mask.shape[-1]}x{mask.shape[-2]}; "
                 f"resize it to that of {of}"
             )
-    return torch.cat(found, dim=1)
+    return torch.cat(masks, dim=1)
 
 
 def check_apart(option: str, path: str | Path | None, **files: str | Path | Iterable[str | Path] | None) -> None:
     """Raise ValueError if the file that an option or argument writes is one of the others, given by what they are."""
     if path is None:
         return
-    for what, some in files.items():
-        for file in [some] if isinstance(some, str | Path) else some or []:
+    for what, names in files.items():
+        for file in [names] if isinstance(names, str | Path) else names or []:
             if Path(path).resolve() == Path(file).resolve():
                 raise ValueError(f"{option} must be another file than the {what}, got {path}; choose another name")
 
@@ -150,10 +150,10 @@ class Job:
 
     def open(self, path: Path) -> StoredPicture:
         """Open another picture to be read by rows; it is closed at the end of the job."""
-        found = self.files.enter_context(open_picture(path, self.memory))
-        check_depth(path, found.rows.dtype)
-        self.memory -= found.cached
-        return found
+        picture = self.files.enter_context(open_picture(path, self.memory))
+        check_depth(path, picture.rows.dtype)
+        self.memory -= picture.cached
+        return picture
 
 
 def check_workers(workers: int | None, cluster: str | None) -> None:

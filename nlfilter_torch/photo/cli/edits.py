@@ -36,9 +36,9 @@ def other_recipe(context: typer.Context, preset: str, names: Iterable[str]) -> R
     recipe = find_recipe(preset)
     if plain_step(recipe) is not None:
         return None
-    if given := typed_options(context, names):
+    if typed := typed_options(context, names):
         raise ValueError(
-            f"--{given[0].replace('_', '-')} must not be given with a --preset of edits other than detail, got "
+            f"--{typed[0].replace('_', '-')} must not be given with a --preset of edits other than detail, got "
             f"{preset}; leave it out, or set it in that file"
         )
     return recipe

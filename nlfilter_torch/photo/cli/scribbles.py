@@ -50,13 +50,13 @@ class Rectangle:
         try:
             lengths = [size[1 - i % 2] for i in range(4)]
             parts = numbers.split(",")
-            found = [_pixels(part, length) for part, length in zip(parts, lengths[: len(parts)], strict=True)]
-            point = found if len(found) == 2 else [0]
-            if len(found) == 2:
+            values = [_pixels(part, length) for part, length in zip(parts, lengths[: len(parts)], strict=True)]
+            point = values if len(values) == 2 else [0]
+            if len(values) == 2:
                 side = max(1, round(DOT_SIZE * min(size)))
-                found = [min(max(int(at) - side // 2, 0), n - side) for at, n in zip(found, lengths, strict=False)]
-                found += [side, side]
-            x, y, width, height = (math.floor(number) for number in found)
+                values = [min(max(int(at) - side // 2, 0), n - side) for at, n in zip(values, lengths, strict=False)]
+                values += [side, side]
+            x, y, width, height = (math.floor(value) for value in values)
         except ValueError:
             raise ValueError(
                 f"{option} must be four whole numbers X,Y,W,H, such as 40,60,20,20, got {text!r}; percentages "
@@ -116,13 +116,13 @@ class Overlay(ABC):
 
     def __getitem__(self, rows: slice) -> Floats:
         """The rows from ``rows.start`` to ``rows.stop``."""
-        found = np.zeros((rows.stop - rows.start, *self.shape[1:]), self.dtype)
+        overlay = np.zeros((rows.stop - rows.start, *self.shape[1:]), self.dtype)
         if self.picture is not None:
-            found = self._of_picture(rows, self.picture)
+            overlay = self._of_picture(rows, self.picture)
         for rectangle, channels, values in self.rectangles:
             top, bottom = (max(row - rows.start, 0) for row in (rectangle.rows.start, rectangle.rows.stop))
-            found[top:bottom, rectangle.columns, channels] = values
-        return found
+            overlay[top:bottom, rectangle.columns, channels] = values
+        return overlay
 
     def checked(self) -> Self:
         """Return this overlay; raise ValueError if nothing is marked in its picture."""
@@ -317,10 +317,10 @@ def _picture(size: Size, path: Path | None, read: Open, *, transparent: bool = F
         return None
     stored = read(path)
     check_depth(path, stored.rows.dtype)
-    found = stored.shape[:2]
-    if found != size:
+    height, width = stored.shape[:2]
+    if (height, width) != size:
         raise ValueError(
-            f"{path} must be as large as the photograph, {size[1]}x{size[0]}, but is {found[1]}x{found[0]}; resize it"
+            f"{path} must be as large as the photograph, {size[1]}x{size[0]}, but is {width}x{height}; resize it"
         )
     if transparent and not stored.alpha:
         raise ValueError(f"{path} {Strokes.opaque}")
