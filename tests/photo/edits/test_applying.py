@@ -7,13 +7,22 @@ from nlfilter_torch import abstract, adjust_tone, colorize, defocus, denoise, en
 from nlfilter_torch.filtering.filters import polynomial_filter
 from nlfilter_torch.operator.build import nonlocal_operator
 from nlfilter_torch.operator.features import reduce_channels
-from nlfilter_torch.photo.declared.parameters import CRISP
+from nlfilter_torch.photo.declared.parameters import CRISP, EDITS
 from nlfilter_torch.photo.declared.presets import PRESETS, Recipe
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.declared.strokes import Stroke
-from nlfilter_torch.photo.edits.applying import apply_recipe
+from nlfilter_torch.photo.edits.applying import (
+    EDIT_OF,
+    PreparedStep,
+    apply_recipe,
+    apply_step,
+    edit_of,
+    filter_key,
+    scribbles_of,
+    viewed_stride,
+)
 from nlfilter_torch.photo.picture.colour import edit_luminance
-from nlfilter_torch.photo.picture.painting import mask_of, paint
+from nlfilter_torch.photo.picture.painting import TensorPainter, mask_of, paint
 
 SIZE = (48, 64)
 LINE = ((0.25, 0.25), (0.5, 0.25))
@@ -135,3 +144,63 @@ def test_gradient_reaches_the_image() -> None:
     apply_recipe(PRESETS["glow"], image).square().mean().backward()
     assert image.grad is not None
     assert image.grad.abs().max() > 0
+
+
+def test_a_prepared_picture_gives_the_same_for_any_step(pixels: torch.Tensor) -> None:
+    prepared = PreparedStep(pixels)
+    for alpha in (ALPHA, INSIDE):
+        step = DETAIL.changed(alpha=alpha)
+        assert torch.equal(prepared(step), apply_step(step, pixels))
+    assert prepared(DETAIL).dtype == pixels.dtype
+
+
+def test_steps_with_equal_filters_share_them() -> None:
+    key = filter_key(DETAIL)
+    assert filter_key(DETAIL.changed(alpha=INSIDE, strokes=())) == key
+    assert filter_key(DETAIL.changed(bandwidth=31.0)) != key
+    assert filter_key(DETAIL.changed(landmarks=299)) != key
+
+
+def test_pixels_of_a_preview_are_counted_at_the_viewing_size() -> None:
+    size = (300, 400)
+    for step in (Step("detail"), Step("defocus", (IN,))):
+        assert viewed_stride(step, size, 1) == 1
+    assert viewed_stride(Step("defocus", (IN,)), size, 5) == 5  # it counts pixels of the photograph
+    # A photograph of 1500 x 2000 is viewed in 1061 x 1414.
+    assert viewed_stride(Step("detail"), size, 5) == pytest.approx(5 * 1061 / 1500)
+    assert viewed_stride(Step("detail", viewing_size=0), size, 5) == 5
+
+
+def test_edits_have_the_settings_of_their_steps() -> None:
+    assert tuple(EDIT_OF) == tuple(EDITS)
+    edit = edit_of(Step("defocus", (IN,), radius=4.0), SIZE)
+    assert vars(edit)["radius"] == 0.04 * 48
+    assert torch.equal(torch.rand(3, generator=vars(edit)["generator"]), torch.rand(3, generator=seeded()))
+    own = torch.Generator().manual_seed(7)
+    assert vars(edit_of(Step("tone"), SIZE, generator=own))["generator"] is own
+
+
+def test_scribbles_are_painted_under_the_names_of_the_arguments() -> None:
+    painter = TensorPainter()
+    assert scribbles_of(Step("tone"), SIZE, painter).masks == {}
+    recoloured = scribbles_of(RECOLOR, SIZE, painter)
+    colours, painted = paint([BLUE], SIZE)
+    assert recoloured.colours is not None
+    assert torch.equal(recoloured.colours, colours)
+    assert torch.equal(recoloured.masks["stroke_mask"], painted)
+    assert torch.equal(recoloured.masks["keep"], mask_of([KEEP], SIZE, above=[BLUE]))
+    regional = scribbles_of(DETAIL, SIZE, painter)
+    assert list(regional.masks) == ["regions", "negative"]
+    assert regional.sliders is not None
+    assert regional.outside is not None
+    assert regional.sliders.tolist() == [list(INSIDE)]
+    assert regional.outside.tolist() == list(ALPHA)
+    hidden = Stroke(IN.points, 0.01, "out")  # wholly under the strokes on the subject
+    assert list(scribbles_of(DEFOCUS.changed(strokes=(IN, hidden)), SIZE, painter).masks) == ["focus_region"]
+
+
+def test_progress_is_reported_before_every_acting_step(pixels: torch.Tensor) -> None:
+    reports: list[tuple[int, int]] = []
+    steps = (Step("tone", clarity=2.0), Step.idle("detail"), ABSTRACT)
+    apply_recipe(Recipe(steps), pixels, lambda done, total: reports.append((done, total)))
+    assert reports == [(0, 2), (1, 2)]
