@@ -51,9 +51,9 @@ Array = NDArray[np.uint8]
 
 def photographs() -> list[Array]:
     """Photographs (H, W, 3) of scikit-image, padded to at least the size of a piece."""
-    found = [getattr(skimage.data, name)() for name in (*NAMES, "retina", "hubble_deep_field")]
-    found.append(skimage.data.stereo_motorcycle()[0])
-    colour = [picture if picture.ndim == 3 else np.repeat(picture[..., None], 3, axis=2) for picture in found]
+    pictures = [getattr(skimage.data, name)() for name in (*NAMES, "retina", "hubble_deep_field")]
+    pictures.append(skimage.data.stereo_motorcycle()[0])
+    colour = [picture if picture.ndim == 3 else np.repeat(picture[..., None], 3, axis=2) for picture in pictures]
     short = [np.maximum(PIECE - np.array(picture.shape[:2]), 0) for picture in colour]
     return [np.pad(p, ((0, s[0]), (0, s[1]), (0, 0)), mode="symmetric") for p, s in zip(colour, short, strict=True)]
 

@@ -79,9 +79,11 @@ def main() -> None:
             first = [wall for wall, _ in runs[options.threads[0], 0]]
             for threads in options.threads:
                 alone, beside = runs[threads, 0], runs[threads, options.neighbours]
-                columns = [median(run[part] for run in found) for found in (alone, beside) for part in (0, 1)]
+                columns = [
+                    median(run[part] for run in runs_of_way) for runs_of_way in (alone, beside) for part in (0, 1)
+                ]
                 ratio = median(b[0] / a[0] for a, b in zip(alone, beside, strict=True))
-                gain = median(one / many[0] for one, many in zip(first, alone, strict=True))
+                gain = median(single / several[0] for single, several in zip(first, alone, strict=True))
                 figures = " | ".join(f"{value:.2f}" for value in (*columns, ratio, gain))
                 print(f"| {verb} | {megapixels:g} | {threads} | {figures} |", flush=True)
 

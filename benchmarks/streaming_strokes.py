@@ -96,11 +96,11 @@ def exactness(side: int) -> list[str]:
 
         sampled = edited(sample=side * side // 4, tile_rows=64)
         other = np.abs(edited(sample=side * side // 4, tile_rows=1000) - sampled).max()
-        some, full = np.abs(sampled - wanted), np.abs(edited(statistics="full") - wanted).max()
+        error, full = np.abs(sampled - wanted), np.abs(edited(statistics="full") - wanted).max()
         lines.append(
-            f"{verb}, {side * side / 1e6:.2f} MP: a quarter as sample is off by {255 * some.max():.2f} of 255 at most "
-            f"(RMS {255 * np.sqrt(np.square(some, dtype=np.float64).mean()):.3f}), full passes by {full:.1e} of white; "
-            f"tiles of 64 and 1000 rows differ by {other:.1e}"
+            f"{verb}, {side * side / 1e6:.2f} MP: a quarter as sample is off by {255 * error.max():.2f} of 255 at most "
+            f"(RMS {255 * np.sqrt(np.square(error, dtype=np.float64).mean()):.3f}), full passes by {full:.1e} of "
+            f"white; tiles of 64 and 1000 rows differ by {other:.1e}"
         )
     return lines
 
