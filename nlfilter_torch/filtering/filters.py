@@ -19,7 +19,7 @@ from nlfilter_torch.core.checks import (
     checked_response,
 )
 from nlfilter_torch.core.kernels.tall_skinny import spread
-from nlfilter_torch.core.layouts import as_given
+from nlfilter_torch.core.layouts import in_format_of
 from nlfilter_torch.core.precision import full_precision, per_image
 from nlfilter_torch.operator.operator import NonlocalOperator
 from nlfilter_torch.operator.products import Columns
@@ -153,7 +153,7 @@ def polynomial_filter(
         captured = spectral_filter(operator.spectrum(), image.to(filtered), torch.ones_like)
         weight = operator.communicator.copy_to_group(residual)
         filtered = filtered + residual_change(alpha, weight, image.to(filtered) - captured, operator.diagonal_share)
-    return as_given(filtered, image)
+    return in_format_of(filtered, image)
 
 
 def residual_change(alpha: Tensor, weight: float | Tensor, residual: Tensor, remainder: Tensor) -> Tensor:
@@ -232,11 +232,11 @@ def spectral_filter(
         shape = (max(batch, image.shape[0]), image.shape[1], landmarks)
         check_shape(coefficients, shape, "coefficients", "use spectrum.coefficients(image)")
     if isinstance(residual, int | float) and residual == 0:
-        return as_given(spectrum.synthesize(response, coefficients), image)
+        return in_format_of(spectrum.synthesize(response, coefficients), image)
     rho = per_image(spectrum.communicator.copy_to_group(residual), spectrum.root, 2)
     # V f V^T y + rho (y - V V^T y) = V (f - rho) V^T y + rho y, still in two passes over the factor.
     filtered = spectrum.synthesize(lambda eigenvalues: response(eigenvalues) - rho, coefficients)
-    return as_given(filtered + rho.to(filtered).reshape(-1, 1, 1, 1) * image.to(filtered), image)
+    return in_format_of(filtered + rho.to(filtered).reshape(-1, 1, 1, 1) * image.to(filtered), image)
 
 
 @full_precision

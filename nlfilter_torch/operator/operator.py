@@ -16,7 +16,7 @@ from nlfilter_torch.core.checks import (
 from nlfilter_torch.core.communicator import ALONE, Communicator
 from nlfilter_torch.core.containers import Target, loadable, moved
 from nlfilter_torch.core.kernels.tall_skinny import moment
-from nlfilter_torch.core.layouts import as_given
+from nlfilter_torch.core.layouts import in_format_of
 from nlfilter_torch.core.precision import full_precision, uncompiled
 from nlfilter_torch.operator.eigenvalue_bound import largest_eigenvalue, shifted_gram
 from nlfilter_torch.operator.features import GuideFeatures
@@ -220,7 +220,7 @@ class NonlocalOperator:
         Raises:
             TypeError, ValueError: if ``image`` is not a finite floating-point tensor of that size.
         """
-        return as_given(self.powers(image, 1)[:, 0], image)
+        return in_format_of(self.powers(image, 1)[:, 0], image)
 
     def __matmul__(self, image: Tensor) -> Tensor:
         return self.matmul(image)

@@ -15,7 +15,7 @@ from nlfilter_torch.core.checks import (
 )
 from nlfilter_torch.core.inner import EVERYWHERE, Inner
 from nlfilter_torch.core.kernels.convolution import SLOPE, channels_last, convolve
-from nlfilter_torch.core.layouts import as_given
+from nlfilter_torch.core.layouts import in_format_of
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.core.torch_internals import refuse_transforms
 from nlfilter_torch.filtering.filters import detail_layers
@@ -138,7 +138,7 @@ class NonlocalDenoiser(nn.Module):
         dtype = self.log_bandwidths.dtype
         image = noisy.to(dtype)
         levels = noise_map(noise, image)
-        return as_given(image - self.estimate_in_tiles(image, levels, turns), noisy)
+        return in_format_of(image - self.estimate_in_tiles(image, levels, turns), noisy)
 
     def estimate_in_tiles(self, image: Tensor, noise: Tensor, turns: int, inner: Inner = EVERYWHERE) -> Tensor:
         """Estimate the noise of an image (B, C, H, W) from its levels (B, 1 or C, H, W), both in the weights' dtype.

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from nlfilter_torch.core.checks import check_choice, check_count, check_image
-from nlfilter_torch.core.layouts import as_given
+from nlfilter_torch.core.layouts import in_format_of
 from nlfilter_torch.core.precision import working_dtype
 from nlfilter_torch.filtering.filters import polynomial_filter
 from nlfilter_torch.nn.parameters import check_learn
@@ -159,7 +159,7 @@ class Look(nn.Module):
         if operator is None and acts(parts["alpha"]):
             operator = operator_from_guide(reduce_channels(exact, "luminance"), self._options(image))
         detail = None if operator is None else partial(polynomial_filter, operator)
-        return as_given(filter_look(exact, parts, detail), image)
+        return in_format_of(filter_look(exact, parts, detail), image)
 
     def _options(self, image: Tensor) -> OperatorOptions:
         """Options of the filter for an image (B, 3, H, W)."""
