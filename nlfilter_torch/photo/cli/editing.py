@@ -64,7 +64,7 @@ def viewed_within_memory(path: str | Path, size: tuple[int, int], step: Step, fa
 
 
 def read_if_it_fits(source: str, target: str, bytes_per_pixel: int, gigabytes: float | None) -> Photograph | None:
-    """Read the photograph, or return None if it must be read by rows, given ``--memory``."""
+    """Read the photograph, or return None if ``--memory`` requires that it is read by rows."""
     if is_zarr(Path(source)) or is_zarr(Path(target)):
         return None
     try:
@@ -88,7 +88,7 @@ def read_masks(paths: Sequence[Path], of: str | Path, size: tuple[int, int] | No
 
 
 def check_apart(option: str, path: str | Path | None, **files: str | Path | Iterable[str | Path] | None) -> None:
-    """Raise ValueError if the file that an option or argument writes is one of the others, given by what they are."""
+    """Raise ValueError if the file that an option or argument writes is one of ``files``, named by what they hold."""
     if path is None:
         return
     for what, names in files.items():
@@ -126,7 +126,7 @@ class Job:
         limit: bytes that tiles may use, at most.
         report: called with the progress.
         files: closes opened files.
-        processes: compute tiles in place of the threads of this process, if given.
+        processes: compute tiles in place of the threads of this process; None are these threads.
     """
 
     picture: StoredPicture

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 import typer
 
 from nlfilter_torch.photo.cli import options
-from nlfilter_torch.photo.declared.declaration import FILTER_PANEL, UNITS, Edit, Parameter, ScribbleKind
+from nlfilter_torch.photo.declared.declaration import FILTER_PANEL, UNITS, Edit, Kind, Parameter, ScribbleKind
 from nlfilter_torch.photo.declared.parameters import DETAIL, EDITS
 from nlfilter_torch.photo.declared.presets import PRESETS, Recipe, find_recipe
 from nlfilter_torch.photo.declared.steps import Step
@@ -16,7 +16,7 @@ from nlfilter_torch.photo.declared.steps import Step
 Command = Callable[..., None]  # typer reads its signature
 #: Options of detail that do not concern regions.
 DETAIL_OPTIONS = tuple(p.name for p in EDITS["detail"] if p.is_option and p.name not in ("reach", "tolerance"))
-TYPES = {"number": float, "count": int, "odd": int, "sliders": str}
+NUMBERS: dict[Kind, type[float]] = {"number": float, "count": int, "odd": int}
 
 
 def plain_step(recipe: Recipe) -> Step | None:
@@ -26,13 +26,13 @@ def plain_step(recipe: Recipe) -> Step | None:
 
 
 def typed_options(context: typer.Context, names: Iterable[str]) -> list[str]:
-    """Those of these options that are on the command line, even if with their default values."""
+    """The options with these names that the user typed, even if with their default values."""
     sources = {name: context.get_parameter_source(name) for name in names}
     return [name for name, source in sources.items() if source is not None and source.name == "COMMANDLINE"]
 
 
 def other_recipe(context: typer.Context, preset: str, names: Iterable[str]) -> Recipe | None:
-    """The recipe of a preset, if options of ``detail`` cannot express it; ValueError if parameters are given too."""
+    """The recipe of a preset, if options of ``detail`` cannot express it; ValueError if the user typed such options."""
     recipe = find_recipe(preset)
     if plain_step(recipe) is not None:
         return None
@@ -50,7 +50,7 @@ def preset_step(recipe: Recipe, edit: Edit) -> Step | None:
     return step if step is not None and step.edit in edit.presets else None
 
 
-def preset_option(help: str, *, plain: bool = True) -> Any:
+def preset_option(help: str, *, plain: bool = True) -> object:
     """An option for a preset, whose values replace the defaults of other options.
 
     If ``plain``, presets must be a look or a single step of detail without strokes.
@@ -104,33 +104,31 @@ def scribble_options(edit: Edit) -> dict[str, object]:
     return annotations
 
 
-def option_value(parameter: Parameter, value: Any) -> Any:
+def option_value(parameter: Parameter, value: object) -> object:
     """Convert the value of a parameter to that of its option.
 
     >>> option_value(EDITS["detail"]["alpha"], (3.0, 1.05)), option_value(EDITS["tone"]["bandwidth"], 20.0)
     ('3,1.05', '20')
     """
-    if parameter.kind == "sliders":
+    if isinstance(value, list | tuple):
         return ",".join(f"{slider:.9g}" for slider in value)
     return f"{value:.9g}" if parameter.words and isinstance(value, int | float) else value
 
 
-def option(parameter: Parameter, panel: str | None = None) -> Any:
+def option(parameter: Parameter, panel: str | None = None) -> object:
     """The annotation of a parameter's option; ``panel`` replaces the title of its section in the help."""
-    kind: Any = Literal[parameter.choices] if parameter.choices else TYPES[parameter.kind]
-    limits: dict[str, Any] = {}
-    if parameter.words:
-        kind = str
-    elif parameter.kind in ("number", "count"):
-        limits = {"min": kind(parameter.low), "max": kind(parameter.high)}
-    elif parameter.kind == "odd":
-        limits = {"max": int(parameter.high)}
+    number = None if parameter.words else NUMBERS.get(parameter.kind)
+    low = number(parameter.low) if number and parameter.kind != "odd" else None  # check_odd has a better error
+    kind: Any = number or str  # typer reads annotations that are made here
+    if parameter.choices and not parameter.words:
+        kind = Literal[parameter.choices]
     decorated = typer.Option(
         f"--{parameter.name.replace('_', '-')}",
         metavar=None if parameter.choices else parameter.metavar or UNITS[parameter.unit][1],
         help=parameter.help,
         rich_help_panel=panel or parameter.panel,
-        **limits,
+        min=low,
+        max=number(parameter.high) if number else None,
     )
     return Annotated[kind | None if parameter.optional else kind, decorated]
 
@@ -196,21 +194,21 @@ def command(edit: Edit) -> Command:
     return with_signature(run, options_of_edit.replace(parameters=[*options_of_edit.parameters.values(), context]))
 
 
-def step_of(edit: Edit, options_of_edit: Mapping[str, Any]) -> Step:
+def step_of(edit: Edit, options_of_edit: Mapping[str, object]) -> Step:
     """Create a step from options, without its scribbles."""
-    values = {}
+    values: dict[str, object] = {}
     for parameter in edit:
         if parameter.name not in options_of_edit:
             continue
         value = options_of_edit[parameter.name]
-        if parameter.kind == "sliders":
+        if isinstance(value, str) and parameter.kind == "sliders":
             value = options.parse_sliders(value, f"--{parameter.name}")
-        elif parameter.words or (parameter.kind == "number" and isinstance(value, str)):
-            value = value if value is None else options.parse_number(value, parameter)
-        elif parameter.kind == "odd":
+        elif isinstance(value, str) and (parameter.words or parameter.kind == "number"):
+            value = options.parse_number(value, parameter)
+        elif isinstance(value, int) and parameter.kind == "odd":
             options.check_odd(value, parameter)
         values[parameter.name] = value
-    return Step(edit.name, **values)
+    return Step(edit.name, (), **values)
 
 
 def edit_photograph(
@@ -231,11 +229,11 @@ def edit_photograph(
     mask: Path | None = None,
     show: Path | None = None,
     map: Path | None = None,
-    **values: Any,
+    **values: object,
 ) -> None:
     """Apply an edit to a file.
 
-    ``values`` are those of its parameters and of its options for the background, and ``typed`` are the names of the
+    ``values`` are those of its parameters and of its options for the background, and ``typed`` holds the names of the
     options that the user typed.
     """
     step = step_of(edit, values)
@@ -251,8 +249,9 @@ def edit_photograph(
     from nlfilter_torch.photo.cli.edit_job import EditJob
     from nlfilter_torch.photo.cli.scribbles import ScribbleOptions
 
-    backgrounds = {s.option: values.get(s.option.removeprefix("--")) for s in edit.backgrounds}
-    drawn = ScribbleOptions(region, strokes, mask, backgrounds)
+    backgrounds = [(s.option, values.get(s.option.removeprefix("--"))) for s in edit.backgrounds]
+    rectangles = {option: texts for option, texts in backgrounds if isinstance(texts, list)}
+    drawn = ScribbleOptions(region, strokes, mask, rectangles)
     note_useless(step, typed, marked=drawn.marks_objects)
     editing.check_written(source, target, show=show, map=map, mask=mask, strokes=strokes, preset=preset)
     job = EditJob(step, source, target, drawn, show, map, depth, seed, memory, full)

@@ -1,7 +1,7 @@
 """``nlfilter-torch mask``: write a soft mask of an object in a photograph."""
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -40,7 +40,7 @@ def mask(
     full: bool = False,
     workers: int | None = None,
     cluster: str | None = None,
-    **values: Any,
+    **values: object,
 ) -> None:
     """See :data:`MASK`."""
     from nlfilter_torch.photo.cli import editing

@@ -5,7 +5,6 @@ from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from nlfilter_torch.photo.cli import editing, options
 from nlfilter_torch.photo.cli.edit_job import Opener, as_rows
@@ -56,7 +55,7 @@ class MaskJob:
         depth: of the file; None is that of its type.
     """
 
-    values: Mapping[str, Any]
+    values: Mapping[str, object]
     source: str
     target: Path
     scribbles: ScribbleOptions
@@ -65,6 +64,13 @@ class MaskJob:
     memory: float | None
     full: bool
     depth: options.FileDepth | None
+
+    @property
+    def bytes_per_pixel(self) -> int:
+        """Memory that the mask needs per pixel of the photograph."""
+        landmarks = self.values["landmarks"]
+        assert isinstance(landmarks, int)  # for mypy
+        return working_bytes(landmarks, 3)
 
     @property
     def floats(self) -> bool:
@@ -88,8 +94,7 @@ class MaskJob:
         allowed = editing.allowed_memory(self.memory)
         with steps(3) as begin:
             begin("Reading")
-            needed = working_bytes(self.values["landmarks"], 3)
-            photograph = editing.read_if_it_fits(self.source, str(self.target), needed, self.memory)
+            photograph = editing.read_if_it_fits(self.source, str(self.target), self.bytes_per_pixel, self.memory)
             if photograph is not None:
                 mask = Photograph(photograph.pixels[:, :1], self.kind)
                 check_file(self.target) if self.floats else check_output(self.target, mask)

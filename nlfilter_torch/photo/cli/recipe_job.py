@@ -25,7 +25,7 @@ class RecipeJob:
     """Recipes that are applied to a photograph in a file.
 
     Attributes:
-        recipes: the only one, or one for each mask.
+        recipes: a recipe for the whole photograph, or a recipe for each mask.
         masks: grey pictures of the regions of the recipes.
         source: the file to read.
         target: the file to write.
@@ -73,7 +73,7 @@ class RecipeJob:
         return edit_regions(passes, job.picture.rows, edits, [mask.rows for mask in masks], self.source)
 
     def _tell(self, rows: Rows) -> None:
-        """Print the notes of all steps, each of them once."""
+        """Print the notes of all steps, without repeating any."""
         steps = [step for recipe in self.recipes for step in recipe.acting]
         for note in dict.fromkeys(note for step in steps for note in edit_of(step, rows.size).notes(rows)):
             options.note(note)

@@ -100,7 +100,7 @@ class Overlay(ABC):
     Attributes:
         shape: (H, W, S).
         picture: the picture, or None.
-        rectangles: with the channels that each sets, and their values.
+        rectangles: with the channels that a rectangle sets, and their values.
     """
 
     shape: tuple[int, int, int]
@@ -169,8 +169,9 @@ class Strokes(Overlay):
 
     def checked(self) -> Self:
         """Return these scribbles; raise ValueError if their picture has none, or they cover all of it."""
-        if super().checked().picture is not None and not self._any(lambda opacity: opacity == 0):
-            raise ValueError(f"{self.picture.name} {self.opaque}")  # type: ignore[union-attr]
+        super().checked()
+        if self.picture is not None and not self._any(lambda opacity: opacity == 0):
+            raise ValueError(f"{self.picture.name} {self.opaque}")
         return self
 
     def _of_picture(self, rows: slice, picture: Picture) -> Floats:
@@ -278,7 +279,7 @@ def _strokes(size: Size, path: Path | None, regions: list[str] | None, read: Ope
 
 
 def selection(size: Size, path: Path | None, texts: list[str] | None, option: str, read: Open) -> Regions | None:
-    """Read a single region from a mask file and the rectangles of an option, or return None if neither is given."""
+    """Read a single region from a mask file and the rectangles of an option, or return None without either."""
     rectangles = []
     for text in texts or []:
         rectangle = Rectangle.parse(text, option, size)
@@ -293,7 +294,7 @@ def selection(size: Size, path: Path | None, texts: list[str] | None, option: st
 def _slider_regions(
     size: Size, path: Path | None, texts: list[str] | None, alpha: Tensor, read: Open
 ) -> tuple[Regions, Tensor]:
-    """Read K regions and their sliders (K, k+1) from ``--mask`` and ``--region``, of which at least one is given.
+    """Read K regions and their sliders (K, k+1) from ``--mask`` and ``--region``, or one of them.
 
     The mask, and rectangles without their own sliders, have the sliders ``alpha`` (k+1,).
     """

@@ -145,7 +145,7 @@ def unlike(pixels: Tensor, middle: Tensor) -> float:
 
 
 def _planes(overlay: Overlay, size: tuple[int, int], stride: int) -> Tensor:
-    """Reduce scribbles; one that covers less than a pixel remains visible."""
+    """Reduce scribbles; even those of less than a reduced pixel remain visible."""
     return _reduced(overlay.planes, size, stride, F.max_pool2d)
 
 
