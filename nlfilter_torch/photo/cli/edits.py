@@ -9,6 +9,7 @@ import typer
 
 from nlfilter_torch.photo.cli import options
 from nlfilter_torch.photo.declared.declaration import FILTER_PANEL, UNITS, Edit, Kind, Parameter, ScribbleKind
+from nlfilter_torch.photo.declared.json_values import Value
 from nlfilter_torch.photo.declared.parameters import DETAIL, EDITS
 from nlfilter_torch.photo.declared.presets import PRESETS, Recipe, find_recipe
 from nlfilter_torch.photo.declared.steps import Step
@@ -104,13 +105,13 @@ def scribble_options(edit: Edit) -> dict[str, object]:
     return annotations
 
 
-def option_value(parameter: Parameter, value: object) -> object:
+def option_value(parameter: Parameter, value: Value) -> float | str | None:
     """Convert the value of a parameter to that of its option.
 
     >>> option_value(EDITS["detail"]["alpha"], (3.0, 1.05)), option_value(EDITS["tone"]["bandwidth"], 20.0)
     ('3,1.05', '20')
     """
-    if isinstance(value, list | tuple):
+    if isinstance(value, tuple):
         return ",".join(f"{slider:.9g}" for slider in value)
     return f"{value:.9g}" if parameter.words and isinstance(value, int | float) else value
 
@@ -194,9 +195,9 @@ def command(edit: Edit) -> Command:
     return with_signature(run, options_of_edit.replace(parameters=[*options_of_edit.parameters.values(), context]))
 
 
-def step_of(edit: Edit, options_of_edit: Mapping[str, object]) -> Step:
+def step_of(edit: Edit, options_of_edit: Mapping[str, Value]) -> Step:
     """Create a step from options, without its scribbles."""
-    values: dict[str, object] = {}
+    values: dict[str, Value] = {}
     for parameter in edit:
         if parameter.name not in options_of_edit:
             continue
@@ -229,14 +230,14 @@ def edit_photograph(
     mask: Path | None = None,
     show: Path | None = None,
     map: Path | None = None,
-    **values: object,
+    **values: Value | list[str],
 ) -> None:
     """Apply an edit to a file.
 
     ``values`` are those of its parameters and of its options for the background, and ``typed`` holds the names of the
     options that the user typed.
     """
-    step = step_of(edit, values)
+    step = step_of(edit, {name: value for name, value in values.items() if not isinstance(value, list)})
     look = None if preset is None else preset_step(find_recipe(preset), edit)
     if look is not None:
         if {"region", "mask", *(parameter.name for parameter in edit)}.intersection(typed):

@@ -11,6 +11,7 @@ import typer
 
 from nlfilter_torch.photo.cli import options
 from nlfilter_torch.photo.cli.edits import step_of, with_options
+from nlfilter_torch.photo.declared.json_values import Value
 from nlfilter_torch.photo.declared.parameters import EDITS
 
 if TYPE_CHECKING:
@@ -71,7 +72,7 @@ def fit(
     mask: options.MasksOfPairs = None,
     preview: Preview = None,
     left: Map = None,
-    **values: object,
+    **values: Value,
 ) -> None:
     """Find the look that turns a photograph into an edited one, or a folder of them, whatever program made the edit.
 

@@ -16,6 +16,7 @@ from nlfilter_torch.photo.cli.edits import (
     typed_options,
     with_options,
 )
+from nlfilter_torch.photo.declared.json_values import Value
 from nlfilter_torch.photo.declared.parameters import EDITS
 from nlfilter_torch.photo.declared.presets import PRESETS, Recipe
 
@@ -78,7 +79,7 @@ def frames(
     seed: options.Seed = 0,
     preset: Preset = None,
     memory: options.Memory = None,
-    **values: object,
+    **values: Value,
 ) -> None:
     """Edit all frames of a film alike, without flicker.
 
@@ -111,7 +112,7 @@ def frames(
     typer.echo(f"{count} frames in {target}")
 
 
-def chosen_recipe(context: typer.Context, name: str, preset: str | None, values: dict[str, object]) -> Recipe:
+def chosen_recipe(context: typer.Context, name: str, preset: str | None, values: dict[str, Value]) -> Recipe:
     """Create the edit from the values of options.
 
     Raises:

@@ -9,6 +9,7 @@ import typer
 
 from nlfilter_torch.photo.cli import options
 from nlfilter_torch.photo.cli.edits import step_of, with_options
+from nlfilter_torch.photo.declared.json_values import Value
 from nlfilter_torch.photo.declared.parameters import EDITS
 
 if TYPE_CHECKING:
@@ -41,7 +42,7 @@ MEANINGS = {
 
 
 @with_options("alpha", "bandwidth", "spatial_bandwidth", "patch_size", "landmarks", "sampling", "viewing_size")
-def inspect(source: options.Source, folder: Folder, seed: options.Seed = 0, **values: object) -> None:
+def inspect(source: options.Source, folder: Folder, seed: options.Seed = 0, **values: Value) -> None:
     """Show the filter of a photograph: the patterns it finds, how strong they are, and how sliders change them.
 
     Writes eigenvectors.png, eigenvalues.png, response.png and diagnostics.json into a folder and prints a table. A

@@ -7,6 +7,7 @@ import typer
 
 from nlfilter_torch.photo.cli import options
 from nlfilter_torch.photo.cli.edits import signature, with_signature
+from nlfilter_torch.photo.declared.json_values import Value
 from nlfilter_torch.photo.declared.parameters import MASK
 
 Target = Annotated[
@@ -40,7 +41,7 @@ def mask(
     full: bool = False,
     workers: int | None = None,
     cluster: str | None = None,
-    **values: object,
+    **values: Value,
 ) -> None:
     """See :data:`MASK`."""
     from nlfilter_torch.photo.cli import editing

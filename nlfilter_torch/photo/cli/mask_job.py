@@ -12,6 +12,7 @@ from nlfilter_torch.photo.cli.editing import pixels_of, rows_of
 from nlfilter_torch.photo.cli.progress import stages, steps
 from nlfilter_torch.photo.cli.scribbles import Open, Overlay, ScribbleOptions, at_once, of_edit
 from nlfilter_torch.photo.cli.showing import Scribbled, tell_selected
+from nlfilter_torch.photo.declared.json_values import Value
 from nlfilter_torch.photo.declared.parameters import MASK
 from nlfilter_torch.photo.declared.steps import working_bytes
 from nlfilter_torch.photo.io.extras import NO_EXTRAS
@@ -55,7 +56,7 @@ class MaskJob:
         depth: of the file; None is that of its type.
     """
 
-    values: Mapping[str, object]
+    values: Mapping[str, Value]
     source: str
     target: Path
     scribbles: ScribbleOptions

@@ -5,14 +5,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tifffile
-import torch
 from PIL import Image
 
 from nlfilter_torch.photo.cli import main
 from nlfilter_torch.photo.cli.recipe_job import RecipeJob
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.declared.steps import Step
-from nlfilter_torch.photo.edits.applying import apply_recipe
 from nlfilter_torch.photo.io.photographs import read_photograph
 from tests.problems import colour
 from tests.recipes import COLORIZE
@@ -83,16 +81,6 @@ def test_steps_keep_values_above_white(tmp_path: Path, tiled: bool) -> None:
     edited, before = loaded(target), loaded(source)
     assert edited.max() > 0.9 * before.max() > 2
     assert edited.min() >= before.min()
-
-
-def test_steps_of_integers_are_limited_to_black_and_white() -> None:
-    strong = Step("look", matrix=tuple(4 * value for value in GREYS))
-    weak = Step("look", matrix=tuple(0.5 * value for value in GREYS))
-    image = torch.rand(2, 3, 24, 24, generator=torch.Generator().manual_seed(0))
-    image[1] *= 3
-    edited = apply_recipe(Recipe((strong, weak)), image)
-    assert edited[0].max() == 0.5
-    assert edited[1].max() == pytest.approx(0.5 * float(image[1].max()))
 
 
 def test_what_is_known_before_the_photograph_is_read() -> None:

@@ -204,3 +204,13 @@ def test_progress_is_reported_before_every_acting_step(pixels: torch.Tensor) -> 
     steps = (Step("tone", clarity=2.0), Step.idle("detail"), ABSTRACT)
     apply_recipe(Recipe(steps), pixels, lambda done, total: reports.append((done, total)))
     assert reports == [(0, 2), (1, 2)]
+
+
+def test_steps_of_integers_are_limited_to_black_and_white() -> None:
+    greys = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)  # a matrix that leaves colours as they are
+    strong, weak = (Step("look", matrix=tuple(factor * value for value in greys)) for factor in (4, 0.5))
+    image = torch.rand(2, 3, 24, 24, generator=torch.Generator().manual_seed(0))
+    image[1] *= 3
+    edited = apply_recipe(Recipe((strong, weak)), image)
+    assert edited[0].max() == 0.5
+    assert edited[1].max() == pytest.approx(0.5 * float(image[1].max()))
