@@ -30,7 +30,9 @@ def pixels(path: Path) -> np.ndarray:
 
 
 @pytest.mark.parametrize("alpha", [False, True])
-def test_noise_that_is_found(tmp_path: Path, capsys: pytest.CaptureFixture[str], tiled: bool, alpha: bool) -> None:
+def test_estimated_noise_and_the_change_are_printed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], tiled: bool, alpha: bool
+) -> None:
     photo, out = write(tmp_path / "in.tif", 10.0, alpha=alpha), tmp_path / "out.tif"
     assert main(["denoise", str(photo), str(out), "--landmarks", "40", *(["--full"] if tiled else [])]) == 0
     said = re.fullmatch(
@@ -52,7 +54,7 @@ def test_nothing_to_do(tmp_path: Path, capsys: pytest.CaptureFixture[str], tiled
     np.testing.assert_array_equal(pixels(photo), pixels(out))
 
 
-def test_a_level_that_is_given(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_chosen_level_is_printed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     photo = write(tmp_path / "in.tif", 2.0)
     arguments = ["denoise", str(photo), str(tmp_path / "out.tif"), "--landmarks", "40", "--noise-level"]
     assert main([*arguments, "3"]) == 0

@@ -52,7 +52,7 @@ def test_shares_and_points(text: str, wanted: str) -> None:
 
 
 @pytest.mark.parametrize("text", ["50%", "1,2,3", "a%,2", "nan%,2,3,4", "50%,50%,60%,10%", "0,0,0%,5", "1.5,2,3,4"])
-def test_shares_that_are_none(text: str) -> None:
+def test_wrong_shares(text: str) -> None:
     with pytest.raises(ValueError, match="--region must"):
         Rectangle.parse(text, "--region", (64, 96))
 
