@@ -15,7 +15,6 @@ from typing import Any
 from packaging.requirements import Requirement
 
 ROOT = Path(__file__).resolve().parents[1]
-CPU_BUILDS = "INDEX_OF_BUILDS_FOR_CPUS"
 
 
 def oldest_torch() -> str:
@@ -25,10 +24,10 @@ def oldest_torch() -> str:
     return next(specifier.version for specifier in torch.specifier if specifier.operator == ">=")
 
 
-def offered(version: str, *options: str) -> dict[str, Any] | str:
+def offered(version: str) -> dict[str, Any] | str:
     """What pip would install for this version of torch, or its error."""
     command = [sys.executable, "-m", "pip", "install", "--dry-run", "--ignore-installed", "--no-deps", "--quiet"]
-    command += ["--retries", "1", "--report", "-", *options, f"torch=={version}"]
+    command += ["--retries", "1", "--report", "-", f"torch=={version}"]
     result = subprocess.run(command, capture_output=True, text=True, check=False)
     if result.returncode:
         return next(line for line in result.stderr.splitlines() if line.startswith("ERROR"))
@@ -45,26 +44,25 @@ def needs_cuda(download: dict[str, Any]) -> bool:
     )
 
 
-def build_for_cpus(version: str) -> tuple[str | None, list[str]]:
-    """Address of a build of torch for CPUs, or None, and for every index without one a sentence that says so."""
-    reasons = []
-    for name, options in (("PyPI", ()), (CPU_BUILDS, ("--index-url", CPU_BUILDS))):
-        download = offered(version, *options)
-        if isinstance(download, str):
-            reasons.append(f"{name} offers no torch {version}: {download}")
-        elif needs_cuda(download):
-            reasons.append(f"{name} offers only a build with libraries for CUDA: {download['download_info']['url']}")
-        else:
-            return str(download["download_info"]["url"]), reasons
-    return None, reasons
+def build_for_cpus(version: str) -> tuple[str | None, str]:
+    """Address of the build of torch for CPUs that pip finds, or None, and the reason if there is none."""
+    download = offered(version)
+    if isinstance(download, str):
+        return None, f"pip finds no torch {version}: {download}"
+    if needs_cuda(download):
+        return (
+            None,
+            "pip finds only a build with libraries for CUDA; set PIP_INDEX_URL to an index with builds for CPUs",
+        )
+    return str(download["download_info"]["url"]), ""
 
 
 def main(folder: Path) -> int:
     """Make the environment in a folder, and run the tests in it; returns the exit status."""
     version = oldest_torch()
-    address, reasons = build_for_cpus(version)
+    address, reason = build_for_cpus(version)
     if address is None:
-        print(f"Skipped the tests with torch {version}: no build for CPUs was found.", *reasons, sep="\n  ")
+        print(f"Skipped the tests with torch {version}: {reason}")
         return 0
     python = folder / "bin" / "python"
     if not python.exists():
