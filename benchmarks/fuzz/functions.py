@@ -67,11 +67,11 @@ AFFINITY: dict[str, Kind] = {
     "num_landmarks": _count(1, 16),
     "landmarks": _one_of(*SAMPLINGS),
     "completion": _one_of("diagonal"),
-    "tolerance": _plain(1e-6, 1e-3),
     "generator": lambda scene: scene.generator,
 }
 BANDWIDTH = {"photometric_bandwidth": _one_of("auto", 0.05, 0.2)}
 GUIDED = {"guide_channels": _one_of("luminance", "all")}
+BALANCED: dict[str, Kind] = {"tolerance": _plain(1e-6, 1e-3)}
 LOCAL = {name: AFFINITY[name] for name in ("patch_size", "spatial_bandwidth", "num_landmarks")}
 FILTER = AFFINITY | BANDWIDTH
 OPERATOR: dict[str, Kind] = {"operator": lambda scene: scene.operator}
@@ -158,11 +158,12 @@ class Function:
 
 NUMBERS = {name: _plain(0.1, 4.0) for name in ("time", "width")}
 FUNCTIONS = {
-    "nonlocal_operator": Function(nlf.nonlocal_operator, {"guide": _image(1, 3, 2)}, FILTER | GUIDED),
+    "nonlocal_operator": Function(nlf.nonlocal_operator, {"guide": _image(1, 3, 2)}, FILTER | GUIDED | BALANCED),
     "operator_from_features": Function(
         nlf.operator_from_features,
         {"features": lambda scene: 5 * scene.noise(scene.batch, 3, math.prod(scene.size)), "size": _size},
         {name: kind for name, kind in AFFINITY.items() if name not in ("patch_size", "spatial_bandwidth")}
+        | BALANCED
         | {"weights": lambda scene: 0.5 + 9 * scene.noise(math.prod(scene.size))},
     ),
     "NonlocalOperator.matmul": Function(lambda operator, image: operator @ image, OPERATOR | IMAGE, {}),
@@ -283,9 +284,13 @@ FUNCTIONS = {
     ),
     "Look": Function(_look, {"image": _image(3)}, {"learn": _one_of((), ("matrix",)), "knots": _count(2, 20)}),
     "NonlocalFilter": Function(
-        _layer, LIST | {"image": _image(1, 3)}, RESIDUAL | FILTER | GUIDED | {"learn": _one_of((), ("alpha",))}
+        _layer,
+        LIST | {"image": _image(1, 3)},
+        RESIDUAL | FILTER | GUIDED | BALANCED | {"learn": _one_of((), ("alpha",))},
     ),
-    "NonlocalAffinity": Function(_affinity, {"image": _image(1, 3)}, FILTER | GUIDED | {"learn": _one_of(())}),
+    "NonlocalAffinity": Function(
+        _affinity, {"image": _image(1, 3)}, FILTER | GUIDED | BALANCED | {"learn": _one_of(())}
+    ),
     "NonlocalDenoiser": Function(_denoiser, {"image": _image(1, 3)}, {"noise": _number(0, 0.3)}),
     "Portable": Function(_portable, LIST | {"image": _image(1, 3)}, {}),
     "PolynomialSliders": Function(_sliders, OPERATOR | IMAGE | LIST, RESIDUAL | {"learn": _one_of((), ("alpha",))}),

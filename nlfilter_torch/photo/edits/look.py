@@ -323,4 +323,6 @@ def _numbers(value: Numbers, name: str, dtype: torch.dtype) -> Tensor:
         raise TypeError(f"{name} must be a list of numbers or a tensor, got {value!r}; pass numbers") from error
     if numbers.ndim == 0:
         raise ValueError(f"{name} must be several numbers, got a single one; pass a list or a tensor of them")
+    if numbers.is_complex():
+        raise TypeError(f"{name} must be real numbers, got {numbers.dtype}; pass their real part")
     return numbers.to(dtype)

@@ -97,3 +97,8 @@ def test_looks_differ_within_a_batch() -> None:
 def test_bad_parts_are_refused(options: dict[str, tuple[float, ...]], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         apply_look(CAT, **options)  # type: ignore[arg-type]
+
+
+def test_complex_numbers_are_refused() -> None:
+    with pytest.raises(TypeError, match="stretch must be real numbers, got torch.complex64; pass their real part"):
+        apply_look(CAT, stretch=torch.zeros(3, dtype=torch.complex64))
