@@ -46,11 +46,11 @@ def scribbles_of(step: Step, size: tuple[int, int], painter: Painter[M]) -> Draw
         strokes = step.painted(scribble.word)
         if scribble.kind == "colours":
             colours, mask = painter.colours(strokes, size)
-            _check_covered(step, painter, [colours if mask is None else mask])
+            _check_covered(step, painter.covers(colours if mask is None else mask))
             masks |= {} if mask is None else {scribble.argument: mask}
         elif scribble.role == "object":
             masks[scribble.argument] = painter.mask(strokes, size)
-            _check_covered(step, painter, [masks[scribble.argument]])
+            _check_covered(step, painter.covers(masks[scribble.argument]))
         elif strokes:
             mask = painter.mask(strokes, size, above=on_object)
             masks |= {scribble.argument: mask} if painter.covers(mask) else {}
@@ -59,8 +59,8 @@ def scribbles_of(step: Step, size: tuple[int, int], painter: Painter[M]) -> Draw
     return Drawn(masks, colours, torch.tensor(step.sliders_inside)[None], torch.tensor(step["alpha"]))
 
 
-def _check_covered(step: Step, painter: Painter[M], marks: list[M]) -> None:
-    if not any(map(painter.covers, marks)):
+def _check_covered(step: Step, covered: bool) -> None:
+    if not covered:
         raise ValueError(f"strokes of {step.edit} must cover a pixel of the photograph, got none that do; move them")
 
 
@@ -139,7 +139,7 @@ def viewed_stride(step: Step, size: tuple[int, int], stride: float) -> float:
 
 
 def filter_key(step: Step) -> tuple[object, ...]:
-    """Values that the filter of a step depends on; steps of one kind with equal values share it in :func:`prepare`."""
+    """Values that the filter of a step depends on; steps with equal values share it in :class:`PreparedStep`."""
     return tuple(step[p.name] for p in step.declared if p.keyword in FILTER)
 
 
