@@ -98,8 +98,8 @@ def random_lines(image: Tensor, count: int, seed: int) -> tuple[Tensor, Tensor]:
 def levin(grey: Tensor, strokes: Tensor, mask: Tensor) -> Tensor:
     """Levin's optimisation with the library's gamut mapping."""
     chroma = split_luminance(strokes)[1][0].double()
-    found = propagate(grey[0, 0].double().numpy(), chroma[[0, 2]].numpy(), mask[0, 0].numpy() > 0)
-    return merge_luminance(grey, with_green(torch.from_numpy(found).float()[None]))
+    result = propagate(grey[0, 0].double().numpy(), chroma[[0, 2]].numpy(), mask[0, 0].numpy() > 0)
+    return merge_luminance(grey, with_green(torch.from_numpy(result).float()[None]))
 
 
 METHODS: dict[str, Method] = {
@@ -109,14 +109,14 @@ METHODS: dict[str, Method] = {
 }
 
 
-def psnr(found: Tensor, wanted: Tensor) -> float:
+def psnr(result: Tensor, wanted: Tensor) -> float:
     """PSNR in dB, for images in [0, 1]."""
-    return float(-10 * (found - wanted).square().mean().log10())
+    return float(-10 * (result - wanted).square().mean().log10())
 
 
 def crops(names: tuple[str, ...], shape: tuple[int, int]) -> dict[str, Tensor]:
     """Upper left, middle and lower right crops of photographs, each of half their height and width."""
-    found = {}
+    images = {}
     for name in names:
         picture = photograph(name)
         height, width = picture.shape[2] // 2, picture.shape[3] // 2
@@ -126,8 +126,8 @@ def crops(names: tuple[str, ...], shape: tuple[int, int]) -> dict[str, Tensor]:
             scale = min(height / shape[0], width / shape[1])
             cut = part[:, :, : round(shape[0] * scale), : round(shape[1] * scale)]
             reduced = torch.nn.functional.interpolate(cut, shape, mode="bicubic", antialias=True).clamp(0, 1)
-            found[f"{name[:10]} {number + 1}"] = reduced
-    return found
+            images[f"{name[:10]} {number + 1}"] = reduced
+    return images
 
 
 def measure(name: str, image: Tensor, count: int, seed: int, lines: bool, save: Path | None) -> Case:
@@ -141,9 +141,9 @@ def measure(name: str, image: Tensor, count: int, seed: int, lines: bool, save: 
     results, shown = {}, [torch.where(mask > 0, strokes, grey)]
     for method, function in METHODS.items():
         start = time.process_time()
-        found = function(grey, strokes, mask)
-        results[method] = Result(psnr(found, image), time.process_time() - start)
-        shown.append(found)
+        colorized = function(grey, strokes, mask)
+        results[method] = Result(psnr(colorized, image), time.process_time() - start)
+        shown.append(colorized)
     if save is not None:
         from skimage.io import imsave
 

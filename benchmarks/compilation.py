@@ -61,11 +61,11 @@ def milliseconds(calls: Sequence[Call], image: Tensor, repeats: int) -> list[flo
     """The medians of several calls, which take turns."""
     times: list[list[float]] = [[] for _ in calls]
     for _ in range(repeats):
-        for call, found in zip(calls, times, strict=True):
+        for call, durations in zip(calls, times, strict=True):
             start = time.perf_counter()
             call(image)
-            found.append(1000 * (time.perf_counter() - start))
-    return [median(found) for found in times]
+            durations.append(1000 * (time.perf_counter() - start))
+    return [median(durations) for durations in times]
 
 
 def main() -> None:

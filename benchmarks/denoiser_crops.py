@@ -194,12 +194,12 @@ class Crops:
 
     def _noise(self, clean: Tensor) -> tuple[Tensor, Tensor]:
         """Noisy crops and the given noise level: uniform, varying over the crop, or dependent on brightness."""
-        each = (len(clean), 1, 1, 1)
-        level = LARGEST * self._random(*each) ** 1.4
+        shape = (len(clean), 1, 1, 1)
+        level = LARGEST * self._random(*shape) ** 1.4
         shades = F.interpolate(self._random(len(clean), 1, 3, 3), clean.shape[-2:], mode="bilinear", align_corners=True)
-        gain = level.square() * (0.5 + 1.5 * self._random(*each))  # variance at white
-        dark = (0.3 * level * self._random(*each)).square()
-        kind = self._random(*each)
+        gain = level.square() * (0.5 + 1.5 * self._random(*shape))  # variance at white
+        dark = (0.3 * level * self._random(*shape)).square()
+        kind = self._random(*shape)
         even = level.expand_as(clean)
         uneven = torch.where(kind < 0.7, even, level * (0.3 + 1.4 * shades))
         deviation = torch.where(kind < 0.82, uneven, (gain * clean.clamp(min=0) + dark).sqrt())
@@ -207,7 +207,7 @@ class Crops:
         seen = F.avg_pool2d(F.pad(noisy, (2, 2, 2, 2), mode="reflect"), 5, 1)  # estimated brightness
         told = torch.where(kind < 0.82, uneven, (gain * seen.clamp(min=0) + dark).sqrt())
         low, high = (math.log(factor) for factor in RATIOS)
-        factor = (low + (high - low) * self._random(*each)).exp()
-        wrong = torch.where(self._random(*each) < self.misstated, factor, 1.0)
-        clipped = torch.where(self._random(*each) < 0.15, noisy.clamp(0, 1), noisy)
+        factor = (low + (high - low) * self._random(*shape)).exp()
+        wrong = torch.where(self._random(*shape) < self.misstated, factor, 1.0)
+        clipped = torch.where(self._random(*shape) < 0.15, noisy.clamp(0, 1), noisy)
         return clipped, told * wrong

@@ -84,12 +84,12 @@ class Figures:
 def scenes(folder: Path | None, kind: str, *, quick: bool) -> dict[str, Tensor]:
     """Photographs (1, 1 or 3, H, W) by name, in ``"grey"`` or ``"colour"``; grey ones are left out of the latter."""
     if folder is not None:
-        found = pictures(folder, 320, ())
+        photographs = pictures(folder, 320, ())
     else:
-        found = {name: photograph(name) for name in HELD_OUT}
-        found |= {name: found[name][..., : found[name].shape[-1] // 2] for name in LEFT_HALVES}
+        photographs = {name: photograph(name) for name in HELD_OUT}
+        photographs |= {name: photographs[name][..., : photographs[name].shape[-1] // 2] for name in LEFT_HALVES}
     cut = {}
-    for name, picture in found.items():
+    for name, picture in photographs.items():
         if kind == "colour" and picture.shape[1] == 1:
             continue
         scale = LONGEST / max(picture.shape[-2:])
@@ -180,15 +180,15 @@ def opencv(case: Case) -> Tensor:
     pixels = (case.array.clip(0, 1) * 255).round().astype(np.uint8)
     strengths = [255 * case.noise * strength for strength in OPENCV_STRENGTHS]
     if case.axis is None:
-        found = (cv2.fastNlMeansDenoising(pixels, None, strength, 7, 21) for strength in strengths)
+        arrays = (cv2.fastNlMeansDenoising(pixels, None, strength, 7, 21) for strength in strengths)
     else:
-        found = (cv2.fastNlMeansDenoisingColored(pixels, None, strength, strength, 7, 21) for strength in strengths)
-    return best(case, (as_image(array / 255) for array in found))
+        arrays = (cv2.fastNlMeansDenoisingColored(pixels, None, strength, strength, 7, 21) for strength in strengths)
+    return best(case, (as_image(array / 255) for array in arrays))
 
 
 def best(case: Case, results: Iterable[Tensor]) -> Tensor:
     """Select the result of the highest PSNR."""
-    return max(results, key=lambda found: psnr(found, case.clean))
+    return max(results, key=lambda result: psnr(result, case.clean))
 
 
 @cache
@@ -225,9 +225,9 @@ METHODS: dict[str, Method] = {
 def judge(method: Method, case: Case) -> Figures:
     """Run a method on a photograph and measure the result."""
     start = time.process_time()
-    found = method(case)
+    estimate = method(case)
     seconds = time.process_time() - start
-    return Figures(psnr(found, case.clean), ssim(found.clamp(0, 1), case.clean), seconds)
+    return Figures(psnr(estimate, case.clean), ssim(estimate.clamp(0, 1), case.clean), seconds)
 
 
 def table(methods: Mapping[str, Method], cases: Sequence[Case]) -> dict[str, dict[str, Figures]]:
@@ -236,9 +236,11 @@ def table(methods: Mapping[str, Method], cases: Sequence[Case]) -> dict[str, dic
     rows: dict[str, dict[str, Figures]] = {}
     for name, method in methods.items():
         rows[name] = {case.name: judge(method, case) for case in cases}
-        found = list(rows[name].values())
-        mean = [statistics.mean(getattr(figures, which) for figures in found) for which in ("psnr", "ssim", "seconds")]
-        line = "".join(f"{figures.psnr:10.2f}" for figures in found)
+        results = list(rows[name].values())
+        mean = [
+            statistics.mean(getattr(figures, which) for figures in results) for which in ("psnr", "ssim", "seconds")
+        ]
+        line = "".join(f"{figures.psnr:10.2f}" for figures in results)
         print(f"{name:22}{line}{mean[0]:10.2f}{mean[1]:8.4f}{mean[2]:8.2f}", flush=True)
     return rows
 
@@ -275,8 +277,8 @@ def misstated(denoiser: Method, clean: Mapping[str, Tensor]) -> None:
     )
     for number, (name, image) in enumerate(clean.items()):
         noisy = [with_noise(image, level / 255, number) for level in NOISE]
-        rounded = [(one.clamp(0, 1) * 255).round() / 255 for one in noisy]
-        print(f"  {name:20}" + "".join(f"{255 * float(estimate_noise(one)):8.2f}" for one in noisy + rounded))
+        rounded = [(picture.clamp(0, 1) * 255).round() / 255 for picture in noisy]
+        print(f"  {name:20}" + "".join(f"{255 * float(estimate_noise(picture)):8.2f}" for picture in noisy + rounded))
 
 
 def megapixel(level: float, *, quick: bool) -> None:
@@ -342,7 +344,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             print(f"\n{kind}, noise {level:g}")
             rows = table(methods, cases)
             figures.setdefault(f"{kind}, {level:g}", {}).update(
-                {name: {scene: asdict(found) for scene, found in row.items()} for name, row in rows.items()}
+                {name: {scene: asdict(result) for scene, result in row.items()} for name, row in rows.items()}
             )
             if options.out is not None:
                 with open_beside(options.out) as stream:

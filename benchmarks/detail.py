@@ -179,16 +179,16 @@ def reach(scene: Scene, strength: Strength, gain: float) -> float | None:
 
 def measure(scene: Scene) -> dict[float, dict[str, Figures | None]]:
     """Measure every method for every gain; None if a method does not reach the gain."""
-    found: dict[float, dict[str, Figures | None]] = {gain: {} for gain in GAINS}
+    figures: dict[float, dict[str, Figures | None]] = {gain: {} for gain in GAINS}
     for name, method in METHODS.items():
         clean, *noisy = (method(image) for image in (scene.image, *scene.noisy))
         for gain in GAINS:
             amount = reach(scene, clean, gain)
             if amount is None:
-                found[gain][name] = None
+                figures[gain][name] = None
             else:
-                found[gain][name] = scene.figures(clean(amount), [shown(one(amount)) for one in noisy])
-    return found
+                figures[gain][name] = scene.figures(clean(amount), [shown(edit(amount)) for edit in noisy])
+    return figures
 
 
 def row(cells: list[str]) -> str:

@@ -85,12 +85,12 @@ def _blur(plane: Tensor) -> Tensor:
 def detail_enhance(image: Tensor, strength: float) -> Tensor:
     """OpenCV's detailEnhance of an RGB image (1, 3, H, W); ``sigma_r`` grows with the strength."""
     rows = np.ascontiguousarray((image[0].permute(1, 2, 0).numpy() * 255).round().astype(np.uint8))
-    found = cv2.detailEnhance(rows, sigma_s=10, sigma_r=min(0.02 * strength, 1.0))
-    return torch.from_numpy(found).permute(2, 0, 1)[None].float() / 255
+    result = cv2.detailEnhance(rows, sigma_s=10, sigma_r=min(0.02 * strength, 1.0))
+    return torch.from_numpy(result).permute(2, 0, 1)[None].float() / 255
 
 
 def clahe(y: Plane, strength: float) -> Plane:
     """Contrast-limited adaptive histogram equalisation of luminance; the clip limit grows with the strength."""
     equalizer = cv2.createCLAHE(clipLimit=0.2 + strength, tileGridSize=(8, 8))
-    found: Plane = equalizer.apply(np.rint(y * 65535).astype(np.uint16)).astype(np.float32) / 65535
-    return found
+    result: Plane = equalizer.apply(np.rint(y * 65535).astype(np.uint16)).astype(np.float32) / 65535
+    return result

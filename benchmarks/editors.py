@@ -56,7 +56,7 @@ EDITORS: dict[str, Callable[..., list[str]]] = {"gmic": gmic, "darktable-cli": d
 @cache
 def installed() -> dict[str, Callable[..., list[str]]]:
     """Those of :data:`EDITORS` that are installed; says which are not."""
-    found = {name: command for name, command in EDITORS.items() if shutil.which(name)}
-    for name in EDITORS.keys() - found.keys():
+    programs = {name: command for name, command in EDITORS.items() if shutil.which(name)}
+    for name in EDITORS.keys() - programs.keys():
         print(f"{name} is not installed here (Debian: apt-get install gmic darktable), and is left out")
-    return found
+    return programs

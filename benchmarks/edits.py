@@ -129,9 +129,9 @@ def pan() -> Iterator[Claim]:
     film = [whole[..., 60 + STEP * i : 160 + STEP * i, 130 + STEP * i : 250 + STEP * i] for i in range(10)]
     alpha = torch.tensor([3.0, 3.0, 4.0, 1.05])
     together = list(filter_frames(film, alpha, references=[film[0], film[5], film[9]]))
-    each = [next(filter_frames([frame], alpha, references=[frame])) for frame in film]
+    singles = [next(filter_frames([frame], alpha, references=[frame])) for frame in film]
     yield Claim(
-        "flicker of a ten-frame pan / flicker of frames edited alone", 0.25, _flicker(together) / _flicker(each)
+        "flicker of a ten-frame pan / flicker of frames edited alone", 0.25, _flicker(together) / _flicker(singles)
     )
 
 

@@ -94,19 +94,19 @@ def results(device: str, side: int = 96, dtype: torch.dtype = torch.float32) -> 
 
 def differences(device: str, side: int = 96) -> dict[str, float]:
     """Largest difference of each result from that of the CPU in float64."""
-    expected, found = results("cpu", side, torch.float64), results(device, side)
+    expected, tensors = results("cpu", side, torch.float64), results(device, side)
     return {
-        name: (found[name].cpu().double() - values).abs().max().item()
-        if found[name].shape == values.shape
-        else padded_difference(found[name].cpu().double(), values)
+        name: (tensors[name].cpu().double() - values).abs().max().item()
+        if tensors[name].shape == values.shape
+        else padded_difference(tensors[name].cpu().double(), values)
         for name, values in expected.items()
     }
 
 
-def padded_difference(found: Tensor, expected: Tensor) -> float:
+def padded_difference(eigenvalues: Tensor, expected: Tensor) -> float:
     """Largest difference of eigenvalues (B, R), which accelerators pad with zeros."""
-    count = min(found.shape[1], expected.shape[1])
-    return (found[:, :count] - expected[:, :count]).abs().max().item()
+    count = min(eigenvalues.shape[1], expected.shape[1])
+    return (eigenvalues[:, :count] - expected[:, :count]).abs().max().item()
 
 
 def seconds(call: Callable[[], object], device: str, repeats: int = 7) -> float:

@@ -73,13 +73,13 @@ def in_fresh_process(method: str, options: argparse.Namespace) -> dict[str, floa
     command = [sys.executable, "-m", "benchmarks.gradients", "--child", method]
     for name in ("side", "landmarks", "repeats"):
         command += [f"--{name}", str(getattr(options, name))]
-    found = json.loads(subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout)
-    ratios = [b / f for f, b in zip(found["forward"], found["backward"], strict=True)]
+    record = json.loads(subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout)
+    ratios = [b / f for f, b in zip(record["forward"], record["backward"], strict=True)]
     return {
-        "forward": statistics.median(found["forward"]),
-        "backward": statistics.median(found["backward"]),
+        "forward": statistics.median(record["forward"]),
+        "backward": statistics.median(record["backward"]),
         "ratio": statistics.median(ratios),
-        "peak": found["peak"],
+        "peak": record["peak"],
     }
 
 
@@ -104,19 +104,19 @@ def main() -> None:
         return
 
     factor = options.side**2 * options.landmarks * 4 / MIB
-    found = {method: in_fresh_process(method, options) for method in METHODS}
+    rows = {method: in_fresh_process(method, options) for method in METHODS}
     print(
         f"{options.side}x{options.side} grey, m = {options.landmarks}, k = {len(ALPHA) - 1}, float32, "
         f"{torch.get_num_threads()} threads, torch {torch.__version__}, median of {options.repeats} steps; "
         f"factor {factor:.0f} MiB"
     )
     print(f"{'':10} {'forward s':>10} {'backward s':>11} {'ratio':>6} {'peak MiB':>9} {'of factor':>10}")
-    for method, row in found.items():
+    for method, row in rows.items():
         print(
             f"{method:10} {row['forward']:10.3f} {row['backward']:11.3f} {row['ratio']:6.2f} {row['peak']:9.0f} "
             f"{row['peak'] / factor:10.2f}"
         )
-    ours, peer = found["library"], found["plain"]
+    ours, peer = rows["library"], rows["plain"]
     speedup = (peer["forward"] + peer["backward"]) / (ours["forward"] + ours["backward"])
     share = ours["peak"] / peer["peak"]
     times = ours["peak"] / factor

@@ -37,13 +37,13 @@ def told(name: str, image: Tensor, repeats: int) -> str:
     after, processor, wall = edited(name, image), [], []
     for _ in range(repeats):
         started, ran = time.perf_counter(), time.process_time()
-        found = fit_look([(image, after)])
+        look = fit_look([(image, after)])
         processor.append(time.process_time() - ran)
         wall.append(time.perf_counter() - started)
     told = f"{name:26}{min(processor):6.2f} processor s {min(wall):6.2f} wall s"
-    if name != SLIDERS or isinstance(found, tuple):
+    if name != SLIDERS or isinstance(look, tuple):
         return told
-    error = (torch.tensor(found.step["alpha"]) - torch.tensor(ALPHA)).abs().max()
+    error = (torch.tensor(look.step["alpha"]) - torch.tensor(ALPHA)).abs().max()
     return f"{told}, alpha off by {float(error):.1e} at most"
 
 

@@ -146,16 +146,16 @@ def applied(edit: Edit, photograph: Tensor) -> Tensor:
 
 def look_of(pairs: Pairs) -> Predict:
     """The look."""
-    found = fit_look(pairs)
-    assert not isinstance(found, tuple)
-    return found.apply
+    look = fit_look(pairs)
+    assert not isinstance(look, tuple)
+    return look.apply
 
 
 def sliders_of(pairs: Pairs) -> Predict:
     """Sliders alone."""
-    found = fit_look(pairs, parts=("alpha",))
-    assert not isinstance(found, tuple)
-    return found.apply
+    look = fit_look(pairs, parts=("alpha",))
+    assert not isinstance(look, tuple)
+    return look.apply
 
 
 def curves_of(pairs: Pairs) -> Predict:
@@ -213,8 +213,8 @@ def histograms_of(pairs: Pairs) -> Predict:
     def predict(image: Tensor) -> Tensor:
         edited = torch.cat([after[0].flatten(1) for _, after in pairs], dim=1).numpy()
         flat = image[0].flatten(1).numpy()
-        found = exposure.match_histograms(flat.T[:, None], edited.T[:, None], channel_axis=2)[:, 0].T
-        return torch.from_numpy(np.ascontiguousarray(found)).float().view_as(image)
+        result = exposure.match_histograms(flat.T[:, None], edited.T[:, None], channel_axis=2)[:, 0].T
+        return torch.from_numpy(np.ascontiguousarray(result)).float().view_as(image)
 
     return predict
 
@@ -228,9 +228,9 @@ METHODS: dict[str, Callable[[Pairs], Predict]] = {
 }
 
 
-def explained(before: Tensor, after: Tensor, found: Tensor) -> float:
+def explained(before: Tensor, after: Tensor, prediction: Tensor) -> float:
     """Percent of the change's energy."""
-    left = (after - found.clamp(0, 1)).double().square().sum()
+    left = (after - prediction.clamp(0, 1)).double().square().sum()
     return 100 * (1 - float(left / (after - before).double().square().sum().clamp(min=1e-12)))
 
 
@@ -276,9 +276,9 @@ def main() -> None:
     )
     arguments = parser.parse_args()
     names = CHOSEN_ON if arguments.set == "choosing" or arguments.quick else REPORTED_ON
-    found = pictures(arguments.pictures, 64 if arguments.quick else arguments.side, names)
-    order = torch.randperm(len(found), generator=torch.Generator().manual_seed(arguments.seed)).tolist()
-    chosen = [list(found)[i] for i in order][: 4 if arguments.quick else 10]
+    images = pictures(arguments.pictures, 64 if arguments.quick else arguments.side, names)
+    order = torch.randperm(len(images), generator=torch.Generator().manual_seed(arguments.seed)).tolist()
+    chosen = [list(images)[i] for i in order][: 4 if arguments.quick else 10]
     edits = EDITS | (MAGICK if magick_program() else {})
     edits = {name: edit for name, edit in edits.items() if any(word in name for word in arguments.edits)}
     if arguments.quick:
@@ -287,7 +287,7 @@ def main() -> None:
     print(f"{len(edits)} edits; ImageMagick is {magic}")
     half = len(chosen) // 2
     print(f"fitted: {', '.join(chosen[:half])}; held out: {', '.join(chosen[half:])}")
-    photographs = [(found[name] * 255).round() / 255 for name in chosen]
+    photographs = [(images[name] * 255).round() / 255 for name in chosen]
     pairs = {name: [(image, applied(edit, image)) for image in photographs] for name, (_, edit) in edits.items()}
     for count in [1, 2] if arguments.quick else arguments.counts:
         if count > half:
@@ -303,9 +303,9 @@ def report(
     print(f"\nafter {count} pair{'s' * (count > 1)}: fitted mean, held out mean (lowest), in percent")
     print(f"{'':34}" + "".join(f"{name:>21}" for name in methods))
     best, tied, judged, ended = 0, 0, 0, time.perf_counter()
-    for edit, some in pairs.items():
-        half = len(some) // 2
-        fitted, held = some[: half if count == 1 else count], some[half:]
+    for edit, examples in pairs.items():
+        half = len(examples) // 2
+        fitted, held = examples[: half if count == 1 else count], examples[half:]
         if not all(any(is_changed(*pair) for pair in part) for part in (fitted, held)):
             print(f"{edit:34}  left out, since it changes none of the fitted or of the held-out photographs")
             continue

@@ -41,8 +41,8 @@ def closed_form(image: Tensor, inside: Tensor, outside: Tensor) -> Tensor:
     known = np.where(front | back, 100.0, 0.0).ravel()
     system = pymatting.cf_laplacian(_array(image)) + diags(known)
     inverse = diags(1 / system.diagonal())
-    found, _ = cg(system, known * front.ravel(), rtol=1e-5, maxiter=3000, M=inverse)
-    return _tensor(found.reshape(front.shape))
+    solution, _ = cg(system, known * front.ravel(), rtol=1e-5, maxiter=3000, M=inverse)
+    return _tensor(solution.reshape(front.shape))
 
 
 def grabcut(image: Tensor, inside: Tensor, outside: Tensor) -> Tensor:
@@ -91,8 +91,10 @@ def walker(image: Tensor, inside: Tensor, outside: Tensor) -> Tensor:
     labels = np.where(front, 1, np.where(back, 2, 0))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # about probabilities just outside [0, 1], which are clamped
-        found = random_walker(_array(image), labels, beta=130, mode="cg_j", channel_axis=2, return_full_prob=True)
-    return _tensor(found[0])
+        probabilities = random_walker(
+            _array(image), labels, beta=130, mode="cg_j", channel_axis=2, return_full_prob=True
+        )
+    return _tensor(probabilities[0])
 
 
 def diffusion(image: Tensor, inside: Tensor, outside: Tensor) -> Tensor:

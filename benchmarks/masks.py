@@ -39,17 +39,19 @@ class Score:
     overlap: float
 
 
-def score(found: Tensor, wanted: Tensor) -> Score:
+def score(estimate: Tensor, wanted: Tensor) -> Score:
     """Score a mask (1, 1, H, W) against the true one."""
-    both, either = (found > 0.5) & (wanted > 0.5), (found > 0.5) | (wanted > 0.5)
-    return Score(float((found - wanted).square().mean()), float(both.sum() / either.sum()))
+    both, either = (estimate > 0.5) & (wanted > 0.5), (estimate > 0.5) | (wanted > 0.5)
+    return Score(float((estimate - wanted).square().mean()), float(both.sum() / either.sum()))
 
 
 def measure(composite: Composite, count: int, seed: int) -> dict[str, Score]:
     """Score every method with ``count`` scribbles on each side; the key "alone" has none on the background."""
     inside, outside = composite.scribbles(count, seed)
-    found = {name: score(method(composite.image, inside, outside), composite.alpha) for name, method in METHODS.items()}
-    return {"alone": score(region_mask(composite.image, inside), composite.alpha), **found}
+    scores = {
+        name: score(method(composite.image, inside, outside), composite.alpha) for name, method in METHODS.items()
+    }
+    return {"alone": score(region_mask(composite.image, inside), composite.alpha), **scores}
 
 
 def report(cases: dict[str, dict[str, Score]]) -> bool:

@@ -78,12 +78,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path)
     parser.add_argument("names", nargs="*", help="names of scripts, without .py; default: all")
-    given = parser.parse_args()
-    for script in sorted(given.folder.glob("*.py")):
-        if given.names and script.stem not in given.names:
+    options = parser.parse_args()
+    for script in sorted(options.folder.glob("*.py")):
+        if options.names and script.stem not in options.names:
             continue
         notebook, before, started = jupytext.read(script), processor(), time.perf_counter()
-        run(notebook, given.folder)
+        run(notebook, options.folder)
         target = script.with_suffix(".ipynb")
         nbformat.write(notebook, target)
         print(

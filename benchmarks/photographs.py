@@ -41,13 +41,13 @@ def pictures(folder: Path | None, side: int, names: Sequence[str]) -> dict[str, 
         names: of scikit-image's photographs.
     """
     if folder is None:
-        found = {name: photograph(name) for name in names}
+        images = {name: photograph(name) for name in names}
     else:
         paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in (".png", ".jpg", ".jpeg", ".tif"))
-        found = {path.stem: read_photograph(path).pixels for path in paths}
-    if not found:
+        images = {path.stem: read_photograph(path).pixels for path in paths}
+    if not images:
         raise SystemExit(f"{folder} must hold pictures (PNG, JPEG or TIFF), but holds none; name another folder")
-    return {name: reduced_to(picture.expand(-1, 3, -1, -1), side) for name, picture in found.items()}
+    return {name: reduced_to(picture.expand(-1, 3, -1, -1), side) for name, picture in images.items()}
 
 
 def reduced_to(picture: torch.Tensor, side: int) -> torch.Tensor:

@@ -153,22 +153,22 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if options.quick:
         options.pixels, options.strides, options.most = 6_000, [2], 1
     recipes = {name: RECIPES[name] for name in options.edits}
-    found = list(pictures(options.pictures, 1 << 20, NAMES).items())[: options.most]
+    photographs = list(pictures(options.pictures, 1 << 20, NAMES).items())[: options.most]
     results: dict[str, dict[int, list[tuple[float, float]]]] = {}
     for stride in options.strides:
-        for title, picture in found:
+        for title, picture in photographs:
             peers = errors_of_peers(picture, options.pixels, stride) if options.peers else ()
             for name, error, change in chain(errors(picture, options.pixels, stride, recipes), peers):
                 results.setdefault(name, {}).setdefault(stride, []).append((error, change))
                 print(f"{title}, stride {stride}, {name}: {error:.2f} of {change:.1f}", flush=True)
-    print(f"\n{len(found)} photographs, previews of {options.pixels} pixels, {torch.get_num_threads()} threads")
+    print(f"\n{len(photographs)} photographs, previews of {options.pixels} pixels, {torch.get_num_threads()} threads")
     strides = "".join(f"{f'stride {stride}':>10}" for stride in options.strides)
     print(f"{'RMS difference in grey levels':<32}{'mean':>8}{'largest':>9}{strides}{'change':>9}")
     for name, by_stride in results.items():
-        pairs = [pair for some in by_stride.values() for pair in some]
+        pairs = [pair for rows in by_stride.values() for pair in rows]
         mean, change = (statistics.mean(column) for column in zip(*pairs, strict=True))
-        each = "".join(f"{statistics.mean(error for error, _ in by_stride[s]):>10.2f}" for s in options.strides)
-        print(f"{name:<32}{mean:>8.2f}{max(error for error, _ in pairs):>9.2f}{each}{change:>9.1f}")
+        cells = "".join(f"{statistics.mean(error for error, _ in by_stride[s]):>10.2f}" for s in options.strides)
+        print(f"{name:<32}{mean:>8.2f}{max(error for error, _ in pairs):>9.2f}{cells}{change:>9.1f}")
 
 
 if __name__ == "__main__":

@@ -79,9 +79,9 @@ def measure_recolor(composite: Composite, number: int, count: int, seed: int, *,
     inside = scene.scribbles(count, seed)[0]
     colour = torch.tensor(COLOURS[number % len(COLOURS)]).view(1, 3, 1, 1)
     options = {"keep": scene.scribbles(1, seed + 1)[1]} if keep else {}
-    found = recolor(scene.image, (colour * inside).expand_as(scene.image), inside, **options)
+    result = recolor(scene.image, (colour * inside).expand_as(scene.image), inside, **options)
     wanted = recoloured(scene, colour, inside)
-    change, ideal = found - scene.image, wanted - scene.image
+    change, ideal = result - scene.image, wanted - scene.image
     along = (change * ideal).sum(1, keepdim=True) / ideal.square().sum(1, keepdim=True).clamp(min=1e-8)
     core, ground = (scene.alpha > 0.98).float(), (scene.alpha < 0.02).float()
     border = 1 - core - ground
@@ -89,7 +89,7 @@ def measure_recolor(composite: Composite, number: int, count: int, seed: int, *,
     return {
         "covered": 100 * float(((along > 0.5) * visible).sum() / visible.sum()),
         "outside": 100 * float(((change.abs().amax(1, keepdim=True) > CHANGED) * ground).sum() / ground.sum()),
-        "border": rms(found - wanted, border),
+        "border": rms(result - wanted, border),
         "nothing": rms(ideal, border),
     }
 
@@ -99,14 +99,14 @@ def measure_defocus(composite: Composite, count: int, seed: int) -> dict[str, fl
     inside, _ = composite.scribbles(count, seed)
     radius = RADIUS * min(composite.image.shape[-2:])
     probe = torch.cat([composite.image, composite.alpha], dim=1)
-    found = defocus(composite.image, inside, radius=radius)
+    result = defocus(composite.image, inside, radius=radius)
     kernel = blur_kernel(radius, "disc").float()
     ones = convolve(torch.ones_like(composite.alpha), kernel)
     behind = convolve(composite.background, kernel) / ones
     wanted = composite.alpha * composite.object + (1 - composite.alpha) * behind
     blurred = convolve(composite.image, kernel) / ones
     step = (composite.image - blurred).abs().mean(1, keepdim=True)
-    sharp = ((found - blurred).abs().mean(1, keepdim=True) / step.clamp(min=1e-6)).clamp(0, 1)
+    sharp = ((result - blurred).abs().mean(1, keepdim=True) / step.clamp(min=1e-6)).clamp(0, 1)
     core, ground = composite.alpha > 0.98, composite.alpha < 0.02
     near = torch.nn.functional.max_pool2d(probe[:, 3:], 2 * round(BESIDE * min(step.shape[-2:])) + 1, 1,
                                           round(BESIDE * min(step.shape[-2:])))  # fmt: skip
@@ -115,7 +115,7 @@ def measure_defocus(composite: Composite, count: int, seed: int) -> dict[str, fl
     return {
         "kept": 100 * float((sharp > 0.5)[core & seen].float().mean()),
         "blurred": 100 * float((sharp < 0.5)[ground & seen].float().mean()),
-        "halo": rms(found - wanted, beside),
+        "halo": rms(result - wanted, beside),
         "plain": rms(blurred - wanted, beside),
     }
 
@@ -146,11 +146,11 @@ def measure_smooth(image: Tensor, area: NDArray[np.bool_], number: int, seed: in
     """Measure the recolouring of a smooth area by one scribble: share in percent, and standard deviations."""
     inside = draw_strokes(area, 1, np.random.default_rng(seed))
     colour = torch.tensor(COLOURS[number % len(COLOURS)]).view(1, 3, 1, 1)
-    found = recolor(image, (colour * inside).expand_as(image), inside)
+    result = recolor(image, (colour * inside).expand_as(image), inside)
     whole = Composite("", image, torch.ones_like(inside), image, image)
     before, even, after = (
         100 * hundredths_of_lab(part)[0, 1:, torch.from_numpy(area)]
-        for part in (image, recoloured(whole, colour, inside), found)
+        for part in (image, recoloured(whole, colour, inside), result)
     )
     ideal = (even - before).square().sum(0)
     visible = ideal > 1  # a distance of 1 in Lab is just noticeable
@@ -184,8 +184,8 @@ def main(arguments: list[str] | None = None) -> None:
     first = chosen.first + 1000
     scenes = list(enumerate(composites(chosen.count, first, chosen.images, chosen.size)))
     print(f"{chosen.count} composites of {chosen.size[0]}x{chosen.size[1]} ({chosen.kind} set)")
-    one = [measure_recolor(scene, i, 1, first + 10 * i, keep=False) for i, scene in scenes]
-    report("recolor, one scribble", one, {"covered": "covered", "outside": "outside", "border": "border"})
+    single = [measure_recolor(scene, i, 1, first + 10 * i, keep=False) for i, scene in scenes]
+    report("recolor, one scribble", single, {"covered": "covered", "outside": "outside", "border": "border"})
     two = [measure_recolor(scene, i, 2, first + 10 * i, keep=True) for i, scene in scenes]
     report("recolor, two and one to keep", two, {"covered": "covered", "outside": "outside, keep", "border": "border"})
     report("defocus, one scribble", [measure_defocus(s, 1, first + 10 * i) for i, s in scenes], {"kept": "kept"})

@@ -35,7 +35,7 @@ def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return "\n".join("| " + " | ".join(line) + " |" for line in (header, rule, *rows))
 
 
-def claims_table(given: Sequence[Claim]) -> str:
+def claims_table(entries: Sequence[Claim]) -> str:
     """A table of claims: limit, measured value, with quartiles where calls alternated, and whether the claim holds."""
     verdicts = {True: "holds", False: "**falls short**", None: "not measured"}
 
@@ -56,7 +56,7 @@ def claims_table(given: Sequence[Claim]) -> str:
                 measured(claim),
                 verdicts[claim.holds],
             ]
-            for claim in given
+            for claim in entries
         ],
     )
 

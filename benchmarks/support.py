@@ -45,8 +45,8 @@ def main() -> None:
     if page is None:
         print(table(), end="")
         return
-    before, found, rest = page.read_text(encoding="utf-8").partition(HEAD)
-    if not found:
+    before, head, rest = page.read_text(encoding="utf-8").partition(HEAD)
+    if not head:
         parser.error(f"{page} must have a table that begins with {HEAD.splitlines()[0]}; add these two lines")
     after = "".join(dropwhile(lambda line: line.startswith("|"), rest.splitlines(keepends=True)))
     page.write_text(f"{before}{table()}{after}", encoding="utf-8")

@@ -64,8 +64,8 @@ class PlainDenoiser(NonlocalDenoiser):
 
     def smooth(self, features: Tensor, planes: Tensor, pixels: int) -> Tensor:
         """Estimate the smoothed planes by convolutions."""
-        found: Tensor = self.picture(F.leaky_relu(self.guide(features), SLOPE))
-        return planes + found.to(planes)
+        change: Tensor = self.picture(F.leaky_relu(self.guide(features), SLOPE))
+        return planes + change.to(planes)
 
 
 def errors(image: Tensor, clean: Tensor) -> Tensor:
@@ -164,8 +164,8 @@ class Training:
     def denoise(self, model: nn.Module, noisy: Tensor, told: Tensor) -> Tensor:
         """Denoise crops as in training."""
         with torch.autocast("cpu", torch.bfloat16, enabled=self.half):
-            found: Tensor = model.estimate_noise(noisy, told)  # type: ignore[operator]
-        return noisy - found
+            noise: Tensor = model.estimate_noise(noisy, told)  # type: ignore[operator]
+        return noisy - noise
 
     def without_rim(self, crops: Tensor) -> Tensor:
         """The pixels of crops (B, C, H, W) whose errors count."""
@@ -193,11 +193,11 @@ class Training:
     @torch.no_grad()
     def judge(self) -> float:
         """Mean error of the running-mean weights on the validation crops, in grey levels."""
-        found = [
+        losses = [
             errors(*map(self.without_rim, (self.denoise(self.mean.module, noisy, told), clean)))
             for clean, noisy, told in self.aside
         ]
-        return float(torch.stack(found).mean())
+        return float(torch.stack(losses).mean())
 
     def run(self, steps: int, folder: Path | None = None) -> None:
         """Train up to ``steps`` steps in all; with a folder, save the state every :data:`EVERY` steps."""

@@ -71,11 +71,11 @@ def adaptive(image: Tensor) -> Tensor:
     correlation = 1e-2 * torch.eye(2).to(image).expand(batch, height, 2, 2)
     columns = []
     for x in range(width):  # all rows at once
-        given = torch.stack([dynamics_across[:, 0, :, x], dynamics_along[:, 0, :, x]], dim=-1)
+        pairs = torch.stack([dynamics_across[:, 0, :, x], dynamics_along[:, 0, :, x]], dim=-1)
         columns.append(gains)
-        lack = (wanted * dynamics - dynamics)[:, 0, :, x] - (gains * given).sum(-1)
-        correlation = (1 - FORGETTING) * correlation + FORGETTING * given.unsqueeze(-1) * given.unsqueeze(-2)
-        step = torch.linalg.solve(correlation + 1e-3 * torch.eye(2).to(image), given)
+        lack = (wanted * dynamics - dynamics)[:, 0, :, x] - (gains * pairs).sum(-1)
+        correlation = (1 - FORGETTING) * correlation + FORGETTING * pairs.unsqueeze(-1) * pairs.unsqueeze(-2)
+        step = torch.linalg.solve(correlation + 1e-3 * torch.eye(2).to(image), pairs)
         gains = gains + 2 * STEP * lack.unsqueeze(-1) * step
     adapted = torch.stack(columns, dim=2)  # (B, H, W, 2)
     detail = adapted[..., 0].unsqueeze(1) * across + adapted[..., 1].unsqueeze(1) * along

@@ -54,7 +54,7 @@ def table_1(size: int = SIZE) -> tuple[Figure, Numbers]:
             widths = [level * OWN_UNIT / 255 for level in LEVELS] + [auto]
             measured = [tables.measure(image, width, tables.LANDMARKS, options) for width in widths]
             gradient = f"{255 * auto / 2.5:.1f}"
-            cells = ["–" if one.failed else f"{100 * one.beta:.2f}" for one in measured]
+            cells = ["–" if result.failed else f"{100 * result.beta:.2f}" for result in measured]
             kind = "paper's method" if method == PAPER else "defaults"
             labels.append(f"{name}, {kind}")
             rows.append([gradient, f"{255 * auto:.0f}", *cells])

@@ -80,7 +80,7 @@ def figure_16(size: int = SIZE) -> tuple[Figure, Numbers]:
     }
     pieces = merge_luminance(torch.full_like(grey, 0.45), split_luminance(cut)[1])
     panels = {"(a) grey": grey, "(b) strokes": painted_over(grey, image, mask), "(c) pieces of k-means": pieces}
-    numbers: Numbers = {title: {"PSNR in dB": rounded(psnr(found, image), 1)} for title, found in methods.items()}
+    numbers: Numbers = {title: {"PSNR in dB": rounded(psnr(result, image), 1)} for title, result in methods.items()}
     return show_images(panels | methods, columns=3, side=SIDE), numbers
 
 

@@ -66,11 +66,11 @@ def figure_17(size: int = SIZE) -> tuple[Figure, Numbers]:
     numbers: Numbers = {
         name: {
             "gradient energy of the subject": rounded(
-                _energy(found, distance < NEAR) / _energy(image, distance < NEAR), 3
+                _energy(result, distance < NEAR) / _energy(image, distance < NEAR), 3
             ),
-            "behind it": rounded(_energy(found, distance > FAR) / _energy(image, distance > FAR), 3),
+            "behind it": rounded(_energy(result, distance > FAR) / _energy(image, distance > FAR), 3),
         }
-        for name, found in (("(g) from the spots", lens), ("(h) from the true depth", true))
+        for name, result in (("(g) from the spots", lens), ("(h) from the true depth", true))
     }
     return show_images(panels, columns=4, side=round(0.9 * SIDE)), numbers
 

@@ -27,12 +27,12 @@ SHOWN = 5  # kinds of warnings printed
 CASES = 1000
 
 
-def report(found: list[Result], command: str) -> int:
+def report(cases: list[Result], command: str) -> int:
     """Print the table and the worst case of each kind of failure; return the number of broken promises."""
     print(f"{'promise':62} {'cases':>6} {'broken':>6}  worst")
     kinds: dict[tuple[str, str], list[tuple[Result, Figure]]] = {}
     for promise in PROMISES:
-        figures = [(result, figure) for result in found for figure in result.figures if figure.promise == promise]
+        figures = [(result, figure) for result in cases for figure in result.figures if figure.promise == promise]
         if not figures:
             continue
         broken = [(result, figure) for result, figure in figures if figure.broken]
@@ -41,7 +41,7 @@ def report(found: list[Result], command: str) -> int:
         for result, figure in broken:
             kinds.setdefault((promise, re.sub(r"\d[\d.e+-]*|\(.*?\)", "#", figure.detail)), []).append((result, figure))
     warned = Counter(
-        re.sub(r"\d[\d.e+-]*", "#", text.split(";")[0])[:100] for result in found for text in result.warned
+        re.sub(r"\d[\d.e+-]*", "#", text.split(";")[0])[:100] for result in cases for text in result.warned
     )
     for text, count in warned.most_common(SHOWN):
         print(f"warned {count} times: {text}")
@@ -88,20 +88,20 @@ def main(arguments: list[str] | None = None) -> None:
     whole = len(pictures(options.seed)) if options.pictures else None
     count = options.cases if options.cases is not None else whole or CASES
     last = options.first + count if whole is None else min(options.first + count, whole)
-    found = list(results(check, range(options.first, last), min(options.workers, count)))
-    print(f"{len(found)} {name} from number {options.first}, seed {options.seed}")
+    cases = list(results(check, range(options.first, last), min(options.workers, count)))
+    print(f"{len(cases)} {name} from number {options.first}, seed {options.seed}")
     flag = "" if name == "operators" else f" --{name}"
-    broken = report(found, f"python -m benchmarks.fuzz{flag} --seed {options.seed}")
+    broken = report(cases, f"python -m benchmarks.fuzz{flag} --seed {options.seed}")
     if options.out is not None:
         failures = [
             {"case": result.number, "what": result.what, **asdict(figure)}
-            for result in found
+            for result in cases
             for figure in result.figures
             if figure.broken
         ]
         options.out.parent.mkdir(parents=True, exist_ok=True)
         with open_beside(options.out) as file:
-            text = json.dumps({"kind": name, "seed": options.seed, "cases": len(found), "failures": failures}, indent=1)
+            text = json.dumps({"kind": name, "seed": options.seed, "cases": len(cases), "failures": failures}, indent=1)
             file.write(text.encode())
     sys.exit(1 if broken else 0)
 

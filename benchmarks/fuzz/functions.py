@@ -138,9 +138,9 @@ def _look(**options: Any) -> Tensor:
 
 def _fitted_look(before: Tensor, **options: Any) -> Tensor:
     after = before.square() if isinstance(before, Tensor) else before
-    found = nlf.fit_look([(before, after)], **options)
-    assert isinstance(found, nlf.FittedLook)
-    return torch.tensor([found.fitted, found.left_out])
+    look = nlf.fit_look([(before, after)], **options)
+    assert isinstance(look, nlf.FittedLook)
+    return torch.tensor([look.fitted, look.left_out])
 
 
 def _first(scene: Scene) -> Tensor:

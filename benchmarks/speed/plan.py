@@ -134,4 +134,4 @@ def measured(
 
 def records_of(results: Results, suite: str) -> list[Record]:
     """The records of one suite, in the order in which they were measured."""
-    return [found for found in results["results"] if found["suite"] == suite]
+    return [entry for entry in results["results"] if entry["suite"] == suite]

@@ -52,7 +52,7 @@ def rounding_error(case: Case, image: Tensor) -> dict[str, float]:
     """
     with torch.no_grad():
         operator = case.operator(image)
-        given = (operator @ image).double()
+        result = (operator @ image).double()
         kernel = operator.kernel
         points = kernel.landmarks.double()
         recipe = replace(
@@ -65,7 +65,7 @@ def rounding_error(case: Case, image: Tensor) -> dict[str, float]:
         scaling = sinkhorn_balance(factor, diagonal).scaling
         remainder = scaling.square() * diagonal
         exact = replace(operator, factor=factor, diagonal=diagonal, scaling=scaling, remainder=remainder)
-        difference = 255 * (given - exact @ image.double())
+        difference = 255 * (result - exact @ image.double())
     return {"rms": difference.square().mean().sqrt().item(), "max": difference.abs().max().item()}
 
 
@@ -78,8 +78,8 @@ def held(case: Case) -> tuple[float, float]:
 
 def main() -> None:
     """Measure one case in this process."""
-    work, given = sys.argv[1], json.loads(sys.argv[2])
-    case = Case(**given)
+    work, fields = sys.argv[1], json.loads(sys.argv[2])
+    case = Case(**fields)
     torch.set_num_threads(case.used_threads)
     import kornia.color
     import kornia.filters  # noqa: F401  imported by the package on first use, which is not to be measured

@@ -225,7 +225,7 @@ def refusals(group: Any, rank: int) -> dict[str, str]:
     operator = nonlocal_operator(rows, num_landmarks=5, group=group)
     calls: dict[str, Callable[[], object]] = {
         "to_dense": operator.to_dense,
-        "a loss": lambda: fit_alpha(operator, rows, rows, loss=lambda one, other: (one - other).abs().sum()),
+        "a loss": lambda: fit_alpha(operator, rows, rows, loss=lambda estimate, other: (estimate - other).abs().sum()),
         "width": lambda: nonlocal_operator(rows[..., : 6 - rank], num_landmarks=5, group=group),
         "dtype": lambda: nonlocal_operator(rows if rank else rows.float(), num_landmarks=5, group=group),
     }

@@ -273,10 +273,10 @@ def test_gradients_by_masks_are_right_where_all_are_0(count: int, painted: float
     masks = torch.zeros(1, count, 10, 12, dtype=torch.float64)
     masks[..., :3] = painted
     weights = noise(*image.shape)
-    given = masks.clone().requires_grad_()
-    filtered = filter_regions(operator, image, given, alpha)
+    leaf = masks.clone().requires_grad_()
+    filtered = filter_regions(operator, image, leaf, alpha)
     assert torch.equal(filtered[..., 3:], image[..., 3:])
-    (result,) = torch.autograd.grad((filtered * weights).sum(), given)
+    (result,) = torch.autograd.grad((filtered * weights).sum(), leaf)
     for k in range(count):
         moved = masks.clone()
         moved[:, k] += 1e-6
@@ -484,8 +484,8 @@ def test_sliders_of_regions_blend_their_edits() -> None:
     whole = [polynomial_filter(operator, image, row) for row in sliders]
     expected = image + sum(masks[:, k : k + 1] * (whole[k] - image) for k in range(2))
     torch.testing.assert_close(edited, expected)
-    one = polynomial_filter(operator, image, compose_alpha(masks[:, :1], sliders[:1]))
-    torch.testing.assert_close(one, torch.lerp(image, whole[0], masks[:, :1]))
+    blend = polynomial_filter(operator, image, compose_alpha(masks[:, :1], sliders[:1]))
+    torch.testing.assert_close(blend, torch.lerp(image, whole[0], masks[:, :1]))
 
 
 @pytest.mark.parametrize("residual", [None, 0.0, 1.0])

@@ -301,8 +301,8 @@ def test_only_the_proportions_of_a_mask_count_for_a_loss() -> None:
     operator = nonlocal_operator(image, num_landmarks=20)
     target = polynomial_filter(operator, image, torch.tensor([2.0, 1.5, 1.0])).clamp(min=0) ** 1.1
     mask = torch.linspace(0.1, 1, 30).expand(1, 1, 24, 30)
-    one, many = (
+    unscaled, scaled = (
         fit_alpha(operator, image, target, order=2, mask=scale * mask, loss=torch.nn.functional.smooth_l1_loss)
         for scale in (1, 255)
     )
-    torch.testing.assert_close(one, many, atol=1e-4, rtol=0)
+    torch.testing.assert_close(unscaled, scaled, atol=1e-4, rtol=0)

@@ -101,13 +101,13 @@ def test_a_constant_stays_constant(guide: torch.Tensor, options: dict, data: st.
 
 def test_it_is_linear_in_the_strokes_and_reads_only_painted_ones(spectrum: Spectrum) -> None:
     mask = spots(*PLACES)
-    one, other = noise(1, 1, 20, 24), noise(1, 1, 20, 24, seed=1)
+    colours, other = noise(1, 1, 20, 24), noise(1, 1, 20, 24, seed=1)
 
     def spread(strokes: torch.Tensor) -> torch.Tensor:
         return propagate_strokes(spectrum, strokes, mask)
 
-    torch.testing.assert_close(spread(2 * one - other), 2 * spread(one) - spread(other))
-    torch.testing.assert_close(spread(one), spread(one * mask + 99 * (1 - mask)))
+    torch.testing.assert_close(spread(2 * colours - other), 2 * spread(colours) - spread(other))
+    torch.testing.assert_close(spread(colours), spread(colours * mask + 99 * (1 - mask)))
 
 
 def test_values_go_to_their_likes_and_fade_on_request() -> None:
@@ -153,9 +153,9 @@ def test_a_batch_is_its_images() -> None:
     mask = torch.cat([spots((1, 2), (9, 9), height=16, width=18), spots((4, 12), height=16, width=18)])
     together = propagate_strokes(build(guide, num_landmarks=40).spectrum(), strokes, mask)
     for i in range(2):
-        one = slice(i, i + 1)
-        alone = propagate_strokes(build(guide[one], num_landmarks=40).spectrum(), strokes[one], mask[one])
-        torch.testing.assert_close(together[one], alone, atol=1e-6, rtol=0)
+        part = slice(i, i + 1)
+        alone = propagate_strokes(build(guide[part], num_landmarks=40).spectrum(), strokes[part], mask[part])
+        torch.testing.assert_close(together[part], alone, atol=1e-6, rtol=0)
 
 
 def test_one_operator_serves_several_strokes_and_one_stroke_several_operators(spectrum: Spectrum) -> None:

@@ -56,8 +56,8 @@ def test_points_of_weight_four_are_the_pixels_they_stand_for(
 ) -> None:
     image, points, pixels = pair(dtype, completion=completion, tolerance=1e-7 if dtype == torch.float32 else None)
 
-    def assert_same(found: Tensor, expected: Tensor) -> None:
-        torch.testing.assert_close(repeated(found), expected, atol=precision, rtol=0)
+    def assert_same(result: Tensor, expected: Tensor) -> None:
+        torch.testing.assert_close(repeated(result), expected, atol=precision, rtol=0)
 
     torch.testing.assert_close(points.kernel.landmarks, pixels.kernel.landmarks, atol=1e-5, rtol=0)
     assert_same(points @ image, pixels @ repeated(image))
@@ -99,9 +99,9 @@ def test_gradients_of_weighted_points_are_those_of_the_pixels() -> None:
     gradients = []
     for copies in (1, COPIES):
         features = features_of(image).detach().requires_grad_()
-        each = None if copies > 1 else torch.full((144,), float(COPIES), dtype=torch.float64)
+        counts = None if copies > 1 else torch.full((144,), float(COPIES), dtype=torch.float64)
         operator = operator_from_features(
-            features.repeat_interleave(copies, dim=2), size=(12, 12 * copies), weights=each, num_landmarks=10
+            features.repeat_interleave(copies, dim=2), size=(12, 12 * copies), weights=counts, num_landmarks=10
         )
         filtered = polynomial_filter(operator, repeated(image) if copies > 1 else image, torch.tensor(ALPHA).double())
         by = repeated(weights) / COPIES if copies > 1 else weights
@@ -320,8 +320,8 @@ def test_arguments_are_not_written_to() -> None:
 def test_custom_patch_weights_are_scaled_to_unit_sum() -> None:
     guide = noise(1, 1, 12, 13)
     box = torch.ones(3, 3, dtype=torch.float64)
-    one, other = (build(guide, patch_weights=w, num_landmarks=156).to_dense() for w in (box, 7 * box))
-    torch.testing.assert_close(one, other)
+    matrix, other = (build(guide, patch_weights=w, num_landmarks=156).to_dense() for w in (box, 7 * box))
+    torch.testing.assert_close(matrix, other)
     only_centre = torch.zeros(3, 3, dtype=torch.float64)
     only_centre[1, 1] = 1
     torch.testing.assert_close(

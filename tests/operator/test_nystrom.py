@@ -81,8 +81,8 @@ def test_pixels_in_another_order_give_columns_in_that_order(order: list[int]) ->
 def test_the_order_of_the_landmarks_does_not_matter(order: list[int]) -> None:
     x = cloud(1, 3, 40)
     z = x[:, :, 5:15]
-    one, other = (completed(*nystrom_factor(x, y, inverse_cholesky(y), "diagonal")) for y in (z, z[:, :, order]))
-    torch.testing.assert_close(one, other, atol=1e-10, rtol=0)
+    matrix, other = (completed(*nystrom_factor(x, y, inverse_cholesky(y), "diagonal")) for y in (z, z[:, :, order]))
+    torch.testing.assert_close(matrix, other, atol=1e-10, rtol=0)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -99,8 +99,8 @@ def test_a_common_offset_does_not_matter(dtype: torch.dtype) -> None:
 def test_repeated_landmarks_are_no_harm() -> None:
     x = cloud(1, 3, 60).float()
     once, twice = x[:, :, :10], torch.cat([x[:, :, :10]] * 2, dim=2)
-    one, other = (completed(*nystrom_factor(x, z, inverse_cholesky(z), "diagonal")) for z in (once, twice))
-    torch.testing.assert_close(one, other, atol=1e-3, rtol=0)
+    matrix, other = (completed(*nystrom_factor(x, z, inverse_cholesky(z), "diagonal")) for z in (once, twice))
+    torch.testing.assert_close(matrix, other, atol=1e-3, rtol=0)
 
 
 def test_single_precision_is_double_precision_rounded() -> None:
@@ -117,8 +117,8 @@ def test_a_batch_is_its_images() -> None:
     together = nystrom_factor(x, z, inverse_cholesky(z), "diagonal")
     for i in range(3):
         alone = nystrom_factor(x[i : i + 1], z[i : i + 1], inverse_cholesky(z[i : i + 1]), "diagonal")
-        for one, other in zip(together, alone, strict=True):
-            torch.testing.assert_close(one[i : i + 1], other, atol=1e-11, rtol=0)
+        for batch, other in zip(together, alone, strict=True):
+            torch.testing.assert_close(batch[i : i + 1], other, atol=1e-11, rtol=0)
 
 
 @pytest.mark.parametrize("completion", ["diagonal", "none"])

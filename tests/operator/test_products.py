@@ -21,12 +21,12 @@ def test_one_operator_evaluates_a_batch_of_points_and_several_operators_one_set(
     features, points = noise(2, 3, 60, seed=1).float(), noise(3, 3, 40, seed=2).float()
     both = operator_from_features(features, size=(60,), num_landmarks=20)
     single = operator_from_features(features[:1], size=(60,), num_landmarks=20)
-    many, one = single.at(points), both.at(points[:1])
+    many, pair = single.at(points), both.at(points[:1])
     for result, expected in (
         *((many.factor[i : i + 1], single.at(points[i : i + 1]).factor) for i in range(3)),
         *((many.scaling[i : i + 1], single.at(points[i : i + 1]).scaling) for i in range(3)),
-        (one.factor, both.at(points[:1].repeat(2, 1, 1)).factor),
-        (one.scaling, both.at(points[:1].repeat(2, 1, 1)).scaling),
+        (pair.factor, both.at(points[:1].repeat(2, 1, 1)).factor),
+        (pair.scaling, both.at(points[:1].repeat(2, 1, 1)).scaling),
     ):
         torch.testing.assert_close(result, expected, atol=1e-6, rtol=0)
     with pytest.raises(ValueError, match="features must have batch size 1 or 2, like the operator, got 3"):
@@ -60,8 +60,8 @@ def test_columns_are_differentiable_in_the_features_of_the_operator() -> None:
         )
         return built.at(others).scaling.sum()
 
-    given = points.clone().requires_grad_()
-    (result,) = torch.autograd.grad(total(given), given)
+    leaf = points.clone().requires_grad_()
+    (result,) = torch.autograd.grad(total(leaf), leaf)
     for index in range(0, 30, 5):
         step = torch.zeros_like(points)
         step[0, 0, index] = 1e-5

@@ -73,8 +73,8 @@ def test_derivatives_by_any_whitening_and_of_long_columns(level: int) -> None:
             torch.autograd.grad(nystrom_factor(*twins, completion), twins, [slope.to(twins[0]) for slope in slopes])
             for twins in ([t.to(dtype).requires_grad_() for t in inputs] for dtype in (torch.float32, torch.float64))
         )
-        for one, other in zip(result, exact, strict=True):
-            torch.testing.assert_close(one.double(), other, atol=1e-4, rtol=1e-5)
+        for gradient, other in zip(result, exact, strict=True):
+            torch.testing.assert_close(gradient.double(), other, atol=1e-4, rtol=1e-5)
 
 
 def test_far_features_meet_the_floor_and_nan_is_not_hidden(level: int) -> None:

@@ -14,20 +14,20 @@ from tests.native import random
 @pytest.mark.parametrize("dilation", [1, 2, 3, 5])
 @pytest.mark.parametrize(("channels", "outputs"), [(16, 16), (48, 48), (32, 28), (16, 1), (6, 48)])
 def test_convolution(size: tuple[int, int], dilation: int, channels: int, outputs: int) -> None:
-    given = (
+    inputs = (
         random(2, channels, *size),
         random(outputs, channels, 3, 3, seed=1) / (3 * channels**0.5),
         random(outputs, seed=2),
         dilation,
         random(2, outputs, *size, seed=3),
     )
-    features, weight, bias, _, added = (t.double() if isinstance(t, Tensor) else t for t in given)
+    features, weight, bias, _, added = (t.double() if isinstance(t, Tensor) else t for t in inputs)
     rectified = torch.where(features < 0, 0.1 * features, features)
     exact = torch.nn.functional.conv2d(rectified, weight, bias, padding=dilation, dilation=dilation)
     for context in (nullcontext(), definitions_only()):
         with context:
-            torch.testing.assert_close(convolution.convolve(*given).double(), exact + added, atol=3e-5, rtol=0)
-            torch.testing.assert_close(convolution.convolve(*given[:4]).double(), exact, atol=3e-5, rtol=0)
+            torch.testing.assert_close(convolution.convolve(*inputs).double(), exact + added, atol=3e-5, rtol=0)
+            torch.testing.assert_close(convolution.convolve(*inputs[:4]).double(), exact, atol=3e-5, rtol=0)
 
 
 def test_convolution_under_autocast_and_vmap() -> None:
@@ -35,8 +35,8 @@ def test_convolution_under_autocast_and_vmap() -> None:
     wanted = convolution.convolve(features, weight)
     with torch.autocast("cpu", torch.bfloat16):
         torch.testing.assert_close(convolution.convolve(features, weight).float(), wanted, atol=0.05, rtol=0)
-    each = torch.vmap(lambda one: convolution.convolve(one[None], weight)[0])(features)
-    torch.testing.assert_close(each, wanted)
+    results = torch.vmap(lambda sample: convolution.convolve(sample[None], weight)[0])(features)
+    torch.testing.assert_close(results, wanted)
 
 
 def test_convolution_of_other_shapes_is_left_to_the_definition() -> None:

@@ -73,12 +73,12 @@ def test_every_operator_is_checked() -> None:
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
 @pytest.mark.parametrize("name", NAMES)
 def test_opcheck(name: str, dtype: torch.dtype, in_c: bool) -> None:
-    operator, given = getattr(torch.ops.nlfilter, name).default, arguments(dtype)[name]
+    operator, inputs = getattr(torch.ops.nlfilter, name).default, arguments(dtype)[name]
     with nullcontext() if in_c else definitions_only():
-        torch.library.opcheck(operator, given)
+        torch.library.opcheck(operator, inputs)
         if name in DERIVED:
             torch.library.opcheck(
-                operator, tuple(t.clone().requires_grad_() if isinstance(t, Tensor) else t for t in given)
+                operator, tuple(t.clone().requires_grad_() if isinstance(t, Tensor) else t for t in inputs)
             )
 
 
@@ -143,8 +143,8 @@ def test_any_number_of_threads(level: int, count: int, threads: Any) -> None:
     threads(1)
     alone, operator = results(), nonlocal_operator(guide, num_landmarks=30)
     threads(count)
-    for one, many, again in zip(alone, results(), results(), strict=True):
-        torch.testing.assert_close(one, many, rtol=1e-5, atol=1e-6)  # sums are divided differently
+    for expected, many, again in zip(alone, results(), results(), strict=True):
+        torch.testing.assert_close(expected, many, rtol=1e-5, atol=1e-6)  # sums are divided differently
         assert torch.equal(many, again)
     torch.testing.assert_close(nonlocal_operator(guide, num_landmarks=30).scaling, operator.scaling)
 

@@ -50,10 +50,10 @@ def test_float32_is_as_good_and_stays_so_under_autocast() -> None:
 @pytest.mark.filterwarnings("ignore:.*torch.jit.script.* is deprecated:DeprecationWarning")
 @pytest.mark.parametrize("size", [(4, 5), (5, 3)])
 def test_coefficients_and_right_sides_have_gradients(size: tuple[int, int]) -> None:
-    given = tuple(tensor.requires_grad_() for tensor in problem(*size))
+    inputs = tuple(tensor.requires_grad_() for tensor in problem(*size))
     batched = {"check_forward_ad": True, "check_batched_grad": True, "check_batched_forward_grad": True}
-    assert torch.autograd.gradcheck(solve_stencil, given, **batched)
-    assert torch.autograd.gradgradcheck(solve_stencil, given, fast_mode=True)
+    assert torch.autograd.gradcheck(solve_stencil, inputs, **batched)
+    assert torch.autograd.gradgradcheck(solve_stencil, inputs, fast_mode=True)
 
 
 def test_transforms_of_functions_and_compilation() -> None:
@@ -65,8 +65,10 @@ def test_transforms_of_functions_and_compilation() -> None:
     wanted = torch.autograd.grad(loss(stencil.requires_grad_(), right), stencil)
     result = torch.func.grad(loss)(stencil.detach(), right)
     torch.testing.assert_close(result, *wanted)
-    each = torch.vmap(lambda one, side: solve_stencil(one[None], side[None])[0])(stencil.detach(), right)
-    torch.testing.assert_close(each, solve_stencil(stencil.detach(), right))
+    solutions = torch.vmap(lambda coefficients, side: solve_stencil(coefficients[None], side[None])[0])(
+        stencil.detach(), right
+    )
+    torch.testing.assert_close(solutions, solve_stencil(stencil.detach(), right))
     compiled = torch.compile(loss, fullgraph=True, backend="eager")
     torch.testing.assert_close(torch.autograd.grad(compiled(stencil, right), stencil), wanted)
 

@@ -290,7 +290,7 @@ def test_compiled() -> None:
 
 def test_transforms_are_refused() -> None:
     with pytest.raises(TypeError, match=r"noisy must not be transformed by torch\.func"):
-        torch.vmap(lambda one: TRAINED_ONE(one, 0.1))(noisy(CAT, 0.1)[None])
+        torch.vmap(lambda image: TRAINED_ONE(image, 0.1))(noisy(CAT, 0.1)[None])
 
 
 @pytest.mark.parametrize("turns", [2.0, True])
