@@ -1,7 +1,7 @@
 """Synthetic defocus: a sharp subject before a blurred background, as with a wide aperture. Paper: Sec. V-C."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import ClassVar, Literal
 
@@ -14,10 +14,9 @@ from nlfilter_torch.operator.options import Completion, Sampling
 from nlfilter_torch.photo.declared.declaration import Edit
 from nlfilter_torch.photo.declared.parameters import DEFOCUS
 from nlfilter_torch.photo.picture.drawn import Drawn, M
-from nlfilter_torch.photo.picture.edit import PhotoEdit
 from nlfilter_torch.photo.picture.in_memory import edit_image
 from nlfilter_torch.photo.picture.source import Fitted, Source
-from nlfilter_torch.photo.selections.mask import RegionMask, background_of, fit_regions
+from nlfilter_torch.photo.selections.mask import ObjectEdit, background_of, fit_regions
 
 Aperture = Literal["disc", "gaussian"]
 
@@ -102,32 +101,13 @@ def defocus(
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Defocus(PhotoEdit):
+class Defocus(ObjectEdit):
     """The edit of :func:`defocus`."""
 
     declared: ClassVar[Edit] = DEFOCUS
     radius: float | None
     aperture: Aperture
     reach: float | Tensor = REACH
-    photometric_bandwidth: float | Tensor
-    spatial_bandwidth: float | Tensor | None
-    patch_size: int
-    num_landmarks: int
-    landmarks: Sampling = "kmeans"
-    completion: Completion = "diagonal"
-    generator: torch.Generator | None = None
-
-    def selection(self) -> RegionMask:
-        """The mask of the subject, without the default of the spatial bandwidth, which depends on the size."""
-        return RegionMask(
-            reach=self.reach,
-            photometric_bandwidth=self.photometric_bandwidth,
-            spatial_bandwidth=self.spatial_bandwidth,
-            num_landmarks=self.num_landmarks,
-            landmarks=self.landmarks,
-            completion=self.completion,
-            generator=self.generator,
-        )
 
     def fit(self, source: Source[M], drawn: Drawn[M]) -> Fitted:
         """Fit the mask of the subject."""
@@ -138,9 +118,7 @@ class Defocus(PhotoEdit):
         check_reach(radius, "radius", source.size)
         scribbles = source.scribbles(drawn.masks.get("focus_region"), None, "focus_region")
         background = background_of(source, drawn.masks.get("background"), scribbles, "background")
-        distance = DEFOCUS["spatial_bandwidth"].distance(self.spatial_bandwidth, source.size)
-        selector = replace(self.selection(), spatial_bandwidth=distance, patch_size=self.patch_size)
-        subject = fit_regions(source, [scribbles], background, selector)
+        subject = fit_regions(source, [scribbles], background, self.selection_in(source.size))
         finish = partial(_blurred, radius=radius, aperture=self.aperture)
         return Fitted(subject.masks, finish, _kernel_radius(radius, self.aperture))
 

@@ -1,6 +1,6 @@
 """Recolouring of objects by strokes of colour. Paper: Sec. V-A, Figs. 14, 15."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import ClassVar
 
 import torch
@@ -11,12 +11,11 @@ from nlfilter_torch.photo.declared.declaration import Edit
 from nlfilter_torch.photo.declared.parameters import RECOLOR
 from nlfilter_torch.photo.picture.colour import dot, group_colours, merge_luminance, region_means, split_luminance
 from nlfilter_torch.photo.picture.drawn import Drawn, M
-from nlfilter_torch.photo.picture.edit import PhotoEdit
 from nlfilter_torch.photo.picture.in_memory import edit_image
 from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles
 from nlfilter_torch.photo.picture.source import Fitted, Pixels, Source
 from nlfilter_torch.photo.selections.border_colours import Sides, colours_beside, refine_mask
-from nlfilter_torch.photo.selections.mask import RegionMask, Regions, background_of, fit_regions
+from nlfilter_torch.photo.selections.mask import ObjectEdit, Regions, background_of, fit_regions
 
 EPSILON = 1e-12  # keeps the derivative of a root finite
 END_MARGIN = 0.1  # masks closer to 0 or 1 are set to 0 or 1: a faint tint far away is visible, a less soft edge is not
@@ -93,35 +92,15 @@ def recolor(
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Recolor(PhotoEdit):
+class Recolor(ObjectEdit):
     """The edit of :func:`recolor`."""
 
     declared: ClassVar[Edit] = RECOLOR
-    reach: float | Tensor
-    photometric_bandwidth: float | Tensor
-    spatial_bandwidth: float | Tensor | None
-    patch_size: int
-    num_landmarks: int
-    landmarks: Sampling = "kmeans"
-    completion: Completion = "diagonal"
-    generator: torch.Generator | None = None
 
     def check_channels(self, channels: int) -> None:
         """Raise ValueError for a grey photograph."""
         if channels < 3:
             raise ValueError("recolor needs a colour photograph, got a grey one; use colorize for grey photographs")
-
-    def selection(self) -> RegionMask:
-        """The masks of the objects, without the default of the spatial bandwidth, which depends on the size."""
-        return RegionMask(
-            reach=self.reach,
-            photometric_bandwidth=self.photometric_bandwidth,
-            spatial_bandwidth=self.spatial_bandwidth,
-            num_landmarks=self.num_landmarks,
-            landmarks=self.landmarks,
-            completion=self.completion,
-            generator=self.generator,
-        )
 
     def fit(self, source: Source[M], drawn: Drawn[M]) -> Fitted:
         """Fit the new colours of the objects under the strokes."""
@@ -135,9 +114,7 @@ class Recolor(PhotoEdit):
         )
         colours = with_room(colours, brightness)
         inside = [scribbles.weighted(part) for part in regions.split(1, dim=1)]
-        distance = RECOLOR["spatial_bandwidth"].distance(self.spatial_bandwidth, source.size)
-        selector = replace(self.selection(), spatial_bandwidth=distance, patch_size=self.patch_size)
-        objects = fit_regions(source, inside, kept, selector)
+        objects = fit_regions(source, inside, kept, self.selection_in(source.size))
         change = Recoloring(colours, old, valid)
         reduced = split_luminance(objects.reduced)[1]
         beside = []

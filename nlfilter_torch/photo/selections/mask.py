@@ -11,7 +11,7 @@ from its own colour; results in tiles are therefore exact.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import ClassVar
 
@@ -158,6 +158,37 @@ class RegionMask(PhotoEdit):
                 "none; paint outside them, or omit it"
             )
         return regions
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ObjectEdit(PhotoEdit):
+    """An edit of objects that scribbles mark; the fields are those of their mask."""
+
+    reach: float | Tensor
+    photometric_bandwidth: float | Tensor
+    spatial_bandwidth: float | Tensor | None
+    patch_size: int
+    num_landmarks: int
+    landmarks: Sampling = "kmeans"
+    completion: Completion = "diagonal"
+    generator: torch.Generator | None = None
+
+    def selection(self) -> RegionMask:
+        """The masks of the objects, without the default of the spatial bandwidth, which depends on the size."""
+        return RegionMask(
+            reach=self.reach,
+            photometric_bandwidth=self.photometric_bandwidth,
+            spatial_bandwidth=self.spatial_bandwidth,
+            num_landmarks=self.num_landmarks,
+            landmarks=self.landmarks,
+            completion=self.completion,
+            generator=self.generator,
+        )
+
+    def selection_in(self, size: tuple[int, int]) -> RegionMask:
+        """The masks of the objects in a picture (H, W)."""
+        distance = self.declared["spatial_bandwidth"].distance(self.spatial_bandwidth, size)
+        return replace(self.selection(), spatial_bandwidth=distance, patch_size=self.patch_size)
 
 
 @dataclass(frozen=True, eq=False)
