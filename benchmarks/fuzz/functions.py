@@ -57,6 +57,10 @@ def _size(scene: Scene) -> tuple[int, int]:
     return scene.size
 
 
+def _background(scene: Scene) -> Tensor:
+    return scene.background()
+
+
 def _short_side(part: float) -> Kind:
     return lambda scene: scene.rng.uniform(0.1, part * min(scene.size))
 
@@ -259,7 +263,7 @@ FUNCTIONS = {
     "recolor": Function(
         nlf.recolor,
         {"image": _image(3)} | PAINTED,
-        LOCAL | {"keep": NEGATIVE["negative"], "reach": _number(0, 0.99), "photometric_bandwidth": _plain(0.03, 0.5)},
+        LOCAL | {"keep": _background, "reach": _number(0, 0.99), "photometric_bandwidth": _plain(0.03, 0.5)},
     ),
     "colorize": Function(
         nlf.colorize,

@@ -38,11 +38,18 @@ class Scene:
         return image
 
     def mask(self, channels: int) -> Tensor:
-        """Draw a mask (B, C, H, W) in [0, 1] with a rectangle in every channel."""
+        """Draw a mask (B, C, H, W) in [0, 1] with a rectangle in every channel, which leaves the last row free."""
         mask = torch.zeros(self.batch, channels, *self.size, dtype=self.dtype)
         for plane in mask.flatten(0, 1):
             top, left = (self.rng.randint(0, side - 2) for side in self.size)
-            plane[top : top + self.rng.randint(1, 8), left : left + self.rng.randint(1, 8)] = self.rng.choice((1, 0.5))
+            bottom = min(top + self.rng.randint(1, 8), self.size[0] - 1)
+            plane[top:bottom, left : left + self.rng.randint(1, 8)] = self.rng.choice((1, 0.5))
+        return mask
+
+    def background(self) -> Tensor:
+        """Draw a mask (B, 1, H, W) in [0, 1] with a rectangle and the last row, so that no other mask covers it."""
+        mask = self.mask(1)
+        mask[..., -1, :] = 1
         return mask
 
     @cached_property

@@ -104,6 +104,8 @@ class PolynomialSliders(nn.Module):
 
 def _sliders(alpha: Any) -> Tensor:
     """Convert constructor sliders to a tensor of the default dtype."""
+    if isinstance(alpha, Tensor) and alpha.is_complex():
+        raise TypeError(f"alpha must be real, got {described(alpha)}; pass alpha.real")
     try:
         return torch.as_tensor(alpha, dtype=torch.get_default_dtype()).detach().clone()
     except (TypeError, ValueError, RuntimeError, OverflowError):

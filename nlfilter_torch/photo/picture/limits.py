@@ -14,7 +14,7 @@ from torch import Tensor
 
 from nlfilter_torch.core.torch_internals import is_hidden
 from nlfilter_torch.operator.features import reduce_channels
-from nlfilter_torch.photo.picture.colour import split_luminance
+from nlfilter_torch.photo.picture.colour import limited, split_luminance
 
 HEADROOM_SHARE = 0.9  # share of its headroom towards white or black that a channel may use
 LEVEL = 1 / 255  # distance kept from white and black, an 8-bit level, so that rounding does not clip
@@ -24,7 +24,6 @@ MIN_LUMINANCE = 0.02  # lower limit of the luminance that the change of luminanc
 MAX_CHROMA_LOSS = 0.01  # share of the mean chroma that may be lost in some pixels and made up for in others
 MAX_CURVE = 0.9  # limit of the parameter of the tone curve; 1 would make it flat at one end
 EPSILON = 1e-9
-LARGEST = 1e18  # chroma whose square is a finite number of single precision
 Limits = Literal["soft", "none"]
 MeanOf = Callable[[Callable[[Tensor, Tensor], Tensor]], Tensor]  # mean of a function of an image and its change
 
@@ -158,7 +157,7 @@ def _chroma(image: Tensor, moved: Tensor, restraint: float | Tensor, curve: Tens
     if moved.shape[1] == image.shape[1]:
         return image.new_zeros(len(image), 3, *image.shape[2:])
     less, more = _saturation(image, _bent(_before(image, moved), _restrained(image, moved, restraint), curve))
-    colours = split_luminance(image)[1].clamp(-LARGEST, LARGEST)
+    colours = limited(split_luminance(image)[1])
     chroma = colours.square().sum(1, keepdim=True).clamp(min=EPSILON).sqrt()
     return torch.cat([-less * chroma, more * chroma, chroma], dim=1)
 
