@@ -1,0 +1,35 @@
+"""Figures of the library as a layer in training: ``python -m benchmarks.training [TOPIC ...] [--out FILE.json]``."""
+
+import argparse
+import importlib
+import json
+import sys
+from dataclasses import asdict
+from pathlib import Path
+
+from benchmarks.training.figures import Figure, table
+
+TOPICS: dict[str, str] = {}  # name of a module of this package: what it measures
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Measure the topics, print a table of each, and return 1 if a figure falls short of its limit."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.training", description=__doc__)
+    topics = "; ".join(f"{name}: {text}" for name, text in TOPICS.items())
+    parser.add_argument("topics", nargs="*", default=list(TOPICS), help=topics)
+    parser.add_argument("--quick", action="store_true", help="small cases, to see that everything runs")
+    parser.add_argument("--out", type=Path, help="JSON with every figure")
+    options = parser.parse_args(arguments)
+    figures: dict[str, list[Figure]] = {}
+    for topic in options.topics:
+        print(f"{topic}: {TOPICS[topic]}", flush=True)
+        figures[topic] = list(importlib.import_module(f"benchmarks.training.{topic}").measure(quick=options.quick))
+        print(table(figures[topic]), flush=True)
+    if options.out:
+        options.out.parent.mkdir(parents=True, exist_ok=True)
+        options.out.write_text(json.dumps({name: [asdict(each) for each in row] for name, row in figures.items()}))
+    return int(any(not each.holds for row in figures.values() for each in row))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
