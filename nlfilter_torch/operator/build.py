@@ -319,10 +319,9 @@ def _assemble(
     kernel = Kernel(chosen, inverse_cholesky(chosen), method.completion, features=recipe)
     factor, diagonal = kernel.factor(features)
     completed, watched = method.completion == "diagonal", not is_hidden(factor)
-    bound = is_bounded(method.landmarks, points, count)
 
-    if in_graph:
-        worst, goal = 0.0, tolerance or TOLERANCE[factor.dtype]
+    if in_graph:  # where nothing may depend on the number of pixels
+        worst, goal, bound = 0.0, tolerance or TOLERANCE[factor.dtype], method.landmarks != "kmeans"
         factor, diagonal, balancing, before = sinkhorn_in_graph(factor, diagonal, goal, completed, bound)
     else:
         balanced = partial(
@@ -342,7 +341,7 @@ def _assemble(
     remainder = scaling * (scaling * diagonal)  # in this order: without completion d^2 may overflow
     gram = shifted_gram(factor, root_weighted(scaling, weights), remainder, communicator)
     allowed = slack(factor.dtype, worst)
-    if watched and bound and exceeds(gram, balancing.moment, allowed):
+    if watched and is_bounded(method.landmarks, points, count) and exceeds(gram, balancing.moment, allowed):
         limit = limiter(gram, KernelMatrix(factor, diagonal, weights, communicator).moment(scaling), allowed)
         factor, kernel = limit.to(factor) @ factor, replace(kernel, limiter=limit.to(factor))
         before = tuple(torch.linalg.solve(limit.detach(), total) for total in before)  # preserves u . total

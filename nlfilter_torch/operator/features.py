@@ -155,7 +155,9 @@ class _ScaledPatches(torch.autograd.Function):
         ctx.save_for_backward(padded, scale)
         height, width = (padded.shape[-2] - scale.shape[-2] + 1, padded.shape[-1] - scale.shape[-1] + 1)
         batch, channels = padded.shape[:2]
-        shifted = padded.unfold(2, height, 1).unfold(3, width, 1)  # (B, C, p, p, H, W): views, not copies
+        size = scale.shape[-1]
+        # (B, C, p, p, H, W): views, not copies. The windows are patches, since their size must be known in a program.
+        shifted = padded.unfold(2, size, 1).unfold(3, size, 1).permute(0, 1, 4, 5, 2, 3)
         if torch.compiler.is_compiling():
             return (shifted * scale[:, None, :, :, None, None]).flatten(4).flatten(1, 3)
         features = large_empty((batch, channels, *scale.shape[1:], height, width), padded)

@@ -1,5 +1,7 @@
 """Landmarks: the few points whose affinities to all pixels determine the kernel. Paper: Sec. II-C, set A."""
 
+import math
+from collections.abc import Sequence
 from functools import partial
 
 import torch
@@ -125,7 +127,11 @@ def draw_few(candidates: int, count: int, generator: torch.Generator) -> Tensor:
 
 def candidate_count(pixels: int, count: int, sampling: str) -> int:
     """Number of pixels that :func:`candidate_pixels` draws."""
-    return min(pixels, _bounded(PER_LANDMARK * count, MOST_CANDIDATES, count)) if sampling == "kmeans" else count
+    if sampling != "kmeans":
+        return count
+    # Unlike min, sym_min asks nothing of a number of pixels that a program does not know.
+    fewer: int = torch.sym_min(pixels, _bounded(PER_LANDMARK * count, MOST_CANDIDATES, count))
+    return fewer
 
 
 def _bounded(candidates: int, most: int, count: int) -> int:
@@ -228,32 +234,31 @@ def _sums_by_product(points: Tensor, assignment: Tensor, count: int) -> Tensor:
     return points @ members.scatter_(1, assignment.unsqueeze(1), 1.0).mT
 
 
-def _fake_choice(features: Tensor, height: int, width: int, count: int, sampling: str) -> tuple[Tensor, ...]:
-    batch, candidates = features.shape[0], candidate_count(height * width, count, sampling)
+def _fake_choice(features: Tensor, size: Sequence[int], count: int, sampling: str) -> tuple[Tensor, ...]:
+    batch, candidates = features.shape[0], candidate_count(math.prod(size), count, sampling)
     shapes = (candidates,), (batch, 1, count), (batch, candidates)
     return tuple(features.new_empty(shape, dtype=torch.long) for shape in shapes)
 
 
 @register(
-    "choose(Tensor features, int height, int width, int count, str sampling) -> (Tensor, Tensor, Tensor)",
+    "choose(Tensor features, SymInt[] size, int count, str sampling) -> (Tensor, Tensor, Tensor)",
     None,
     _fake_choice,
 )
-def choose(features: Tensor, height: int, width: int, count: int, sampling: Sampling) -> tuple[Tensor, Tensor, Tensor]:
+def choose(features: Tensor, size: Sequence[int], count: int, sampling: Sampling) -> tuple[Tensor, Tensor, Tensor]:
     """Choose candidates (S,), initial centroids among them (B, 1, M) and their assignment to clusters (B, S)."""
     generator = torch.Generator().manual_seed(0)
-    pixels = candidate_pixels((height, width), count, sampling, generator).to(features.device)
-    if len(pixels) == count:
-        _, start, assignment = _fake_choice(features, height, width, count, sampling)
-        return pixels, start.zero_(), assignment.zero_()
+    pixels = candidate_pixels((size[0], size[1]), count, sampling, generator).to(features.device)
+    if len(pixels) == count:  # each is a cluster of its own
+        alone = torch.arange(count, device=features.device).expand(len(features), -1)
+        return pixels, alone.unsqueeze(1).contiguous(), alone.contiguous()
     start, assignment = clusters(ALONE.columns(features, pixels), count, generator)
     return pixels, start, assignment
 
 
 def choose_in_graph(features: Tensor, size: tuple[int, int], count: int, sampling: Sampling) -> Tensor:
     """:func:`choose_landmarks` in a form that can be compiled; chooses the same landmarks as without a generator."""
-    if count == features.shape[2]:
-        return features
-    pixels, start, assignment = choose(features.detach(), size[0], size[1], count, sampling)
+    # Nothing here depends on the size of the image, so that a program serves for all sizes.
+    pixels, start, assignment = choose(features.detach(), size, count, sampling)
     subset = ALONE.columns(features, pixels)
-    return subset if pixels.shape[0] == count else means_of_clusters(subset, start, assignment)
+    return means_of_clusters(subset, start, assignment) if sampling == "kmeans" else subset

@@ -57,4 +57,5 @@ def landmark_count(options: Construction, points: int) -> int:
     if options.num_landmarks > points:
         got = described(options.num_landmarks)
         warn(f"num_landmarks must be at most the number of pixels, {points}, got {got}; using every pixel")
-    return min(options.num_landmarks, points)
+        return points
+    return options.num_landmarks

@@ -6,7 +6,7 @@ an inverse square root by Newton-Schulz iteration replaces the Cholesky decompos
 is by Chebyshev semi-iteration. As on accelerators, isolated pixels are not removed and eigenvalues above 1 not reduced.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from itertools import islice
 from typing import Any
 
@@ -44,17 +44,18 @@ class PortableForms(TorchFunctionMode):
         return FORMS.get(func, func)(*args, **(kwargs or {}))
 
 
-def choose(features: Tensor, height: int, width: int, count: int, sampling: Sampling) -> tuple[Tensor, Tensor, Tensor]:
+def choose(features: Tensor, size: Sequence[int], count: int, sampling: Sampling) -> tuple[Tensor, Tensor, Tensor]:
     """As :func:`nlfilter_torch.operator.landmarks.choose`, with the random numbers as constants of the program."""
     with outside_modes():
         generator = torch.Generator().manual_seed(0)
-        drawn = candidate_pixels((height, width), count, sampling, generator)
+        drawn = candidate_pixels((size[0], size[1]), count, sampling, generator)
         few = draw_few(len(drawn), count, generator)
         draws = torch.rand(count, generator=generator, dtype=torch.float64).float()
     pixels, first = (torch.tensor(constant.tolist(), device=features.device) for constant in (drawn, few))
     batch = features.shape[0]
     if len(pixels) == count:
-        return pixels, pixels.new_zeros(batch, 1, count), pixels.new_zeros(batch, count)
+        alone = torch.arange(count, device=features.device).expand(batch, -1)
+        return pixels, alone.unsqueeze(1), alone
     if count > DRAWN_SINGLY:
         raise ValueError(
             f"num_landmarks must be at most {DRAWN_SINGLY} in a portable program with landmarks='kmeans', got {count}; "

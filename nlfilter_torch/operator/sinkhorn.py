@@ -34,7 +34,7 @@ from nlfilter_torch.core.low_rank import outer_product
 from nlfilter_torch.core.precision import once_differentiable
 from nlfilter_torch.core.torch_internals import is_hidden, register
 from nlfilter_torch.core.warning import warn
-from nlfilter_torch.operator.eigenvalue_bound import exceeds, shifted_gram, slack
+from nlfilter_torch.operator.eigenvalue_bound import ALWAYS, exceeds, shifted_gram, slack
 from nlfilter_torch.operator.scaling import (
     Balancing,
     KernelMatrix,
@@ -295,13 +295,13 @@ def sinkhorn(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Balance a kernel: return d (B, N), moments, residual (B,), inverse Jacobian and a mask of the removed pixels.
 
-    The moments are those of the rounds, padded with copies of the last to ``Rounds.MOST + 1``. With ``bound``, warn if
-    eigenvalues exceed 1.
+    The moments are those of the rounds, padded with copies of the last to ``Rounds.MOST + 1``. Warn if eigenvalues
+    exceed 1, of large factors only with ``bound``.
     """
     balanced = partial(_solve_and_warn, tolerance=tolerance, completed=completed)
     rounds = sinkhorn_in_rounds(factor, diagonal, balanced, completed=completed and factor.device.type == "cpu")
     result, factor, diagonal = rounds.result, rounds.factor, rounds.diagonal
-    if bound and factor.device.type == "cpu":
+    if (bound or factor.shape[1] * factor.shape[2] <= ALWAYS) and factor.device.type == "cpu":
         remainder = result.scaling * (result.scaling * diagonal)
         gram = shifted_gram(factor, result.scaling, remainder, ALONE)
         if exceeds(gram, result.moment, slack(factor.dtype, rounds.residual)):

@@ -49,11 +49,11 @@ def test_the_inverse_root_is_that_of_the_same_matrix(points: float) -> None:
 
 def test_landmarks_are_those_of_the_operator() -> None:
     features = noise(2, 3, 2000, dtype=torch.float32) / 0.2
-    expected = NLFILTER.choose(features, 40, 50, 20, "kmeans")
-    for ours, theirs in zip(portable.choose(features, 40, 50, 20, "kmeans"), expected, strict=True):
+    expected = NLFILTER.choose(features, [40, 50], 20, "kmeans")
+    for ours, theirs in zip(portable.choose(features, [40, 50], 20, "kmeans"), expected, strict=True):
         assert torch.equal(ours, theirs)
     with pytest.raises(ValueError, match=r"num_landmarks must be at most 256 .*, got 300; use landmarks='uniform'"):
-        portable.choose(features, 40, 50, 300, "kmeans")
+        portable.choose(features, [40, 50], 300, "kmeans")
 
 
 def test_a_model_is_wanted() -> None:

@@ -143,6 +143,7 @@ def lonely() -> tuple[Tensor, Tensor]:
     return factor, (1 - factor.square().sum(1)).clamp(min=0)
 
 
+@pytest.mark.filterwarnings("ignore:eigenvalues exceed 1")
 @pytest.mark.parametrize("completed", [True, False])
 def test_balancing_in_a_graph_is_that_without_one(completed: bool) -> None:
     actual = []

@@ -2,6 +2,7 @@
 
 import io
 from collections.abc import Callable
+from typing import Any
 
 import pytest
 import torch
@@ -59,7 +60,8 @@ def test_compiled_layer_gives_the_same() -> None:
 
 @pytest.mark.client(
     "`torch.compile(fullgraph=True)`",
-    "building included, for images of one size; a `generator`, a `group`, `residual` and spectra break the graph",
+    "building included, for images of any size with `dynamic=True`; a `generator`, a `group`, `residual` and spectra "
+    "break the graph",
 )
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.*autograd.function.Function.* should not be instantiated:DeprecationWarning")
@@ -80,6 +82,22 @@ def test_the_whole_layer_compiles_as_one_graph() -> None:
     torch.testing.assert_close(fast(second), layer(second), atol=1e-5, rtol=0)
 
 
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:.*autograd.function.Function.* should not be instantiated:DeprecationWarning")
+def test_a_compiled_layer_takes_other_sizes_without_compiling_again() -> None:
+    layer = NonlocalFilter(ALPHA, photometric_bandwidth=0.2, num_landmarks=20, learn=("photometric_bandwidth",))
+    torch.compiler.reset()
+    fast = torch.compile(layer, backend="aot_eager", fullgraph=True, dynamic=True)
+    fast(noise(2, 3, 24, 32, dtype=torch.float32))
+    with torch.compiler.set_stance("fail_on_recompile"):
+        for shape in ((3, 3, 40, 29), (2, 3, 96, 80)):
+            picture = noise(*shape, dtype=torch.float32)
+            expected, result = layer(picture), fast(picture)
+            torch.testing.assert_close(result, expected, atol=1e-5, rtol=0)
+            gradients = [torch.autograd.grad(y.square().mean(), list(layer.parameters())) for y in (result, expected)]
+            torch.testing.assert_close(*gradients, rtol=1e-4, atol=1e-8)
+
+
 @pytest.mark.filterwarnings("ignore:.*autograd.function.Function.* should not be instantiated:DeprecationWarning")
 def test_a_generator_keeps_building_out_of_the_graph() -> None:
     def landmarks(guide: Tensor) -> Tensor:
@@ -92,19 +110,24 @@ def test_a_generator_keeps_building_out_of_the_graph() -> None:
 
 @pytest.mark.client(
     "`torch.export`",
-    "building included; import `nlfilter_torch.operator.build` before a program is loaded, or export `Portable`",
+    "building included, for images of any size; import `nlfilter_torch.operator.build` before a program is loaded, or "
+    "export `Portable`",
 )
 @pytest.mark.slow
-def test_export_of_a_layer_that_builds_its_operator() -> None:
-    layer = NonlocalFilter(ALPHA, **OPTIONS)
-    sizes = {"image": {0: torch.export.Dim("images", min=1, max=64)}}
+@pytest.mark.parametrize("changed", [{}, {"landmarks": "uniform", "spatial_bandwidth": 9.0}])
+def test_export_of_a_layer_that_builds_its_operator(changed: dict[str, Any]) -> None:
+    layer = NonlocalFilter(ALPHA, **(OPTIONS | changed))
+    limits = {"images": (1, 64), "height": (8, 512), "width": (8, 512)}
+    batch, height, width = (torch.export.Dim(name, min=low, max=high) for name, (low, high) in limits.items())
+    sizes = {"image": {0: batch, 2: height, 3: width}}
     program = torch.export.export(layer, (image(batch=2),), dynamic_shapes=sizes)
     stream = io.BytesIO()
     torch.export.save(program, stream)
     stream.seek(0)
     loaded = torch.export.load(stream).module()
-    for batch in (1, 2, 5):
-        torch.testing.assert_close(loaded(image(3, batch)), layer(image(3, batch)), atol=1e-5, rtol=0)
+    for shape in ((1, 3, 8, 8), (2, 3, 24, 32), (5, 3, 40, 29), (1, 3, 200, 150)):
+        picture = noise(*shape, dtype=torch.float32)
+        torch.testing.assert_close(loaded(picture), layer(picture), atol=1e-5, rtol=0)
 
 
 # --- operators that a graph calls
