@@ -1,3 +1,4 @@
+from .core.containers import collate as collate
 from .filtering.filters import captured_energy as captured_energy
 from .filtering.filters import compose_alpha as compose_alpha
 from .filtering.filters import detail_layers as detail_layers

@@ -113,6 +113,11 @@ def _affinity(**options: Any) -> Tensor:
     return nlf.NonlocalAffinity(**options)(image) @ image
 
 
+def _collated(samples: list[Any]) -> Tensor:
+    batch = nlf.collate(samples)
+    return batch.row_sums() if isinstance(batch, nlf.NonlocalOperator) else torch.zeros(1)
+
+
 def _denoiser(image: Tensor, noise: float | Tensor = 0.1) -> Tensor:
     """Denoise with an untrained network."""
     return nlf.NonlocalDenoiser()(image, noise)
@@ -174,6 +179,10 @@ FUNCTIONS = {
     "NonlocalOperator.spectrum": Function(
         lambda operator, **options: operator.spectrum(**options), OPERATOR, {"rank": _count(1, 20)}
     ),
+    "NonlocalOperator.cat": Function(
+        lambda operator, image: nlf.NonlocalOperator.cat([operator, operator])[0] @ image[:1], OPERATOR | IMAGE, {}
+    ),
+    "collate": Function(_collated, {"samples": lambda scene: [scene.operator, scene.operator]}, {}),
     "polynomial_filter": Function(nlf.polynomial_filter, OPERATOR | IMAGE | ALPHA, RESIDUAL),
     "detail_layers": Function(nlf.detail_layers, OPERATOR | IMAGE, ORDER),
     "spectral_filter": Function(nlf.spectral_filter, SPECTRUM | IMAGE | {"response": _responses}, RESIDUAL),

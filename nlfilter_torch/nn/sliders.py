@@ -233,6 +233,11 @@ class NonlocalFilter(nn.Module):
             guide, mask = _as_batch(guide), _as_batch(mask)
             of_regions = mask is not None and mask.shape[1] > 1  # then a 3-dimensional alpha is (B, K, k+1)
             return self(image.unsqueeze(0), guide, mask, alpha if of_regions else _as_batch(alpha)).squeeze(0)
+        if isinstance(guide, NonlocalOperator):
+            raise TypeError(
+                "guide must be a torch.Tensor, from which the layer builds an operator, got a NonlocalOperator; "
+                "call layer.sliders(operator, image)"
+            )
         check_image(image, "image", empty=True)
         operator = self.affinity(image if guide is None else guide)
         if mask is not None:

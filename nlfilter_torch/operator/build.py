@@ -162,6 +162,8 @@ _built_uncompiled = uncompiled(_built)
 
 def _check_guide(guide: Tensor, options: OperatorOptions) -> None:
     """Raise an error for an invalid guide or option."""
+    if isinstance(guide, NonlocalOperator):
+        raise TypeError("guide must be a torch.Tensor, got a NonlocalOperator, which is built already; use it as it is")
     spatial = bandwidths_of(options.spatial_bandwidth)
     refuse_transforms("guide", guide, options.photometric_bandwidth, *spatial, options.patch_weights)
     check_image(guide, "guide", empty=True)

@@ -1,6 +1,8 @@
 """The filter W as an object, with its products, spectrum and diagnostics. Paper: Sec. II."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Self
 
 import torch
 from torch import Tensor
@@ -14,7 +16,7 @@ from nlfilter_torch.core.checks import (
     check_same_size,
 )
 from nlfilter_torch.core.communicator import ALONE, Communicator
-from nlfilter_torch.core.containers import Target, loadable, moved
+from nlfilter_torch.core.containers import Batch, loadable
 from nlfilter_torch.core.kernels.tall_skinny import moment
 from nlfilter_torch.core.layouts import in_format_of
 from nlfilter_torch.core.precision import full_precision, uncompiled
@@ -126,13 +128,16 @@ class Certificate:
     largest_eigenvalue: list[float]
 
 
-@dataclass(frozen=True, eq=False)
-class NonlocalOperator:
+@dataclass(frozen=True, eq=False, repr=False)
+class NonlocalOperator(Batch):
     """The symmetric, doubly stochastic filter ``W = diag(d) U^T U diag(d) + diag(r)`` of an image, never formed.
 
     Made by :func:`nonlocal_operator`. Every pixel is linked to every other through M landmarks; W has unit row sums and
     its eigenvalues lie in [0, 1]. With few landmarks, approximate affinities may be negative. A pixel whose affinities
     to all others sum to less than zero keeps its value; eigenvalues that would exceed 1 are set to 1.
+
+    Operators are values: ``operator[0]``, ``operator[1:3]`` and iteration select images, :meth:`cat` joins operators,
+    and :meth:`to` and :meth:`detach` return new ones. :func:`collate` joins those of a data set.
 
     Attributes:
         factor: U, (B, M, N), pixels last.
@@ -162,17 +167,38 @@ class NonlocalOperator:
     weights: Tensor | None = None
     communicator: Communicator = ALONE
 
-    def to(self, target: Target, dtype: torch.dtype | None = None) -> "NonlocalOperator":
-        """Move the operator to another device, or convert it to another precision.
+    def __repr__(self) -> str:
+        images, (height, width) = len(self), self.size
+        return (
+            f"NonlocalOperator({images} image{'' if images == 1 else 's'} of {height}x{width}, "
+            f"{self.factor.shape[1]} landmarks, {self.dtype}, {self.device})"
+        )
 
-        Args:
-            target: a device, a dtype (float32 or float64), or a tensor that has both.
-            dtype: the dtype, if ``target`` is a device.
+    @property
+    def shape(self) -> torch.Size:
+        """Shape (B, N, N) of the matrices W; :attr:`size` is that of the images."""
+        images, _, pixels = self.factor.shape
+        return torch.Size((images, pixels, pixels))
 
-        Raises:
-            TypeError: if the dtype is neither float32 nor float64.
-        """
-        return moved(self, target, dtype)
+    @classmethod
+    def alike(cls, batches: Sequence[Self]) -> Sequence[Self]:
+        """The operators, with weights and a limiter if one of them has these, and equally many rounds of balancing."""
+        weighted = any(operator.weights is not None for operator in batches)
+        limited = any(operator.kernel.limiter is not None for operator in batches)
+        rounds = max(len(operator.balancing.before) for operator in batches)
+        return [operator._explicit(weighted, limited, rounds) for operator in batches]
+
+    def _explicit(self, weighted: bool, limited: bool, rounds: int) -> Self:
+        """The same operator, with fields of neutral values where they are missing."""
+        kernel, balancing, weights = self.kernel, self.balancing, self.weights
+        if limited and kernel.limiter is None:
+            identity = torch.eye(self.factor.shape[1], dtype=self.dtype, device=self.device)
+            kernel = replace(kernel, limiter=identity.expand(len(self), -1, -1))
+        if weighted and weights is None:
+            weights = torch.ones_like(self.scaling)
+            balancing = replace(balancing, least=torch.ones_like(self.scaling[:, :1]))
+        before = (*balancing.before, *[balancing.moment] * (rounds - len(balancing.before)))
+        return replace(self, kernel=kernel, weights=weights, balancing=replace(balancing, before=before))
 
     @full_precision
     def at(self, features: Tensor) -> Columns:

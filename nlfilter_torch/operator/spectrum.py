@@ -5,17 +5,19 @@ their span is ``T = G^(-1/2) (G^2 + F diag(r) F^T) G^(-1/2)``. G and T are M x M
 twice: once for G, and once to form or apply eigenvectors.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Self
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from nlfilter_torch.core.blocks import fold_batch, root_weighted, unfold_batch, weighted
 from nlfilter_torch.core.checks import check_coefficients, check_image, check_same_size, checked_response
 from nlfilter_torch.core.communicator import ALONE, Communicator
-from nlfilter_torch.core.containers import Target, loadable, moved
+from nlfilter_torch.core.containers import Batch, loadable
 from nlfilter_torch.core.kernels.grams import compute_grams
 from nlfilter_torch.core.kernels.tall_skinny import moment, spread
 from nlfilter_torch.core.matrix_function import SymmetricMatrix
@@ -80,12 +82,13 @@ class RitzPairs:
         return self.root @ self.basis(checked_response(response, self.support))
 
 
-@dataclass(frozen=True, eq=False)
-class Spectrum(RitzPairs):
+@dataclass(frozen=True, eq=False, repr=False)
+class Spectrum(Batch, RitzPairs):
     """Leading eigenvalues and eigenvectors of a :class:`NonlocalOperator`. Paper: eq. (3), (4).
 
     Made by :meth:`NonlocalOperator.spectrum`. Eigenvectors are formed when first used. Filters and masks do not need
-    them, since :meth:`gain` gives any f(W) through M x M matrices.
+    them, since :meth:`gain` gives any f(W) through M x M matrices. Spectra are values like operators: ``spectrum[0]``
+    selects an image, ``cat`` joins spectra, and ``to`` and ``detach`` return new ones.
 
     Attributes:
         eigenvalues: (B, R), descending, in [0, 1]; padded with zeros if the images of a batch differ in rank, and to
@@ -113,9 +116,25 @@ class Spectrum(RitzPairs):
     weights: Tensor | None = None
     communicator: Communicator = ALONE
 
-    def to(self, target: Target, dtype: torch.dtype | None = None) -> "Spectrum":
-        """Move the spectrum to another device or precision, as :meth:`NonlocalOperator.to`."""
-        return moved(self, target, dtype)
+    def __repr__(self) -> str:
+        images, (height, width) = len(self), self.size
+        return (
+            f"Spectrum({images} image{'' if images == 1 else 's'} of {height}x{width}, "
+            f"{self.eigenvalues.shape[1]} eigenvalues, {self.dtype}, {self.device})"
+        )
+
+    @classmethod
+    def alike(cls, batches: Sequence[Self]) -> Sequence[Self]:
+        """The spectra, with equally many eigenvalues, and with weights if one of them has these."""
+        rank = max(spectrum.eigenvalues.shape[1] for spectrum in batches)
+        weighted = any(spectrum.weights is not None for spectrum in batches)
+        explicit = []
+        for spectrum in batches:
+            values = pad(spectrum.eigenvalues, (0, rank - spectrum.eigenvalues.shape[1]))
+            missing = weighted and spectrum.weights is None
+            weights = torch.ones_like(spectrum.scaling) if missing else spectrum.weights
+            explicit.append(replace(spectrum, eigenvalues=values, weights=weights))
+        return explicit
 
     @property
     def pixels(self) -> float | Tensor:

@@ -88,6 +88,7 @@ CASES: dict[str, Case] = {
     "NonlocalFilter": lambda x: nlf.NonlocalFilter(learn=(), num_landmarks=20)(x.image(), alpha=x.zeros(4)),
     "NonlocalAffinity": lambda x: nlf.NonlocalAffinity(num_landmarks=20)(x.image()).factor,
     "NonlocalDenoiser": lambda x: nlf.NonlocalDenoiser.trained(device=x.device)(x.image(), 0.1),
+    "collate": lambda x: nlf.collate([(x.operator(), x.image()[0])] * 2)[0][1] @ x.image(),
     "Portable": lambda x: nlf.Portable(nlf.NonlocalFilter(learn=(), num_landmarks=20))(x.image(), alpha=x.zeros(4)),
     "PolynomialSliders": lambda x: nlf.PolynomialSliders(learn=())(x.operator(), x.image(), x.zeros(4)),
 }
