@@ -75,6 +75,7 @@ AFFINITY: dict[str, Kind] = {
 }
 BANDWIDTH = {"photometric_bandwidth": _one_of("auto", 0.05, 0.2)}
 GUIDED = {"guide_channels": _one_of("luminance", "all")}
+HELD: dict[str, Kind] = {"hold": _one_of(None, "assignment")}
 BALANCED: dict[str, Kind] = {"tolerance": _plain(1e-6, 1e-3)}
 LOCAL = {name: AFFINITY[name] for name in ("patch_size", "spatial_bandwidth", "num_landmarks")}
 FILTER = AFFINITY | BANDWIDTH
@@ -299,10 +300,10 @@ FUNCTIONS = {
     "NonlocalFilter": Function(
         _layer,
         LIST | {"image": _image(1, 3)},
-        RESIDUAL | FILTER | GUIDED | BALANCED | {"learn": _one_of((), ("alpha",))},
+        RESIDUAL | FILTER | GUIDED | BALANCED | HELD | {"learn": _one_of((), ("alpha",))},
     ),
     "NonlocalAffinity": Function(
-        _affinity, {"image": _image(1, 3)}, FILTER | GUIDED | BALANCED | {"learn": _one_of(())}
+        _affinity, {"image": _image(1, 3)}, FILTER | GUIDED | BALANCED | HELD | {"learn": _one_of(())}
     ),
     "NonlocalDenoiser": Function(_denoiser, {"image": _image(1, 3)}, {"noise": _number(0, 0.3)}),
     "Portable": Function(_portable, LIST | {"image": _image(1, 3)}, {}),

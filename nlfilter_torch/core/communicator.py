@@ -66,7 +66,10 @@ class Communicator:
         return value
 
     def columns(self, features: Tensor, indices: Tensor) -> Tensor:
-        """Columns (B, D, S) of the features (B, D, N) of all ranks, at pixels (S,) numbered over the whole image."""
+        """Columns (B, D, S) of the features (B, D, N) of all ranks, at pixels numbered over the whole image.
+
+        Their indices are (S,), or (B, 1, S) with a batch of 1 for all images.
+        """
         # torch gathers on all cores where all planes share an index; selecting would use one core.
         return features.gather(2, indices.expand(*features.shape[:2], -1))
 

@@ -7,14 +7,27 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from nlfilter_torch.core.checks import check_choice
+from nlfilter_torch.core.checks import check_choice, check_image
 from nlfilter_torch.core.communicator import check_group
+from nlfilter_torch.core.precision import working_dtype
+from nlfilter_torch.nn.held import HeldAssignment, HeldFeatures, Hold
 from nlfilter_torch.nn.parameters import Learnable, UnitWindow, check_learn, positive_option
+from nlfilter_torch.operator.assignment import Assignment
 from nlfilter_torch.operator.build import nonlocal_operator
-from nlfilter_torch.operator.features import unit_window
+from nlfilter_torch.operator.features import GuideFeatures, estimate_bandwidth, unit_window
+from nlfilter_torch.operator.landmarks import choose_landmarks
 from nlfilter_torch.operator.operator import NonlocalOperator
-from nlfilter_torch.operator.option_checks import check_options
-from nlfilter_torch.operator.options import AUTO, Completion, GuideChannels, OperatorOptions, Sampling
+from nlfilter_torch.operator.option_checks import check_options, count_of
+from nlfilter_torch.operator.options import (
+    AUTO,
+    SAMPLING,
+    Completion,
+    GuideChannels,
+    HasLandmarks,
+    Landmarks,
+    OperatorOptions,
+    Sampling,
+)
 
 
 class NonlocalAffinity(Learnable):
@@ -25,7 +38,9 @@ class NonlocalAffinity(Learnable):
         photometric_bandwidth: a positive number in units of the guide, or ``"auto"``.
         spatial_bandwidth: a positive number of pixels, or None.
         num_landmarks: as for :func:`nonlocal_operator`.
-        landmarks: as for :func:`nonlocal_operator`.
+        landmarks: as for :func:`nonlocal_operator`. An operator or an assignment is held as with
+            ``hold="assignment"``, unless ``hold="features"``; features are held as with ``hold="features"``, and must
+            be divided by the bandwidths with which the layer starts.
         completion: as for :func:`nonlocal_operator`.
         guide_channels: as for :func:`nonlocal_operator`.
         patch_weights: as for :func:`nonlocal_operator`.
@@ -33,6 +48,12 @@ class NonlocalAffinity(Learnable):
         generator: as for :func:`nonlocal_operator`. Every call then draws different landmarks; do not combine it with
             gradient checkpointing, which expects two runs of the layer to agree.
         group: as for :func:`nonlocal_operator`. A layer with a group cannot be pickled or copied.
+        hold: None chooses landmarks anew in every call, which makes the layer discontinuous in guide and bandwidths.
+            ``"assignment"`` is for calls with the same images, as when sliders and bandwidths are fitted to a
+            picture: the first call assigns pixels to landmarks, and later calls keep the assignment, while the
+            landmarks move smoothly with guide and bandwidths. Images of another size, or another number of them, are
+            assigned anew. ``"features"`` is for images that change: landmarks are those of the guides that
+            :meth:`renew` was called with last, for all images, and part of ``state_dict``.
         learn: the options to learn: any of ``"photometric_bandwidth"`` and ``"spatial_bandwidth"`` (which need initial
             values) and ``"patch_weights"``. All stay positive.
 
@@ -61,13 +82,14 @@ class NonlocalAffinity(Learnable):
         photometric_bandwidth: float | Literal["auto"] = AUTO,
         spatial_bandwidth: float | None = None,
         num_landmarks: int = OperatorOptions.num_landmarks,
-        landmarks: Sampling = OperatorOptions.landmarks,
+        landmarks: Landmarks = OperatorOptions.landmarks,
         completion: Completion = OperatorOptions.completion,
         guide_channels: GuideChannels = OperatorOptions.guide_channels,
         patch_weights: Tensor | None = OperatorOptions.patch_weights,
         tolerance: float | None = OperatorOptions.tolerance,
         generator: torch.Generator | None = OperatorOptions.generator,
         group: Any = OperatorOptions.group,
+        hold: Hold | None = None,
         learn: Collection[str] = (),
     ) -> None:
         super().__init__()
@@ -85,8 +107,8 @@ class NonlocalAffinity(Learnable):
         check_group(group)
         window = unit_window(patch_size, patch_weights).detach()  # learned only with learn=("patch_weights",)
         self.patch_size = patch_size
-        self.num_landmarks = num_landmarks
-        self.landmarks: Sampling = landmarks
+        self.num_landmarks = num_landmarks if isinstance(landmarks, str) else count_of(landmarks)
+        self.landmarks: Sampling = landmarks if isinstance(landmarks, str) else SAMPLING
         self.completion: Completion = completion
         self.guide_channels: GuideChannels = guide_channels
         self.tolerance = tolerance
@@ -113,20 +135,123 @@ class NonlocalAffinity(Learnable):
             self.patch_weights = UnitWindow(window)
         else:
             self.register_buffer("patch_weights", None if patch_weights is None else window, persistent=False)
+        self.held = self._held(hold, landmarks)
 
     def forward(self, guide: Tensor) -> NonlocalOperator:
         """Build the operator of a guide (B, C, H, W)."""
+        if isinstance(self.held, HeldFeatures):
+            bandwidth = self.photometric_bandwidth
+            if isinstance(bandwidth, str):
+                bandwidth = estimate_bandwidth(guide, guide_channels=self.guide_channels, group=self.group)
+            return self._build(guide, self.held.of(self._recipe(bandwidth, guide)), bandwidth)
+        if isinstance(self.held, HeldAssignment):
+            check_image(guide, "guide", empty=True)
+            operator = self._build(guide, self.held.of(guide) or self.landmarks, self.photometric_bandwidth)
+            self.held.keep(operator.assignment, guide)
+            return operator
+        return self._build(guide, self.landmarks, self.photometric_bandwidth)
+
+    @torch.no_grad()
+    def renew(self, guide: Tensor | None = None) -> None:
+        """Choose the landmarks that are held anew, by the sampling, number and generator of the layer.
+
+        Args:
+            guide: (B, C, H, W) to choose them from, whole images, also for a layer with a group. With
+                ``hold="features"``, landmarks are chosen from all of the guides at once, and the mean of their
+                bandwidths counts if it is ``"auto"``; in distributed training, call this before the layer is wrapped,
+                with the same guides on all ranks. With ``hold="assignment"``, None forgets the assignment, and the next
+                call makes a new one.
+
+        Raises:
+            TypeError, ValueError: if the layer holds no landmarks, or the guide is missing or invalid.
+        """
+        if self.held is None:
+            raise ValueError(
+                "hold must be 'assignment' or 'features' to renew landmarks, got None; every call chooses new ones"
+            )
+        if isinstance(self.held, HeldAssignment):
+            self.held.forget()
+            if guide is not None:
+                self(guide)
+            return
+        if guide is None:
+            raise ValueError("guide must be images to choose landmarks from if hold is 'features', got None; pass some")
+        check_image(guide, "guide")
+        bandwidth = self.photometric_bandwidth
+        if isinstance(bandwidth, str):
+            bandwidth = estimate_bandwidth(guide, guide_channels=self.guide_channels).mean()
+        recipe = self._recipe(bandwidth, guide)
+        features = recipe(guide).transpose(0, 1).flatten(1).unsqueeze(0)  # (1, D, B N), of all images
+        size = (guide.shape[0] * guide.shape[2], guide.shape[3])
+        count = min(self.num_landmarks, features.shape[2])
+        self.held.keep(choose_landmarks(features, size, count, self.landmarks, self.generator), recipe)
+
+    def _held(self, hold: Hold | None, landmarks: Landmarks) -> HeldAssignment | HeldFeatures | None:
+        """What the layer keeps from call to call, from the arguments of the constructor."""
+        if hold is None and not isinstance(landmarks, str):
+            hold = "features" if isinstance(landmarks, Tensor) else "assignment"
+        if hold is None:
+            return None
+        check_choice(hold, "hold", ("assignment", "features"), "choose one of these, or None")
+        if hold == "assignment":
+            return self._held_assignment(landmarks)
+        held = HeldFeatures()
+        if not isinstance(landmarks, str):
+            self._keep_features(held, landmarks)
+        return held
+
+    def _held_assignment(self, landmarks: Landmarks) -> HeldAssignment:
+        """Hold the assignment of an operator, if there is one; otherwise that of the first call."""
+        assignment = landmarks if isinstance(landmarks, str | Tensor | Assignment) else landmarks.assignment
+        if assignment is None or isinstance(assignment, Tensor):
+            raise ValueError(
+                "hold must be 'features' if landmarks are features, got 'assignment'; pass an operator whose landmarks "
+                "were chosen from its guide, or hold='features'"
+            )
+        return HeldAssignment(None if isinstance(assignment, str) else assignment)
+
+    def _keep_features(self, held: HeldFeatures, landmarks: Tensor | Assignment | HasLandmarks) -> None:
+        """Keep landmarks in units of the guide, given those divided by the initial bandwidths."""
+        if isinstance(landmarks, Assignment):
+            raise ValueError(
+                "hold must be 'assignment' if landmarks are an assignment, got 'features'; pass the operator itself"
+            )
+        features = landmarks if isinstance(landmarks, Tensor) else landmarks.landmarks
+        recipe = landmarks.kernel.features if isinstance(landmarks, NonlocalOperator) else None
+        if recipe is None:
+            bandwidth = self.photometric_bandwidth
+            if isinstance(bandwidth, str):
+                raise ValueError(
+                    "photometric_bandwidth must be a number if landmarks are features, which are divided by it, got "
+                    "'auto'; pass a number, or an operator of a guide"
+                )
+            recipe = self._recipe(bandwidth, features)
+        held.keep(features, recipe)
+
+    def _recipe(self, bandwidth: float | Tensor, like: Tensor) -> GuideFeatures:
+        """The function that computes features of a guide, in the precision of ``like``."""
+        window = unit_window(self.patch_size, self._weights()).to(like.device, working_dtype(like))
+        return GuideFeatures(window, bandwidth, self.spatial_bandwidth, self.guide_channels)
+
+    def _weights(self) -> Tensor | None:
+        """Learned or fixed patch weights (p, p); None for the Gaussian window."""
         weights = self.patch_weights
+        return weights() if isinstance(weights, UnitWindow) else weights
+
+    def _build(
+        self, guide: Tensor, landmarks: Landmarks, bandwidth: float | Tensor | Literal["auto"]
+    ) -> NonlocalOperator:
+        """Build the operator with the options of the layer, and these landmarks."""
         return nonlocal_operator(
             guide,
             patch_size=self.patch_size,
-            photometric_bandwidth=self.photometric_bandwidth,
+            photometric_bandwidth=bandwidth,
             spatial_bandwidth=self.spatial_bandwidth,
-            num_landmarks=self.num_landmarks,
-            landmarks=self.landmarks,
+            num_landmarks=self.num_landmarks if isinstance(landmarks, str) else count_of(landmarks),
+            landmarks=landmarks,
             completion=self.completion,
             guide_channels=self.guide_channels,
-            patch_weights=weights() if isinstance(weights, UnitWindow) else weights,
+            patch_weights=self._weights(),
             tolerance=self.tolerance,
             generator=self.generator,
             group=self.group,
@@ -134,8 +259,10 @@ class NonlocalAffinity(Learnable):
 
     def extra_repr(self) -> str:
         """The options of the operator."""
+        holding = "" if self.held is None else f", hold={self.held.kind!r}"
         return (
             f"patch_size={self.patch_size}, photometric_bandwidth={self.shown('photometric_bandwidth')}, "
             f"spatial_bandwidth={self.shown('spatial_bandwidth')}, num_landmarks={self.num_landmarks}, "
-            f"landmarks={self.landmarks!r}, completion={self.completion!r}, guide_channels={self.guide_channels!r}"
+            f"landmarks={self.landmarks!r}{holding}, completion={self.completion!r}, "
+            f"guide_channels={self.guide_channels!r}"
         )

@@ -17,9 +17,10 @@ from nlfilter_torch.core.checks import (
 )
 from nlfilter_torch.filtering.filters import filter_regions, polynomial_filter, weigh_layers
 from nlfilter_torch.nn.affinity import NonlocalAffinity
+from nlfilter_torch.nn.held import Hold
 from nlfilter_torch.nn.parameters import check_learn
 from nlfilter_torch.operator.operator import NonlocalOperator
-from nlfilter_torch.operator.options import AUTO, Completion, GuideChannels, OperatorOptions, Sampling
+from nlfilter_torch.operator.options import AUTO, Completion, GuideChannels, Landmarks, OperatorOptions
 
 LEARNABLE = ("alpha", "residual")
 
@@ -139,6 +140,8 @@ class NonlocalFilter(nn.Module):
         tolerance: as for :class:`NonlocalAffinity`.
         generator: as for :class:`NonlocalAffinity`.
         group: as for :class:`NonlocalAffinity`.
+        hold: which landmarks are kept from call to call, ``"assignment"``, ``"features"`` or None, as for
+            :class:`NonlocalAffinity`; gradients then describe what the next call does.
 
     Raises:
         TypeError, ValueError: if ``learn`` has any other name, or ``alpha``, ``residual`` or an option is invalid.
@@ -184,13 +187,14 @@ class NonlocalFilter(nn.Module):
         photometric_bandwidth: float | Literal["auto"] = AUTO,
         spatial_bandwidth: float | None = None,
         num_landmarks: int = OperatorOptions.num_landmarks,
-        landmarks: Sampling = OperatorOptions.landmarks,
+        landmarks: Landmarks = OperatorOptions.landmarks,
         completion: Completion = OperatorOptions.completion,
         guide_channels: GuideChannels = OperatorOptions.guide_channels,
         patch_weights: Tensor | None = OperatorOptions.patch_weights,
         tolerance: float | None = OperatorOptions.tolerance,
         generator: torch.Generator | None = OperatorOptions.generator,
         group: Any = OperatorOptions.group,
+        hold: Hold | None = None,
     ) -> None:
         super().__init__()
         names = check_learn(learn, (*LEARNABLE, *NonlocalAffinity.learnable))
@@ -206,9 +210,14 @@ class NonlocalFilter(nn.Module):
             tolerance=tolerance,
             generator=generator,
             group=group,
+            hold=hold,
             learn=names.intersection(NonlocalAffinity.learnable),
         )
         self.sliders = PolynomialSliders(alpha, residual=residual, learn=names.intersection(LEARNABLE))
+
+    def renew(self, guide: Tensor | None = None) -> None:
+        """Choose the landmarks that are held anew; see :meth:`NonlocalAffinity.renew`."""
+        self.affinity.renew(guide)
 
     def forward(
         self, image: Tensor, guide: Tensor | None = None, mask: Tensor | None = None, alpha: Tensor | None = None

@@ -27,7 +27,8 @@ from nlfilter_torch.operator.features import (
     reduce_channels,
     unit_window,
 )
-from nlfilter_torch.operator.landmarks import choose_in_graph, choose_landmarks
+from nlfilter_torch.operator.held import landmarks_by
+from nlfilter_torch.operator.landmarks import choose_landmarks
 from nlfilter_torch.operator.nystrom import inverse_cholesky
 from nlfilter_torch.operator.operator import Kernel, NonlocalOperator
 from nlfilter_torch.operator.option_checks import check_bandwidths, check_construction, check_options, landmark_count
@@ -35,6 +36,7 @@ from nlfilter_torch.operator.options import (
     Completion,
     Construction,
     GuideChannels,
+    Landmarks,
     OperatorOptions,
     Sampling,
     SpatialBandwidth,
@@ -73,7 +75,7 @@ def nonlocal_operator(
     photometric_bandwidth: float | Tensor | Literal["auto"] = OperatorOptions.photometric_bandwidth,
     spatial_bandwidth: SpatialBandwidth | None = OperatorOptions.spatial_bandwidth,
     num_landmarks: int = OperatorOptions.num_landmarks,
-    landmarks: Sampling = OperatorOptions.landmarks,
+    landmarks: Landmarks = OperatorOptions.landmarks,
     completion: Completion = OperatorOptions.completion,
     guide_channels: GuideChannels = OperatorOptions.guide_channels,
     patch_weights: Tensor | None = OperatorOptions.patch_weights,
@@ -97,7 +99,12 @@ def nonlocal_operator(
         spatial_bandwidth: h_x in pixels, a positive number or a tensor of shape () or (B,), or two of them, for
             vertical and horizontal distances; None leaves out the spatial term, so that W is fully nonlocal.
         num_landmarks: M; reduced with a warning where the image has fewer pixels.
-        landmarks: ``"kmeans"``, ``"uniform"`` (the paper's grid) or ``"random"``.
+        landmarks: ``"kmeans"``, ``"uniform"`` (the paper's grid) or ``"random"``, chosen anew in every call. Or an
+            operator built before, whose landmarks are kept: for a guide of the same size, the assignment of pixels to
+            landmarks is held, and the landmarks move smoothly with guide and bandwidths; for any other, its landmarks
+            are taken as they are, as constants. Or ``operator.assignment``, which refuses guides of another size. Or
+            features (B, D, M) or (1, D, M), such as ``operator.landmarks``, divided by the bandwidths like those of the
+            pixels; differentiable. ``num_landmarks`` is then their number.
         completion: ``"diagonal"`` corrects the diagonal of the kernel to 1; ``"none"`` is the paper's method, which
             fails at small bandwidths.
         guide_channels: ``"luminance"`` reduces a guide of three channels to one, ``"all"`` compares all of them. A
@@ -165,7 +172,7 @@ def _check_guide(guide: Tensor, options: OperatorOptions) -> None:
     if isinstance(guide, NonlocalOperator):
         raise TypeError("guide must be a torch.Tensor, got a NonlocalOperator, which is built already; use it as it is")
     spatial = bandwidths_of(options.spatial_bandwidth)
-    refuse_transforms("guide", guide, options.photometric_bandwidth, *spatial, options.patch_weights)
+    refuse_transforms("guide", guide, options.photometric_bandwidth, *spatial, options.patch_weights, options.landmarks)
     check_image(guide, "guide", empty=True)
     check_options(options)
     check_bandwidths(options.photometric_bandwidth, options.spatial_bandwidth, guide.shape[0])
@@ -203,7 +210,7 @@ def operator_from_features(
     size: tuple[int, ...],
     weights: Tensor | None = None,
     num_landmarks: int = Construction.num_landmarks,
-    landmarks: Sampling = Construction.landmarks,
+    landmarks: Landmarks = Construction.landmarks,
     completion: Completion = Construction.completion,
     tolerance: float | None = Construction.tolerance,
     generator: torch.Generator | None = Construction.generator,
@@ -221,7 +228,7 @@ def operator_from_features(
             landmarks are drawn in proportion to the weights, averaged over a batch. None means one each. Constant for
             gradients.
         num_landmarks: M; reduced with a warning where there are fewer points.
-        landmarks: as for :func:`nonlocal_operator`.
+        landmarks: as for :func:`nonlocal_operator`; features have the meaning and scale of ``features``.
         completion: as for :func:`nonlocal_operator`.
         tolerance: as for :func:`nonlocal_operator`.
         generator: as for :func:`nonlocal_operator`.
@@ -240,7 +247,7 @@ def operator_from_features(
         >>> bool((smoothed - 1).abs().max() < 1e-4)
         True
     """
-    refuse_transforms("features", features)
+    refuse_transforms("features", features, landmarks)
     check_features(features, "features", empty=True)
     method = Construction(
         num_landmarks=num_landmarks,
@@ -313,12 +320,11 @@ def _assemble(
     count = landmark_count(method, points)
     if features.shape[0] == 0:
         return _empty(features, size, count, method.completion, recipe)
-    in_graph = torch.compiler.is_compiling()  # never with a generator, weights or a group
-    if chosen is None and in_graph:
-        chosen = choose_in_graph(features, size, count, method.landmarks)
-    elif chosen is None:
-        chosen = choose_landmarks(features, whole, count, method.landmarks, method.generator, communicator, weights)
-    kernel = Kernel(chosen, inverse_cholesky(chosen), method.completion, features=recipe)
+    in_graph, assignment = torch.compiler.is_compiling(), None  # never with a generator, weights or a group
+    if chosen is None:
+        chosen, assignment = landmarks_by(method, features, whole, count, communicator, weights)
+    inverse = inverse_cholesky(chosen)
+    kernel = Kernel(chosen, inverse, method.completion, features=recipe, assignment=assignment)
     factor, diagonal = kernel.factor(features)
     completed, watched = method.completion == "diagonal", not is_hidden(factor)
 
@@ -393,7 +399,8 @@ def _empty(
 ) -> NonlocalOperator:
     """The operator of an empty batch of features (0, D, N)."""
     per_pixel, total = features.new_empty(0, features.shape[2]), features.new_empty(0, count, 1, dtype=torch.float64)
-    kernel = Kernel(features[:, :, :count], features.new_empty(0, count, count), completion, features=recipe)
+    landmarks = features.new_empty(0, features.shape[1], count)
+    kernel = Kernel(landmarks, features.new_empty(0, count, count), completion, features=recipe)
     return NonlocalOperator(
         factor=features.new_empty(0, count, features.shape[2]),
         diagonal=per_pixel,

@@ -17,6 +17,7 @@ from torch import Tensor
 from nlfilter_torch.core.communicator import Communicator
 from nlfilter_torch.core.kernels.grams import compute_grams
 from nlfilter_torch.core.matrix_function import SymmetricMatrix
+from nlfilter_torch.operator.options import Landmarks
 
 # Amount by which eigenvalues may exceed 1 through rounding and inexact row sums; r exceeds 1 by less.
 SLACK = {torch.float32: 3e-5, torch.float64: 1e-9}
@@ -27,13 +28,14 @@ ALWAYS = 1 << 22  # elements of a factor; up to this size the bound takes a few 
 ShiftedGram = Callable[[Tensor, int], Tensor]
 
 
-def is_bounded(sampling: str, pixels: int, num_landmarks: int) -> bool:
+def is_bounded(landmarks: Landmarks, pixels: int, num_landmarks: int) -> bool:
     """Whether the eigenvalues of an operator are checked against 1 when it is built.
 
     They are not for large images with k-means landmarks: among thousands of such operators, of photographs and of
     adversarial images, no eigenvalue exceeded 1, and the check would add a third to the time of building one.
+    Landmarks that are held or passed may lie anywhere.
     """
-    return sampling != "kmeans" or pixels * num_landmarks <= ALWAYS
+    return not isinstance(landmarks, str) or landmarks != "kmeans" or pixels * num_landmarks <= ALWAYS
 
 
 def shifted_gram(factor: Tensor, scaling: Tensor, remainder: Tensor, communicator: Communicator) -> ShiftedGram:

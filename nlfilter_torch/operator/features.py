@@ -112,11 +112,8 @@ class GuideFeatures:
         """
         guide = reduce_channels(guide.to(self.patch_weights.dtype), self.guide_channels)
         batch, channels, height, width = guide.shape
-        weights = self.patch_weights.to(guide).div(channels)
-        # The derivative of the root is infinite at 0, but that of squared distances is not.
-        weights = weights + FAINT_WEIGHT * (weights == 0).to(weights)
-        scale = weights.sqrt() / per_image(self.photometric_bandwidth, guide, 3)
-        padded = pad_border(guide, weights.shape[0] // 2)
+        scale = self._patch_scale(channels, guide)
+        padded = pad_border(guide, scale.shape[-1] // 2)
         # Halo rows replace reflected ones; a halo shorter than the margin ends at the border of the image.
         padded = padded[..., halo[0] : padded.shape[-2] - halo[1], :]
         features: Tensor = (
@@ -131,6 +128,24 @@ class GuideFeatures:
         columns = origin[1] + stride * torch.arange(width, dtype=guide.dtype, device=guide.device)
         grid = torch.stack(torch.meshgrid(rows, columns, indexing="ij")).flatten(1)  # (2, N)
         return torch.cat([features, self.coordinates(grid).expand(batch, -1, -1)], dim=1)
+
+    def _patch_scale(self, channels: int, like: Tensor) -> Tensor:
+        """Factors (1 or B, p, p) by which the pixels of a patch are multiplied, in the format of ``like``."""
+        weights = self.patch_weights.to(like).div(channels)
+        # The derivative of the root is infinite at 0, but that of squared distances is not.
+        weights = weights + FAINT_WEIGHT * (weights == 0).to(weights)
+        return weights.sqrt() / per_image(self.photometric_bandwidth, like, 3)
+
+    def scales(self, like: Tensor) -> Tensor:
+        """Factors (1 or B, D, 1) from pixels and coordinates to features like those of ``like``, (B, D, n)."""
+        located = self.spatial_bandwidth is not None
+        channels = max((like.shape[1] - 2 * located) // self.patch_weights.numel(), 1)
+        patch = self._patch_scale(channels, like).flatten(1).repeat(1, channels).unsqueeze(2)
+        if not located:
+            return patch
+        places = self.coordinates(like.new_ones(2, 1))
+        batch = max(patch.shape[0], places.shape[0])
+        return torch.cat([patch.expand(batch, -1, -1), places.expand(batch, -1, -1)], dim=1)
 
     def coordinates(self, places: Tensor) -> Tensor:
         """Features (1 or B, 2, N) of rows and columns (2, N) of pixels; there must be a spatial bandwidth."""

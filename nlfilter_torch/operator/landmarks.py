@@ -11,6 +11,7 @@ from nlfilter_torch.core.blocks import stratified
 from nlfilter_torch.core.communicator import ALONE, Communicator
 from nlfilter_torch.core.kernels.clusters import affinities_between, chance, draw_pivots, lloyd, pick, pivots
 from nlfilter_torch.core.torch_internals import register
+from nlfilter_torch.operator.assignment import Assignment
 from nlfilter_torch.operator.options import Sampling
 
 CAPTURED = 1e-4  # a point whose residual on the unit diagonal is below this counts as captured
@@ -42,7 +43,20 @@ def choose_landmarks(
     communicator: Communicator = ALONE,
     weights: Tensor | None = None,
 ) -> Tensor:
-    """Choose or compute ``count`` landmarks.
+    """The landmarks (B, D, M) of :func:`assign_landmarks`."""
+    return assign_landmarks(features, size, count, sampling, generator, communicator, weights)[0]
+
+
+def assign_landmarks(
+    features: Tensor,
+    size: tuple[int, int],
+    count: int,
+    sampling: Sampling,
+    generator: torch.Generator | None,
+    communicator: Communicator = ALONE,
+    weights: Tensor | None = None,
+) -> tuple[Tensor, Assignment]:
+    """Choose or compute ``count`` landmarks; also return of which points they are made.
 
     Args:
         features: (B, D, N) with N = H * W.
@@ -56,19 +70,38 @@ def choose_landmarks(
         weights: (B, N), number of pixels that each point represents; k-means candidates are drawn in proportion to it.
 
     Returns:
-        (B, D, M), differentiable in the features (for k-means with the assignment held fixed). The same pixels are
-        drawn for all images of a batch, so that a batch without weights gives the same results as single calls.
+        (B, D, M), differentiable in the features (for k-means with the assignment held fixed), and the assignment. The
+        same pixels are drawn for all images of a batch, so that a batch without weights gives the same results as
+        single calls.
     """
     generator = torch.Generator().manual_seed(0) if generator is None else generator
+    points = size[0] * size[1]
     if count == features.shape[-1] and communicator.size == 1:
-        return features.clone()
+        return features.clone(), Assignment(torch.arange(points, device=features.device)[None], None, None, points)
     pixels = (
         _candidates_by_weight(weights.mean(0), count, generator)
         if weights is not None and sampling == "kmeans"
         else candidate_pixels(size, count, sampling, generator)
     )
     pixels = communicator.broadcast(pixels.to(features.device))
-    return condense(communicator.columns(features, pixels), count, generator, communicator)
+    subset = communicator.columns(features, pixels)
+    if len(pixels) == count:
+        return subset, Assignment(pixels[None], None, None, points)
+    start, assignment = clusters(subset.detach(), count, generator, communicator)
+    return means_of_clusters(subset, start, assignment), Assignment(pixels[None], assignment, start, points)
+
+
+def landmarks_of(features: Tensor, assignment: Assignment, communicator: Communicator = ALONE) -> Tensor:
+    """Landmarks (B, D, M) of features (B, D, N) by an assignment that was made before; differentiable in the features.
+
+    Equal to those of :func:`assign_landmarks`, if that returned the assignment for the same features.
+    """
+    assignment, batch = assignment.on(features.device), features.shape[0]
+    subset = communicator.columns(features, assignment.candidates.unsqueeze(1))
+    if assignment.clusters is None or assignment.start is None:
+        return subset
+    start, members = (tensor.expand(batch, *tensor.shape[1:]) for tensor in (assignment.start, assignment.clusters))
+    return means_of_clusters(subset, start, members)
 
 
 def candidate_pixels(size: tuple[int, int], count: int, sampling: Sampling, generator: torch.Generator) -> Tensor:
@@ -256,9 +289,12 @@ def choose(features: Tensor, size: Sequence[int], count: int, sampling: Sampling
     return pixels, start, assignment
 
 
-def choose_in_graph(features: Tensor, size: tuple[int, int], count: int, sampling: Sampling) -> Tensor:
-    """:func:`choose_landmarks` in a form that can be compiled; chooses the same landmarks as without a generator."""
+def choose_in_graph(
+    features: Tensor, size: tuple[int, int], count: int, sampling: Sampling
+) -> tuple[Tensor, Assignment]:
+    """:func:`assign_landmarks` in a form that can be compiled; chooses the same landmarks as without a generator."""
     # Nothing here depends on the size of the image, so that a program serves for all sizes.
-    pixels, start, assignment = choose(features.detach(), size, count, sampling)
-    subset = ALONE.columns(features, pixels)
-    return means_of_clusters(subset, start, assignment) if sampling == "kmeans" else subset
+    pixels, start, clusters = choose(features.detach(), size, count, sampling)
+    means = sampling == "kmeans"
+    assignment = Assignment(pixels[None], clusters if means else None, start if means else None, features.shape[2])
+    return landmarks_of(features, assignment), assignment

@@ -20,6 +20,7 @@ from nlfilter_torch.core.containers import Batch, loadable
 from nlfilter_torch.core.kernels.tall_skinny import moment
 from nlfilter_torch.core.layouts import in_format_of
 from nlfilter_torch.core.precision import full_precision, uncompiled
+from nlfilter_torch.operator.assignment import Assignment
 from nlfilter_torch.operator.eigenvalue_bound import largest_eigenvalue, shifted_gram
 from nlfilter_torch.operator.features import GuideFeatures
 from nlfilter_torch.operator.nystrom import nystrom_factor
@@ -41,6 +42,7 @@ class Kernel:
         completion: ``"diagonal"`` or ``"none"``.
         limiter: (B, M, M) matrix by which the factor is multiplied so that no eigenvalue of W exceeds 1, or None.
         features: computes features of a guide; None if the operator was made from features.
+        assignment: of which points the landmarks are made; None if they were passed as features.
     """
 
     landmarks: Tensor
@@ -48,6 +50,7 @@ class Kernel:
     completion: Completion
     limiter: Tensor | None = None
     features: GuideFeatures | None = None
+    assignment: Assignment | None = None
 
     @property
     def recipe(self) -> GuideFeatures:
@@ -175,6 +178,19 @@ class NonlocalOperator(Batch):
         )
 
     @property
+    def landmarks(self) -> Tensor:
+        """Features of the landmarks (B, D, M), which ``landmarks=`` of another operator takes; differentiable.
+
+        They are divided by the bandwidths of this operator, like the features of :func:`operator_from_features`.
+        """
+        return self.kernel.landmarks
+
+    @property
+    def assignment(self) -> Assignment | None:
+        """Of which pixels the landmarks are made; None if they were passed as features."""
+        return self.kernel.assignment
+
+    @property
     def shape(self) -> torch.Size:
         """Shape (B, N, N) of the matrices W; :attr:`size` is that of the images."""
         images, _, pixels = self.factor.shape
@@ -182,15 +198,21 @@ class NonlocalOperator(Batch):
 
     @classmethod
     def alike(cls, batches: Sequence[Self]) -> Sequence[Self]:
-        """The operators, with weights and a limiter if one of them has these, and equally many rounds of balancing."""
+        """The operators, with weights and a limiter if one of them has these, and equally many rounds of balancing.
+
+        Without an assignment if theirs cannot be joined, so that the landmarks are kept as features.
+        """
         weighted = any(operator.weights is not None for operator in batches)
         limited = any(operator.kernel.limiter is not None for operator in batches)
         rounds = max(len(operator.balancing.before) for operator in batches)
-        return [operator._explicit(weighted, limited, rounds) for operator in batches]
+        assigned = len({operator.assignment and operator.assignment.kind for operator in batches}) == 1
+        return [operator._explicit(weighted, limited, rounds, assigned) for operator in batches]
 
-    def _explicit(self, weighted: bool, limited: bool, rounds: int) -> Self:
+    def _explicit(self, weighted: bool, limited: bool, rounds: int, assigned: bool) -> Self:
         """The same operator, with fields of neutral values where they are missing."""
         kernel, balancing, weights = self.kernel, self.balancing, self.weights
+        if not assigned:
+            kernel = replace(kernel, assignment=None)
         if limited and kernel.limiter is None:
             identity = torch.eye(self.factor.shape[1], dtype=self.dtype, device=self.device)
             kernel = replace(kernel, limiter=identity.expand(len(self), -1, -1))
@@ -373,4 +395,4 @@ class NonlocalOperator(Batch):
         )
 
 
-loadable(NonlocalOperator, Kernel, GuideFeatures, PixelScaling, Communicator, Columns)
+loadable(NonlocalOperator, Kernel, Assignment, GuideFeatures, PixelScaling, Communicator, Columns)

@@ -6,26 +6,60 @@ from torch import Tensor
 from nlfilter_torch.core.checks import (
     check_choice,
     check_count,
+    check_features,
     check_instance,
     check_number,
     check_positive,
     described,
 )
 from nlfilter_torch.core.warning import warn
-from nlfilter_torch.operator.options import Construction, OperatorOptions, SpatialBandwidth, bandwidths_of
+from nlfilter_torch.operator.assignment import Assignment
+from nlfilter_torch.operator.options import (
+    Construction,
+    HasLandmarks,
+    Landmarks,
+    OperatorOptions,
+    SpatialBandwidth,
+    bandwidths_of,
+)
+
+SAMPLINGS = (
+    "choose one of these, or pass features (B, D, M) or an operator, and pass the number of landmarks as num_landmarks"
+)
 
 
 def check_construction(options: Construction) -> None:
     """Raise an error for an invalid option."""
-    remedy = "choose one of these, and pass the number of landmarks as num_landmarks"
-    check_choice(options.landmarks, "landmarks", ("kmeans", "uniform", "random"), remedy)
-    check_choice(options.completion, "completion", ("diagonal", "none"))
     check_count(options.num_landmarks, "num_landmarks")
+    check_landmarks(options.landmarks, options.num_landmarks)
+    check_choice(options.completion, "completion", ("diagonal", "none"))
     if options.tolerance is not None:
         check_number(options.tolerance, "tolerance", "pass a float or None")
         check_positive(options.tolerance, "tolerance")
     if options.generator is not None:
         check_instance(options.generator, torch.Generator, "generator", "create one with torch.Generator()")
+
+
+def check_landmarks(landmarks: Landmarks, num_landmarks: int) -> None:
+    """Raise unless this is a name of a sampling, or landmarks whose number does not contradict ``num_landmarks``."""
+    if not isinstance(landmarks, Tensor | Assignment | HasLandmarks):
+        check_choice(landmarks, "landmarks", ("kmeans", "uniform", "random"), SAMPLINGS)
+        return
+    if isinstance(landmarks, Tensor):
+        check_features(landmarks, "landmarks")
+    count = count_of(landmarks)
+    if num_landmarks not in (count, Construction.num_landmarks):
+        raise ValueError(
+            f"num_landmarks must be the number of the landmarks that are passed, {count}, got "
+            f"{described(num_landmarks)}; leave it out"
+        )
+
+
+def count_of(landmarks: Tensor | Assignment | HasLandmarks) -> int:
+    """M."""
+    if isinstance(landmarks, Assignment):
+        return landmarks.num_landmarks
+    return (landmarks if isinstance(landmarks, Tensor) else landmarks.landmarks).shape[2]
 
 
 def check_options(options: OperatorOptions) -> None:
@@ -53,7 +87,9 @@ def check_bandwidths(
 
 
 def landmark_count(options: Construction, points: int) -> int:
-    """Number of landmarks, reduced with a warning where there are fewer points."""
+    """Number of landmarks, reduced with a warning where there are fewer points to choose from."""
+    if not isinstance(options.landmarks, str):
+        return count_of(options.landmarks)
     if options.num_landmarks > points:
         got = described(options.num_landmarks)
         warn(f"num_landmarks must be at most the number of pixels, {points}, got {got}; using every pixel")

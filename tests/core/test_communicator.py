@@ -120,6 +120,16 @@ def options(rows: slice, group: Any, dtype: torch.dtype) -> Results:
         assert own.grad is not None
         result[f"rows gradient {name}"] = own.grad
         result[f"bandwidth {name}"] = torch.as_tensor(operator.kernel.recipe.photometric_bandwidth)
+        if name == "auto":
+            own = own.detach().requires_grad_()
+            held = nonlocal_operator(own, photometric_bandwidth=0.2, landmarks=operator, group=group)
+            (held @ own).square().sum().backward()
+            result["landmarks"], result["rows gradient held"] = held.landmarks, own.grad
+            points = operator.landmarks.detach()[:1].requires_grad_()
+            passed = nonlocal_operator(own.detach(), photometric_bandwidth=0.2, landmarks=points, group=group)
+            (passed @ own.detach()).square().sum().backward()
+            assert points.grad is not None
+            result["gradient landmarks"] = points.grad
     return {name: value.detach() for name, value in result.items()}
 
 

@@ -16,7 +16,15 @@ from nlfilter_torch.nn.parameters import check_learn
 from nlfilter_torch.operator.build import operator_from_guide
 from nlfilter_torch.operator.features import reduce_channels
 from nlfilter_torch.operator.operator import NonlocalOperator
-from nlfilter_torch.operator.options import AUTO, Completion, GuideChannels, OperatorOptions, Sampling, SpatialBandwidth
+from nlfilter_torch.operator.options import (
+    AUTO,
+    SAMPLING,
+    Completion,
+    GuideChannels,
+    OperatorOptions,
+    Sampling,
+    SpatialBandwidth,
+)
 from nlfilter_torch.photo.declared.shading import LANDMARKS, LEVELS, NEAR
 from nlfilter_torch.photo.looks.histogram import KINDS, STRENGTHS
 from nlfilter_torch.photo.looks.look_filter import BLURS, NAMES, acts, check_part, filter_look
@@ -75,7 +83,7 @@ class Look(nn.Module):
         photometric_bandwidth: float | Tensor | Literal["auto"] = LEVELS / 255,
         spatial_bandwidth: SpatialBandwidth | Literal["auto"] | None = AUTO,
         num_landmarks: int = LANDMARKS,
-        landmarks: Sampling = OperatorOptions.landmarks,
+        landmarks: Sampling = SAMPLING,
         completion: Completion = OperatorOptions.completion,
         guide_channels: GuideChannels = OperatorOptions.guide_channels,
         patch_weights: Tensor | None = OperatorOptions.patch_weights,
