@@ -2,14 +2,23 @@
 
 import math
 from collections.abc import Sequence
-from functools import partial
 
 import torch
 from torch import Tensor
 
 from nlfilter_torch.core.blocks import stratified
 from nlfilter_torch.core.communicator import ALONE, Communicator
-from nlfilter_torch.core.kernels.clusters import affinities_between, chance, draw_pivots, lloyd, pick, pivots
+from nlfilter_torch.core.kernels.clusters import (
+    TRIALS,
+    UNCOVERED,
+    PivotSampler,
+    affinities,
+    lloyd,
+    odds,
+    pick,
+    pivots,
+    squared_distances,
+)
 from nlfilter_torch.core.torch_internals import register
 from nlfilter_torch.operator.assignment import Assignment
 from nlfilter_torch.operator.options import Sampling
@@ -189,14 +198,16 @@ def _grid(size: tuple[int, int], count: int) -> Tensor:
 def _pivots(points: Tensor, count: int, generator: torch.Generator) -> Tensor:
     """Choose initial centroids (B, count) among points (B, D, S): pivots of a randomly pivoted Cholesky decomposition.
 
-    Each pivot is drawn in proportion to the fourth power of the residual: the part of the kernel's unit diagonal that
+    Pivots are proposed in proportion to the fourth power of the residual: the part of the kernel's unit diagonal that
     the earlier pivots do not capture (Chen, Epperly, Tropp and Webber, 2022). Rare patches that are unlike all others
     thus get a landmark; uniform sampling would miss them, and k-means would never move a centroid there. The fourth
     power is greedier than the residual itself: at h_y = 40/255 the error of W y on the small astronaut of
     benchmarks.accuracy is 0.55 grey levels with it, 0.79 with the first power, and 0.71 if k-means starts from
-    arbitrary candidates.
+    arbitrary candidates. Half of the proposals depend on the distance from the nearest pivot too, so that clusters
+    wider than the bandwidth are not missed, and of several proposals the one that covers most is taken: on six
+    photographs, at bandwidths of 5 to 40 grey levels, this lowers the error of W y by another 3 %.
     """
-    draws = torch.rand(count, generator=generator, device=generator.device, dtype=torch.float64).to(points)
+    draws = pivot_draws(count, generator).to(points)
     if count > DRAWN_SINGLY:
         offsets = torch.rand(count, generator=generator, device=generator.device, dtype=torch.float64).to(points.device)
         images = points.split(1) if points.device.type == "cpu" else [points]  # on CPUs one image at a time
@@ -204,43 +215,45 @@ def _pivots(points: Tensor, count: int, generator: torch.Generator) -> Tensor:
     return pivots(points, draws, CAPTURED)
 
 
+def pivot_draws(count: int, generator: torch.Generator) -> Tensor:
+    """Random numbers (count, TRIALS) in [0, 1) that decide the pivots, in float64."""
+    return torch.rand(count, TRIALS, generator=generator, device=generator.device, dtype=torch.float64)
+
+
 def _pivots_by_blocks(points: Tensor, draws: Tensor, offsets: Tensor) -> Tensor:
     """Choose pivots as in :func:`_pivots`, but a block at a time, so that nearly all of the work is matrix products.
 
-    Within a block, pivots are drawn one by one from a systematic sample of proposals. Half of the proposals are drawn
-    in proportion to the fourth power of the residual before the block, the other half uniformly, since a few points may
-    hold all of the residual. In the draw, weights are divided by the probability of the proposal.
+    Within a block, pivots are drawn from a systematic sample of candidates. A third of these are drawn by each of the
+    two :func:`odds` before the block, the others uniformly, since a few points may hold all of the residual. In the
+    draw, weights are divided by the probability of the candidate.
     """
     batch, _, size = points.shape
     norms = points.square().sum(1, keepdim=True)  # (B, 1, S)
-    residual = torch.ones_like(norms)
+    residual, nearest = torch.ones_like(norms), torch.full_like(norms, UNCOVERED)
     columns = points.new_empty(batch, len(draws), size)
     drawn: list[Tensor] = []
     for block, offset in zip(draws.split(BLOCK), offsets, strict=False):
         first = sum(pivot.shape[2] for pivot in drawn)
         before = columns[:, :first]
-        odds = chance(residual, CAPTURED)
-        odds += odds.mean(2, keepdim=True)
-        summed = odds.cumsum(2, dtype=torch.float64)
+        shares = odds(residual, nearest, CAPTURED)
+        shares = (shares / shares.mean(2, keepdim=True)).sum(1, keepdim=True) + 1.0
+        summed = shares.cumsum(2, dtype=torch.float64)
         ticks = (torch.arange(PROPOSED * len(block), device=points.device) + offset) / (PROPOSED * len(block))
         proposed = torch.searchsorted(summed, summed[:, :, -1:] * ticks).clamp_(max=size - 1)  # (B, 1, P)
         few, lengths, known = (pick(planes, proposed) for planes in (points, norms, before))
-        shared = torch.baddbmm(affinities_between(few, lengths, few, lengths), known.mT, known, alpha=-1)  # (B, P, P)
-        chosen, rows, scales = draw_pivots(
-            partial(_row, shared), pick(residual, proposed), pick(odds, proposed), block, CAPTURED
-        )
+        shared = affinities(squared_distances(few, lengths, few, lengths))
+        shared = torch.baddbmm(shared, known.mT, known, alpha=-1)  # (B, P, P)
+        sampler = PivotSampler(few, lengths, pick(shares, proposed), CAPTURED, shared)
+        chosen, rows, scales = sampler.draw(pick(residual, proposed), pick(nearest, proposed), block)
         drawn.append(proposed.gather(2, chosen))  # (B, 1, n)
         few, lengths, known = (pick(planes, chosen) for planes in (few, lengths, known))
-        rest = torch.baddbmm(affinities_between(points, norms, few, lengths), known.mT, before, alpha=-1)  # (B, n, S)
+        apart = squared_distances(points, norms, few, lengths)  # (B, n, S)
+        nearest = torch.minimum(nearest, apart.amin(1, keepdim=True))
+        rest = torch.baddbmm(affinities(apart), known.mT, before, alpha=-1)
         lower = pick(rows, chosen).mT.tril(-1) + torch.diag_embed(scales)
         columns[:, first : first + len(block)] = torch.linalg.solve_triangular(lower, rest, upper=False)
         residual -= columns[:, first : first + len(block)].square().sum(1, keepdim=True)
     return torch.cat(drawn, dim=2).squeeze(1)
-
-
-def _row(matrices: Tensor, pivot: Tensor) -> Tensor:
-    """Row (B, 1, S) with index ``pivot`` (B, 1, 1) of symmetric matrices (B, S, S)."""
-    return pick(matrices, pivot).mT
 
 
 def means_of_clusters(subset: Tensor, start: Tensor, assignment: Tensor) -> Tensor:

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
 
-from nlfilter_torch.core.kernels.clusters import chance, pick
+from nlfilter_torch.core.kernels.clusters import UNCOVERED, best_trial, odds, pick
 from nlfilter_torch.core.kernels.columns import PLAIN_EXPONENT, SMALLEST_EXPONENT
 from nlfilter_torch.core.torch_internals import outside_modes
 from nlfilter_torch.operator.landmarks import (
@@ -25,6 +25,7 @@ from nlfilter_torch.operator.landmarks import (
     TIE,
     candidate_pixels,
     draw_few,
+    pivot_draws,
 )
 from nlfilter_torch.operator.nystrom import JITTER
 from nlfilter_torch.operator.options import Sampling
@@ -50,7 +51,7 @@ def choose(features: Tensor, size: Sequence[int], count: int, sampling: Sampling
         generator = torch.Generator().manual_seed(0)
         drawn = candidate_pixels((size[0], size[1]), count, sampling, generator)
         few = draw_few(len(drawn), count, generator)
-        draws = torch.rand(count, generator=generator, dtype=torch.float64).float()
+        draws = pivot_draws(count, generator).float()
     pixels, first = (torch.tensor(constant.tolist(), device=features.device) for constant in (drawn, few))
     batch = features.shape[0]
     if len(pixels) == count:
@@ -68,24 +69,36 @@ def choose(features: Tensor, size: Sequence[int], count: int, sampling: Sampling
     return pixels, start, _lloyd(points, pick(points, start))
 
 
-def _pivots(points: Tensor, draws: list[float]) -> Tensor:
+def _pivots(points: Tensor, draws: list[list[float]]) -> Tensor:
     """As :func:`nlfilter_torch.core.kernels.clusters.pivots`."""
-    size, last = points.shape[1], points.shape[2] - 1
+    last = points.shape[2] - 1
     norms = points.square().sum(1, keepdim=True)
-    rows, residual = points[:, :0], torch.ones_like(norms)
+    rows, residual, nearest = points[:, :0], torch.ones_like(norms), torch.full_like(norms, UNCOVERED)
+    known = torch.cat([points, norms], dim=1)
     chosen: list[Tensor] = []
-    for draw in draws:
-        summed = chance(residual, CAPTURED).double().cumsum(2)
-        pivot = (summed < draw * summed[:, :, -1:]).sum(2, keepdim=True).clamp(max=last)
-        known = torch.cat([points, norms, rows], dim=1)
-        point, norm, before = pick(known, pivot).split([size, 1, len(chosen)], dim=1)
-        affinities = (2 * torch.bmm(point.mT, points) - norms - norm).clamp(PLAIN_EXPONENT, 0.0).exp()
-        row = affinities - torch.bmm(before.mT, rows) if chosen else affinities
+    for numbers in draws:
+        pivot, apart = _pivot(known, residual, nearest, numbers, last)
+        row = apart.clamp(max=-PLAIN_EXPONENT).neg().exp()
+        row = row - torch.bmm(pick(rows, pivot).mT, rows) if chosen else row
         row = row / row.gather(2, pivot).clamp(min=CAPTURED).sqrt()
         residual = residual - row.square()
+        nearest = torch.minimum(nearest, apart).scatter(2, pivot, 0.0)
         rows = torch.cat([rows, row], dim=1)
         chosen.append(pivot)
     return torch.cat(chosen, dim=2).squeeze(1)
+
+
+def _pivot(known: Tensor, residual: Tensor, nearest: Tensor, numbers: list[float], last: int) -> tuple[Tensor, Tensor]:
+    """A pivot (B, 1, 1) and the squared distances (B, 1, S) from it of points and their squared norms (B, D + 1, S)."""
+    rows = odds(residual, nearest, CAPTURED).double().cumsum(2).unbind(1)
+    half = len(numbers) // 2
+    draws = [(rows[position // half], number) for position, number in enumerate(numbers)]
+    proposed = torch.stack([(row < number * row[:, -1:]).sum(1).clamp(max=last) for row, number in draws], dim=1)
+    others = pick(known, proposed.unsqueeze(1))  # (B, D + 1, TRIALS)
+    inner = torch.bmm(others[:, :-1].mT, known[:, :-1])
+    apart = (known[:, -1:] + others[:, -1:].mT - 2 * inner).clamp(min=0.0)
+    best = best_trial(apart, nearest, torch.ones_like(nearest))
+    return proposed.unsqueeze(1).gather(2, best), pick(apart.mT, best).mT
 
 
 def _lloyd(points: Tensor, start: Tensor) -> Tensor:

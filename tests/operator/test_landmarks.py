@@ -146,6 +146,18 @@ def test_starts_drawn_in_blocks_are_about_as_good_as_those_drawn_singly(
     assert (in_blocks < 1.25 * residual()).all()
 
 
+@pytest.mark.parametrize("marks", [64, 100, 300])
+@pytest.mark.parametrize("spread", [0.05, 0.1, 0.15])
+def test_no_cluster_is_missed(marks: int, spread: float) -> None:
+    generator = seeded(1)
+    centres = torch.randn(60, 64, generator=generator)
+    members = torch.randint(60, (4096,), generator=generator)
+    x = (centres[members] + spread * torch.randn(4096, 64, generator=generator)).mT.unsqueeze(0)
+    landmarks = choose_landmarks(x, (1, 4096), marks, "kmeans", None)
+    apart = torch.cdist(centres, landmarks[0].mT).amin(1)
+    assert apart.max() < 8 * spread / 2 + 0.1  # of clusters whose radius is 8 spreads, and which are 11 apart
+
+
 def test_starts_drawn_in_blocks_do_not_depend_on_the_batch() -> None:
     x = cloud(2, 1000)
     alone = torch.cat([_pivots(image, 300, seeded()) for image in x.split(1)])

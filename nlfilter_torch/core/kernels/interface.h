@@ -6,6 +6,13 @@
 
 #pragma once
 
+/* Of the choice of pivots; as in clusters.py. */
+#define TRIALS 6          /* points proposed for a pivot */
+#define COVERED 4.0f      /* squared distance from the nearest pivot at which a point counts as half covered */
+#define UNCOVERED 1e16f   /* squared distance before there is a pivot, and the largest that counts */
+#define DISTINCT 1e-6f    /* added to squared distances, so that there are probabilities where all points are equal */
+#define NEARLY 1e-5       /* proposals whose coverage differs by less than this share are equally good */
+
 /* The best instruction set that this processor supports, as an index of SETS; 0 for none. */
 int nlfilter_level(void);
 
@@ -52,7 +59,7 @@ int nlfilter_grams(int level, int threads, long pixels, long images, long num_la
 int nlfilter_lloyd(int level, int threads, long images, long size, long count, long num_landmarks, long iterations,
                    float margin, const float *points, const float *start, int *nearest);
 
-/* Pivots (B, M) of randomly pivoted Cholesky decompositions. */
+/* Pivots (B, M) of randomly pivoted Cholesky decompositions, each the best of TRIALS proposals. */
 int nlfilter_pivots(int level, int threads, long images, long size, long count, long num_landmarks, float captured,
                     const float *points, const float *draws, long *pivots);
 

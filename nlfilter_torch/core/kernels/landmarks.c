@@ -45,10 +45,13 @@ int nlfilter_lloyd(int level, int threads, long images, long size, long count, l
     return run_pieces(&work, threads);
 }
 
+/* Rows of S floats of the scratch memory before the points; LINE sums of blocks fit in the last one. */
+static long pivot_rows(long num_landmarks) { return num_landmarks + TRIALS + 6; }
+
 static void run_pivots(struct work *work, long image, long piece, long first, long last, float *scratch)
 {
     const struct pivots *task = work->task;
-    float *points = scratch + (task->num_landmarks + 2) * task->count; /* rows padded to a multiple of LINE */
+    float *points = scratch + pivot_rows(task->num_landmarks) * task->count; /* rows padded to a multiple of LINE */
     (void)piece, (void)first, (void)last;
     for (long k = 0; k < task->size; k++) {
         const float *row = task->points + (image * task->size + k) * task->used;
@@ -64,6 +67,6 @@ int nlfilter_pivots(int level, int threads, long images, long size, long count, 
     const long whole = padded(count, LINE);
     struct pivots task = {points, draws, pivots, size, count, whole, num_landmarks, captured};
     struct work work = {.run = run_pivots, .task = &task, .level = level, .images = images, .pixels = 1, .length = 1,
-                        .pieces = 1, .floats = (num_landmarks + 2 + size) * whole};
+                        .pieces = 1, .floats = (pivot_rows(num_landmarks) + size) * whole};
     return run_pieces(&work, threads);
 }

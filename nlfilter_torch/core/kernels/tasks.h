@@ -70,7 +70,7 @@ struct grams {
 };
 
 struct pivots {
-    const float *points, *draws; /* (B, D, S), (M) */
+    const float *points, *draws; /* (B, D, S), (M, TRIALS) */
     long *pivots;                /* (B, M) */
     long size, used, count, num_landmarks; /* used = S; count = S padded to a multiple of LINE */
     float captured;

@@ -175,11 +175,11 @@ static void check_products(int level, int threads)
 
 static void check_landmarks(int level, int threads)
 {
-    static float samples[B][D][S], start[B][D][M], draws[M];
+    static float samples[B][D][S], start[B][D][M], draws[M][TRIALS];
     static int nearest[B][S];
     static long pivots[B][M];
     fill(samples[0][0], sizeof samples, -1, 1);
-    fill(draws, sizeof draws, 0, 1);
+    fill(draws[0], sizeof draws, 0, 1);
     for (int b = 0; b < B; b++)
         for (int k = 0; k < D; k++)
             memcpy(start[b][k], samples[b][k], M * sizeof(float));
@@ -197,26 +197,40 @@ static void check_landmarks(int level, int threads)
             compare(chosen, least);
         }
     judge("lloyd", status, 1e-5);
-    status = nlfilter_pivots(level, threads, B, D, S, M, 1e-6f, samples[0][0], draws, pivots[0]);
+    status = nlfilter_pivots(level, threads, B, D, S, M, 1e-6f, samples[0][0], draws[0], pivots[0]);
     for (int b = 0; b < B; b++) {
-        static double column[M][S], residual[S];
-        for (int i = 0; i < S; i++)
+        static double column[M][S], residual[S], nearest_pivot[S];
+        for (int i = 0; i < S; i++) {
             residual[i] = 1;
+            nearest_pivot[i] = UNCOVERED;
+        }
         for (int m = 0; m < M; m++) {
-            double whole = 0, before = 0;
             const long pivot = pivots[b][m];
-            for (int i = 0; i < S; i++) {
-                whole += pow(fmax(residual[i], 1e-6), 4);
-                before += i < pivot ? pow(fmax(residual[i], 1e-6), 4) : 0;
+            double apart = INFINITY, at = 0, reached = 0; /* of the proposal whose share is nearest to its draw */
+            for (int t = 0; t < TRIALS; t++) {
+                double whole = 0, before = 0, own = 0;
+                for (int i = 0; i < S; i++) {
+                    own = pow(fmax(residual[i], 1e-6), 4);
+                    own *= t < TRIALS / 2 ? pow(nearest_pivot[i] + DISTINCT, 2) : 1;
+                    whole += own;
+                    before += i <= pivot ? own : 0;
+                }
+                own = pow(fmax(residual[pivot], 1e-6), 4) * (t < TRIALS / 2 ? pow(nearest_pivot[pivot] + DISTINCT, 2) : 1);
+                const double tick = draws[m][t], end = fmin(fmax(tick, (before - own) / whole), before / whole);
+                if (fabs(end - tick) < apart) {
+                    apart = fabs(end - tick);
+                    at = tick;
+                    reached = end;
+                }
             }
-            const double through = before + pow(fmax(residual[pivot], 1e-6), 4), at = draws[m] * whole;
-            compare(fmin(fmax(at, before), through) / whole, at / whole); /* the draw is within the share of the pivot */
+            compare(reached, at); /* the draw is within the share of the pivot */
             const double root = sqrt(fmax(residual[pivot], 1e-6));
             for (int i = 0; i < S; i++) {
                 double distance = 0;
                 for (int k = 0; k < D; k++)
                     distance += pow(samples[b][k][i] - samples[b][k][pivot], 2);
                 column[m][i] = exp(-distance);
+                nearest_pivot[i] = fmin(nearest_pivot[i], distance);
                 for (int j = 0; j < m; j++)
                     column[m][i] -= column[j][i] * column[j][pivot];
                 column[m][i] /= root;

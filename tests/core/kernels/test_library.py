@@ -13,7 +13,7 @@ from torch import Tensor
 
 from nlfilter_torch import nonlocal_operator
 from nlfilter_torch.core.kernels import columns, convolution, definitions_only, library, stencil  # noqa: F401, register
-from nlfilter_torch.core.kernels.clusters import lloyd, pivots  # noqa: F401, registers both
+from nlfilter_torch.core.kernels.clusters import TRIALS, lloyd, pivots  # noqa: F401, registers both
 from nlfilter_torch.core.kernels.grams import sum_grams
 from nlfilter_torch.core.kernels.tall_skinny import moment, spread
 from nlfilter_torch.operator import build  # noqa: F401, registers two
@@ -47,7 +47,7 @@ def arguments(dtype: torch.dtype) -> dict[str, tuple[Any, ...]]:
         "weigh": (factor, weights, vector),
         "grams": (factor, weights, weights, 2),
         "gram": (factor, weights),
-        "pivots": (features, torch.linspace(0.1, 0.9, LANDMARKS, dtype=dtype), 1e-4),
+        "pivots": (features, torch.linspace(0.1, 0.9, TRIALS * LANDMARKS, dtype=dtype).view(-1, TRIALS), 1e-4),
         "lloyd": (features, landmarks, 3, 1e-6),
         "invert": (factor @ factor.mT + torch.eye(LANDMARKS, dtype=dtype),),
         "choose": (features, [1, PIXELS], LANDMARKS, "kmeans"),
