@@ -12,6 +12,7 @@ from .filtering.fitted import fit_filter as fit_filter
 from .filtering.masks import diffusion_map as diffusion_map
 from .filtering.masks import diffusion_mask as diffusion_mask
 from .filtering.masks import segment_mask as segment_mask
+from .filtering.refine import refine as refine
 from .filtering.scribbles import propagate_strokes as propagate_strokes
 from .nn.affinity import NonlocalAffinity as NonlocalAffinity
 from .nn.denoiser.network import NonlocalDenoiser as NonlocalDenoiser
@@ -19,6 +20,7 @@ from .nn.denoiser.noise import estimate_noise as estimate_noise
 from .nn.masks import DiffusionMask as DiffusionMask
 from .nn.masks import SegmentMask as SegmentMask
 from .nn.portable import Portable as Portable
+from .nn.refine import Refine as Refine
 from .nn.sliders import NonlocalFilter as NonlocalFilter
 from .nn.sliders import PolynomialSliders as PolynomialSliders
 from .operator.build import nonlocal_operator as nonlocal_operator

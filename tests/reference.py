@@ -216,3 +216,20 @@ def captured_energy(v: Array, y: Array) -> float:
 def relative_rmse(v: Array, y: Array) -> float:
     """||y - V V^T y|| / ||y|| in per cent. Appendix B, Fig. 20."""
     return float(np.linalg.norm(y - v @ (v.T @ y)) / np.linalg.norm(y) * 100)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Refinement of probabilities, which is not in the paper
+
+
+def mean_field(w: Array, logits: Array, strength: float, steps: int) -> Array:
+    """Probabilities (n, K) after mean-field steps from logits (n, K): q <- softmax(logits + strength W q)."""
+
+    def softmax(values: Array) -> Array:
+        powers = np.exp(values - values.max(1, keepdims=True))
+        return powers / powers.sum(1, keepdims=True)
+
+    q = softmax(logits)
+    for _ in range(steps):
+        q = softmax(logits + strength * (w @ q))
+    return q

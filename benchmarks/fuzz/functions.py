@@ -92,6 +92,15 @@ LIST: dict[str, Kind] = {"alpha": lambda scene: [scene.rng.uniform(0, 4) for _ i
 RESIDUAL = {"residual": _plain(0.0, 2.0)}
 TIME = {"time": _number(0.1, 5.0)}
 WIDTH = {"width": _number(0.5, 8.0)}
+LOGITS: dict[str, Kind] = {"logits": _image(1, 2, 4)}
+REFINED: dict[str, Kind] = {
+    "steps": _count(1, 5),
+    "strength": _number(0, 10),
+    "margin": _number(0.5, 5),
+    "caution": _plain(0.05, 1),
+    "confidence": lambda scene: scene.mask(1),
+}
+AFFINITY_OF_GUIDE = {name: kind for name, kind in FILTER.items() if name != "completion"} | GUIDED
 ORDER: dict[str, Kind] = {"order": lambda scene: scene.order}
 
 
@@ -139,6 +148,11 @@ def _diffusion_module(spectrum: nlf.Spectrum, region: Tensor, **options: Any) ->
 
 def _segment_module(spectrum: nlf.Spectrum, regions: Tensor, **options: Any) -> Tensor:
     return nlf.SegmentMask(**options)(spectrum, regions)
+
+
+def _refine_module(logits: Tensor, guide: Tensor, **options: Any) -> Tensor:
+    confidence = options.pop("confidence", None)
+    return nlf.Refine(**options)(logits, guide, confidence)
 
 
 def _look(**options: Any) -> Tensor:
@@ -196,6 +210,7 @@ FUNCTIONS = {
     "diffusion_map": Function(nlf.diffusion_map, SPECTRUM | TIME, {}),
     "diffusion_mask": Function(nlf.diffusion_mask, SPECTRUM | REGION, TIME | WIDTH | NEGATIVE),
     "segment_mask": Function(nlf.segment_mask, SPECTRUM | REGIONS, TIME),
+    "refine": Function(nlf.refine, LOGITS | {"guide": _image(1, 3, 2)}, REFINED | AFFINITY_OF_GUIDE),
     "compose_alpha": Function(nlf.compose_alpha, {"masks": REGION["region"]} | ROWS, {}),
     "filter_regions": Function(nlf.filter_regions, OPERATOR | IMAGE | {"masks": REGION["region"]} | ROWS, RESIDUAL),
     "propagate_strokes": Function(
@@ -310,6 +325,12 @@ FUNCTIONS = {
     "PolynomialSliders": Function(_sliders, OPERATOR | IMAGE | LIST, RESIDUAL | {"learn": _one_of((), ("alpha",))}),
     "DiffusionMask": Function(
         _diffusion_module, SPECTRUM | REGION, NUMBERS | {"learn": _one_of((), ("time", "width"))}
+    ),
+    "Refine": Function(
+        _refine_module,
+        LOGITS | {"guide": _image(1, 3, 2)},
+        {name: kind for name, kind in (REFINED | AFFINITY_OF_GUIDE).items() if name != "generator"}
+        | {"strength": _plain(0.1, 10), "margin": _plain(0.5, 5), "learn": _one_of((), ("strength", "margin"))},
     ),
     "SegmentMask": Function(_segment_module, SPECTRUM | REGIONS, {"time": NUMBERS["time"]}),
 }

@@ -193,6 +193,8 @@ def of_masks(spectrum: nf.Spectrum, dtype: torch.dtype) -> Calls:
         "diffusion_mask": lambda: nf.diffusion_mask(spectrum, both),
         "diffusion_mask: gradients": lambda: with_gradients(mask, region, time, width),
         "segment_mask": lambda: nf.segment_mask(spectrum, both, time=2.0),
+        "refine": lambda: nf.refine(8 * both, image("astronaut", dtype), num_landmarks=40),
+        "refine: trimap": lambda: nf.refine(region + others / 2, image("astronaut", dtype), kind="trimap"),
         "propagate_strokes": lambda: with_gradients(spread, strokes, both.sum(1, keepdim=True)),
         "propagate_strokes: options": lambda: nf.propagate_strokes(
             spectrum, strokes, both.sum(1, keepdim=True), strength=0.6, reach=0.7, smoothness=0.4

@@ -21,7 +21,7 @@ def calls(dtype: torch.dtype) -> Calls:
     built = nf.nonlocal_operator(guide, **FEW)
     return (
         of_filters(photo, guide, built, dtype)
-        | of_masks(built.spectrum(), dtype)
+        | of_masks(built.spectrum(), photo, dtype)
         | of_looks(photo, dtype)
         | of_denoisers(photo, dtype)
     )
@@ -64,13 +64,15 @@ def of_filters(photo: Tensor, guide: Tensor, built: nf.NonlocalOperator, dtype: 
     }
 
 
-def of_masks(spectrum: nf.Spectrum, dtype: torch.dtype) -> Calls:
+def of_masks(spectrum: nf.Spectrum, photo: Tensor, dtype: torch.dtype) -> Calls:
     """Calls of masks."""
     region, others = box(3, 4, dtype), box(15, 22, dtype, 6)
     mask = nf.DiffusionMask(time=1.5, width=3.0, learn=("time", "width")).to(dtype)
     segments = nf.SegmentMask(time=2.0)
+    refined = nf.Refine(kind="mask", classes=2, learn=("strength", "margin", "compatibility")).to(dtype)
     return {
         "DiffusionMask": lambda: of_module(mask, lambda region: mask(spectrum, region, others), region),
+        "Refine": lambda: of_module(refined, lambda region: refined(region, photo, region), region),
         "SegmentMask": lambda: [repr(segments), segments(spectrum, torch.cat([region, others], dim=1))],
     }
 

@@ -49,6 +49,7 @@ OF_IMAGES: dict[str, Callable[[Any], object]] = {
     "fit_filter": lambda x: nf.fit_filter(BUILT, x),
     "diffusion_mask": lambda x: nf.diffusion_mask(SPECTRUM, x),
     "segment_mask": lambda x: nf.segment_mask(SPECTRUM, x),
+    "refine": lambda x: nf.refine(x, BUILT),
     "propagate_strokes": lambda x: nf.propagate_strokes(SPECTRUM, IMAGE, x),
     "filter_regions": lambda x: nf.filter_regions(BUILT, IMAGE, x, ONES[None]),
     "enhance": lambda x: nf.enhance(x, ONES, **FEW),

@@ -4,6 +4,7 @@ from nlfilter_torch.nn.affinity import NonlocalAffinity
 from nlfilter_torch.nn.denoiser.network import NonlocalDenoiser
 from nlfilter_torch.nn.masks import DiffusionMask, SegmentMask
 from nlfilter_torch.nn.portable import Portable
+from nlfilter_torch.nn.refine import Refine
 from nlfilter_torch.nn.sliders import NonlocalFilter, PolynomialSliders
 
 __all__ = [
@@ -13,5 +14,6 @@ __all__ = [
     "NonlocalFilter",
     "PolynomialSliders",
     "Portable",
+    "Refine",
     "SegmentMask",
 ]

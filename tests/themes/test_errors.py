@@ -20,6 +20,7 @@ from nlfilter_torch import (
     polynomial_filter,
     polynomial_response,
     propagate_strokes,
+    refine,
     segment_mask,
     spectral_filter,
 )
@@ -75,6 +76,7 @@ TAKE_AN_IMAGE: dict[str, tuple[str, Callable[[torch.Tensor], object]]] = {
     "captured_energy": ("image", lambda x: captured_energy(SPECTRUM, x)),
     "diffusion_mask": ("region", lambda x: diffusion_mask(SPECTRUM, x)),
     "segment_mask": ("regions", lambda x: segment_mask(SPECTRUM, x)),
+    "refine": ("logits", lambda x: refine(x, OPERATOR)),
     "mask of a layer": ("mask", lambda x: NonlocalFilter(num_landmarks=20)(IMAGE, mask=x)),
 }
 
