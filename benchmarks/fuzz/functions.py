@@ -53,6 +53,13 @@ def _alpha(scene: Scene) -> Tensor:
     return 4 * torch.rand(shape, generator=scene.generator).to(scene.dtype)
 
 
+def _weights(scene: Scene) -> Tensor:
+    """Weights of pixels, some of them 0."""
+    weights = (9 * scene.noise(scene.batch, 1, *scene.size) - 3).clamp(min=0.0)
+    weights[..., 0, 0] = 1.0
+    return weights
+
+
 def _size(scene: Scene) -> tuple[int, int]:
     return scene.size
 
@@ -182,7 +189,9 @@ class Function:
 
 NUMBERS = {name: _plain(0.1, 4.0) for name in ("time", "width")}
 FUNCTIONS = {
-    "nonlocal_operator": Function(nlf.nonlocal_operator, {"guide": _image(1, 3, 2)}, FILTER | GUIDED | BALANCED),
+    "nonlocal_operator": Function(
+        nlf.nonlocal_operator, {"guide": _image(1, 3, 2)}, FILTER | GUIDED | BALANCED | {"weights": _weights}
+    ),
     "operator_from_features": Function(
         nlf.operator_from_features,
         {"features": lambda scene: 5 * scene.noise(scene.batch, 3, math.prod(scene.size)), "size": _size},
@@ -205,7 +214,7 @@ FUNCTIONS = {
         nlf.polynomial_response, {"eigenvalues": lambda scene: scene.noise(scene.batch, 5), **ALPHA}, {}
     ),
     "captured_energy": Function(nlf.captured_energy, SPECTRUM | IMAGE, {}),
-    "estimate_bandwidth": Function(nlf.estimate_bandwidth, {"guide": _image(1, 3, 2)}, GUIDED),
+    "estimate_bandwidth": Function(nlf.estimate_bandwidth, {"guide": _image(1, 3, 2)}, GUIDED | {"weights": _weights}),
     "estimate_noise": Function(nlf.estimate_noise, IMAGE, {}),
     "diffusion_map": Function(nlf.diffusion_map, SPECTRUM | TIME, {}),
     "diffusion_mask": Function(nlf.diffusion_mask, SPECTRUM | REGION, TIME | WIDTH | NEGATIVE),

@@ -377,7 +377,57 @@ def check_weights(weights: Tensor, features: Tensor) -> Tensor:
             f"weights must have shape ({points},) or ({batch}, {points}), got {tuple(weights.shape)}; pass one each"
         )
     weights = weights.detach().to(features).expand(batch, points).clone(memory_format=torch.contiguous_format)
-    if not is_hidden(weights) and not bool(((weights >= LEAST_WEIGHT) & (weights <= 1 / LEAST_WEIGHT)).all()):
-        allowed, actual = f"{LEAST_WEIGHT:g} to {1 / LEAST_WEIGHT:g}", "{:g} to {:g}".format(*weights.aminmax())
-        raise ValueError(f"weights must be from {allowed}, got {actual}; drop points of negligible weight")
+    _check_range_of_weights(weights)
     return weights
+
+
+def check_pixel_weights(weights: Tensor, guide: Tensor, group: object = None) -> Tensor:
+    """Return weights, (B, 1, H, W) or (1, 1, H, W), as (B, 1, H, W) in the dtype of the guide (B, C, H, W).
+
+    Raises unless all are in range and some pixel of every image counts.
+    """
+    if group is not None:
+        raise ValueError(
+            "weights must be None for an image whose rows are distributed, since patches mirror at the edge of what "
+            "counts, got a tensor; build the operator without a group"
+        )
+    check_tensor(weights, "weights")
+    check_dtype(weights, "weights", "convert it with weights.float()")
+    batch, _, *size = guide.shape
+    if tuple(weights.shape) not in ((1, 1, *size), (batch, 1, *size)):
+        raise ValueError(
+            f"weights must have shape {(batch, 1, *size)}, a number for each pixel of the guide, got "
+            f"{tuple(weights.shape)}; pass 1 for pixels that count and 0 for others"
+        )
+    if weights.device != guide.device:
+        raise ValueError(
+            f"weights must be on the device of the guide, {guide.device}, got {weights.device}; move one by .to()"
+        )
+    weights = (
+        weights.detach()
+        .to(torch.promote_types(guide.dtype, torch.float32))
+        .expand(batch, 1, *size)
+        .clone(memory_format=torch.contiguous_format)
+    )
+    _check_range_of_weights(weights)
+    check_counted(weights.flatten(1).amax(1))
+    return weights
+
+
+def _check_range_of_weights(weights: Tensor) -> None:
+    """Raise unless weights are 0 or neither tiny nor huge."""
+    if is_hidden(weights) or weights.numel() == 0:
+        return
+    positive = (weights >= LEAST_WEIGHT) & (weights <= 1 / LEAST_WEIGHT)
+    if not bool((positive | (weights == 0)).all()):
+        allowed, actual = f"{LEAST_WEIGHT:g} to {1 / LEAST_WEIGHT:g}", "{:g} to {:g}".format(*weights.aminmax())
+        raise ValueError(f"weights must be 0, or from {allowed}, got {actual}; set negligible ones to 0")
+
+
+def check_counted(largest: Tensor) -> None:
+    """Raise if the largest weight of an image, (B,), is 0."""
+    if not is_hidden(largest) and not bool((largest > 0).all()):
+        raise ValueError(
+            "weights must be positive at some pixel of every image, got 0 everywhere in image(s) "
+            f"{(largest <= 0).nonzero().squeeze(1).tolist()}; pass 1 for pixels that count"
+        )

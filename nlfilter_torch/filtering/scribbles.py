@@ -95,6 +95,8 @@ def propagate_strokes(
     strength, reach, smoothness = (communicator.copy_to_group(value) for value in (strength, reach, smoothness))
     factor = spectrum.factor
     weights = weighted(stroke_mask.to(factor).flatten(2), spectrum.weights)  # (B or 1, 1, N)
+    if spectrum.weights is not None:
+        check_painted(weights.clamp(max=1.0).unsqueeze(3), communicator=communicator)
     values = strokes.to(factor).flatten(2)  # (B or 1, C, N)
     if not are_derived([weights]):  # pixels of weight 0 matter only for the gradient of the weights
         painted = (weights > 0).any(0).squeeze(0).nonzero().squeeze(1)

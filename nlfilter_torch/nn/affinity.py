@@ -137,19 +137,22 @@ class NonlocalAffinity(Learnable):
             self.register_buffer("patch_weights", None if patch_weights is None else window, persistent=False)
         self.held = self._held(hold, landmarks)
 
-    def forward(self, guide: Tensor) -> NonlocalOperator:
-        """Build the operator of a guide (B, C, H, W)."""
+    def forward(self, guide: Tensor, weights: Tensor | None = None) -> NonlocalOperator:
+        """Build the operator of a guide (B, C, H, W), with weights (B, 1, H, W) of its pixels: 0 for padding."""
         if isinstance(self.held, HeldFeatures):
             bandwidth = self.photometric_bandwidth
             if isinstance(bandwidth, str):
-                bandwidth = estimate_bandwidth(guide, guide_channels=self.guide_channels, group=self.group)
-            return self._build(guide, self.held.of(self._recipe(bandwidth, guide)), bandwidth)
+                bandwidth = estimate_bandwidth(
+                    guide, guide_channels=self.guide_channels, weights=weights, group=self.group
+                )
+            return self._build(guide, self.held.of(self._recipe(bandwidth, guide)), bandwidth, weights)
         if isinstance(self.held, HeldAssignment):
             check_image(guide, "guide", empty=True)
-            operator = self._build(guide, self.held.of(guide) or self.landmarks, self.photometric_bandwidth)
+            landmarks = self.held.of(guide) or self.landmarks
+            operator = self._build(guide, landmarks, self.photometric_bandwidth, weights)
             self.held.keep(operator.assignment, guide)
             return operator
-        return self._build(guide, self.landmarks, self.photometric_bandwidth)
+        return self._build(guide, self.landmarks, self.photometric_bandwidth, weights)
 
     @torch.no_grad()
     def renew(self, guide: Tensor | None = None) -> None:
@@ -239,7 +242,11 @@ class NonlocalAffinity(Learnable):
         return weights() if isinstance(weights, UnitWindow) else weights
 
     def _build(
-        self, guide: Tensor, landmarks: Landmarks, bandwidth: float | Tensor | Literal["auto"]
+        self,
+        guide: Tensor,
+        landmarks: Landmarks,
+        bandwidth: float | Tensor | Literal["auto"],
+        weights: Tensor | None,
     ) -> NonlocalOperator:
         """Build the operator with the options of the layer, and these landmarks."""
         return nonlocal_operator(
@@ -252,6 +259,7 @@ class NonlocalAffinity(Learnable):
             completion=self.completion,
             guide_channels=self.guide_channels,
             patch_weights=self._weights(),
+            weights=weights,
             tolerance=self.tolerance,
             generator=self.generator,
             group=self.group,

@@ -220,7 +220,12 @@ class NonlocalFilter(nn.Module):
         self.affinity.renew(guide)
 
     def forward(
-        self, image: Tensor, guide: Tensor | None = None, mask: Tensor | None = None, alpha: Tensor | None = None
+        self,
+        image: Tensor,
+        guide: Tensor | None = None,
+        mask: Tensor | None = None,
+        alpha: Tensor | None = None,
+        weights: Tensor | None = None,
     ) -> Tensor:
         """Filter an image.
 
@@ -231,6 +236,7 @@ class NonlocalFilter(nn.Module):
                 everywhere.
             alpha: sliders that replace the layer's own in this call, for example computed by a network: (k+1,),
                 (B, k+1) per image or (B, k+1, H, W) per pixel; for K > 1 masks (K, k+1) or (B, K, k+1).
+            weights: (B, 1, H, W), how much each pixel counts, 0 for padding, as for :func:`nonlocal_operator`.
 
         Returns:
             (B, C, H, W) in the image's dtype, or (C, H, W) for one image.
@@ -239,16 +245,17 @@ class NonlocalFilter(nn.Module):
             TypeError, ValueError: if a tensor does not fit, or there are sliders for K regions but not K masks.
         """
         if isinstance(image, Tensor) and image.ndim == 3:
-            guide, mask = _as_batch(guide), _as_batch(mask)
+            guide, mask, weights = _as_batch(guide), _as_batch(mask), _as_batch(weights)
             of_regions = mask is not None and mask.shape[1] > 1  # then a 3-dimensional alpha is (B, K, k+1)
-            return self(image.unsqueeze(0), guide, mask, alpha if of_regions else _as_batch(alpha)).squeeze(0)
+            alpha = alpha if of_regions else _as_batch(alpha)
+            return self(image.unsqueeze(0), guide, mask, alpha, weights).squeeze(0)
         if isinstance(guide, NonlocalOperator):
             raise TypeError(
                 "guide must be a torch.Tensor, from which the layer builds an operator, got a NonlocalOperator; "
                 "call layer.sliders(operator, image)"
             )
         check_image(image, "image", empty=True)
-        operator = self.affinity(image if guide is None else guide)
+        operator = self.affinity(image if guide is None else guide, weights)
         if mask is not None:
             check_image(mask, "mask", batch=max(image.shape[0], operator.factor.shape[0]), empty=len(image) == 0)
             check_same_size(mask, (image.shape[-2], image.shape[-1]), "mask", "image")

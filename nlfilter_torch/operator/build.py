@@ -9,8 +9,10 @@ from torch import Tensor
 
 from nlfilter_torch.core.blocks import root_weighted
 from nlfilter_torch.core.checks import (
+    check_counted,
     check_features,
     check_image,
+    check_pixel_weights,
     check_scale,
     check_size,
     check_weights,
@@ -19,10 +21,13 @@ from nlfilter_torch.core.checks import (
 from nlfilter_torch.core.communicator import ALONE, Communicator, all_gather_shapes
 from nlfilter_torch.core.precision import full_precision, uncompiled, uncompiled_with, working_dtype
 from nlfilter_torch.core.torch_internals import is_hidden, refuse_transforms
+from nlfilter_torch.operator.assignment import Assignment
+from nlfilter_torch.operator.counting import assign_among_counted, extended, has_values, hidden_points
 from nlfilter_torch.operator.eigenvalue_bound import exceeds, is_bounded, limiter, shifted_gram, slack
 from nlfilter_torch.operator.features import (
     GuideFeatures,
     bandwidth_of_rows,
+    bandwidth_of_weighted,
     estimate_bandwidth,
     reduce_channels,
     unit_window,
@@ -66,7 +71,7 @@ def _largest(guide: Tensor) -> Tensor:
     return torch.stack([torch.stack(image.aminmax()).abs().amax() for image in guide])  # faster on CPUs
 
 
-@uncompiled_with("generator", "group")
+@uncompiled_with("generator", "group", "weights")
 @full_precision
 def nonlocal_operator(
     guide: Tensor,
@@ -79,6 +84,7 @@ def nonlocal_operator(
     completion: Completion = OperatorOptions.completion,
     guide_channels: GuideChannels = OperatorOptions.guide_channels,
     patch_weights: Tensor | None = OperatorOptions.patch_weights,
+    weights: Tensor | None = None,
     tolerance: float | None = OperatorOptions.tolerance,
     generator: torch.Generator | None = OperatorOptions.generator,
     group: Any = OperatorOptions.group,
@@ -110,6 +116,11 @@ def nonlocal_operator(
         guide_channels: ``"luminance"`` reduces a guide of three channels to one, ``"all"`` compares all of them. A
             guide with any other number of channels is used unchanged.
         patch_weights: (p, p), non-negative, replaces the Gaussian window; scaled to unit sum.
+        weights: (B, 1, H, W) or (1, 1, H, W), how much each pixel counts: 0 for padding, hidden or unknown pixels, and
+            otherwise from 1e-6 to 1e6; None means 1 each. Where they are 0 the guide is not read: patches, landmarks
+            and ``"auto"`` know only pixels that count, and patches mirror at their edge, so that the results of a
+            padded image are those of the image. Pixels of weight 0 are filtered from those that count. Constant for
+            gradients; not with a group.
         tolerance: largest deviation of a row sum from 1; None means 1e-5 in float32 and 1e-12 in float64.
         generator: source of randomness for the landmarks; with None every call draws the same. The global generator is
             never used.
@@ -147,9 +158,12 @@ def nonlocal_operator(
         group=group,
     )
     _check_guide(guide, options)
+    if weights is not None:
+        weights = check_pixel_weights(weights, guide, group)
+        guide = torch.where(weights > 0, guide, 0.0)  # large values there are no mistake
     if not is_hidden(guide) and _is_small(photometric_bandwidth):
         warn_of_scale(guide, "guide")
-    return _from_guide(guide, options)
+    return _from_guide(guide, options, weights)
 
 
 def operator_from_guide(guide: Tensor, options: OperatorOptions) -> NonlocalOperator:
@@ -178,17 +192,14 @@ def _check_guide(guide: Tensor, options: OperatorOptions) -> None:
     check_bandwidths(options.photometric_bandwidth, options.spatial_bandwidth, guide.shape[0])
 
 
-def _from_guide(guide: Tensor, options: OperatorOptions) -> NonlocalOperator:
-    """Build an operator from a checked guide and checked options."""
+def _from_guide(guide: Tensor, options: OperatorOptions, weights: Tensor | None = None) -> NonlocalOperator:
+    """Build an operator from a checked guide, checked options and weights (B, 1, H, W)."""
     guide = reduce_channels(guide.to(working_dtype(guide)), options.guide_channels)
     communicator = all_gather_shapes(guide, options.group)
     size = (guide.shape[2], guide.shape[3])  # of the rows of this rank
     window = unit_window(options.patch_size, communicator.copy_to_group(options.patch_weights)).to(guide)
     guide, halo = communicator.with_halo(guide, max(window.shape[0] // 2, 1))
-    if isinstance(options.photometric_bandwidth, str):
-        bandwidth: float | Tensor = bandwidth_of_rows(guide, halo, communicator)
-    else:
-        bandwidth = communicator.copy_to_group(options.photometric_bandwidth)
+    bandwidth = _bandwidth(guide, halo, options, communicator, weights)
     largest = _largest(guide.detach())
     check_scale(bandwidth, "photometric_bandwidth", largest, "values of the guide")
     spatial = options.spatial_bandwidth
@@ -198,8 +209,26 @@ def _from_guide(guide: Tensor, options: OperatorOptions) -> NonlocalOperator:
             check_scale(axis_bandwidth, "spatial_bandwidth", farthest, "coordinates")
         spatial = tuple(_copy(communicator.copy_to_group(value)) for value in bandwidths_of(spatial))
     recipe = GuideFeatures(window, _copy(bandwidth), spatial, options.guide_channels)
-    features = recipe(guide, origin=(communicator.first_row - halo[0], 0), halo=halo)
-    return _assemble(features, size, options, recipe=recipe, communicator=communicator)
+    counts = None if weights is None else weights > 0
+    features = recipe(guide, origin=(communicator.first_row - halo[0], 0), halo=halo, counts=counts)
+    weights = None if weights is None else weights.flatten(1)
+    return _assemble(features, size, options, recipe=recipe, weights=weights, communicator=communicator)
+
+
+def _bandwidth(
+    guide: Tensor,
+    halo: tuple[int, int],
+    options: OperatorOptions,
+    communicator: Communicator,
+    weights: Tensor | None,
+) -> float | Tensor:
+    """The photometric bandwidth, estimated from the guide if it is ``"auto"``."""
+    if not isinstance(options.photometric_bandwidth, str):
+        bandwidth: float | Tensor = communicator.copy_to_group(options.photometric_bandwidth)
+        return bandwidth
+    if weights is not None:
+        return bandwidth_of_weighted(guide, weights)
+    return bandwidth_of_rows(guide, halo, communicator)
 
 
 @uncompiled
@@ -224,9 +253,9 @@ def operator_from_features(
     Args:
         features: (B, D, N), already divided by bandwidths: the affinity of two points is ``exp(-|x_i - x_j|^2)``.
         size: (H, W) with H * W = N, the shape of the images to filter; (N,), meaning (1, N), for unordered points.
-        weights: (N,) or (B, N), positive: how many identical pixels each point represents. With ``"kmeans"``,
-            landmarks are drawn in proportion to the weights, averaged over a batch. None means one each. Constant for
-            gradients.
+        weights: (N,) or (B, N): how many identical pixels each point represents, 0 for points that do not count, which
+            are filtered from those that do. With ``"kmeans"``, landmarks are drawn in proportion to the weights,
+            averaged over a batch. None means one each. Constant for gradients.
         num_landmarks: M; reduced with a warning where there are fewer points.
         landmarks: as for :func:`nonlocal_operator`; features have the meaning and scale of ``features``.
         completion: as for :func:`nonlocal_operator`.
@@ -263,6 +292,8 @@ def operator_from_features(
     if weights is not None:
         weights = check_weights(weights, features)
     communicator = all_gather_shapes(features.unflatten(2, shape), group)
+    if weights is not None:
+        check_counted(communicator.max(weights.amax(1)))
     return _assemble(features, shape, method, weights=weights, communicator=communicator)
 
 
@@ -316,16 +347,21 @@ def _assemble(
     Landmarks (B, D, M) are chosen by the method unless they are already ``chosen``.
     """
     whole = communicator.whole(size)
+    hidden = hidden_points(weights)
     points, tolerance = whole[0] * whole[1], method.tolerance
+    if hidden is not None and communicator.size == 1:
+        points = int((~hidden).sum(1).min())
     count = landmark_count(method, points)
     if features.shape[0] == 0:
         return _empty(features, size, count, method.completion, recipe)
     in_graph, assignment = torch.compiler.is_compiling(), None  # never with a generator, weights or a group
     if chosen is None:
-        chosen, assignment = landmarks_by(method, features, whole, count, communicator, weights)
+        chosen, assignment = _landmarks(method, features, whole, count, communicator, weights)
     inverse = inverse_cholesky(chosen)
     kernel = Kernel(chosen, inverse, method.completion, features=recipe, assignment=assignment)
-    factor, diagonal = kernel.factor(features)
+    factor, diagonal = whole_kernel = kernel.factor(features)
+    if hidden is not None:  # set aside, with row sums of 1
+        factor, diagonal = factor * ~hidden.unsqueeze(1), torch.where(hidden, 1.0, diagonal)
     completed, watched = method.completion == "diagonal", not is_hidden(factor)
 
     if in_graph:  # where nothing may depend on the number of pixels
@@ -355,7 +391,12 @@ def _assemble(
         before = tuple(torch.linalg.solve(limit.detach(), total) for total in before)  # preserves u . total
         residual = _residual(KernelMatrix(factor.detach(), diagonal.detach(), weights, communicator), scaling.detach())
         warn_of_residual(residual, tolerance, factor.dtype, completed=completed)
-    least = None if weights is None else -communicator.max(-weights.amin(1, keepdim=True))
+    if hidden is not None:
+        columns, own = whole_kernel
+        columns = columns if kernel.limiter is None else kernel.limiter @ columns
+        balanced_kernel = KernelMatrix(factor, diagonal, weights, communicator)
+        factor, diagonal, scaling = extended(balanced_kernel, scaling, columns, own, hidden, completed=completed)
+        remainder = scaling * (scaling * diagonal)
     return NonlocalOperator(
         factor=factor,
         diagonal=diagonal,
@@ -363,12 +404,35 @@ def _assemble(
         size=size,
         kernel=kernel,
         remainder=remainder,
-        balancing=PixelScaling(balancing.moment, completed, worst, before, least),
+        balancing=PixelScaling(balancing.moment, completed, worst, before, _least(weights, communicator)),
         residual=residual,
         balancing_steps=balancing.steps,
         weights=weights,
         communicator=communicator,
     )
+
+
+def _landmarks(
+    method: Construction,
+    features: Tensor,
+    size: tuple[int, int],
+    count: int,
+    communicator: Communicator,
+    weights: Tensor | None,
+) -> tuple[Tensor, Assignment | None]:
+    """:func:`landmarks_by`, from the points that count alone where weights are 0."""
+    if weights is None or not has_values(weights):
+        return landmarks_by(method, features, size, count, communicator)
+    if hidden_points(weights) is None or not isinstance(method.landmarks, str) or communicator.size > 1:
+        return landmarks_by(method, features, size, count, communicator, weights)
+    return assign_among_counted(features, size, count, method.landmarks, method.generator, weights)
+
+
+def _least(weights: Tensor | None, communicator: Communicator) -> Tensor | None:
+    """The smallest weight of the points that count, (B, 1)."""
+    if weights is None:
+        return None
+    return -communicator.max(-torch.where(weights > 0, weights, torch.inf).amin(1, keepdim=True))
 
 
 def _residual(matrix: KernelMatrix, scaling: Tensor) -> Tensor:

@@ -18,12 +18,14 @@ from nlfilter_torch.core.checks import (
     check_finite,
     check_image,
     check_patch_size,
+    check_pixel_weights,
     check_tensor,
 )
 from nlfilter_torch.core.communicator import Communicator, all_gather_shapes
 from nlfilter_torch.core.kernels.columns import large_empty
 from nlfilter_torch.core.precision import Gradients, full_precision, once_differentiable, per_image, working_dtype
 from nlfilter_torch.core.torch_internals import is_hidden
+from nlfilter_torch.operator.hidden import fill_hidden
 from nlfilter_torch.operator.options import GuideChannels, SpatialBandwidth, bandwidths_of
 
 FAINT_WEIGHT = 1e-12  # in place of patch weights of 0
@@ -95,7 +97,13 @@ class GuideFeatures:
     guide_channels: GuideChannels
 
     def __call__(
-        self, guide: Tensor, *, origin: tuple[int, int] = (0, 0), halo: tuple[int, int] = (0, 0), stride: int = 1
+        self,
+        guide: Tensor,
+        *,
+        origin: tuple[int, int] = (0, 0),
+        halo: tuple[int, int] = (0, 0),
+        stride: int = 1,
+        counts: Tensor | None = None,
     ) -> Tensor:
         """Compute the features of a guide, or of a tile of it.
 
@@ -105,6 +113,8 @@ class GuideFeatures:
             halo: numbers of rows at the top and at the bottom that are read by patches but get no features themselves:
                 half a patch, or less at the border of the whole guide.
             stride: n, to use only the pixel in the middle of each complete square of n x n pixels.
+            counts: (B or 1, 1, H, W), true where a pixel counts, for a guide without a halo. Patches read what counts
+                alone, and are continued elsewhere by :func:`fill_hidden`. None means that all pixels do.
 
         Returns:
             (B, D, N) with D = C p^2, plus 2 with coordinates; N counts the pixels outside the halo. Pixels come last:
@@ -113,7 +123,8 @@ class GuideFeatures:
         guide = reduce_channels(guide.to(self.patch_weights.dtype), self.guide_channels)
         batch, channels, height, width = guide.shape
         scale = self._patch_scale(channels, guide)
-        padded = pad_border(guide, scale.shape[-1] // 2)
+        margin = scale.shape[-1] // 2
+        padded = pad_border(guide, margin) if counts is None else fill_hidden(guide, counts, margin)
         # Halo rows replace reflected ones; a halo shorter than the margin ends at the border of the image.
         padded = padded[..., halo[0] : padded.shape[-2] - halo[1], :]
         features: Tensor = (
@@ -225,7 +236,13 @@ SMALLEST = 1.0 / 255.0  # one grey level; keeps the kernel defined for a constan
 
 
 @full_precision
-def estimate_bandwidth(guide: Tensor, *, guide_channels: GuideChannels = "luminance", group: Any = None) -> Tensor:
+def estimate_bandwidth(
+    guide: Tensor,
+    *,
+    guide_channels: GuideChannels = "luminance",
+    weights: Tensor | None = None,
+    group: Any = None,
+) -> Tensor:
     """Estimate the photometric bandwidth h_y: 2.5 times the mean gradient magnitude, at least 1 / 255.
 
     Paper: eq. (20), with 1/n read as a mean (outside the root the bandwidth would decrease with image size).
@@ -233,13 +250,15 @@ def estimate_bandwidth(guide: Tensor, *, guide_channels: GuideChannels = "lumina
     Args:
         guide: (B, C, H, W) in [0, 1].
         guide_channels: ``"luminance"`` reduces three channels to one; ``"all"`` takes the mean over channels.
+        weights: as for :func:`nonlocal_operator`: how much each pixel counts in the mean.
         group: as for :func:`nonlocal_operator`; ``guide`` then holds the rows of this rank.
 
     Returns:
         (B,), in units of the guide, without a gradient.
 
     Raises:
-        TypeError, ValueError: if ``guide`` is not a finite floating-point (B, C, H, W) tensor.
+        TypeError, ValueError: if ``guide`` is not a finite floating-point (B, C, H, W) tensor, or ``weights`` do not
+            fit it.
 
     Example:
         >>> estimate_bandwidth(torch.linspace(0, 1, 101).expand(1, 1, 8, 101)) * 255  # a slope of 0.01 per pixel
@@ -249,8 +268,18 @@ def estimate_bandwidth(guide: Tensor, *, guide_channels: GuideChannels = "lumina
     check_choice(guide_channels, "guide_channels", ("luminance", "all"))
     with torch.no_grad():
         rows = reduce_channels(guide.to(working_dtype(guide)), guide_channels)
+        if weights is not None:
+            return bandwidth_of_weighted(rows, check_pixel_weights(weights, rows, group))
         communicator = all_gather_shapes(rows, group)
         return bandwidth_of_rows(*communicator.with_halo(rows, 1), communicator)
+
+
+def bandwidth_of_weighted(guide: Tensor, weights: Tensor) -> Tensor:
+    """:func:`estimate_bandwidth` of a whole image whose pixels have weights (B, 1, H, W)."""
+    with torch.no_grad():
+        magnitude = _magnitude(fill_hidden(guide / 2, weights > 0, 1, mirrored=False)).mean(1, keepdim=True).double()
+        mean = (magnitude * weights).flatten(1).sum(1) / weights.double().flatten(1).sum(1)
+        return bandwidth_of_gradient(mean).clamp(max=torch.finfo(guide.dtype).max).to(guide)
 
 
 def bandwidth_of_rows(guide: Tensor, halo: tuple[int, int], communicator: Communicator) -> Tensor:
@@ -266,13 +295,18 @@ def gradients(guide: Tensor, halo: tuple[int, int]) -> Tensor:
     """Gradient magnitude (B, C, h, W) of the rows of a guide, without those of the halo."""
     # Central differences by slicing take a twentieth of the time of a convolution, not counting the import of kornia.
     padded = F.pad(guide / 2, (1, 1, 1, 1), mode="replicate")  # halved first, so that no finite value overflows
+    return _magnitude(padded)[:, :, halo[0] : guide.shape[2] - halo[1]]
+
+
+def _magnitude(padded: Tensor) -> Tensor:
+    """Gradient magnitude (B, C, H, W) of half an image that is padded by a pixel on all sides."""
     down = padded[..., 2:, 1:-1] - padded[..., :-2, 1:-1]
     right = padded[..., 1:-1, 2:] - padded[..., 1:-1, :-2]
     magnitude = (down.square() + right.square()).sqrt()
     if is_hidden(magnitude) or not bool(magnitude.sum().isfinite()):
         # hypot cannot overflow, but on CPUs its last digit depends on the position in memory, and therefore on tiling.
         magnitude = torch.hypot(down, right)
-    return magnitude[:, :, halo[0] : guide.shape[2] - halo[1]]
+    return magnitude
 
 
 def bandwidth_of_gradient(mean: Tensor) -> Tensor:

@@ -150,7 +150,8 @@ class NonlocalOperator(Batch):
         kernel: computes factor and diagonal of the pixels of other guides.
         remainder: r, (B, N), the diagonal part of W.
         weights: number of pixels that each point represents, (B, N); None means one each. With weights, ``W y`` is
-            ``diag(d) U^T U diag(weights d) y + r y``, which sums over the pixels that the points represent.
+            ``diag(d) U^T U diag(weights d) y + r y``, which sums over the pixels that the points represent. A point of
+            weight 0 is filtered from those that count, and keeps its value only if it resembles none of them.
         balancing: computes the scaling of other pixels.
         residual: largest deviation of a row sum of W from 1, (B,).
         balancing_steps: number of sweeps over the factor in balancing.
@@ -377,6 +378,8 @@ class NonlocalOperator(Batch):
         occupied = torch.diag_embed(spectrum.support[:, :rank].to(flat))
         matrix = KernelMatrix(self.factor, self.diagonal, self.weights, self.communicator)
         kernel_sums = matrix.affinities(matrix.moment(torch.ones_like(self.scaling))) + self.diagonal
+        if self.weights is not None:
+            kernel_sums = torch.where(self.weights > 0, kernel_sums, torch.inf)  # rows that count
         recipe = self.kernel.features
         pixels = torch.as_tensor(spectrum.pixels).to(self.factor)
         bandwidth = torch.as_tensor(1.0 if recipe is None else recipe.photometric_bandwidth).reshape(-1)

@@ -211,11 +211,15 @@ def _guess(matrix: KernelMatrix) -> Tensor:
     count = min(max(pixels // SHARE, 16 * factor.shape[1]), EXPLORED)
     if 2 * count < pixels:
         # One random pixel from each interval: a fixed stride could coincide with the period of a texture.
-        chosen = stratified(pixels, count, torch.Generator().manual_seed(0)).to(factor.device)
-        counts = weighted(torch.ones_like(diagonal), matrix.weights)
-        counts = counts[:, chosen] * (counts.sum(1, keepdim=True) / counts[:, chosen].sum(1, keepdim=True))
-        few = factor.gather(2, chosen.expand(*factor.shape[:2], -1))
-        sample = JacobianSample(few, diagonal[:, chosen], counts, matrix.communicator)
+        chosen = stratified(pixels, count, torch.Generator().manual_seed(0)).to(factor.device).expand(len(factor), -1)
+        counts = torch.ones_like(diagonal[:, :1]) * (pixels / count)
+        if matrix.weights is not None:  # in proportion to the weights, so that no point of weight 0 is drawn
+            summed = matrix.weights.double().cumsum(1)
+            ticks = (chosen.double() + 0.5) / pixels * summed[:, -1:]
+            chosen = torch.searchsorted(summed, ticks.contiguous()).clamp_(max=pixels - 1)
+            counts = (summed[:, -1:] / count).to(factor)
+        few = factor.gather(2, chosen.unsqueeze(1).expand(-1, factor.shape[1], -1))
+        sample = JacobianSample(few, diagonal.gather(1, chosen), counts.expand(-1, count), matrix.communicator)
     sums = sample.affinities(sample.moment(torch.ones_like(sample.diagonal))) + sample.diagonal
     total = sample.moment(sums.clamp_(min=1.0).rsqrt_())  # no row of K sums to less than its unit diagonal
     for _ in range(GUESSES):

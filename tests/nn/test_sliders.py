@@ -141,3 +141,19 @@ def test_held_layers_take_sliders_of_a_call() -> None:
     sliders = PolynomialSliders(ALPHA)
     layers = detail_layers(operator, image())
     torch.testing.assert_close(sliders.combine(layers, alpha), sliders(operator, image(), alpha))
+
+
+@pytest.mark.parametrize("changed", [{}, {"photometric_bandwidth": "auto", "spatial_bandwidth": 9.0}])
+def test_a_padded_batch_is_filtered_as_its_images_are(changed: dict[str, object]) -> None:
+    layer = NonlocalFilter(ALPHA, learn=(), **(OPTIONS | changed))  # type: ignore[arg-type]
+    images = [image(0, 1)[..., :9, :], image(1, 1)[..., :11]]
+    weights = torch.zeros(2, 1, 12, 13)
+    weights[0, :, :9], weights[1, ..., :11] = 1, 1
+    batch = torch.where(weights > 0, image(2), 5.0)
+    for number, small in enumerate(images):
+        batch[number, :, : small.shape[2], : small.shape[3]] = small[0]
+    filtered = layer(batch, weights=weights)
+    for number, small in enumerate(images):
+        size = (slice(None), slice(small.shape[2]), slice(small.shape[3]))
+        torch.testing.assert_close(filtered[number][size], layer(small)[0], atol=1e-5, rtol=0)
+        torch.testing.assert_close(layer(batch[number], weights=weights[number]), filtered[number], atol=1e-5, rtol=0)

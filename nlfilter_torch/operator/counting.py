@@ -1,0 +1,120 @@
+"""Points of weight 0, which are filtered but do not count: padding, hidden or unknown pixels.
+
+Sums over points do not contain them, so that they take no part in balancing and landmarks are not made of them. Their
+own rows of W are computed afterwards, as those of points of another image: from what counts, with little weight on the
+point's own value, so that W extends what is known to them.
+"""
+
+import math
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from nlfilter_torch.core.kernels.tall_skinny import spread
+from nlfilter_torch.core.torch_internals import is_fake
+from nlfilter_torch.operator.assignment import Assignment
+from nlfilter_torch.operator.landmarks import assign_landmarks
+from nlfilter_torch.operator.options import Sampling
+from nlfilter_torch.operator.scaling import KernelMatrix
+
+# Share of the diagonal correction that a point of weight 0 keeps: its own value counts where little else does.
+OWN = 1e-3
+FEW = 1e-6  # affinities to all that counts, below which a point of weight 0 keeps its value
+
+
+def has_values(weights: Tensor) -> bool:
+    """Whether weights can be read, perhaps by waiting for an accelerator, unlike those of a tensor without data."""
+    return not is_fake(weights) and weights.device.type != "meta"
+
+
+def hidden_points(weights: Tensor | None) -> Tensor | None:
+    """The points of weight 0, (B, N) bool; None if there are none, or if values cannot be read."""
+    if weights is None or not has_values(weights):
+        return None
+    hidden = weights == 0
+    return hidden if bool(hidden.any()) else None
+
+
+def assign_among_counted(
+    features: Tensor,
+    size: tuple[int, int],
+    count: int,
+    sampling: Sampling,
+    generator: torch.Generator | None,
+    weights: Tensor,
+) -> tuple[Tensor, Assignment | None]:
+    """:func:`~nlfilter_torch.operator.landmarks.assign_landmarks`, of the points that count in each image.
+
+    The landmarks are those of an image without its padding. ``weights`` (B, N) may be 0. The assignment is None if the
+    images differ in their numbers of candidates.
+    """
+    state = None if generator is None else generator.get_state()
+    parts = []
+    for image, row in zip(features.split(1), weights, strict=True):
+        if generator is not None and state is not None:
+            generator.set_state(state)  # all images of a batch use the same random numbers
+        kept = row.nonzero().squeeze(1)
+        counted = row[kept].unsqueeze(0)
+        even = bool((counted == counted[:, :1]).all())
+        landmarks, assignment = assign_landmarks(
+            image[:, :, kept], _size_of(kept, size), count, sampling, generator,
+            weights=None if even else counted,
+        )  # fmt: skip
+        parts.append((landmarks, replace(assignment, candidates=kept[assignment.candidates], points=math.prod(size))))
+    return torch.cat([landmarks for landmarks, _ in parts]), _joined([assignment for _, assignment in parts])
+
+
+def _joined(assignments: list[Assignment]) -> Assignment | None:
+    """The assignment of a batch, from those of its images."""
+    first = assignments[0]
+    if any(assignment.kind != first.kind for assignment in assignments):
+        return None
+    candidates = torch.cat([assignment.candidates for assignment in assignments])
+    if first.clusters is None:
+        return replace(first, candidates=candidates)
+    clusters, start = (
+        torch.cat([torch.as_tensor(getattr(assignment, name)) for assignment in assignments])
+        for name in ("clusters", "start")
+    )
+    return replace(first, candidates=candidates, clusters=clusters, start=start)
+
+
+def _size_of(kept: Tensor, size: tuple[int, ...]) -> tuple[int, int]:
+    """Height and width of the rectangle that points (n,) of an image of ``size`` fill; (1, n) if they fill none."""
+    if len(size) == 2:
+        rows, columns = kept // size[1], kept % size[1]
+        height, width = (int(axis.max() - axis.min()) + 1 for axis in (rows, columns))
+        if height * width == len(kept):
+            return height, width
+    return 1, len(kept)
+
+
+def extended(
+    matrix: KernelMatrix, scaling: Tensor, factor: Tensor, diagonal: Tensor, hidden: Tensor, *, completed: bool
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Factor, diagonal and scaling of a kernel that was balanced without its hidden points, with those of these points.
+
+    Args:
+        matrix: the balanced kernel, of factor zero at hidden points.
+        scaling: d, (B, N), of the balanced kernel.
+        factor: (B, M, N), also of the hidden points.
+        diagonal: (B, N), also of the hidden points.
+        hidden: (B, N) bool.
+        completed: whether the kernel has a unit diagonal.
+
+    Returns:
+        Factor (B, M, N), diagonal (B, N) and scaling (B, N); differentiable.
+    """
+    total = matrix.moment(scaling)
+    sums = spread(total.to(factor).mT, factor).squeeze(1)  # u . t
+    alone = hidden & ~(sums > (FEW if completed else torch.finfo(sums.dtype).tiny ** 0.5))
+    sums = torch.where(hidden & ~alone, sums, 1.0)
+    own = OWN * diagonal
+    root = 2 / (sums + (sums.square() + 4 * own).sqrt()) if completed else 1 / sums  # of d (u . t + c d) = 1
+    factor = torch.where(hidden.unsqueeze(1), factor * ~alone.unsqueeze(1), matrix.factor)
+    return (
+        factor,
+        torch.where(hidden, torch.where(alone, 1.0, own), matrix.diagonal),
+        torch.where(hidden, torch.where(alone, 1.0, root), scaling),
+    )

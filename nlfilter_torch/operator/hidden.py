@@ -1,0 +1,62 @@
+"""Pixels of weight 0: their values, read by patches of others, come from pixels that count."""
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+
+def fill_hidden(planes: Tensor, counts: Tensor, margin: int, *, mirrored: bool = True) -> Tensor:
+    """Pad planes by ``margin`` pixels on all sides, and replace there and at hidden pixels what is unknown.
+
+    A hidden pixel takes the values of its mirror images at the nearest pixels that count, in both directions of its row
+    and of its column, weighted by the inverse distance. Where no pixel of row and column counts, this is repeated with
+    the filled ones. Reflection turns into replication where ``margin`` pixels or fewer count in a line. A rectangle of
+    pixels that count is thus continued as an image of that size is padded.
+
+    Args:
+        planes: (B, C, ...), with any number of axes of pixels.
+        counts: (B or 1, 1, ...), true where a pixel counts; some pixel of every image must.
+        margin: half a patch.
+        mirrored: whether to reflect; replication otherwise.
+
+    Returns:
+        Planes that are longer by twice the margin along each axis of pixels; differentiable.
+    """
+    axes = range(2, planes.ndim)
+    widths = (margin, margin) * len(axes)
+    planes = F.pad(torch.where(counts, planes, 0.0), widths)
+    counts = F.pad(counts.byte(), widths).bool()
+    for _ in axes:
+        planes, counts = _filled_along_axes(planes, counts, margin if mirrored else 0)
+    return planes
+
+
+def _filled_along_axes(planes: Tensor, counts: Tensor, reach: int) -> tuple[Tensor, Tensor]:
+    """Fill pixels of rows and columns with pixels that count; return the planes and what counts now."""
+    total, shares = torch.zeros_like(planes), torch.zeros_like(planes[:, :1])
+    for axis in range(2, planes.ndim):
+        for backwards in (False, True):
+            source, distance = _mirror_images(counts, axis, reach, backwards=backwards)
+            share = torch.where(distance > 0, 1.0 / distance.clamp(min=1), 0.0).to(planes)
+            total = total + share * planes.gather(axis, source.expand(*planes.shape[:2], *source.shape[2:]))
+            shares = shares + share
+    filled = total / torch.where(shares > 0, shares, 1.0)
+    return torch.where(counts, planes, filled), counts | (shares > 0)
+
+
+def _mirror_images(counts: Tensor, axis: int, reach: int, *, backwards: bool) -> tuple[Tensor, Tensor]:
+    """Indices along an axis of mirror images at the last pixel before that counts, and distances to that pixel.
+
+    Both have the shape of ``counts``. The distance is 0 at pixels that count, and where no pixel before counts.
+    """
+    length = counts.shape[axis]
+    if backwards:
+        source, distance = _mirror_images(counts.flip(axis), axis, reach, backwards=False)
+        return (length - 1 - source).flip(axis), distance.flip(axis)
+    index = torch.arange(length, device=counts.device).view(-1, *[1] * (counts.ndim - 1 - axis)).expand_as(counts)
+    last = torch.where(counts, index, -1).cummax(axis).values
+    hidden = torch.where(counts, -1, index).cummax(axis).values
+    nearest = last.clamp(min=0)
+    run = nearest - hidden.gather(axis, nearest)  # number of pixels that count, up to the nearest
+    distance = torch.where(last >= 0, index - last, 0)
+    return nearest - torch.where(run > reach, distance.clamp(max=reach), 0), distance

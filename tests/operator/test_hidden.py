@@ -1,0 +1,58 @@
+"""Filling hidden pixels: a rectangle that counts is continued as an image of that size is padded."""
+
+from collections.abc import Callable
+
+import pytest
+import torch
+from torch import Tensor
+
+from nlfilter_torch.operator.features import pad_border
+from nlfilter_torch.operator.hidden import fill_hidden
+from tests.problems import noise
+
+
+@pytest.mark.parametrize("margin", [0, 1, 2, 3])
+@pytest.mark.parametrize("shape", [(7, 9), (7, 2), (1, 1), (3, 8)])
+def test_a_rectangle_is_continued_as_an_image_is_padded(shape: tuple[int, int], margin: int) -> None:
+    image = noise(2, 3, *shape)
+    canvas, counts = torch.full((2, 3, 12, 14), torch.nan), torch.zeros(2, 1, 12, 14)
+    canvas = canvas.double()
+    canvas[..., : shape[0], : shape[1]] = image
+    counts[..., : shape[0], : shape[1]] = 1
+    filled = fill_hidden(canvas, counts > 0, margin)
+    assert filled.shape == (2, 3, 12 + 2 * margin, 14 + 2 * margin)
+    expected = pad_border(image, margin)
+    torch.testing.assert_close(filled[..., : expected.shape[2], : expected.shape[3]], expected, atol=1e-14, rtol=0)
+
+
+def test_replication_and_volumes() -> None:
+    volume = noise(1, 1, 3, 4, 5)
+    counts = torch.ones_like(volume) > 0
+    expected = torch.nn.functional.pad(volume, (1,) * 6, mode="replicate")
+    torch.testing.assert_close(fill_hidden(volume, counts, 1, mirrored=False), expected, atol=1e-14, rtol=0)
+    expected = torch.nn.functional.pad(volume, (2,) * 6, mode="reflect")
+    torch.testing.assert_close(fill_hidden(volume, counts, 2), expected, atol=1e-14, rtol=0)
+
+
+def test_a_hole_lies_between_what_surrounds_it() -> None:
+    ramp = torch.arange(9.0).expand(1, 1, 9, 9).clone()
+    counts = torch.ones_like(ramp)
+    counts[..., 3:6, 3:6] = 0
+    filled = fill_hidden(ramp * counts, counts > 0, 0)
+    assert torch.equal(filled[counts > 0], ramp[counts > 0])
+    middle = filled[0, 0, 3:6, 3:6]
+    assert bool(((middle > 2) & (middle < 6)).all())
+    assert bool((middle.diff(dim=1) > 0).all())
+
+
+@pytest.mark.parametrize("turn", [lambda x: x.flip(2), lambda x: x.flip(3), lambda x: x.mT], ids=["up", "left", "mT"])
+def test_no_direction_is_preferred(turn: Callable[[Tensor], Tensor]) -> None:
+    image, counts = noise(1, 2, 11, 11), noise(1, 1, 11, 11, seed=1) > 0.7
+    torch.testing.assert_close(fill_hidden(turn(image), turn(counts), 2), turn(fill_hidden(image, counts, 2)))
+
+
+def test_gradcheck_and_hidden_values_have_no_gradient() -> None:
+    image, counts = noise(1, 2, 5, 6).requires_grad_(), noise(1, 1, 5, 6, seed=1) > 0.5
+    assert torch.autograd.gradcheck(lambda planes: fill_hidden(planes, counts, 2), image)
+    (gradient,) = torch.autograd.grad(fill_hidden(image, counts, 2).sum(), image)
+    assert not bool(gradient[(~counts).expand_as(gradient)].any())
