@@ -209,7 +209,19 @@ FUNCTIONS = {
     "collate": Function(_collated, {"samples": lambda scene: [scene.operator, scene.operator]}, {}),
     "polynomial_filter": Function(nlf.polynomial_filter, OPERATOR | IMAGE | ALPHA, RESIDUAL),
     "detail_layers": Function(nlf.detail_layers, OPERATOR | IMAGE, ORDER),
-    "spectral_filter": Function(nlf.spectral_filter, SPECTRUM | IMAGE | {"response": _responses}, RESIDUAL),
+    "spectral_filter": Function(
+        lambda spectrum, **options: nlf.spectral_filter(spectrum, **options),
+        SPECTRUM | IMAGE | {"response": _responses},
+        RESIDUAL,
+    ),
+    "spectral_filter of the operator": Function(
+        nlf.spectral_filter, OPERATOR | IMAGE | {"response": _responses}, {"tolerance": _plain(1e-4, 1e-2)}
+    ),
+    "apply_function": Function(
+        lambda *arguments, **options: nlf.apply_function(*arguments, **options).image,
+        OPERATOR | IMAGE | {"response": _responses},
+        {"tolerance": _plain(1e-4, 1e-2)},
+    ),
     "polynomial_response": Function(
         nlf.polynomial_response, {"eigenvalues": lambda scene: scene.noise(scene.batch, 5), **ALPHA}, {}
     ),

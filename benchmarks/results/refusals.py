@@ -44,6 +44,7 @@ OF_IMAGES: dict[str, Callable[[Any], object]] = {
     "detail_layers": lambda x: nf.detail_layers(BUILT, x),
     "polynomial_filter": lambda x: nf.polynomial_filter(BUILT, x, ONES),
     "spectral_filter": lambda x: nf.spectral_filter(SPECTRUM, x, torch.sqrt),
+    "spectral_filter of the operator": lambda x: nf.spectral_filter(BUILT, x, torch.sqrt),
     "captured_energy": lambda x: nf.captured_energy(SPECTRUM, x),
     "fit_alpha": lambda x: nf.fit_alpha(BUILT, IMAGE, x),
     "fit_filter": lambda x: nf.fit_filter(BUILT, x),

@@ -276,35 +276,39 @@ def check_coefficients(coefficients: Tensor, factor: Tensor) -> None:
     check_finite(coefficients, "coefficients")
 
 
-def checked_response(response: Response, support: Tensor) -> Response:
-    """Wrap a function from eigenvalues (B, M) to gains so that its results are checked where ``support`` is True."""
+def checked_response(response: Response, support: Tensor | None = None, dtype: torch.dtype | None = None) -> Response:
+    """Wrap a function from eigenvalues (B, R) to gains so that its results are checked.
+
+    Args:
+        response: the function.
+        support: (B, M) bool, where gains of so many eigenvalues must be finite; None means everywhere.
+        dtype: in which the function receives eigenvalues; None leaves them as they are.
+    """
     if not callable(response):
         raise TypeError(
             f"response must be a function of the eigenvalues, got {type(response).__name__}; "
             "pass a function such as torch.sqrt"
         )
-    return partial(_gains, response, support)
+    return partial(_gains, response, support, dtype)
 
 
-def _gains(response: Response, support: Tensor, eigenvalues: Tensor) -> Tensor:
-    """Compute and check the gains of eigenvalues (B, M)."""
+def _gains(response: Response, support: Tensor | None, dtype: torch.dtype | None, eigenvalues: Tensor) -> Tensor:
+    """Compute and check the gains of eigenvalues (B, R)."""
     remedy = "return one gain for every eigenvalue"
-    gains = response(eigenvalues)
+    gains = response(eigenvalues if dtype is None else eigenvalues.to(dtype))
     check_tensor(gains, "response", remedy)
     if gains.dtype.is_complex:
         raise TypeError(f"response must be real, got {gains.dtype}; {remedy}")
-    try:
-        fits = torch.broadcast_shapes(gains.shape, eigenvalues.shape) == eigenvalues.shape
-    except RuntimeError:
-        fits = False
-    if not fits:
+    if gains.shape != eigenvalues.shape:
         raise ValueError(
             f"response must return a tensor with the shape of its argument, {tuple(eigenvalues.shape)}, "
             f"got {tuple(gains.shape)}; {remedy}"
         )
-    if eigenvalues.shape == support.shape:
+    if support is None:
+        check_finite(gains, "response")
+    elif eigenvalues.shape == support.shape:
         check_finite(torch.where(support, gains.detach(), 0), "response")
-    return gains if gains.is_floating_point() else gains.to(eigenvalues)
+    return gains if gains.is_floating_point() else gains.to(dtype or eigenvalues.dtype)
 
 
 def check_alpha(alpha: Tensor, *, dimensions: Sequence[int] = (1, 2, 4)) -> None:

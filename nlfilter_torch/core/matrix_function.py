@@ -18,8 +18,8 @@ from nlfilter_torch.core.torch_internals import are_derived, is_transformed
 
 # For eigenvalues with a relative distance below MEETING, f' at their midpoint is used: the truncation error, in f''',
 # and the cancellation error are then both near 1e-10. For eigenvalues below FLOOR the distance is relative to FLOOR,
-# since zero eigenvalues are zero only up to rounding.
-MEETING = 1e-5
+# since zero eigenvalues are zero only up to rounding. A function that computes in float32 needs a larger distance.
+MEETING = {torch.float64: 1e-5, torch.float32: 3e-3}
 FLOOR = 1e-5
 
 
@@ -56,44 +56,71 @@ class SymmetricMatrix:
         """
         # Outside the support f is evaluated at 1, where responses and their derivatives are finite.
         points = torch.where(support, self.eigenvalues, torch.ones_like(self.eigenvalues))
-        values = torch.where(support, function(points), torch.zeros_like(points))
+        gains = function(points)
+        meeting = MEETING.get(gains.dtype, MEETING[torch.float32])
+        values = torch.where(support, gains.to(points), torch.zeros_like(points))
         if not self.matrix.requires_grad:
             constant = (self.vectors * values.unsqueeze(-2)) @ self.vectors.mT
             if not are_derived([self.matrix]):
                 return constant
             change = self.matrix - self.matrix.detach()  # zero, with a forward-mode derivative
             inner = self.vectors.mT @ ((change + change.mT) / 2) @ self.vectors
-            return constant + self.vectors @ (self._differences(function, values, support) * inner) @ self.vectors.mT
+            return (
+                constant
+                + self.vectors @ (self._differences(function, values, support, meeting) * inner) @ self.vectors.mT
+            )
         result: Tensor = _SpectralFunction.apply(  # type: ignore[no-untyped-call]
-            self.matrix, values, self.vectors, self._differences(function, values, support)
+            self.matrix, values, self.vectors, self._differences(function, values, support, meeting)
         )
         return result
 
-    def _differences(self, function: Callable[[Tensor], Tensor], values: Tensor, support: Tensor) -> Tensor:
-        """Divided differences (B, M, M) of f over the eigenvalues."""
-        gap = self.eigenvalues.unsqueeze(-1) - self.eigenvalues.unsqueeze(-2)
-        middle = (self.eigenvalues.unsqueeze(-1) + self.eigenvalues.unsqueeze(-2)) / 2
+    def _differences(
+        self, function: Callable[[Tensor], Tensor], values: Tensor, support: Tensor, meeting: float
+    ) -> Tensor:
+        """Divided differences (B, M, M) of f over the eigenvalues; those of float32 functions ``meet`` earlier."""
         both = support.unsqueeze(-1) & support.unsqueeze(-2)
-        meeting = both & (gap.abs() < MEETING * middle.clamp(min=FLOOR))
-        slope = self._slope(function, torch.where(meeting, middle, torch.ones_like(middle)))
-        values = values.detach()
-        secant = (values.unsqueeze(-1) - values.unsqueeze(-2)) / torch.where(gap == 0, torch.ones_like(gap), gap)
-        return torch.where(meeting, slope, secant)
+        pair = self.eigenvalues, values
+        return divided_differences(function, pair, pair, both, meeting=meeting)
 
-    @staticmethod
-    def _slope(function: Callable[[Tensor], Tensor], points: Tensor) -> Tensor:
-        """Derivative of f at ``points`` (B, M, M); f may differ between the images of a batch."""
-        if is_transformed(points):  # in torch.func
-            slope: Tensor = torch.func.grad(lambda flat: function(flat).sum())(points.detach().flatten(1))
-            return slope.view_as(points)
-        with torch.enable_grad():
-            points = points.detach().requires_grad_()
-            flat = points.flatten(1)
-            total = function(flat).sum()
-            if not total.requires_grad:
-                return torch.zeros_like(points)
-            # A constant function may still have parameters.
-            return torch.autograd.grad(total, points, allow_unused=True, materialize_grads=True)[0]
+
+def divided_differences(
+    function: Callable[[Tensor], Tensor],
+    left: tuple[Tensor, Tensor],
+    right: tuple[Tensor, Tensor],
+    both: Tensor | None = None,
+    *,
+    meeting: float,
+) -> Tensor:
+    """Divided differences (..., k, l) of f between two sets of points, (..., k) and (..., l).
+
+    Args:
+        function: f, elementwise, (B, R) to (B, R).
+        left: points, and values of f there.
+        right: the same of the other set.
+        both: (..., k, l) bool, where f is defined at both points; None means everywhere.
+        meeting: relative distance of points below which the derivative at their midpoint is taken.
+    """
+    gap = left[0].unsqueeze(-1) - right[0].unsqueeze(-2)
+    middle = (left[0].unsqueeze(-1) + right[0].unsqueeze(-2)) / 2
+    near = gap.abs() < meeting * middle.clamp(min=FLOOR)
+    near = near if both is None else both & near
+    slopes = slope(function, torch.where(near, middle, torch.ones_like(middle)))
+    change = left[1].detach().unsqueeze(-1) - right[1].detach().unsqueeze(-2)
+    return torch.where(near, slopes, change / torch.where(gap == 0, torch.ones_like(gap), gap))
+
+
+def slope(function: Callable[[Tensor], Tensor], points: Tensor) -> Tensor:
+    """Derivative of f at ``points`` (B, ...); f may differ between the images of a batch."""
+    if is_transformed(points):  # in torch.func
+        gradient: Tensor = torch.func.grad(lambda flat: function(flat).sum())(points.detach().flatten(1))
+        return gradient.view_as(points)
+    with torch.enable_grad():
+        points = points.detach().requires_grad_()
+        total = function(points.flatten(1)).sum()
+        if not total.requires_grad:
+            return torch.zeros_like(points)
+        # A constant function may still have parameters.
+        return torch.autograd.grad(total, points, allow_unused=True, materialize_grads=True)[0]
 
 
 class _SpectralFunction(torch.autograd.Function):

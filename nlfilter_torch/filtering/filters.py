@@ -1,9 +1,8 @@
-"""Polynomial and spectral filters. Paper: Sec. III, eq. (10) to (14); Appendix A, eq. (19)."""
+"""Polynomial filters: layers and sliders. Paper: Sec. III, eq. (11) to (14)."""
 
 import torch
 from torch import Tensor
 
-from nlfilter_torch.core.blocks import fold_batch, weighted
 from nlfilter_torch.core.checks import (
     check_alpha,
     check_dtype,
@@ -16,14 +15,12 @@ from nlfilter_torch.core.checks import (
     check_tensor,
     check_unit_range,
     check_values,
-    checked_response,
 )
 from nlfilter_torch.core.kernels.tall_skinny import spread
 from nlfilter_torch.core.layouts import in_format_of
 from nlfilter_torch.core.precision import full_precision, per_image
 from nlfilter_torch.operator.operator import NonlocalOperator
 from nlfilter_torch.operator.products import Columns
-from nlfilter_torch.operator.spectrum import Response, Spectrum
 
 
 def detail_layers(operator: NonlocalOperator, image: Tensor, *, order: int = 3) -> Tensor:
@@ -150,7 +147,8 @@ def polynomial_filter(
     alpha = alpha if alpha.ndim == 4 else operator.communicator.copy_to_group(alpha)
     filtered = weigh_layers(_layers(operator, image, order), alpha)
     if residual is not None and len(filtered):
-        captured = spectral_filter(operator.spectrum(), image.to(filtered), torch.ones_like)
+        spectrum = operator.spectrum()
+        captured = spectrum.synthesize(torch.ones_like, spectrum.coefficients(image.to(filtered)))
         weight = operator.communicator.copy_to_group(residual)
         filtered = filtered + residual_change(alpha, weight, image.to(filtered) - captured, operator.diagonal_share)
     return in_format_of(filtered, image)
@@ -172,99 +170,6 @@ def residual_change(alpha: Tensor, weight: float | Tensor, residual: Tensor, rem
     powers = torch.stack([remainder.pow(i) for i in range(entries)], dim=1)  # (B, k+1, 1, H, W)
     gain = weigh_layers(layers_between(powers), alpha)
     return (per_image(weight, residual, 4) - gain) * (1 - remainder) * residual
-
-
-@full_precision
-def spectral_filter(
-    spectrum: Spectrum,
-    image: Tensor,
-    response: Response,
-    *,
-    residual: float | Tensor = 0.0,
-    coefficients: Tensor | None = None,
-) -> Tensor:
-    """Filter an image with any response f: ``V f(S) V^T y``, plus ``residual`` times ``y - V V^T y``.
-
-    Paper: eq. (10), (13), and Sec. V-D, where f is a fractional power.
-
-    Args:
-        spectrum: of the operator.
-        image: y, (B, C, H, W).
-        response: f, an elementwise function of the eigenvalues (B, R), differentiable in torch; may have parameters.
-        residual: weight of ``y - V V^T y``, a number or a tensor of shape () or the spectrum's (B,).
-        coefficients: ``spectrum.coefficients(image)``, if already computed; a further response then reads the factor
-            once instead of twice. None computes them.
-
-    Returns:
-        (B, C, H, W) in the image's dtype. Differentiable in image, operator, residual and the parameters of
-        ``response``, with a finite gradient also if eigenvalues are equal.
-
-    Raises:
-        TypeError, ValueError: if ``image`` is not a finite floating-point tensor of the spectrum's size,
-            ``coefficients`` do not have the shape of those of ``image``, ``response`` does not return a finite gain for
-            every eigenvalue, or ``residual`` is not finite or has the wrong shape.
-
-    Example:
-        >>> from nlfilter_torch import nonlocal_operator
-        >>> image = torch.rand(1, 1, 24, 24, generator=torch.Generator().manual_seed(0))
-        >>> spectrum = nonlocal_operator(image, num_landmarks=20).spectrum()
-        >>> cached = spectrum.coefficients(image)
-        >>> for power in (0.1, 0.5, 2.0):
-        ...     filtered = spectral_filter(spectrum, image, lambda s: s**power, residual=1.0, coefficients=cached)
-        >>> filtered.shape
-        torch.Size([1, 1, 24, 24])
-    """
-    check_instance(spectrum, Spectrum, "spectrum", "take operator.spectrum()")
-    response = checked_response(response, spectrum.support)
-    check_values(residual, "residual", "finite", spectrum.factor.shape[0])
-    check_tensor(image, "image", "convert it with torch.as_tensor")
-    if image.ndim == 4 and len(image) == 0:
-        check_image(image, "image", empty=True)
-        check_same_size(image, spectrum.size, "image", "spectrum", spectrum.factor)
-        fold_batch(image, spectrum.factor.shape[0])  # checks the batch
-        return image.clone()
-    if coefficients is None:
-        coefficients = spectrum.coefficients(image)
-    else:
-        check_image(image, "image")
-        check_same_size(image, spectrum.size, "image", "spectrum", spectrum.factor)
-        batch, landmarks, _ = spectrum.factor.shape
-        shape = (max(batch, image.shape[0]), image.shape[1], landmarks)
-        check_shape(coefficients, shape, "coefficients", "use spectrum.coefficients(image)")
-    if isinstance(residual, int | float) and residual == 0:
-        return in_format_of(spectrum.synthesize(response, coefficients), image)
-    rho = per_image(spectrum.communicator.copy_to_group(residual), spectrum.root, 2)
-    # V f V^T y + rho (y - V V^T y) = V (f - rho) V^T y + rho y, still in two passes over the factor.
-    filtered = spectrum.synthesize(lambda eigenvalues: response(eigenvalues) - rho, coefficients)
-    return in_format_of(filtered + rho.to(filtered).reshape(-1, 1, 1, 1) * image.to(filtered), image)
-
-
-@full_precision
-def captured_energy(spectrum: Spectrum, image: Tensor) -> Tensor:
-    """Compute the share of the image's energy in the span of the eigenvectors, ``|V^T y|^2 / |y|^2``.
-
-    Paper: eq. (19). Near 1 if bandwidth and landmarks suit the image.
-
-    Args:
-        spectrum: of the operator.
-        image: y, (B, C, H, W).
-
-    Returns:
-        beta, (B,), in [0, 1] up to rounding; 1 for a black image. Differentiable in image and operator.
-
-    Raises:
-        TypeError, ValueError: if ``image`` is not a finite floating-point tensor of the spectrum's size.
-    """
-    check_instance(spectrum, Spectrum, "spectrum", "take operator.spectrum()")
-    check_image(image, "image")
-    captured = spectral_filter(spectrum, image.to(spectrum.factor.dtype), torch.ones_like)
-    exact = image.double()
-    energy, inner = (  # |y|^2 and y^T V V^T y, in the sum over weighted points; in float32 they might overflow
-        spectrum.communicator.sum(weighted((planes * exact).flatten(2).sum(1), spectrum.weights).sum(1))
-        for planes in (exact, captured)
-    )
-    share = torch.where(energy > 0, inner / energy.clamp(min=torch.finfo(energy.dtype).tiny), 1.0)
-    return share.to(spectrum.factor)
 
 
 @full_precision

@@ -104,7 +104,8 @@ class Spectrum(Batch, RitzPairs):
         residual: that of the operator, (B,).
         weights: number of pixels that each point represents, (B, N), or None. Eigenvectors are orthonormal in the sum
             over points with these weights.
-        among: ranks that the rows of the image are distributed over.
+        communicator: ranks that the rows of the image are distributed over.
+        remainder: r, the diagonal part of W, (B, N), or None if it has none.
     """
 
     eigenvalues: Tensor
@@ -115,6 +116,7 @@ class Spectrum(Batch, RitzPairs):
     residual: Tensor
     weights: Tensor | None = None
     communicator: Communicator = ALONE
+    remainder: Tensor | None = None
 
     def __repr__(self) -> str:
         images, (height, width) = len(self), self.size
@@ -262,5 +264,16 @@ def compute_spectrum(
     eigenvalues = (values.clamp(0.0, 1.0) * support)[:, :shown].to(factor)
     largest = values[:, 0].detach()
     return Spectrum(
-        pairs.ritz, pairs.root, support, eigenvalues, factor, scaling, size, largest, residual, weights, communicator
+        pairs.ritz,
+        pairs.root,
+        support,
+        eigenvalues,
+        factor,
+        scaling,
+        size,
+        largest,
+        residual,
+        weights,
+        communicator,
+        remainder,
     )

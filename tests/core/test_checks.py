@@ -13,6 +13,7 @@ from nlfilter_torch import (
     NonlocalFilter,
     abstract,
     adjust_tone,
+    apply_function,
     colorize,
     defocus,
     denoise,
@@ -111,6 +112,8 @@ RESPONSES: dict[str, Any] = {
     "no function": 0.5,
     "None": lambda s: None,
     "number": lambda s: 1.0,
+    "scalar": lambda s: s.sum(),
+    "row": lambda s: s[:1],
     "too few": lambda s: s[:, :3],
     "too many": lambda s: s.expand(3, *s.shape),
     "NaN": lambda s: s * NAN,
@@ -155,6 +158,8 @@ def test_responses_return_a_finite_gain_for_every_eigenvalue(response: str) -> N
     result = RESPONSES[response]
     sentence(lambda: spectral_filter(SPECTRUM, IMAGE, result), "response")
     sentence(lambda: spectral_filter(SPECTRUM, IMAGE, result, residual=0.5), "response")
+    sentence(lambda: spectral_filter(OPERATOR, IMAGE, result), "response")
+    sentence(lambda: apply_function(OPERATOR, IMAGE, result), "response")
     sentence(lambda: SPECTRUM.gain(result), "response")
     sentence(lambda: SPECTRUM.synthesize(result, SPECTRUM.coefficients(IMAGE)), "response")
 

@@ -71,6 +71,7 @@ TAKE_AN_IMAGE: dict[str, tuple[str, Callable[[torch.Tensor], object]]] = {
     "detail_layers": ("image", lambda x: detail_layers(OPERATOR, x)),
     "polynomial_filter": ("image", lambda x: polynomial_filter(OPERATOR, x, torch.ones(4))),
     "spectral_filter": ("image", lambda x: spectral_filter(SPECTRUM, x, torch.sqrt)),
+    "spectral_filter of the operator": ("image", lambda x: spectral_filter(OPERATOR, x, torch.sqrt)),
     "coefficients": ("image", SPECTRUM.coefficients),
     "propagate_strokes": ("strokes", lambda x: propagate_strokes(SPECTRUM, x, PAINTED)),
     "captured_energy": ("image", lambda x: captured_energy(SPECTRUM, x)),

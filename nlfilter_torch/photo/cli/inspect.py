@@ -96,7 +96,7 @@ def build_operator(guide: "Tensor", step: "Step", seed: int = 0) -> "NonlocalOpe
 
 def summarize(operator: "NonlocalOperator", spectrum: "Spectrum", guide: "Tensor") -> dict[str, float]:
     """The diagnostics of an operator of a single image as plain numbers, with the bandwidth in grey levels."""
-    from nlfilter_torch.filtering.filters import captured_energy
+    from nlfilter_torch.filtering.spectral import captured_energy
 
     figures = {
         name: value[0] if isinstance(value, list) else value for name, value in asdict(operator.diagnostics()).items()

@@ -66,6 +66,8 @@ CASES: dict[str, Case] = {
     "polynomial_filter": lambda x: nlf.polynomial_filter(x.operator(), x.image(), x.zeros(4), residual=0.5),
     "detail_layers": lambda x: nlf.detail_layers(x.operator(), x.image()),
     "spectral_filter": lambda x: nlf.spectral_filter(x.spectrum(), x.image(), response, residual=0.3),
+    "spectral_filter of the operator": lambda x: nlf.spectral_filter(x.operator(), x.image(), response),
+    "apply_function": lambda x: nlf.apply_function(x.operator(), x.image(), response).image,
     "captured_energy": lambda x: nlf.captured_energy(x.spectrum(), x.image()),
     "compose_alpha": lambda x: nlf.compose_alpha(x.mask(2), x.zeros(2, 4)),
     "filter_regions": lambda x: nlf.filter_regions(x.operator(), x.image(), x.mask(2), x.zeros(2, 4)),
@@ -111,7 +113,14 @@ READS: dict[str, Case] = {
     "region_mask": lambda x: nlf.region_mask(x.image(), x.mask()),
     "enhance": lambda x: nlf.enhance(x.image(), x.zeros(2, 4), x.mask(2)),
 }
-CLASSES = {"Certificate", "Diagnostics", "FittedLook", "NonlocalOperator", "Spectrum"}  # results of functions
+CLASSES = {
+    "Certificate",
+    "Diagnostics",
+    "FittedLook",
+    "FunctionProduct",
+    "NonlocalOperator",
+    "Spectrum",
+}  # results of functions
 
 
 @pytest.fixture

@@ -1,0 +1,161 @@
+"""Functions of W itself, from products with W and shifted systems. Paper: eq. (7), (8).
+
+The eigenvectors in the span of the factor do not show what the diagonal part of W does to a pixel unlike all others.
+Three methods need no eigenvectors:
+
+- a polynomial of W, if one of low degree fits the response on the range of the eigenvalues;
+- a polynomial and poles on the negative axis, if the response has its singularity at or near 0, as a fractional power:
+  every pole is a shifted system, which a Gram matrix solves exactly (:mod:`nlfilter_torch.operator.pixel_matrix`);
+- the method of Lanczos, for responses with steps or kinks inside the range (:mod:`nlfilter_torch.filtering.lanczos`).
+
+The first that keeps the tolerance is taken. The derivative of the first two is exact, however large the tolerance.
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from nlfilter_torch.core.blocks import fold_batch, unfold_batch
+from nlfilter_torch.core.checks import check_image, check_instance, check_same_size, check_values, checked_response
+from nlfilter_torch.core.layouts import in_format_of
+from nlfilter_torch.core.precision import full_precision, uncompiled, working_dtype
+from nlfilter_torch.core.rational import DECADES, RationalForm, best_form, interval_nodes, pole_forms
+from nlfilter_torch.core.torch_internals import is_fake, is_transformed
+from nlfilter_torch.core.warning import warn
+from nlfilter_torch.filtering.lanczos import STEPS, krylov_product, ritz_space
+from nlfilter_torch.filtering.rational_product import rational_product
+from nlfilter_torch.operator.operator import NonlocalOperator
+from nlfilter_torch.operator.pixel_matrix import PixelMatrix
+from nlfilter_torch.operator.spectrum import Response
+
+TOLERANCE = 3e-4  # default; 0.08 of 255 grey levels
+UNSEEN_POLES = 16  # where no value can be read
+CHANNELS = 1 << 27  # numbers in the bases of a few channels, which are filtered in turn
+
+
+@dataclass(frozen=True, eq=False)
+class FunctionProduct:
+    """``f(W) y`` and what it took.
+
+    Attributes:
+        image: (B, C, H, W), in the dtype of y.
+        products: number of products with W.
+        shifts: number of shifted systems that were solved, each at the cost of a Gram matrix and a product.
+        error: estimate of the error. Without a tolerance that is missed, it is at most that: for a rational function
+            the largest error of the gain of an eigenvalue, relative to the largest gain, which bounds the norm of the
+            error; for Lanczos that of a pixel, relative to the largest gain and value of y. NaN where no value can be
+            read.
+    """
+
+    image: Tensor
+    products: int
+    shifts: int
+    error: float
+
+
+@uncompiled
+@full_precision
+def apply_function(
+    operator: NonlocalOperator, image: Tensor, response: Response, *, tolerance: float = TOLERANCE
+) -> FunctionProduct:
+    """Compute ``f(W) y`` for any response f, with the number of products and the error reached.
+
+    Paper: eq. (7), for the W of this library, with its diagonal part; :func:`spectral_filter` returns the image alone.
+
+    Args:
+        operator: W.
+        image: y, (B, C, H, W).
+        response: f, an elementwise function (B, R) to (B, R) of eigenvalues in [0, 1], in the image's dtype (at least
+            float32); may have parameters.
+        tolerance: of the error, relative to the largest gain; see :class:`FunctionProduct`.
+
+    Returns:
+        The product; ``image`` is differentiable in image, operator and the parameters of ``response``, once if the
+        operator needs a gradient or the response has steps or kinks.
+
+    Raises:
+        TypeError, ValueError: if ``image`` does not fit the operator, ``response`` does not return a finite gain for
+            every eigenvalue, or ``tolerance`` is not positive.
+
+    Example:
+        >>> from nlfilter_torch import nonlocal_operator
+        >>> image = torch.rand(1, 3, 24, 24, generator=torch.Generator().manual_seed(0))
+        >>> operator = nonlocal_operator(image, num_landmarks=20)
+        >>> root = apply_function(operator, image, torch.sqrt)
+        >>> twice = apply_function(operator, root.image, torch.sqrt)
+        >>> bool((twice.image - operator @ image).abs().max() < 1e-3), root.products < 30, root.error < 3e-4
+        (True, True, True)
+    """
+    check_instance(operator, NonlocalOperator, "operator", "make it with nonlocal_operator")
+    check_values(tolerance, "tolerance", "positive")
+    response = checked_response(response, dtype=working_dtype(image) if isinstance(image, Tensor) else None)
+    check_image(image, "image", empty=True)
+    check_same_size(image, operator.size, "image", "operator", operator.factor)
+    planes = fold_batch(image.to(operator.factor), operator.factor.shape[0])
+    if planes.numel() == 0:
+        return FunctionProduct(image.clone(), 0, 0, 0.0)
+    parts = operator.factor, operator.scaling, operator.remainder
+    matrix = PixelMatrix(*parts, operator.communicator, operator.weights)
+    decades, seen = _decades(matrix)
+    nodes = interval_nodes(decades).to(planes.device).expand(len(planes), -1)
+    values = response(nodes)
+    seen = seen and not any(map(_is_unreadable, (values, planes)))
+    rounding = torch.finfo(torch.promote_types(working_dtype(image), planes.dtype)).eps / 2
+    rounding = max(rounding, torch.finfo(planes.dtype).eps / 2, torch.finfo(values.dtype).eps / 2)
+    form: RationalForm | None = pole_forms(decades, UNSEEN_POLES)[0]
+    error = math.nan
+    if seen:
+        best = best_form(values, decades, tolerance, rounding)
+        form, error = (None, error) if best is None else best
+    if form is not None:
+        coefficients = form.coefficients(operator.communicator.copy_to_group(values))
+        filtered = rational_product(matrix, planes, form, coefficients)
+        cost = form.degree, len(form.shifts)
+    else:
+        filtered, steps, error = _by_lanczos(matrix, planes, response, tolerance, float(values.detach().abs().max()))
+        cost = steps, 0
+    result = unfold_batch(filtered.unsqueeze(1), image.shape[0], operator.size)[:, 0]
+    return FunctionProduct(in_format_of(result, image), *cost, error)
+
+
+@torch.no_grad()
+def _decades(matrix: PixelMatrix) -> tuple[int, bool]:
+    """Minus the decimal logarithm of a lower bound of the eigenvalues, and whether it could be read.
+
+    W less its diagonal part r is positive semi-definite, so that no eigenvalue is below the smallest r.
+    """
+    most = DECADES[matrix.remainder.dtype]
+    if _is_unreadable(matrix.remainder):
+        return most, False
+    least = -float(matrix.communicator.max(-matrix.remainder.amin(1)).max())
+    return (most if least <= 10.0**-most else min(max(math.ceil(-math.log10(least)), 1), most)), True
+
+
+def _is_unreadable(tensor: Tensor) -> bool:
+    """Whether values cannot be read; those on accelerators can, at the price of waiting for them."""
+    return tensor.device.type == "meta" or is_fake(tensor) or is_transformed(tensor)
+
+
+def _by_lanczos(
+    matrix: PixelMatrix, planes: Tensor, response: Response, tolerance: float, largest: float
+) -> tuple[Tensor, int, float]:
+    """``f(W) y`` for planes y, (B, C, N), the number of products, and the error; some channels at a time.
+
+    ``largest`` is the largest gain. Warns if the tolerance is missed.
+    """
+    count = max(1, CHANNELS // (STEPS[0] * len(planes) * planes.shape[2]))
+    results, steps, errors = [], 0, [0.0]
+    for part in planes.split(count, dim=1):
+        space, error = ritz_space(matrix, part.detach(), response, tolerance * largest)
+        results.append(krylov_product(matrix, part, response, space))
+        steps = max(steps, space.values.shape[2])
+        errors.append(error / largest if largest > 0 else error)
+    if max(errors) > tolerance:
+        warn(
+            f"response must be smooth where W has eigenvalues, or be far from them where it has steps, for an error of "
+            f"{tolerance:g}, got an estimate of {max(errors):.2g} after {steps} products; "
+            "smooth its steps, or pass a larger tolerance"
+        )
+    return torch.cat(results, dim=1), steps, max(errors)

@@ -1,0 +1,153 @@
+"""f(W) against the dense eigen-decomposition, for every kind of response."""
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from nlfilter_torch import NonlocalOperator, apply_function, nonlocal_operator, operator_from_features
+from nlfilter_torch.filtering import lanczos
+from tests.problems import noise, picture
+
+IMAGE = picture("camera", 32, 32)
+NETWORK = torch.nn.Sequential(torch.nn.Linear(1, 32), torch.nn.Tanh(), torch.nn.Linear(32, 1)).double()
+with torch.no_grad():
+    for number, parameter in enumerate(NETWORK.parameters()):
+        parameter.copy_(4 * noise(*parameter.shape, seed=number) - 2)
+
+
+def network(values: Tensor) -> Tensor:
+    gains: Tensor = NETWORK(values.double().unsqueeze(-1)).squeeze(-1)
+    return gains.to(values)
+
+
+RESPONSES = {f"power {p}": (lambda s, p=p: s**p) for p in (0.1, 0.2, 0.5, 1.5, 3, 20)}
+RESPONSES |= {
+    "exp": torch.exp,
+    "network": network,
+    "kink": lambda s: (s - 0.3).abs(),
+    "log": lambda s: (s + 0.01).log(),
+}
+
+
+def dense(operator: NonlocalOperator) -> tuple[Tensor, Tensor]:
+    w = operator.to_dense()[0]
+    values, vectors = torch.linalg.eigh((w + w.mT) / 2)
+    return values.clamp(0, 1), vectors
+
+
+@pytest.mark.parametrize("count", [20, 300])
+def test_functions_are_those_of_the_dense_matrix(count: int) -> None:
+    operator = nonlocal_operator(IMAGE, num_landmarks=count, photometric_bandwidth=20 / 255)
+    values, vectors = dense(operator)
+    gaps = values.diff()
+    place = float((values[:-1] + values[1:])[gaps.argmax()] / 2)
+    steps = {"step": lambda s: s > place} if gaps.max() > 0.02 else {}
+    for name, response in (RESPONSES | steps).items():
+        wanted = vectors @ (response(values).double() * (vectors.mT @ IMAGE.flatten()))
+        result = apply_function(operator, IMAGE, response)
+        assert (result.image.flatten() - wanted).abs().max() < 1e-3, name
+        assert result.products + result.shifts <= 200, name
+        assert result.error <= 3e-4, name
+        single = apply_function(operator.to(torch.float32), IMAGE.float(), response)
+        assert (single.image.flatten() - wanted).abs().max() < 1e-3, name
+
+
+def test_a_smaller_tolerance_gives_a_smaller_error() -> None:
+    operator = nonlocal_operator(IMAGE, num_landmarks=50, photometric_bandwidth=0.3)
+    values, vectors = dense(operator)
+    wanted = vectors @ (values**0.3 * (vectors.mT @ IMAGE.flatten()))
+    costs = []
+    for tolerance in (1e-2, 1e-4, 1e-6):
+        result = apply_function(operator, IMAGE, lambda s: s**0.3, tolerance=tolerance)
+        assert (result.image.flatten() - wanted).abs().max() < 2 * tolerance
+        costs.append(result.shifts)
+    assert sorted(set(costs)) == costs
+
+
+@pytest.mark.parametrize("response", ["power 0.5", "exp", "kink"])
+def test_batches_channels_and_weights(response: str) -> None:
+    weights = noise(2, 48, seed=3) + 0.2
+    operator = operator_from_features(noise(2, 2, 48), size=(6, 8), num_landmarks=10, weights=weights)
+    images = noise(2, 3, 6, 8, seed=1)
+    result = apply_function(operator, images, RESPONSES[response]).image
+    for b in range(2):
+        root = weights[b].sqrt()
+        symmetric = root.unsqueeze(1) * operator.to_dense()[b] / root
+        values, vectors = torch.linalg.eigh((symmetric + symmetric.mT) / 2)
+        function = (vectors * RESPONSES[response](values.clamp(0, 1))) @ vectors.mT
+        wanted = images[b].flatten(1) @ (function * root / root.unsqueeze(1)).mT
+        torch.testing.assert_close(result[b].flatten(1), wanted, atol=1e-3, rtol=0)
+    one = apply_function(operator, images[:1], RESPONSES[response]).image
+    torch.testing.assert_close(one[0], result[0], atol=1e-3, rtol=0)
+    single = nonlocal_operator(images[:1], num_landmarks=10)
+    many = apply_function(single, images, RESPONSES[response]).image
+    torch.testing.assert_close(
+        many[1:], apply_function(single, images[1:], RESPONSES[response]).image, atol=1e-3, rtol=0
+    )
+
+
+@pytest.mark.parametrize("response", ["power 0.1", "exp", "kink"])
+def test_degenerate_images(response: str) -> None:
+    for image in (torch.full((1, 1, 1, 1), 0.4), torch.full((1, 3, 5, 4), 0.4), torch.zeros(1, 1, 4, 4)):
+        operator = nonlocal_operator(image, num_landmarks=1)
+        gain = float(RESPONSES[response](torch.ones(1)))
+        torch.testing.assert_close(
+            apply_function(operator, image, RESPONSES[response]).image, gain * image, atol=2e-4, rtol=0
+        )
+    flat = torch.zeros(1, 1, 6, 6)
+    flat[..., 3:] = 1
+    result = apply_function(nonlocal_operator(flat, num_landmarks=10), flat, RESPONSES[response])
+    assert result.image.isfinite().all()
+    empty = apply_function(nonlocal_operator(flat, num_landmarks=10), flat[:0], RESPONSES[response])
+    assert empty.image.shape == (0, 1, 6, 6)
+
+
+@pytest.mark.parametrize("response", ["power", "kink"])
+def test_gradients(response: str) -> None:
+    leaves = noise(1, 1, 4, 5), noise(1, 2, 4, 5, seed=1), torch.tensor(0.4, dtype=torch.float64)
+    leaves = tuple(leaf.clone().requires_grad_() for leaf in leaves)
+
+    def filtered(guide: Tensor, image: Tensor, number: Tensor) -> Tensor:
+        operator = nonlocal_operator(guide, num_landmarks=6, photometric_bandwidth=0.4, landmarks="uniform")
+        if response == "power":
+            return apply_function(operator, image, lambda s: s**number).image
+        return apply_function(operator, image, lambda s: (s - number).relu() + number * s).image
+
+    assert torch.autograd.gradcheck(filtered, leaves, atol=1e-6)
+
+
+@pytest.mark.filterwarnings("ignore:.*torch.jit.script.* is deprecated:DeprecationWarning")  # in torch.func itself
+def test_transforms_for_a_fixed_operator() -> None:
+    operator, image = nonlocal_operator(IMAGE, num_landmarks=20), IMAGE.expand(2, -1, -1, -1)
+    power = torch.tensor(0.4, dtype=torch.float64)
+
+    def total(power: Tensor) -> Tensor:
+        return apply_function(operator, IMAGE, lambda s: s**power, tolerance=1e-6).image.square().sum()
+
+    step = 1e-4
+    slope = (total(power + step) - total(power - step)) / (2 * step)
+    for transform in (torch.func.grad, torch.func.jacfwd, torch.func.jacrev):
+        torch.testing.assert_close(transform(total)(power), slope, rtol=1e-3, atol=0)
+    mapped = torch.func.vmap(lambda y: apply_function(operator, y.unsqueeze(0), torch.sqrt).image[0])(image)
+    torch.testing.assert_close(mapped, apply_function(operator, image, torch.sqrt).image, atol=1e-3, rtol=0)
+
+
+def test_a_missed_tolerance_warns_with_the_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(lanczos, "STEPS", (32, 32))
+    operator = nonlocal_operator(IMAGE, num_landmarks=20, photometric_bandwidth=0.05)
+    share = float(operator.remainder.median())
+    with pytest.warns(UserWarning, match=r"response must be smooth where W has eigenvalues, .* after 32 products"):
+        result = apply_function(operator, IMAGE, lambda s: s > share)
+    assert 3e-4 < result.error < math.inf
+
+
+def test_wrong_arguments() -> None:
+    operator = nonlocal_operator(IMAGE, num_landmarks=20)
+    with pytest.raises(ValueError, match=r"tolerance must be positive and finite, got 0\.0; pass"):
+        apply_function(operator, IMAGE, torch.sqrt, tolerance=0.0)
+    with pytest.raises(TypeError, match=r"operator must be a NonlocalOperator, got Spectrum; make it"):
+        apply_function(operator.spectrum(), IMAGE, torch.sqrt)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match=r"response must be finite, got .* NaN or infinite value\(s\); replace them"):
+        apply_function(operator, IMAGE, lambda s: (s - 0.5).sqrt())
