@@ -17,6 +17,7 @@ from .filtering.scribbles import propagate_strokes as propagate_strokes
 from .filtering.spectral import captured_energy as captured_energy
 from .filtering.spectral import spectral_filter as spectral_filter
 from .nn.affinity import NonlocalAffinity as NonlocalAffinity
+from .nn.block import NonlocalBlock as NonlocalBlock
 from .nn.denoiser.network import NonlocalDenoiser as NonlocalDenoiser
 from .nn.denoiser.noise import estimate_noise as estimate_noise
 from .nn.masks import DiffusionMask as DiffusionMask

@@ -135,6 +135,13 @@ def _collated(samples: list[Any]) -> Tensor:
     return batch.row_sums() if isinstance(batch, nlf.NonlocalOperator) else torch.zeros(1)
 
 
+def _block(image: Tensor, **options: Any) -> Tensor:
+    """Apply an untrained block, which leaves the image as it is."""
+    channels = image.shape[1] if isinstance(image, Tensor) and image.ndim > 1 else 3
+    block = nlf.NonlocalBlock(channels, **options).eval()
+    return block.to(image.dtype)(image) if isinstance(image, Tensor) and image.is_floating_point() else block(image)
+
+
 def _denoiser(image: Tensor, noise: float | Tensor = 0.1) -> Tensor:
     """Denoise with an untrained network."""
     return nlf.NonlocalDenoiser()(image, noise)
@@ -340,6 +347,20 @@ FUNCTIONS = {
     ),
     "NonlocalAffinity": Function(
         _affinity, {"image": _image(1, 3)}, FILTER | GUIDED | BALANCED | HELD | {"learn": _one_of(())}
+    ),
+    "NonlocalBlock": Function(
+        _block,
+        {"image": _image(1, 3, 2)},
+        {
+            "inner_channels": _count(1, 4),
+            "embedding_channels": _count(1, 4),
+            "num_landmarks": AFFINITY["num_landmarks"],
+            "landmarks": AFFINITY["landmarks"],
+            "temperature": _plain(0.1, 8.0),
+            "spatial_bandwidth": AFFINITY["spatial_bandwidth"],
+            "norm": _one_of("batch", "none"),
+            "learn": _one_of((), ("temperature",)),
+        },
     ),
     "NonlocalDenoiser": Function(_denoiser, {"image": _image(1, 3)}, {"noise": _number(0, 0.3)}),
     "Portable": Function(_portable, LIST | {"image": _image(1, 3)}, {}),

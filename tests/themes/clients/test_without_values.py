@@ -54,6 +54,11 @@ def response(eigenvalues: Tensor) -> Tensor:
     return eigenvalues.sqrt()
 
 
+def block_on(device: str) -> nlf.NonlocalBlock:
+    with torch.device(device):
+        return nlf.NonlocalBlock(3)
+
+
 CASES: dict[str, Case] = {
     "nonlocal_operator": lambda x: x.operator() @ x.image(),
     "nonlocal_operator uniform": lambda x: x.operator(landmarks="uniform").scaling,
@@ -92,6 +97,7 @@ CASES: dict[str, Case] = {
     "SegmentMask": lambda x: nlf.SegmentMask()(x.spectrum(), x.mask()),
     "NonlocalFilter": lambda x: nlf.NonlocalFilter(learn=(), num_landmarks=20)(x.image(), alpha=x.zeros(4)),
     "NonlocalAffinity": lambda x: nlf.NonlocalAffinity(num_landmarks=20)(x.image()).factor,
+    "NonlocalBlock": lambda x: block_on(x.device)(x.image()),
     "NonlocalDenoiser": lambda x: nlf.NonlocalDenoiser.trained(device=x.device)(x.image(), 0.1),
     "collate": lambda x: nlf.collate([(x.operator(), x.image()[0])] * 2)[0][1] @ x.image(),
     "Portable": lambda x: nlf.Portable(nlf.NonlocalFilter(learn=(), num_landmarks=20))(x.image(), alpha=x.zeros(4)),
