@@ -19,36 +19,39 @@ Array = NDArray[np.float64]
 # Section II: the global filter
 
 
-def patch_weights(size: int) -> Array:
-    """Gaussian window (size, size) with sigma = size / 4 and unit sum."""
-    offset = np.arange(size) - size // 2
-    window = np.exp(-(offset[:, None] ** 2 + offset[None, :] ** 2) / (2 * (size / 4) ** 2))
+def patch_weights(size: int, axes: int = 2) -> Array:
+    """Gaussian window (size, size), or with more axes, with sigma = size / 4 and unit sum."""
+    offsets = np.indices((size,) * axes) - size // 2
+    window = np.exp(-(offsets**2).sum(0) / (2 * (size / 4) ** 2))
     return window / window.sum()
 
 
 def pad(image: Array, margin: int) -> Array:
-    """Reflect the borders of (H, W); an axis that is too short to be reflected is replicated."""
-    for axis in (0, 1):
-        widths = [(0, 0), (0, 0)]
+    """Reflect the borders of (H, W) or (D, H, W); an axis that is too short to be reflected is replicated."""
+    for axis in range(image.ndim):
+        widths = [(0, 0)] * image.ndim
         widths[axis] = (margin, margin)
         image = np.pad(image, widths, mode="reflect" if image.shape[axis] > margin else "edge")
     return image
 
 
 def patches(image: Array, size: int) -> Array:
-    """The patch around every pixel of (H, W), as rows (n, size * size)."""
-    windows = np.lib.stride_tricks.sliding_window_view(pad(image, size // 2), (size, size))
-    return windows.reshape(-1, size * size)
+    """The patch around every pixel of (H, W) or (D, H, W), as rows (n, size^2) or (n, size^3)."""
+    windows = np.lib.stride_tricks.sliding_window_view(pad(image, size // 2), (size,) * image.ndim)
+    return windows.reshape(-1, size**image.ndim)
 
 
-def features(guide: Array, patch_size: int, h_y: float, h_x: float | tuple[float, float] | None = None) -> Array:
-    """Rows x_i (n, D) for which the kernel is exp(-||x_i - x_j||^2). Eq. 1; for (C, H, W) the mean of eq. 18."""
+def features(guide: Array, patch_size: int, h_y: float, h_x: float | tuple[float, ...] | None = None) -> Array:
+    """Rows x_i (n, D) for which the kernel is exp(-||x_i - x_j||^2). Eq. 1; for (C, H, W) the mean of eq. 18.
+
+    Volumes are (C, D, H, W).
+    """
     channels = guide[None] if guide.ndim == 2 else guide
-    scale = np.sqrt(patch_weights(patch_size).ravel() / len(channels)) / h_y
+    axes = channels.ndim - 1
+    scale = np.sqrt(patch_weights(patch_size, axes).ravel() / len(channels)) / h_y
     columns = [patches(channel, patch_size) * scale for channel in channels]
     if h_x is not None:
-        height, width = channels.shape[1:]
-        columns.append(np.stack(np.mgrid[:height, :width], axis=-1).reshape(-1, 2) / h_x)
+        columns.append(np.indices(channels.shape[1:]).reshape(axes, -1).T / h_x)
     return np.concatenate(columns, axis=1)
 
 
@@ -105,8 +108,8 @@ def uniform_samples(height: int, width: int, m: int) -> NDArray[np.int64]:
     return np.array(grid)
 
 
-def nystrom_eigenpairs(x: Array, samples: NDArray[np.int64], steps: int = 100) -> tuple[Array, Array]:
-    """S (r,) and V (n, r) from m sampled rows of the kernel. Fig. 2, eq. 5 and 6.
+def nystrom_blocks(x: Array, samples: NDArray[np.int64], steps: int = 100) -> tuple[Array, Array]:
+    """W_A (m, m) and W_AB (m, n - m) of m sampled rows of the kernel. Fig. 2.
 
     Where a pixel resembles no sample, its row of the extended kernel is about zero and may have a negative sum:
     then the scaling, and everything that follows, is NaN. This is a property of the method, and is left unchanged.
@@ -120,7 +123,13 @@ def nystrom_eigenpairs(x: Array, samples: NDArray[np.int64], steps: int = 100) -
         c = 1 / (extended @ (pi * (extended.T @ r)))
         r = 1 / (extended @ (pi * (extended.T @ c)))
     d = np.sqrt(r * c)
-    w_a, w_ab = d[: len(a), None] * k_a * d[: len(a)], d[: len(a), None] * k_ab * d[len(a) :]
+    return d[: len(a), None] * k_a * d[: len(a)], d[: len(a), None] * k_ab * d[len(a) :]
+
+
+def nystrom_eigenpairs(x: Array, samples: NDArray[np.int64], steps: int = 100) -> tuple[Array, Array]:
+    """S (r,) and V (n, r) from the blocks of m sampled rows. Fig. 2, eq. 5 and 6."""
+    a, b = samples, np.setdiff1d(np.arange(len(x)), samples)
+    w_a, w_ab = nystrom_blocks(x, samples, steps)
     root = inverse_root(w_a)
     s, u = positive_part(w_a + root @ w_ab @ w_ab.T @ root)  # Q of Fig. 2
     v = np.empty((len(x), len(s)))

@@ -58,7 +58,7 @@ def buffered_blocks(factor: Tensor, count: int) -> Iterator[tuple[slice, list[Te
 
 
 def fold_batch(image: Tensor, batch: int) -> Tensor:
-    """Reshape images (b, C, H, W) to (batch, C', N) for an operator of ``batch`` images; either batch may be 1.
+    """Reshape images (b, C, *size) to (batch, C', N) for an operator of ``batch`` images; either batch may be 1.
 
     Several images for one operator become channels, so that the factor is read once.
 
@@ -75,8 +75,8 @@ def fold_batch(image: Tensor, batch: int) -> Tensor:
     return image.flatten(2).expand(batch, -1, -1)
 
 
-def unfold_batch(planes: Tensor, images: int, size: tuple[int, int]) -> Tensor:
-    """Invert :func:`fold_batch` for stacks (batch, k, C', N): (B, k, C, H, W), where B is the larger batch."""
+def unfold_batch(planes: Tensor, images: int, size: tuple[int, ...]) -> Tensor:
+    """Invert :func:`fold_batch` for stacks (batch, k, C', N): (B, k, C, *size), where B is the larger batch."""
     if planes.shape[0] == 1:
         planes = planes.squeeze(0).unflatten(1, (images, -1)).transpose(0, 1)
     return planes.unflatten(-1, size)
@@ -87,6 +87,11 @@ def weighted(values: Tensor, weights: Tensor | None) -> Tensor:
     if weights is None:
         return values
     return values * weights.view(weights.shape[0], *[1] * (values.ndim - 2), -1).to(values)
+
+
+def for_planes(values: Tensor, dimensions: int) -> Tensor:
+    """View values (...) as (..., 1, ..., 1), to be broadcast over planes of so many dimensions."""
+    return values.reshape(*values.shape, *[1] * dimensions)
 
 
 def root_weighted(scaling: Tensor, weights: Tensor | None) -> Tensor:

@@ -20,6 +20,7 @@ Response = Callable[[Tensor], Tensor]
 LARGEST_PATCH = 101  # features take patch_size^2 times the memory of the guide
 LARGEST_ORDER = 1000  # each order takes a copy of the image
 LARGEST_EIGENVALUE = 1e6
+SHAPES = {3: "(B, C, N)", 4: "(B, C, H, W)", 5: "(B, C, D, H, W)"}  # of images, by their number of dimensions
 SHOWN = 16  # values of a tensor in a message; of a larger one, only the first wrong value
 LEAST_WEIGHT = 1e-6  # of a point; the largest is its inverse, above which float32 sums lose the other points
 FAR_OUTSIDE = 16.0  # above the values of HDR pictures with white at 1, below those of 8-bit pictures
@@ -57,15 +58,26 @@ def check_instance(value: object, kind: type, name: str, remedy: str) -> None:
 
 
 def check_image(
-    image: Tensor, name: str, *, channels: int | None = None, batch: int | None = None, empty: bool = False
+    image: Tensor,
+    name: str,
+    *,
+    channels: int | None = None,
+    batch: int | None = None,
+    empty: bool = False,
+    dimensions: Sequence[int] = (4,),
 ) -> None:
-    """Raise unless ``image`` is a finite floating-point (B, C, H, W) tensor with pixels; B may be 0 if ``empty``."""
+    """Raise unless ``image`` is a finite floating-point tensor with pixels, (B, C, H, W) unless stated otherwise.
+
+    B may be 0 if ``empty``. ``dimensions`` are the numbers of dimensions that are allowed; see :data:`SHAPES`.
+    """
     check_tensor(image, name, "convert it with torch.as_tensor")
     check_dtype(
         image, name, "divide integer pixels by the value of white, such as 255", values=" with values in [0, 1]"
     )
-    if image.ndim != 4:
-        raise ValueError(f"{name} must have shape (B, C, H, W), got {tuple(image.shape)}; add the missing dimensions")
+    if image.ndim not in dimensions:
+        shapes = " or ".join(SHAPES.get(n, f"of {n} dimensions") for n in dimensions)
+        remedy = "add the missing dimensions" if image.ndim < min(dimensions) else "index or flatten the others"
+        raise ValueError(f"{name} must have shape {shapes}, got {tuple(image.shape)}; {remedy}")
     if 0 in image.shape[empty:]:
         raise ValueError(f"{name} must hold at least one pixel, got shape {tuple(image.shape)}; pass a non-empty image")
     if channels is not None and image.shape[1] != channels:
@@ -123,17 +135,41 @@ def warn_of_scale(image: Tensor, name: str) -> bool:
     return largest > FAR_OUTSIDE
 
 
-def check_same_size(tensor: Tensor, size: tuple[int, int], name: str, other: str, part: Tensor | None = None) -> None:
-    """Raise unless the last two dimensions of ``tensor`` are ``size``, and it is on the device of ``part`` if given."""
+def check_fits(
+    image: Tensor,
+    size: tuple[int, ...],
+    name: str,
+    other: str,
+    part: Tensor | None = None,
+    *,
+    channels: int | None = None,
+    batch: int | None = None,
+    empty: bool = False,
+) -> None:
+    """:func:`check_image` and :func:`check_same_size` for an image (B, C, *size), or (B, C, N) with N points in all."""
+    flat = isinstance(image, Tensor) and image.ndim == 3 and image.shape[2] == math.prod(size)
+    expected = (math.prod(size),) if flat else tuple(size)
+    check_image(image, name, channels=channels, batch=batch, empty=empty, dimensions=(len(expected) + 2,))
+    check_same_size(image, expected, name, other, part)
+
+
+def check_same_size(tensor: Tensor, size: tuple[int, ...], name: str, other: str, part: Tensor | None = None) -> None:
+    """Raise unless the last dimensions of ``tensor`` are ``size``, and it is on the device of ``part`` if given."""
     if part is not None and tensor.device != part.device:
         raise ValueError(
             f"{name} must be on the device of the {other}, {part.device}, got {tensor.device}; move one by .to()"
         )
-    if tuple(tensor.shape[-2:]) != tuple(size):
+    actual = tuple(tensor.shape[-len(size) :])
+    if actual != tuple(size):
+        extent = {1: "number of points", 2: "height and width"}.get(len(size), "size")
         raise ValueError(
-            f"{name} must have the height and width of the {other}, {size[0]}x{size[1]}, "
-            f"got {tensor.shape[-2]}x{tensor.shape[-1]}; resize one of them"
+            f"{name} must have the {extent} of the {other}, {spelled(size)}, got {spelled(actual)}; resize one of them"
         )
+
+
+def spelled(size: Sequence[int]) -> str:
+    """A size in words, such as 32x48."""
+    return "x".join(map(str, size))
 
 
 def check_patch_size(patch_size: int) -> None:
@@ -312,11 +348,11 @@ def _gains(response: Response, support: Tensor | None, dtype: torch.dtype | None
 
 
 def check_alpha(alpha: Tensor, *, dimensions: Sequence[int] = (1, 2, 4)) -> None:
-    """Raise unless ``alpha`` holds at least two sliders: (k+1,), (B, k+1) or, if allowed, (B, k+1, H, W)."""
+    """Raise unless ``alpha`` holds at least two sliders: (k+1,), (B, k+1) or, if allowed, (B, k+1) planes."""
     check_dtype(alpha, "alpha", "write 1.0 instead of 1")
     if alpha.ndim not in dimensions:
-        shapes = {1: "(k+1,)", 2: "(B, k+1)", 4: "(B, k+1, H, W)"}
-        wanted = " or ".join(shapes[n] for n in dimensions)
+        shapes = {1: "(k+1,)", 2: "(B, k+1)"}
+        wanted = " or ".join(shapes.get(n) or SHAPES.get(n, "(B, C, ...)").replace("C", "k+1") for n in dimensions)
         raise ValueError(f"alpha must have shape {wanted}, got {tuple(alpha.shape)}; reshape it")
     entries = alpha.shape[0] if alpha.ndim == 1 else alpha.shape[1]
     if entries < 2:
@@ -355,20 +391,20 @@ def check_features(features: Tensor, name: str, size: int | None = None, *, empt
     check_finite(features, name)
 
 
-def check_size(size: object, points: int) -> tuple[int, int]:
-    """Return ``size``, (H, W) or (N,), as (H, W); raise unless it holds integers whose product is ``points``."""
-    if not isinstance(size, tuple | list) or len(size) not in (1, 2) or any(type(length) is not int for length in size):
+def check_size(size: object, points: int) -> tuple[int, ...]:
+    """Return ``size``, with (N,) as (1, N); raise unless it holds positive integers whose product is ``points``."""
+    if not isinstance(size, tuple | list) or len(size) == 0 or any(type(length) is not int for length in size):
         raise TypeError(
-            f"size must be integers (H, W) or (N,), got {size if isinstance(size, tuple) else described(size)}; "
-            f"pass ({points},), for example"
+            "size must be integers, such as (H, W), (D, H, W) or (N,), got "
+            f"{size if isinstance(size, tuple) else described(size)}; pass ({points},), for example"
         )
-    size = (1, *size)[-2:]
-    if size[0] < 1 or size[1] < 1 or size[0] * size[1] != points:
+    lengths = (1, *size) if len(size) == 1 else tuple(size)
+    if min(lengths) < 1 or math.prod(lengths) != points:
         raise ValueError(
-            f"size must have one pixel for each of the {points} points, got {size[0]}x{size[1]}; "
+            f"size must have one pixel for each of the {points} points, got {spelled(lengths)}; "
             f"pass ({points},) for unordered points"
         )
-    return (size[0], size[1])
+    return lengths
 
 
 def check_weights(weights: Tensor, features: Tensor) -> Tensor:

@@ -11,6 +11,7 @@ Gradients: the loss is the sum of the tensors on which the ranks call ``backward
 these gradients up, and so does that of :meth:`Communicator.copy_to_group`, to which parameters are passed.
 """
 
+import math
 from collections.abc import Callable
 from contextlib import suppress
 from datetime import timedelta
@@ -38,8 +39,8 @@ class Communicator:
     size = 1
     first_row = 0
 
-    def whole(self, here: tuple[int, int]) -> tuple[int, int]:
-        """Height and width of the whole image, given those of the rows here."""
+    def whole(self, here: tuple[int, ...]) -> tuple[int, ...]:
+        """Size of the whole image, given that of the rows here."""
         return here
 
     def pixels(self, here: int) -> int:
@@ -74,7 +75,7 @@ class Communicator:
         return features.gather(2, indices.expand(*features.shape[:2], -1))
 
     def with_halo(self, rows: Tensor, margin: int) -> tuple[Tensor, tuple[int, int]]:
-        """The rows (B, C, H, W) with ``margin`` rows of the neighbours above and below, and how many were added there.
+        """The rows (B, C, H, ...) with ``margin`` rows of the neighbours above and below, and how many were added.
 
         Differentiable. Fewer rows are added where the image has fewer.
         """
@@ -88,12 +89,12 @@ ALONE = Communicator()
 
 
 class RowCommunicator(Communicator):
-    """The rows of an image spread over the ranks of a group, from the top of the image down.
+    """The rows of an image, or the slices of a volume, spread over the ranks of a group, from the top down.
 
     Attributes:
         group: the process group.
         rows: number of rows of each rank.
-        width: of the image.
+        width: number of pixels in a row.
         rank: number of this process in the group.
         height: of the whole image.
     """
@@ -104,9 +105,9 @@ class RowCommunicator(Communicator):
         self.rank, self.size, self.height = dist.get_rank(group), len(rows), sum(rows)
         self.first_row = sum(rows[: self.rank])
 
-    def whole(self, here: tuple[int, int]) -> tuple[int, int]:
-        """Height and width of the whole image."""
-        return self.height, self.width
+    def whole(self, here: tuple[int, ...]) -> tuple[int, ...]:
+        """Size of the whole image."""
+        return (self.height, *here[1:])
 
     def pixels(self, here: int) -> int:
         """Number of pixels of the whole image."""
@@ -162,7 +163,7 @@ class RowCommunicator(Communicator):
 
 
 def all_gather_shapes(guide: Tensor, group: Any) -> Communicator:
-    """All-gather the shapes of the ranks' rows (B, C, H, W): the communicator of their image; ALONE without a group.
+    """All-gather the shapes of the ranks' rows (B, C, H, ...): the communicator of their image; ALONE without a group.
 
     Raises:
         TypeError: if ``group`` is no process group that this process belongs to.
@@ -171,8 +172,8 @@ def all_gather_shapes(guide: Tensor, group: Any) -> Communicator:
     check_group(group)
     if group is None:
         return ALONE
-    batch, channels, height, width = guide.shape
-    own = torch.tensor([height, batch, channels, width, torch.finfo(guide.dtype).bits], device=guide.device)
+    batch, channels, height, *row = guide.shape
+    own = torch.tensor([height, batch, channels, *row, torch.finfo(guide.dtype).bits], device=guide.device)
     parts = [torch.empty_like(own) for _ in range(dist.get_world_size(group))]
     _exchange(lambda: dist.all_gather(parts, own, group=group), group)
     shapes = [part.tolist() for part in parts]
@@ -182,7 +183,7 @@ def all_gather_shapes(guide: Tensor, group: Any) -> Communicator:
                 f"guide must have the batch, channels, width and dtype of the other ranks' rows, {shapes[0][1:]} on "
                 f"rank 0, got {shape[1:]} on rank {rank}; cut one image into rows"
             )
-    return RowCommunicator(group, tuple(shape[0] for shape in shapes), width)
+    return RowCommunicator(group, tuple(shape[0] for shape in shapes), math.prod(row))
 
 
 def check_group(group: Any) -> None:
@@ -230,7 +231,7 @@ class _Halo(torch.autograd.Function):
         first = communicator.first_row
         base = max(0, first - margin)
         height = min(communicator.height, first + guide.shape[2] + margin) - base
-        extended = guide.new_empty(*guide.shape[:2], height, guide.shape[3])
+        extended = guide.new_empty(*guide.shape[:2], height, *guide.shape[3:])
         extended[:, :, first - base : first - base + guide.shape[2]] = guide
         sent = {peer: guide[:, :, rows.start - first : rows.stop - first] for peer, rows in lent.items()}
         shapes = {peer: rows.stop - rows.start for peer, rows in wanted.items()}
@@ -287,8 +288,8 @@ def _without_empty(rows: dict[int, slice]) -> dict[int, slice]:
 def _swap(
     sent: dict[int, Tensor], heights: dict[int, int], like: Tensor, communicator: RowCommunicator
 ) -> dict[int, Tensor]:
-    """Send rows (B, C, h, W) to some ranks and receive others, of these heights, from some."""
-    received = {peer: like.new_empty(*like.shape[:2], height, like.shape[3]) for peer, height in heights.items()}
+    """Send rows (B, C, h, ...) to some ranks and receive others, of these heights, from some."""
+    received = {peer: like.new_empty(*like.shape[:2], height, *like.shape[3:]) for peer, height in heights.items()}
     transfers = [
         dist.P2POp(dist.isend, rows.contiguous(), communicator.global_rank(peer), communicator.group)
         for peer, rows in sent.items()

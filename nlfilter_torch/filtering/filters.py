@@ -3,11 +3,13 @@
 import torch
 from torch import Tensor
 
+from nlfilter_torch.core.blocks import for_planes
 from nlfilter_torch.core.checks import (
     check_alpha,
     check_dtype,
     check_eigenvalues,
     check_finite,
+    check_fits,
     check_image,
     check_instance,
     check_same_size,
@@ -17,7 +19,7 @@ from nlfilter_torch.core.checks import (
     check_values,
 )
 from nlfilter_torch.core.kernels.tall_skinny import spread
-from nlfilter_torch.core.layouts import in_format_of
+from nlfilter_torch.core.layouts import in_format_of, shaped_as
 from nlfilter_torch.core.precision import full_precision, per_image
 from nlfilter_torch.operator.operator import NonlocalOperator
 from nlfilter_torch.operator.products import Columns
@@ -56,7 +58,7 @@ def detail_layers(operator: NonlocalOperator, image: Tensor, *, order: int = 3) 
 def _layers(operator: NonlocalOperator, image: Tensor, order: int) -> Tensor:
     """Compute the layers in the operator's dtype, as differences of ``y, W y, ..., W^k y``."""
     powers = operator.powers(image, order)  # (B, k, C, H, W)
-    first = image.to(powers).unsqueeze(1).expand(powers.shape[0], -1, -1, -1, -1)
+    first = image.to(powers).unsqueeze(1).expand(powers.shape[0], 1, *image.shape[1:])
     return layers_between(torch.cat([first, powers], dim=1))
 
 
@@ -82,10 +84,10 @@ def weigh_layers(layers: Tensor, alpha: Tensor) -> Tensor:
     """Weighted sum of layers, ``sum_i alpha_i y_i``. Paper: eq. (12).
 
     Args:
-        layers: (B, k+1, C, H, W).
+        layers: (B, k+1, C, H, W), or with any other dimensions of an image.
         alpha: (k+1,), (B, k+1) per image, or (B, k+1, H, W) per pixel; a batch of 1 on either side is broadcast.
     """
-    check_alpha(alpha)
+    check_alpha(alpha, dimensions=(1, 2, layers.ndim - 1))
     entries = alpha.shape[-1] if alpha.ndim <= 2 else alpha.shape[1]
     if entries != layers.shape[1]:
         raise ValueError(f"alpha must have one entry per layer, {layers.shape[1]}, got {entries}; add or drop some")
@@ -94,12 +96,13 @@ def weigh_layers(layers: Tensor, alpha: Tensor) -> Tensor:
             f"alpha must have the batch size of the layers, {layers.shape[0]}, got {alpha.shape[0]}; "
             "pass one row per image"
         )
-    if alpha.ndim == 4:
-        check_same_size(alpha, (layers.shape[-2], layers.shape[-1]), "alpha", "image")
+    size = tuple(layers.shape[3:])
+    if alpha.ndim > 2:
+        check_same_size(alpha, size, "alpha", "image")
         weights = alpha.unsqueeze(2)
     else:
-        weights = alpha[..., None, None, None]
-    return (weights.to(layers) * layers).sum(-4)
+        weights = for_planes(alpha, 1 + len(size))
+    return (weights.to(layers) * layers).sum(-2 - len(size))
 
 
 @full_precision
@@ -139,18 +142,19 @@ def polynomial_filter(
     """
     check_instance(operator, NonlocalOperator, "operator", "make it with nonlocal_operator")
     check_tensor(image, "image", "convert it with torch.as_tensor")
-    check_alpha(alpha)
+    check_alpha(alpha, dimensions=(1, 2, image.ndim) if image.ndim > 2 else (1, 2, 4))
     if residual is not None:
         batch = max(len(operator.factor), *(len(t) for t in (image, alpha) if t.ndim > 1), 1)
         check_values(residual, "residual", "finite", batch)
     order = (alpha.shape[0] if alpha.ndim == 1 else alpha.shape[1]) - 1
-    alpha = alpha if alpha.ndim == 4 else operator.communicator.copy_to_group(alpha)
+    alpha = alpha if alpha.ndim > 2 else operator.communicator.copy_to_group(alpha)
     filtered = weigh_layers(_layers(operator, image, order), alpha)
     if residual is not None and len(filtered):
         spectrum = operator.spectrum()
-        captured = spectrum.synthesize(torch.ones_like, spectrum.coefficients(image.to(filtered)))
+        captured = shaped_as(image, spectrum.synthesize(torch.ones_like, spectrum.coefficients(image.to(filtered))))
         weight = operator.communicator.copy_to_group(residual)
-        filtered = filtered + residual_change(alpha, weight, image.to(filtered) - captured, operator.diagonal_share)
+        share = shaped_as(image, operator.diagonal_share)
+        filtered = filtered + residual_change(alpha, weight, image.to(filtered) - captured, share)
     return in_format_of(filtered, image)
 
 
@@ -169,7 +173,7 @@ def residual_change(alpha: Tensor, weight: float | Tensor, residual: Tensor, rem
     entries = alpha.shape[0] if alpha.ndim == 1 else alpha.shape[1]
     powers = torch.stack([remainder.pow(i) for i in range(entries)], dim=1)  # (B, k+1, 1, H, W)
     gain = weigh_layers(layers_between(powers), alpha)
-    return (per_image(weight, residual, 4) - gain) * (1 - remainder) * residual
+    return (per_image(weight, residual, residual.ndim) - gain) * (1 - remainder) * residual
 
 
 @full_precision
@@ -196,7 +200,7 @@ def compose_alpha(masks: Tensor, alpha: Tensor) -> Tensor:
         tensor([[3., 1., 2.],
                 [1., 1., 1.]])
     """
-    check_image(masks, "masks", empty=True)
+    check_image(masks, "masks", empty=True, dimensions=(4, 5, 3))
     check_unit_range(masks, "masks")
     check_tensor(alpha, "alpha")
     check_dtype(alpha, "alpha", "write 1.0 instead of 1")
@@ -213,7 +217,8 @@ def compose_alpha(masks: Tensor, alpha: Tensor) -> Tensor:
     shares = masks / masks.sum(1, keepdim=True).clamp(min=1.0)
     change = alpha.to(masks) - 1.0
     batch = len(change) if change.ndim == 3 and len(masks) == 1 else len(masks)
-    return 1.0 + torch.einsum("bkhw,bkl->blhw", shares.expand(batch, -1, -1, -1), change.expand(batch, -1, -1))
+    sums = torch.einsum("bkn,bkl->bln", shares.flatten(2).expand(batch, -1, -1), change.expand(batch, -1, -1))
+    return 1.0 + sums.unflatten(2, masks.shape[2:])
 
 
 def filter_regions(
@@ -252,11 +257,11 @@ def filter_regions(
         (True, False)
     """
     check_instance(operator, NonlocalOperator, "operator", "make it with nonlocal_operator")
-    check_image(image, "image", empty=True)
+    check_fits(image, operator.size, "image", "operator", operator.factor, empty=True)
     batch = max(operator.factor.shape[0], image.shape[0])
-    check_image(masks, "masks", batch=batch, empty=len(image) == 0)
+    check_image(masks, "masks", batch=batch, empty=len(image) == 0, dimensions=(image.ndim,))
     check_unit_range(masks, "masks")
-    check_same_size(masks, operator.size, "masks", "operator", operator.factor)
+    check_same_size(masks, tuple(image.shape[2:]), "masks", "image", operator.factor)
     masks = masks.to(operator.factor)
     total = masks.sum(1, keepdim=True)
     outside = total == 0

@@ -13,12 +13,12 @@ from functools import cached_property, partial
 import torch
 from torch import Tensor
 
+from nlfilter_torch.core.blocks import weighted
 from nlfilter_torch.core.checks import (
-    check_image,
+    check_fits,
     check_instance,
     check_number,
     check_order,
-    check_same_size,
     check_tensor,
     check_values,
 )
@@ -104,10 +104,9 @@ def fit_alpha(
     if loss is not None:
         operator.communicator.check_whole("a loss")
     check_order(order)
-    check_image(image, "image")
-    check_image(target, "target", channels=image.shape[1], batch=max(image.shape[0], operator.factor.shape[0]))
-    check_same_size(image, operator.size, "image", "operator", operator.factor)
-    check_same_size(target, operator.size, "target", "image", image)
+    check_fits(image, operator.size, "image", "operator", operator.factor)
+    batch = max(image.shape[0], operator.factor.shape[0])
+    check_fits(target, tuple(image.shape[2:]), "target", "image", image, channels=image.shape[1], batch=batch)
     _check_not_negative(ridge, "ridge")
     if rounding is not None:
         _check_not_negative(rounding, "rounding")
@@ -378,20 +377,18 @@ class _Descent:
 
 
 def _pixel_weights(mask: Tensor | None, operator: NonlocalOperator, layers: Tensor) -> Tensor:
-    """Weights (B, C, H, W) or (1, C, H, W) of the pixels, of unit sum for every image."""
-    batch, _, channels, height, width = layers.shape
-    counted = layers.new_ones(1, 1, height, width)
+    """Weights (B, C, N) or (1, C, N) of the pixels, of unit sum for every image."""
+    batch, _, channels, *size = layers.shape
+    counted = layers.new_ones(1, 1, math.prod(size))
     if mask is not None:
-        check_image(mask, "mask", channels=1, batch=batch)
-        check_same_size(mask, (height, width), "mask", "image")
+        check_fits(mask, tuple(size), "mask", "image", channels=1, batch=batch)
         if not is_hidden(mask) and bool((mask < 0).any()):
             raise ValueError(f"mask must be non-negative, got {mask.min().item():g}; clamp it at 0")
-        counted = mask.double()
-    if operator.weights is not None:
-        counted = counted * operator.weights.unflatten(1, operator.size).unsqueeze(1)
-    total = operator.communicator.sum(counted.sum((2, 3), keepdim=True))
+        counted = mask.double().flatten(2)
+    counted = weighted(counted, operator.weights)
+    total = operator.communicator.sum(counted.sum(2, keepdim=True))
     if not is_hidden(counted) and bool((total <= 0).any()):
         raise ValueError(
             "mask must hold a pixel of positive weight for every image, got zeros only; select some pixels"
         )
-    return (counted / (channels * total)).expand(-1, channels, -1, -1)
+    return (counted / (channels * total)).expand(-1, channels, -1)

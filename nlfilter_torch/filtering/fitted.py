@@ -13,6 +13,7 @@ from torch import Tensor
 from nlfilter_torch.core.blocks import weighted
 from nlfilter_torch.core.checks import (
     check_alpha,
+    check_fits,
     check_image,
     check_instance,
     check_order,
@@ -109,8 +110,10 @@ class FittedFilter:
     ) -> Tensor:
         """Layers (B, k+1, C, H, W), followed by residual and r if ``with_residual``, in the kernel's dtype."""
         channels = self.moments.shape[3]
-        check_image(image, "image", channels=channels)
-        size = (image.shape[-2], image.shape[-1])
+        features = self.kernel.features
+        axes = 2 if features is None else features.patch_weights.ndim
+        check_image(image, "image", channels=channels, dimensions=(2 + axes,))
+        size = tuple(image.shape[2:])
         check_same_size(image, size, "image", "filter", self.moments)
         check_pair(origin, "origin")
         check_pair(halo, "halo")
@@ -119,18 +122,18 @@ class FittedFilter:
                 f"halo must leave at least one of the image's {size[0]} rows, got {tuple(halo)}; pass a taller tile"
             )
         if guide is not None:
-            check_image(guide, "guide", batch=image.shape[0])
-            guide = guide.expand(image.shape[0], -1, -1, -1)
+            check_image(guide, "guide", batch=image.shape[0], dimensions=(2 + axes,))
+            guide = guide.expand(image.shape[0], *guide.shape[1:])
             check_same_size(guide, size, "guide", "image", image)
         factor, diagonal = self.kernel.columns(image if guide is None else guide, origin=origin, halo=halo)
         columns = Columns(factor, *self.balancing(factor, diagonal))
-        pixels = image[..., halo[0] : size[0] - halo[1], :].to(factor).flatten(2)
+        pixels = image[:, :, halo[0] : size[0] - halo[1]].to(factor).flatten(2)
         planes = layers_of_columns(columns, self.moments, pixels)
         if with_residual:
             captured = spread(self.captured.to(factor).mT, factor, columns.scaling)
             share = columns.remainder.unsqueeze(1).expand_as(pixels)
             planes = torch.cat([planes, torch.stack([pixels - captured, share], dim=1)], dim=1)
-        return planes.unflatten(-1, (-1, size[1]))
+        return planes.unflatten(-1, (-1, *size[1:]))
 
 
 loadable(FittedFilter)
@@ -161,7 +164,7 @@ def fit_filter(operator: NonlocalOperator, image: Tensor, *, order: int = 3) -> 
     """
     check_instance(operator, NonlocalOperator, "operator", "make it with nonlocal_operator")
     check_order(order)
-    check_image(image, "image")
+    check_fits(image, operator.size, "image", "operator", operator.factor)
     if operator.factor.shape[0] != 1 or image.shape[0] != 1:
         raise ValueError(
             f"image and operator must have batch size 1, got {image.shape[0]} and {operator.factor.shape[0]}; "

@@ -3,8 +3,8 @@
 import torch
 from torch import Tensor
 
-from nlfilter_torch.core.blocks import CACHED, block_length, weighted
-from nlfilter_torch.core.checks import check_image, check_instance, check_positive, check_same_size
+from nlfilter_torch.core.blocks import CACHED, block_length, for_planes, weighted
+from nlfilter_torch.core.checks import check_fits, check_instance, check_positive
 from nlfilter_torch.core.kernels.tall_skinny import moment, spread
 from nlfilter_torch.core.precision import full_precision, per_image
 from nlfilter_torch.core.torch_internals import is_hidden
@@ -30,7 +30,8 @@ def diffusion_map(spectrum: Spectrum, *, time: float | Tensor) -> Tensor:
         time: t > 0; larger values keep only coarse structure, so that edits extend further.
 
     Returns:
-        (B, R-1, H, W). Differentiable, with the limits of :attr:`Spectrum.eigenvectors`.
+        (B, R-1, H, W), or (B, R-1) planes of another size. Differentiable, with the limits of
+        :attr:`Spectrum.eigenvectors`.
 
     Raises:
         TypeError, ValueError: if ``time`` is not positive.
@@ -38,8 +39,9 @@ def diffusion_map(spectrum: Spectrum, *, time: float | Tensor) -> Tensor:
     check_instance(spectrum, Spectrum, "spectrum", "take operator.spectrum()")
     check_positive(time, "time", spectrum.factor.shape[0])
     gain = spectrum.eigenvalues[:, 1:].pow(per_image(time, spectrum.factor, 2))
-    root = per_image(spectrum.pixels, gain, 4).sqrt()
-    return gain[:, :, None, None] * spectrum.eigenvectors[:, 1:] * root
+    root = per_image(spectrum.pixels, gain, 2 + len(spectrum.size)).sqrt()
+    vectors = spectrum.eigenvectors[:, 1:]
+    return for_planes(gain, vectors.ndim - 2) * vectors * root
 
 
 @full_precision
@@ -101,7 +103,7 @@ def diffusion_mask(
     inner, outer = exponents[:, : region.shape[1]], exponents[:, region.shape[1] :]
     mask = torch.exp(-inner.clamp(max=FARTHEST))
     mask = mask if negative is None else mask * torch.sigmoid((outer - inner).clamp(min=-20.0))
-    return mask.unflatten(2, spectrum.size).to(region.dtype)
+    return mask.unflatten(2, region.shape[2:]).to(region.dtype)
 
 
 @torch.no_grad()
@@ -148,13 +150,12 @@ def squared_distances(coordinates: Tensor, centres: Tensor) -> Tensor:
 
 
 def region_weights(spectrum: Spectrum, region: Tensor, *, name: str = "region") -> Tensor:
-    """Check regions (B, K, H, W) and scale each to unit sum over the pixels, (B, K, N), in the spectrum's dtype."""
-    check_image(region, name, batch=spectrum.factor.shape[0], empty=len(spectrum.factor) == 0)
-    check_same_size(region, spectrum.size, name, "spectrum", spectrum.factor)
-    largest = spectrum.communicator.max(
-        region.detach().abs().amax((2, 3), keepdim=True)
-    )  # sums of huge values overflow
-    flat = (region / torch.where(largest > 0, largest, 1.0)).to(spectrum.factor).flatten(2)
+    """Check regions and scale each to unit sum over the pixels, (B, K, N), in the spectrum's dtype."""
+    batch = len(spectrum.factor)
+    check_fits(region, spectrum.size, name, "spectrum", spectrum.factor, batch=batch, empty=batch == 0)
+    planes = region.flatten(2)
+    largest = spectrum.communicator.max(planes.detach().abs().amax(2, keepdim=True))  # sums of huge values overflow
+    flat = (planes / torch.where(largest > 0, largest, 1.0)).to(spectrum.factor)
     if not is_hidden(flat) and bool((flat < 0).any()):
         raise ValueError(f"{name} must be non-negative, got {flat.min().item():g}; clamp it at 0")
     total = spectrum.communicator.sum(weighted(flat, spectrum.weights).sum(2, keepdim=True))
@@ -209,7 +210,7 @@ def segment(spectrum: Spectrum, regions: Tensor, time: float | Tensor, valid: Te
             if not spectrum.communicator.max((previous != assignment).any().to(members)):
                 break
         mask = torch.zeros_like(weights).scatter_(1, assignment.unsqueeze(1), 1.0)
-    return mask.unflatten(2, spectrum.size).to(regions.dtype)
+    return mask.unflatten(2, regions.shape[2:]).to(regions.dtype)
 
 
 def _sums(spectrum: Spectrum, basis: Tensor, weights: Tensor) -> Tensor:

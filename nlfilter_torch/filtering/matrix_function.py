@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.core.blocks import fold_batch, unfold_batch
-from nlfilter_torch.core.checks import check_image, check_instance, check_same_size, check_values, checked_response
+from nlfilter_torch.core.checks import check_fits, check_instance, check_values, checked_response
 from nlfilter_torch.core.layouts import in_format_of
 from nlfilter_torch.core.precision import full_precision, uncompiled, working_dtype
 from nlfilter_torch.core.rational import DECADES, RationalForm, best_form, interval_nodes, pole_forms
@@ -91,8 +91,7 @@ def apply_function(
     check_instance(operator, NonlocalOperator, "operator", "make it with nonlocal_operator")
     check_values(tolerance, "tolerance", "positive")
     response = checked_response(response, dtype=working_dtype(image) if isinstance(image, Tensor) else None)
-    check_image(image, "image", empty=True)
-    check_same_size(image, operator.size, "image", "operator", operator.factor)
+    check_fits(image, operator.size, "image", "operator", operator.factor, empty=True)
     planes = fold_batch(image.to(operator.factor), operator.factor.shape[0])
     if planes.numel() == 0:
         return FunctionProduct(image.clone(), 0, 0, 0.0)
@@ -116,7 +115,7 @@ def apply_function(
     else:
         filtered, steps, error = _by_lanczos(matrix, planes, response, tolerance, float(values.detach().abs().max()))
         cost = steps, 0
-    result = unfold_batch(filtered.unsqueeze(1), image.shape[0], operator.size)[:, 0]
+    result = unfold_batch(filtered.unsqueeze(1), image.shape[0], image.shape[2:])[:, 0]
     return FunctionProduct(in_format_of(result, image), *cost, error)
 
 

@@ -16,10 +16,9 @@ from torch import Tensor
 
 from nlfilter_torch.core.blocks import weighted
 from nlfilter_torch.core.checks import (
-    check_image,
+    check_fits,
     check_instance,
     check_positive,
-    check_same_size,
     check_unit_range,
     check_values,
 )
@@ -81,12 +80,11 @@ def propagate_strokes(
     check_instance(spectrum, Spectrum, "spectrum", "take operator.spectrum()")
     communicator = spectrum.communicator
     batch = spectrum.factor.shape[0]
-    check_image(strokes, "strokes")
-    check_image(stroke_mask, "stroke_mask")
+    for tensor, name in ((strokes, "strokes"), (stroke_mask, "stroke_mask")):
+        check_fits(tensor, spectrum.size, name, "spectrum", spectrum.factor)
     images = batch if batch > 1 else max(strokes.shape[0], stroke_mask.shape[0])
     for tensor, name, channels in ((strokes, "strokes", None), (stroke_mask, "stroke_mask", 1)):
-        check_image(tensor, name, channels=channels, batch=images)
-        check_same_size(tensor, spectrum.size, name, "spectrum", spectrum.factor)
+        check_fits(tensor, spectrum.size, name, "spectrum", spectrum.factor, channels=channels, batch=images)
     check_painted(stroke_mask, communicator=communicator)
     check_values(strength, "strength", "share", images)
     check_values(reach, "reach", "below 1", batch)
@@ -110,7 +108,7 @@ def propagate_strokes(
         smoothness=smoothness,
         communicator=communicator,
     )
-    return fitted(spectrum.factor).unflatten(2, spectrum.size).to(strokes.dtype)
+    return fitted(spectrum.factor).unflatten(2, strokes.shape[2:]).to(strokes.dtype)
 
 
 @dataclass(frozen=True, eq=False)
@@ -244,7 +242,7 @@ def check_painted(stroke_mask: Tensor, name: str = "stroke_mask", *, communicato
     check_unit_range(stroke_mask, name)
     if is_hidden(stroke_mask):
         return
-    empty = communicator.max(stroke_mask.detach().amax((1, 2, 3))) <= 0
+    empty = communicator.max(stroke_mask.detach().flatten(1).amax(1)) <= 0
     if bool(empty.any()):
         raise ValueError(
             f"{name} must hold a painted pixel in every image, got none in image(s) "

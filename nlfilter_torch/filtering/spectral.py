@@ -8,15 +8,14 @@ from torch import Tensor
 from nlfilter_torch.core.blocks import fold_batch, weighted
 from nlfilter_torch.core.checks import (
     check_finite,
-    check_image,
+    check_fits,
     check_instance,
-    check_same_size,
     check_shape,
     check_tensor,
     check_values,
     checked_response,
 )
-from nlfilter_torch.core.layouts import in_format_of
+from nlfilter_torch.core.layouts import in_format_of, shaped_as
 from nlfilter_torch.core.precision import full_precision, per_image, working_dtype
 from nlfilter_torch.filtering.matrix_function import TOLERANCE, apply_function
 from nlfilter_torch.operator.operator import NonlocalOperator
@@ -88,20 +87,19 @@ def spectral_filter(
     response = checked_response(response, operator.support, working_dtype(image))
     if residual is not None:
         check_values(residual, "residual", "finite", operator.factor.shape[0])
-    if image.ndim == 4 and len(image) == 0:
-        check_image(image, "image", empty=True)
-        check_same_size(image, operator.size, "image", "spectrum", operator.factor)
+    if image.ndim > 2 and len(image) == 0:
+        check_fits(image, operator.size, "image", "spectrum", operator.factor, empty=True)
         fold_batch(image, operator.factor.shape[0])  # checks the batch
         return image.clone()
     coefficients = _coefficients(operator, image, coefficients)
     if residual is None:
         return in_format_of(_with_remainder(operator, image, response, coefficients), image)
     if isinstance(residual, int | float) and residual == 0:
-        return in_format_of(operator.synthesize(response, coefficients), image)
+        return in_format_of(shaped_as(image, operator.synthesize(response, coefficients)), image)
     rho = per_image(operator.communicator.copy_to_group(residual), operator.root, 2)
     # V f V^T y + rho (y - V V^T y) = V (f - rho) V^T y + rho y, still in two passes over the factor.
-    filtered = operator.synthesize(partial(_less, response, rho), coefficients)
-    return in_format_of(filtered + rho.to(filtered).reshape(-1, 1, 1, 1) * image.to(filtered), image)
+    filtered = shaped_as(image, operator.synthesize(partial(_less, response, rho), coefficients))
+    return in_format_of(filtered + per_image(rho, filtered, image.ndim) * image.to(filtered), image)
 
 
 def _less(response: Response, weight: Tensor, eigenvalues: Tensor) -> Tensor:
@@ -113,8 +111,7 @@ def _coefficients(spectrum: Spectrum, image: Tensor, coefficients: Tensor | None
     """Those of an image, or the same if they are known and fit it."""
     if coefficients is None:
         return spectrum.coefficients(image)
-    check_image(image, "image")
-    check_same_size(image, spectrum.size, "image", "spectrum", spectrum.factor)
+    check_fits(image, spectrum.size, "image", "spectrum", spectrum.factor)
     batch, landmarks, _ = spectrum.factor.shape
     shape = (max(batch, image.shape[0]), image.shape[1], landmarks)
     check_shape(coefficients, shape, "coefficients", "use spectrum.coefficients(image)")
@@ -123,9 +120,9 @@ def _coefficients(spectrum: Spectrum, image: Tensor, coefficients: Tensor | None
 
 def _with_remainder(spectrum: Spectrum, image: Tensor, response: Response, coefficients: Tensor) -> Tensor:
     """``V f(S) V^T y + f(r) (y - V V^T y)``: W multiplies by r what the factor maps to 0."""
-    captured, filtered = (spectrum.synthesize(f, coefficients) for f in (torch.ones_like, response))
+    captured, filtered = (shaped_as(image, spectrum.synthesize(f, coefficients)) for f in (torch.ones_like, response))
     remainder = torch.zeros_like(spectrum.scaling) if spectrum.remainder is None else spectrum.remainder
-    gain = response(remainder.clamp(0.0, 1.0)).unflatten(1, spectrum.size).unsqueeze(1)
+    gain = response(remainder.clamp(0.0, 1.0)).unflatten(1, image.shape[2:]).unsqueeze(1)
     check_finite(gain, "response")
     return filtered + gain.to(filtered) * (image.to(filtered) - captured)
 
@@ -147,7 +144,7 @@ def captured_energy(spectrum: Spectrum, image: Tensor) -> Tensor:
         TypeError, ValueError: if ``image`` is not a finite floating-point tensor of the spectrum's size.
     """
     check_instance(spectrum, Spectrum, "spectrum", "take operator.spectrum()")
-    check_image(image, "image")
+    check_fits(image, spectrum.size, "image", "spectrum", spectrum.factor)
     captured = spectral_filter(spectrum, image.to(spectrum.factor.dtype), torch.ones_like, residual=0.0)
     exact = image.double()
     energy, inner = (  # |y|^2 and y^T V V^T y, in the sum over weighted points; in float32 they might overflow

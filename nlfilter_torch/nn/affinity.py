@@ -140,6 +140,7 @@ class NonlocalAffinity(Learnable):
     def forward(self, guide: Tensor, weights: Tensor | None = None) -> NonlocalOperator:
         """Build the operator of a guide (B, C, H, W), with weights (B, 1, H, W) of its pixels: 0 for padding."""
         if isinstance(self.held, HeldFeatures):
+            _check_no_volume(guide)
             bandwidth = self.photometric_bandwidth
             if isinstance(bandwidth, str):
                 bandwidth = estimate_bandwidth(
@@ -147,7 +148,7 @@ class NonlocalAffinity(Learnable):
                 )
             return self._build(guide, self.held.of(self._recipe(bandwidth, guide)), bandwidth, weights)
         if isinstance(self.held, HeldAssignment):
-            check_image(guide, "guide", empty=True)
+            check_image(guide, "guide", empty=True, dimensions=(4, 5))
             landmarks = self.held.of(guide) or self.landmarks
             operator = self._build(guide, landmarks, self.photometric_bandwidth, weights)
             self.held.keep(operator.assignment, guide)
@@ -179,6 +180,7 @@ class NonlocalAffinity(Learnable):
             return
         if guide is None:
             raise ValueError("guide must be images to choose landmarks from if hold is 'features', got None; pass some")
+        _check_no_volume(guide)
         check_image(guide, "guide")
         bandwidth = self.photometric_bandwidth
         if isinstance(bandwidth, str):
@@ -273,4 +275,13 @@ class NonlocalAffinity(Learnable):
             f"spatial_bandwidth={self.shown('spatial_bandwidth')}, num_landmarks={self.num_landmarks}, "
             f"landmarks={self.landmarks!r}{holding}, completion={self.completion!r}, "
             f"guide_channels={self.guide_channels!r}"
+        )
+
+
+def _check_no_volume(guide: Tensor) -> None:
+    """Raise if the guide is a volume, for a layer that keeps landmarks as features of images."""
+    if isinstance(guide, Tensor) and guide.ndim == 5:
+        raise ValueError(
+            "guide must be images (B, C, H, W) for a layer that keeps landmarks as features, got a volume of shape "
+            f"{tuple(guide.shape)}; pass hold='assignment'"
         )

@@ -8,8 +8,8 @@ from torch import Tensor, nn
 
 from nlfilter_torch.core.checks import (
     check_alpha,
+    check_fits,
     check_image,
-    check_same_size,
     check_tensor,
     check_unit_range,
     check_values,
@@ -88,7 +88,7 @@ class PolynomialSliders(nn.Module):
                 "residual must be None to combine layers, which lack it, got a weight; call the layer with an operator"
             )
         check_tensor(layers, "layers")
-        if layers.ndim != 5:
+        if layers.ndim not in (4, 5, 6):
             raise ValueError(
                 f"layers must have shape (B, k+1, C, H, W), got {tuple(layers.shape)}; take them from detail_layers"
             )
@@ -254,11 +254,11 @@ class NonlocalFilter(nn.Module):
                 "guide must be a torch.Tensor, from which the layer builds an operator, got a NonlocalOperator; "
                 "call layer.sliders(operator, image)"
             )
-        check_image(image, "image", empty=True)
+        check_image(image, "image", empty=True, dimensions=(4, 5))
         operator = self.affinity(image if guide is None else guide, weights)
         if mask is not None:
-            check_image(mask, "mask", batch=max(image.shape[0], operator.factor.shape[0]), empty=len(image) == 0)
-            check_same_size(mask, (image.shape[-2], image.shape[-1]), "mask", "image")
+            batch = max(image.shape[0], operator.factor.shape[0])
+            check_fits(mask, tuple(image.shape[2:]), "mask", "image", batch=batch, empty=len(image) == 0)
             check_unit_range(mask, "mask")
         rows = self.sliders.alpha if alpha is None else alpha
         own_rows = alpha is None and rows.ndim == 2

@@ -1,5 +1,6 @@
 """Building an operator from a guide or from features: landmarks, Nystrom factor, balancing. Paper: Sec. II."""
 
+import math
 from dataclasses import replace
 from functools import partial
 from typing import Any, Literal
@@ -67,7 +68,7 @@ def _is_small(bandwidth: float | Tensor | str) -> bool:
 def _largest(guide: Tensor) -> Tensor:
     """The largest magnitude of each image, (B,)."""
     if is_hidden(guide) or guide.shape[0] == 0:
-        return guide.abs().amax((1, 2, 3))
+        return guide.abs().flatten(1).amax(1)
     return torch.stack([torch.stack(image.aminmax()).abs().amax() for image in guide])  # faster on CPUs
 
 
@@ -96,14 +97,15 @@ def nonlocal_operator(
     k-means, the assignment of pixels to centroids) held fixed.
 
     Args:
-        guide: (B, C, H, W), finite, usually in [0, 1]; an image, or the feature map of a network. On CPUs, a guide of 1
-            or 3 channels with values above 16 causes a warning if the bandwidth is ``"auto"`` or below 1, since it is
-            probably in [0, 255].
-        patch_size: p, odd, at most 101; the image is reflected at its border.
+        guide: (B, C, H, W), finite, usually in [0, 1]; an image, or the feature map of a network. A volume, such as a
+            scan, is (B, C, D, H, W). On CPUs, a guide of 1 or 3 channels with values above 16 causes a warning if the
+            bandwidth is ``"auto"`` or below 1, since it is probably in [0, 255].
+        patch_size: p, odd, at most 101; the image is reflected at its border. Patches of volumes have p^3 voxels.
         photometric_bandwidth: h_y in units of the guide (10 / 255 is ten grey levels), a positive number, a tensor of
             shape () or (B,), or ``"auto"``: :func:`estimate_bandwidth`, a constant for gradients.
         spatial_bandwidth: h_x in pixels, a positive number or a tensor of shape () or (B,), or two of them, for
-            vertical and horizontal distances; None leaves out the spatial term, so that W is fully nonlocal.
+            vertical and horizontal distances (of volumes three, for depth first); None leaves out the spatial term, so
+            that W is fully nonlocal.
         num_landmarks: M; reduced with a warning where the image has fewer pixels.
         landmarks: ``"kmeans"``, ``"uniform"`` (the paper's grid) or ``"random"``, chosen anew in every call. Or an
             operator built before, whose landmarks are kept: for a guide of the same size, the assignment of pixels to
@@ -115,7 +117,7 @@ def nonlocal_operator(
             fails at small bandwidths.
         guide_channels: ``"luminance"`` reduces a guide of three channels to one, ``"all"`` compares all of them. A
             guide with any other number of channels is used unchanged.
-        patch_weights: (p, p), non-negative, replaces the Gaussian window; scaled to unit sum.
+        patch_weights: (p, p), or (p, p, p) for volumes, non-negative, replaces the Gaussian window; scaled to unit sum.
         weights: (B, 1, H, W) or (1, 1, H, W), how much each pixel counts: 0 for padding, hidden or unknown pixels, and
             otherwise from 1e-6 to 1e6; None means 1 each. Where they are 0 the guide is not read: patches, landmarks
             and ``"auto"`` know only pixels that count, and patches mirror at their edge, so that the results of a
@@ -125,9 +127,10 @@ def nonlocal_operator(
         generator: source of randomness for the landmarks; with None every call draws the same. The global generator is
             never used.
         group: a torch.distributed process group over whose ranks the rows of one image are distributed; ``guide`` then
-            holds the rows of this rank, in rank order from top to bottom. All ranks make the same calls, and each gets
-            the single-process result for its own rows; see :mod:`nlfilter_torch.core.communicator`. None, or
-            ``torch.distributed.group.WORLD`` before it is initialised, means that this process holds the whole image.
+            holds the rows of this rank, or the slices of a volume, in rank order from top to bottom. All ranks make the
+            same calls, and each gets the single-process result for its own rows; see
+            :mod:`nlfilter_torch.core.communicator`. None, or ``torch.distributed.group.WORLD`` before it is
+            initialised, means that this process holds the whole image.
 
     Returns:
         The operator, with row sums of 1 to within ``tolerance`` or rounding.
@@ -187,17 +190,24 @@ def _check_guide(guide: Tensor, options: OperatorOptions) -> None:
         raise TypeError("guide must be a torch.Tensor, got a NonlocalOperator, which is built already; use it as it is")
     spatial = bandwidths_of(options.spatial_bandwidth)
     refuse_transforms("guide", guide, options.photometric_bandwidth, *spatial, options.patch_weights, options.landmarks)
-    check_image(guide, "guide", empty=True)
+    check_image(guide, "guide", empty=True, dimensions=(4, 5))
     check_options(options)
-    check_bandwidths(options.photometric_bandwidth, options.spatial_bandwidth, guide.shape[0])
+    axes, window = guide.ndim - 2, options.patch_weights
+    check_bandwidths(options.photometric_bandwidth, options.spatial_bandwidth, guide.shape[0], axes)
+    if isinstance(window, Tensor) and window.ndim in (2, 3) and window.ndim != axes:
+        raise ValueError(
+            f"patch_weights must have the {axes} axes of the guide, got {tuple(window.shape)}; "
+            f"pass ({', '.join('p' * axes)})"
+        )
 
 
 def _from_guide(guide: Tensor, options: OperatorOptions, weights: Tensor | None = None) -> NonlocalOperator:
     """Build an operator from a checked guide, checked options and weights (B, 1, H, W)."""
     guide = reduce_channels(guide.to(working_dtype(guide)), options.guide_channels)
     communicator = all_gather_shapes(guide, options.group)
-    size = (guide.shape[2], guide.shape[3])  # of the rows of this rank
-    window = unit_window(options.patch_size, communicator.copy_to_group(options.patch_weights)).to(guide)
+    size = tuple(guide.shape[2:])  # of the rows of this rank
+    patch_weights = communicator.copy_to_group(options.patch_weights)
+    window = unit_window(options.patch_size, patch_weights, len(size)).to(guide)
     guide, halo = communicator.with_halo(guide, max(window.shape[0] // 2, 1))
     bandwidth = _bandwidth(guide, halo, options, communicator, weights)
     largest = _largest(guide.detach())
@@ -252,7 +262,8 @@ def operator_from_features(
 
     Args:
         features: (B, D, N), already divided by bandwidths: the affinity of two points is ``exp(-|x_i - x_j|^2)``.
-        size: (H, W) with H * W = N, the shape of the images to filter; (N,), meaning (1, N), for unordered points.
+        size: (H, W) with H * W = N, the shape of the images to filter; (D, H, W) for volumes, and so on; (N,), meaning
+            (1, N), for unordered points. Values (B, C, N) can be filtered whatever the size.
         weights: (N,) or (B, N): how many identical pixels each point represents, 0 for points that do not count, which
             are filtered from those that do. With ``"kmeans"``, landmarks are drawn in proportion to the weights,
             averaged over a batch. None means one each. Constant for gradients.
@@ -272,7 +283,7 @@ def operator_from_features(
     Example:
         >>> points = torch.rand(1, 3, 500, generator=torch.Generator().manual_seed(0))
         >>> operator = operator_from_features(points / 0.3, size=(500,), num_landmarks=20)
-        >>> smoothed = operator @ torch.ones(1, 1, 1, 500)
+        >>> smoothed = operator @ torch.ones(1, 1, 500)
         >>> bool((smoothed - 1).abs().max() < 1e-4)
         True
     """
@@ -334,7 +345,7 @@ def sampled_operator(
 
 def _assemble(
     features: Tensor,
-    size: tuple[int, int],
+    size: tuple[int, ...],
     method: Construction,
     *,
     recipe: GuideFeatures | None = None,
@@ -348,7 +359,7 @@ def _assemble(
     """
     whole = communicator.whole(size)
     hidden = hidden_points(weights)
-    points, tolerance = whole[0] * whole[1], method.tolerance
+    points, tolerance = math.prod(whole), method.tolerance
     if hidden is not None and communicator.size == 1:
         points = int((~hidden).sum(1).min())
     count = landmark_count(method, points)
@@ -415,7 +426,7 @@ def _assemble(
 def _landmarks(
     method: Construction,
     features: Tensor,
-    size: tuple[int, int],
+    size: tuple[int, ...],
     count: int,
     communicator: Communicator,
     weights: Tensor | None,
@@ -459,7 +470,7 @@ def _balanced(
 
 
 def _empty(
-    features: Tensor, size: tuple[int, int], count: int, completion: Completion, recipe: GuideFeatures | None
+    features: Tensor, size: tuple[int, ...], count: int, completion: Completion, recipe: GuideFeatures | None
 ) -> NonlocalOperator:
     """The operator of an empty batch of features (0, D, N)."""
     per_pixel, total = features.new_empty(0, features.shape[2]), features.new_empty(0, count, 1, dtype=torch.float64)

@@ -38,7 +38,7 @@ def hidden_points(weights: Tensor | None) -> Tensor | None:
 
 def assign_among_counted(
     features: Tensor,
-    size: tuple[int, int],
+    size: tuple[int, ...],
     count: int,
     sampling: Sampling,
     generator: torch.Generator | None,
@@ -80,14 +80,10 @@ def _joined(assignments: list[Assignment]) -> Assignment | None:
     return replace(first, candidates=candidates, clusters=clusters, start=start)
 
 
-def _size_of(kept: Tensor, size: tuple[int, ...]) -> tuple[int, int]:
-    """Height and width of the rectangle that points (n,) of an image of ``size`` fill; (1, n) if they fill none."""
-    if len(size) == 2:
-        rows, columns = kept // size[1], kept % size[1]
-        height, width = (int(axis.max() - axis.min()) + 1 for axis in (rows, columns))
-        if height * width == len(kept):
-            return height, width
-    return 1, len(kept)
+def _size_of(kept: Tensor, size: tuple[int, ...]) -> tuple[int, ...]:
+    """Size of the rectangle or cuboid that points (n,) of an image of ``size`` fill; (1, n) if they fill none."""
+    lengths = tuple(int(axis.max() - axis.min()) + 1 for axis in torch.unravel_index(kept, size))
+    return lengths if math.prod(lengths) == len(kept) else (1, len(kept))
 
 
 def extended(

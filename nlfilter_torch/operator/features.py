@@ -5,6 +5,7 @@ Also the estimate of the photometric bandwidth. Paper: Appendix A, eq. (20).
 
 import math
 from dataclasses import dataclass
+from functools import reduce
 from itertools import product
 from typing import Any
 
@@ -12,6 +13,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from nlfilter_torch.core.blocks import for_planes
 from nlfilter_torch.core.checks import (
     LARGEST_PATCH,
     check_choice,
@@ -31,27 +33,30 @@ from nlfilter_torch.operator.options import GuideChannels, SpatialBandwidth, ban
 FAINT_WEIGHT = 1e-12  # in place of patch weights of 0
 
 
-def patch_window(patch_size: int) -> Tensor:
-    """Gaussian patch weights of unit sum, (patch_size, patch_size), sigma = patch_size / 4.
+def patch_window(patch_size: int, axes: int = 2) -> Tensor:
+    """Gaussian patch weights of unit sum, (p, p) for images and (p, p, p) for volumes, with sigma = p / 4.
 
     Because of the unit sum, the photometric bandwidth is in grey levels of the guide for any patch size.
     """
     profile = torch.signal.windows.gaussian(patch_size, std=patch_size / 4, dtype=torch.float64)
-    window = torch.outer(profile, profile)
+    window = profile
+    for _ in range(axes - 1):
+        window = window.unsqueeze(-1) * profile
     return window / window.sum()
 
 
-def unit_window(patch_size: int, patch_weights: Tensor | None) -> Tensor:
-    """Patch weights (p, p) scaled to unit sum; the Gaussian window if none are given."""
+def unit_window(patch_size: int, patch_weights: Tensor | None, axes: int = 2) -> Tensor:
+    """Patch weights (p, p) or (p, p, p) scaled to unit sum; the Gaussian window of so many axes if none are given."""
     check_patch_size(patch_size)
     if patch_weights is None:
-        return patch_window(patch_size)
+        return patch_window(patch_size, axes)
     check_tensor(patch_weights, "patch_weights")
     if patch_weights.dtype.is_complex or patch_weights.dtype == torch.bool:
         raise TypeError(f"patch_weights must be real numbers, got {patch_weights.dtype}; convert them")
-    if patch_weights.ndim != 2 or patch_weights.shape[0] != patch_weights.shape[1] or patch_weights.shape[0] % 2 == 0:
+    if patch_weights.ndim not in (2, 3) or len(set(patch_weights.shape)) > 1 or patch_weights.shape[0] % 2 == 0:
         raise ValueError(
-            f"patch_weights must have shape (p, p) with odd p, got {tuple(patch_weights.shape)}; crop or pad them"
+            "patch_weights must have shape (p, p) with odd p, or (p, p, p) for volumes, got "
+            f"{tuple(patch_weights.shape)}; crop or pad them"
         )
     if len(patch_weights) > LARGEST_PATCH:
         raise ValueError(
@@ -69,11 +74,11 @@ def unit_window(patch_size: int, patch_weights: Tensor | None) -> Tensor:
 
 
 def reduce_channels(guide: Tensor, guide_channels: GuideChannels) -> Tensor:
-    """Reduce three channels to luminance (B, 1, H, W) unless ``guide_channels`` is ``"all"``; keep other guides."""
+    """Reduce three channels to luminance (B, 1, ...) unless ``guide_channels`` is ``"all"``; keep other guides."""
     if guide_channels == "luminance" and guide.shape[1] == 3:
         from kornia.color import rgb_to_grayscale  # importing kornia takes half a second
 
-        return rgb_to_grayscale(guide)
+        return rgb_to_grayscale(guide.flatten(3)).unflatten(3, guide.shape[3:])
     return guide
 
 
@@ -84,10 +89,10 @@ class GuideFeatures:
     Paper: eq. (1), with the mean over channels if the guide has several, and eq. (18).
 
     Attributes:
-        patch_weights: (p, p), non-negative, of unit sum; differentiable.
+        patch_weights: (p, p), or (p, p, p) for volumes, non-negative, of unit sum; differentiable.
         photometric_bandwidth: h_y in units of the guide, a number or a tensor of shape () or (B,).
-        spatial_bandwidth: h_x in pixels, a number or a tensor of shape () or (B,), or two of them, for vertical and
-            horizontal distances; None leaves out the coordinates.
+        spatial_bandwidth: h_x in pixels, a number or a tensor of shape () or (B,), or one of them for each axis; None
+            leaves out the coordinates.
         guide_channels: ``"luminance"`` or ``"all"``.
     """
 
@@ -100,7 +105,7 @@ class GuideFeatures:
         self,
         guide: Tensor,
         *,
-        origin: tuple[int, int] = (0, 0),
+        origin: tuple[int, ...] = (0, 0),
         halo: tuple[int, int] = (0, 0),
         stride: int = 1,
         counts: Tensor | None = None,
@@ -108,25 +113,25 @@ class GuideFeatures:
         """Compute the features of a guide, or of a tile of it.
 
         Args:
-            guide: (B, C, H, W), with the channels of the guide from which the landmarks come.
-            origin: coordinates (row, column) of the first pixel in that guide.
+            guide: (B, C, H, W) or (B, C, D, H, W), with the channels of the guide from which the landmarks come.
+            origin: coordinates (row, column) of the first pixel in that guide; 0 along axes that are left out.
             halo: numbers of rows at the top and at the bottom that are read by patches but get no features themselves:
                 half a patch, or less at the border of the whole guide.
-            stride: n, to use only the pixel in the middle of each complete square of n x n pixels.
+            stride: n, to use only the pixel in the middle of each complete square of n x n pixels; for images only.
             counts: (B or 1, 1, H, W), true where a pixel counts, for a guide without a halo. Patches read what counts
                 alone, and are continued elsewhere by :func:`fill_hidden`. None means that all pixels do.
 
         Returns:
-            (B, D, N) with D = C p^2, plus 2 with coordinates; N counts the pixels outside the halo. Pixels come last:
-            each feature is a plane.
+            (B, D, N) with D = C p^2, or C p^3 for volumes, plus 2 or 3 with coordinates; N counts the pixels outside
+            the halo. Pixels come last: each feature is a plane.
         """
         guide = reduce_channels(guide.to(self.patch_weights.dtype), self.guide_channels)
-        batch, channels, height, width = guide.shape
+        batch, channels, height, *row = guide.shape
         scale = self._patch_scale(channels, guide)
         margin = scale.shape[-1] // 2
         padded = pad_border(guide, margin) if counts is None else fill_hidden(guide, counts, margin)
         # Halo rows replace reflected ones; a halo shorter than the margin ends at the border of the image.
-        padded = padded[..., halo[0] : padded.shape[-2] - halo[1], :]
+        padded = padded[:, :, halo[0] : padded.shape[2] - halo[1]]
         features: Tensor = (
             _ScaledPatches.apply(padded, scale)  # type: ignore[no-untyped-call]
             if stride == 1
@@ -134,32 +139,37 @@ class GuideFeatures:
         )
         if self.spatial_bandwidth is None:
             return features
-        height, width = (height - halo[0] - halo[1]) // stride, width // stride
-        rows = origin[0] + halo[0] + stride * torch.arange(height, dtype=guide.dtype, device=guide.device)
-        columns = origin[1] + stride * torch.arange(width, dtype=guide.dtype, device=guide.device)
-        grid = torch.stack(torch.meshgrid(rows, columns, indexing="ij")).flatten(1)  # (2, N)
+        starts = (origin[0] + halo[0], *origin[1:], 0)  # the last is that of a third axis
+        axes = [
+            start + stride * torch.arange(length // stride, dtype=guide.dtype, device=guide.device)
+            for start, length in zip(starts, (height - halo[0] - halo[1], *row), strict=False)
+        ]
+        grid = torch.stack(torch.meshgrid(*axes, indexing="ij")).flatten(1)  # (2 or 3, N)
         return torch.cat([features, self.coordinates(grid).expand(batch, -1, -1)], dim=1)
 
     def _patch_scale(self, channels: int, like: Tensor) -> Tensor:
-        """Factors (1 or B, p, p) by which the pixels of a patch are multiplied, in the format of ``like``."""
+        """Factors (1 or B, p, p) or (1 or B, p, p, p) of the pixels of a patch, in the format of ``like``."""
         weights = self.patch_weights.to(like).div(channels)
         # The derivative of the root is infinite at 0, but that of squared distances is not.
         weights = weights + FAINT_WEIGHT * (weights == 0).to(weights)
-        return weights.sqrt() / per_image(self.photometric_bandwidth, like, 3)
+        return weights.sqrt() / per_image(self.photometric_bandwidth, like, 1 + weights.ndim)
 
     def scales(self, like: Tensor) -> Tensor:
         """Factors (1 or B, D, 1) from pixels and coordinates to features like those of ``like``, (B, D, n)."""
-        located = self.spatial_bandwidth is not None
-        channels = max((like.shape[1] - 2 * located) // self.patch_weights.numel(), 1)
+        located, axes = self.spatial_bandwidth is not None, self.patch_weights.ndim
+        channels = max((like.shape[1] - axes * located) // self.patch_weights.numel(), 1)
         patch = self._patch_scale(channels, like).flatten(1).repeat(1, channels).unsqueeze(2)
         if not located:
             return patch
-        places = self.coordinates(like.new_ones(2, 1))
+        places = self.coordinates(like.new_ones(axes, 1))
         batch = max(patch.shape[0], places.shape[0])
         return torch.cat([patch.expand(batch, -1, -1), places.expand(batch, -1, -1)], dim=1)
 
     def coordinates(self, places: Tensor) -> Tensor:
-        """Features (1 or B, 2, N) of rows and columns (2, N) of pixels; there must be a spatial bandwidth."""
+        """Features (1 or B, 2, N) of rows and columns (2, N) of pixels, or (1 or B, 3, N) of voxels (3, N).
+
+        There must be a spatial bandwidth.
+        """
         bandwidths = [per_image(bandwidth, places, 2) for bandwidth in bandwidths_of(self.spatial_bandwidth)]
         return places / torch.stack(torch.broadcast_tensors(*bandwidths), dim=1)
 
@@ -174,43 +184,59 @@ def _strided_patches(padded: Tensor, scale: Tensor, stride: int) -> Tensor:
 
 
 class _ScaledPatches(torch.autograd.Function):
-    """One plane per patch offset: the image shifted by the offset, times the weight of the offset."""
+    """One plane per patch offset: the image shifted by the offset, times the weight of the offset.
+
+    Images (B, C, H, W) with a scale (1 or B, p, p), or volumes (B, C, D, H, W) with a scale (1 or B, p, p, p).
+    """
 
     @staticmethod
     def forward(ctx: Any, padded: Tensor, scale: Tensor) -> Tensor:
         ctx.save_for_backward(padded, scale)
-        height, width = (padded.shape[-2] - scale.shape[-2] + 1, padded.shape[-1] - scale.shape[-1] + 1)
-        batch, channels = padded.shape[:2]
-        size = scale.shape[-1]
+        size, last, shifted = _inner_size(padded, scale), padded.ndim - 1, padded
         # (B, C, p, p, H, W): views, not copies. The windows are patches, since their size must be known in a program.
-        shifted = padded.unfold(2, size, 1).unfold(3, size, 1).permute(0, 1, 4, 5, 2, 3)
+        for axis in range(2, padded.ndim):
+            shifted = shifted.unfold(axis, scale.shape[-1], 1)
+        shifted = shifted.permute(0, 1, *range(padded.ndim, shifted.ndim), *range(2, padded.ndim))
+        scales = for_planes(scale.unsqueeze(1), len(size))
         if torch.compiler.is_compiling():
-            return (shifted * scale[:, None, :, :, None, None]).flatten(4).flatten(1, 3)
-        features = large_empty((batch, channels, *scale.shape[1:], height, width), padded)
-        torch.mul(shifted, scale[:, None, :, :, None, None], out=features)
-        return features.flatten(4).flatten(1, 3)
+            return (shifted * scales).flatten(last + 1).flatten(1, last)
+        features = large_empty((*padded.shape[:2], *scale.shape[1:], *size), padded)
+        torch.mul(shifted, scales, out=features)
+        return features.flatten(last + 1).flatten(1, last)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> Gradients:
         padded, scale = ctx.saved_tensors
-        height, width = (padded.shape[-2] - scale.shape[-2] + 1, padded.shape[-1] - scale.shape[-1] + 1)
+        size = _inner_size(padded, scale)
         grad_padded, grad_scale = torch.zeros_like(padded), torch.zeros_like(scale)
-        planes = grad.unflatten(2, (height, width))
+        planes = grad.unflatten(2, size)
         offsets = product(*map(range, (padded.shape[1], *scale.shape[1:])))  # channel, row and column of each plane
-        for plane, (channel, y, x) in enumerate(offsets):
-            window = (slice(None), channel, slice(y, y + height), slice(x, x + width))
-            grad_padded[window] += planes[:, plane] * scale[:, y, x, None, None]
-            moved = (planes[:, plane] * padded[window]).sum((1, 2))  # (B,)
-            grad_scale[:, y, x] += moved if scale.shape[0] == moved.shape[0] else moved.sum()
+        for plane, (channel, *place) in enumerate(offsets):
+            window: tuple[int | slice, ...] = (slice(None), channel, *map(_interval, place, size))
+            weight: tuple[int | slice, ...] = (slice(None), *place)
+            grad_padded[window] += planes[:, plane] * for_planes(scale[weight], len(size))
+            moved = (planes[:, plane] * padded[window]).flatten(1).sum(1)  # (B,)
+            grad_scale[weight] += moved if scale.shape[0] == moved.shape[0] else moved.sum()
         return grad_padded, grad_scale
+
+
+def _interval(start: int, length: int) -> slice:
+    return slice(start, start + length)
+
+
+def _inner_size(padded: Tensor, scale: Tensor) -> tuple[int, ...]:
+    """Size of the image that was padded for patches with this scale, (1 or B, p, ...)."""
+    return tuple(length - side + 1 for length, side in zip(padded.shape[2:], scale.shape[1:], strict=True))
 
 
 def pad_border(image: Tensor, margin: int) -> Tensor:
     """Pad by reflection, or by replication along an axis that is too short for reflection."""
-    height, width = image.shape[-2:]
-    for pad, length in (((margin, margin, 0, 0), width), ((0, 0, margin, margin), height)):
-        image = F.pad(image, pad, mode="reflect" if length > margin else "replicate")
+    axes = image.ndim - 2
+    for axis in range(axes):  # from the last one, as in the argument of F.pad
+        pad = [0] * 2 * axes
+        pad[2 * axis : 2 * axis + 2] = margin, margin
+        image = F.pad(image, pad, mode="reflect" if image.shape[-1 - axis] > margin else "replicate")
     return image
 
 
@@ -248,7 +274,7 @@ def estimate_bandwidth(
     Paper: eq. (20), with 1/n read as a mean (outside the root the bandwidth would decrease with image size).
 
     Args:
-        guide: (B, C, H, W) in [0, 1].
+        guide: (B, C, H, W) in [0, 1], or a volume (B, C, D, H, W).
         guide_channels: ``"luminance"`` reduces three channels to one; ``"all"`` takes the mean over channels.
         weights: as for :func:`nonlocal_operator`: how much each pixel counts in the mean.
         group: as for :func:`nonlocal_operator`; ``guide`` then holds the rows of this rank.
@@ -257,14 +283,14 @@ def estimate_bandwidth(
         (B,), in units of the guide, without a gradient.
 
     Raises:
-        TypeError, ValueError: if ``guide`` is not a finite floating-point (B, C, H, W) tensor, or ``weights`` do not
+        TypeError, ValueError: if ``guide`` is not a finite floating-point tensor of such a shape, or ``weights`` do not
             fit it.
 
     Example:
         >>> estimate_bandwidth(torch.linspace(0, 1, 101).expand(1, 1, 8, 101)) * 255  # a slope of 0.01 per pixel
         tensor([6.3119])
     """
-    check_image(guide, "guide", empty=True)
+    check_image(guide, "guide", empty=True, dimensions=(4, 5))
     check_choice(guide_channels, "guide_channels", ("luminance", "all"))
     with torch.no_grad():
         rows = reduce_channels(guide.to(working_dtype(guide)), guide_channels)
@@ -286,26 +312,33 @@ def bandwidth_of_rows(guide: Tensor, halo: tuple[int, int], communicator: Commun
     """:func:`estimate_bandwidth` from part of the rows of an image, given with a halo of neighbouring rows."""
     with torch.no_grad():
         magnitude = gradients(guide, halo)
-        count = magnitude.shape[1] * communicator.pixels(magnitude.shape[2] * magnitude.shape[3])
-        mean = communicator.sum(magnitude.sum((1, 2, 3), dtype=torch.float64)) / count
+        planes = magnitude.flatten(2)  # (B, C, N)
+        count = planes.shape[1] * communicator.pixels(planes.shape[2])
+        mean = communicator.sum(planes.sum((1, 2), dtype=torch.float64)) / count
         return bandwidth_of_gradient(mean).clamp(max=torch.finfo(guide.dtype).max).to(guide)
 
 
 def gradients(guide: Tensor, halo: tuple[int, int]) -> Tensor:
-    """Gradient magnitude (B, C, h, W) of the rows of a guide, without those of the halo."""
+    """Gradient magnitude (B, C, h, ...) of the rows of a guide, without those of the halo."""
     # Central differences by slicing take a twentieth of the time of a convolution, not counting the import of kornia.
-    padded = F.pad(guide / 2, (1, 1, 1, 1), mode="replicate")  # halved first, so that no finite value overflows
+    padded = F.pad(guide / 2, (1, 1) * (guide.ndim - 2), mode="replicate")  # halved, so that no finite value overflows
     return _magnitude(padded)[:, :, halo[0] : guide.shape[2] - halo[1]]
 
 
 def _magnitude(padded: Tensor) -> Tensor:
-    """Gradient magnitude (B, C, H, W) of half an image that is padded by a pixel on all sides."""
-    down = padded[..., 2:, 1:-1] - padded[..., :-2, 1:-1]
-    right = padded[..., 1:-1, 2:] - padded[..., 1:-1, :-2]
-    magnitude = (down.square() + right.square()).sqrt()
+    """Gradient magnitude (B, C, H, ...) of half an image that is padded by a pixel on all sides."""
+    slopes = []
+    for axis in range(2, padded.ndim):
+        lines = padded
+        for other in range(2, padded.ndim):
+            lines = lines if other == axis else lines.narrow(other, 1, padded.shape[other] - 2)
+        length = padded.shape[axis] - 2
+        slopes.append(lines.narrow(axis, 2, length) - lines.narrow(axis, 0, length))
+    squares = (slope.square() for slope in slopes)
+    magnitude = reduce(torch.add, squares).sqrt()
     if is_hidden(magnitude) or not bool(magnitude.sum().isfinite()):
         # hypot cannot overflow, but on CPUs its last digit depends on the position in memory, and therefore on tiling.
-        magnitude = torch.hypot(down, right)
+        magnitude = reduce(torch.hypot, slopes)
     return magnitude
 
 

@@ -1,5 +1,7 @@
 """Landmarks of an operator: chosen anew, held by an assignment, or passed as features."""
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -12,7 +14,7 @@ from nlfilter_torch.operator.options import Construction
 def landmarks_by(
     method: Construction,
     features: Tensor,
-    size: tuple[int, int],
+    size: tuple[int, ...],
     count: int,
     communicator: Communicator = ALONE,
     weights: Tensor | None = None,
@@ -29,7 +31,7 @@ def landmarks_by(
         if torch.compiler.is_compiling():  # never with a generator, weights or a group
             return choose_in_graph(features, size, count, landmarks)
         return assign_landmarks(features, size, count, landmarks, method.generator, communicator, weights)
-    batch, points = features.shape[0], size[0] * size[1]
+    batch, points = features.shape[0], math.prod(size)
     if isinstance(landmarks, Assignment):
         _check_assignment(landmarks, batch, points)
         return landmarks_of(features, landmarks, communicator), landmarks

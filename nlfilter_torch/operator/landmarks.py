@@ -45,7 +45,7 @@ MANY = 1 << 24  # a permutation of more pixels than this would take more memory 
 
 def choose_landmarks(
     features: Tensor,
-    size: tuple[int, int],
+    size: tuple[int, ...],
     count: int,
     sampling: Sampling,
     generator: torch.Generator | None,
@@ -58,7 +58,7 @@ def choose_landmarks(
 
 def assign_landmarks(
     features: Tensor,
-    size: tuple[int, int],
+    size: tuple[int, ...],
     count: int,
     sampling: Sampling,
     generator: torch.Generator | None,
@@ -68,8 +68,8 @@ def assign_landmarks(
     """Choose or compute ``count`` landmarks; also return of which points they are made.
 
     Args:
-        features: (B, D, N) with N = H * W.
-        size: (H, W).
+        features: (B, D, N).
+        size: (H, W), or any other whose product is N.
         count: M, at most N. With M = N the landmarks are the pixels themselves.
         sampling: ``"kmeans"``: Lloyd centroids of a random subset; ``"uniform"``: the paper's spatial grid;
             ``"random"``: distinct random pixels.
@@ -84,7 +84,7 @@ def assign_landmarks(
         single calls.
     """
     generator = torch.Generator().manual_seed(0) if generator is None else generator
-    points = size[0] * size[1]
+    points = math.prod(size)
     if count == features.shape[-1] and communicator.size == 1:
         return features.clone(), Assignment(torch.arange(points, device=features.device)[None], None, None, points)
     pixels = (
@@ -113,9 +113,9 @@ def landmarks_of(features: Tensor, assignment: Assignment, communicator: Communi
     return means_of_clusters(subset, start, members)
 
 
-def candidate_pixels(size: tuple[int, int], count: int, sampling: Sampling, generator: torch.Generator) -> Tensor:
+def candidate_pixels(size: tuple[int, ...], count: int, sampling: Sampling, generator: torch.Generator) -> Tensor:
     """Draw indices of distinct pixels, from whose features :func:`condense` computes ``count`` landmarks."""
-    pixels = size[0] * size[1]
+    pixels = math.prod(size)
     if count == pixels:
         return torch.arange(pixels)
     if sampling == "uniform":
@@ -181,17 +181,22 @@ def _bounded(candidates: int, most: int, count: int) -> int:
     return min(candidates, max(most, 2 * count))
 
 
-def _grid(size: tuple[int, int], count: int) -> Tensor:
-    """Indices of ``count`` pixels spread evenly over an image of ``size``, as rows of nearly equal length."""
-    height, width = size
-    rows = round((count * height / width) ** 0.5)
+def _grid(size: tuple[int, ...], count: int) -> Tensor:
+    """Indices of ``count`` pixels spread evenly over an image of ``size``, as rows of nearly equal length.
+
+    A volume is divided into slices with nearly equal numbers of voxels, each of which is such a grid.
+    """
+    height, *row_size = size
+    if not row_size:
+        return (2 * torch.arange(count) + 1) * height // (2 * count)
+    width = math.prod(row_size)
+    rows = round((count * height ** len(row_size) / width) ** (1 / len(size)))
     rows = min(max(rows, -(-count // width), 1), height, count)
     lengths = [count // rows + (row < count % rows) for row in range(rows)]
     lines = []
     for row, length in enumerate(lengths):
         y = (2 * row + 1) * height // (2 * rows)
-        x = (2 * torch.arange(length) + 1) * width // (2 * length)
-        lines.append(y * width + x)
+        lines.append(y * width + _grid(tuple(row_size), length))
     return torch.cat(lines)
 
 
@@ -294,7 +299,7 @@ def _fake_choice(features: Tensor, size: Sequence[int], count: int, sampling: st
 def choose(features: Tensor, size: Sequence[int], count: int, sampling: Sampling) -> tuple[Tensor, Tensor, Tensor]:
     """Choose candidates (S,), initial centroids among them (B, 1, M) and their assignment to clusters (B, S)."""
     generator = torch.Generator().manual_seed(0)
-    pixels = candidate_pixels((size[0], size[1]), count, sampling, generator).to(features.device)
+    pixels = candidate_pixels(tuple(size), count, sampling, generator).to(features.device)
     if len(pixels) == count:  # each is a cluster of its own
         alone = torch.arange(count, device=features.device).expand(len(features), -1)
         return pixels, alone.unsqueeze(1).contiguous(), alone.contiguous()
@@ -303,7 +308,7 @@ def choose(features: Tensor, size: Sequence[int], count: int, sampling: Sampling
 
 
 def choose_in_graph(
-    features: Tensor, size: tuple[int, int], count: int, sampling: Sampling
+    features: Tensor, size: tuple[int, ...], count: int, sampling: Sampling
 ) -> tuple[Tensor, Assignment]:
     """:func:`assign_landmarks` in a form that can be compiled; chooses the same landmarks as without a generator."""
     # Nothing here depends on the size of the image, so that a program serves for all sizes.

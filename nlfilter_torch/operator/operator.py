@@ -11,13 +11,12 @@ from nlfilter_torch.core.blocks import fold_batch, root_weighted, unfold_batch, 
 from nlfilter_torch.core.checks import (
     check_count,
     check_features,
-    check_image,
+    check_fits,
     check_order,
-    check_same_size,
 )
 from nlfilter_torch.core.communicator import ALONE, Communicator
 from nlfilter_torch.core.containers import Batch, loadable
-from nlfilter_torch.core.kernels.tall_skinny import moment
+from nlfilter_torch.core.kernels.tall_skinny import moment, spread
 from nlfilter_torch.core.layouts import in_format_of
 from nlfilter_torch.core.precision import full_precision, uncompiled
 from nlfilter_torch.operator.assignment import Assignment
@@ -67,7 +66,7 @@ class Kernel:
         return self.features
 
     def columns(
-        self, guide: Tensor, *, origin: tuple[int, int] = (0, 0), halo: tuple[int, int] = (0, 0)
+        self, guide: Tensor, *, origin: tuple[int, ...] = (0, 0), halo: tuple[int, int] = (0, 0)
     ) -> tuple[Tensor, Tensor]:
         """Compute factor (B, M, N) and diagonal (B, N) of the pixels of any guide; see :class:`GuideFeatures`."""
         return self.factor(self.recipe(guide, origin=origin, halo=halo))
@@ -146,7 +145,7 @@ class NonlocalOperator(Batch):
         factor: U, (B, M, N), pixels last.
         diagonal: c, (B, N), the correction that makes the diagonal of the kernel 1; zeros without completion.
         scaling: d, (B, N), positive.
-        size: (H, W).
+        size: (H, W) of images, (D, H, W) of volumes, or that of :func:`operator_from_features`.
         kernel: computes factor and diagonal of the pixels of other guides.
         remainder: r, (B, N), the diagonal part of W.
         weights: number of pixels that each point represents, (B, N); None means one each. With weights, ``W y`` is
@@ -162,7 +161,7 @@ class NonlocalOperator(Batch):
     factor: Tensor
     diagonal: Tensor
     scaling: Tensor
-    size: tuple[int, int]
+    size: tuple[int, ...]
     kernel: Kernel
     remainder: Tensor
     balancing: PixelScaling
@@ -249,6 +248,35 @@ class NonlocalOperator(Batch):
         return Columns(factor, *self.differentiable_balancing()(factor, diagonal))
 
     @full_precision
+    def nystrom_blocks(self) -> tuple[Tensor, Tensor]:
+        """Form the blocks W_A and W_AB of W, from which the paper computes its eigenvectors. Paper: Fig. 2.
+
+        A is the landmarks, whether they are pixels of the image or the centroids of clusters, with the scaling and the
+        diagonal part that pixels with their features would have. B is all pixels, in the order of ``image.flatten(2)``;
+        landmarks that are pixels are in both, and the diagonal part of W is in W_A alone. Entries are weights between
+        two single pixels, also if points represent several (``weights``).
+
+        Returns:
+            W_A, (B, M, M), and W_AB, (B, M, N). Without their diagonals r, ``W = W_AB^T (W_A - diag(r))^-1 W_AB``.
+            Differentiable in the operator.
+
+        Example:
+            >>> from nlfilter_torch import nonlocal_operator
+            >>> guide = torch.rand(1, 1, 12, 12, generator=torch.Generator().manual_seed(0))
+            >>> operator = nonlocal_operator(guide, num_landmarks=9, landmarks="uniform")
+            >>> within, across = operator.nystrom_blocks()
+            >>> within.shape, across.shape
+            (torch.Size([1, 9, 9]), torch.Size([1, 9, 144]))
+            >>> middle = 6 * 12 + 6  # the middle one of the landmarks, a grid of 3x3 pixels, is this pixel
+            >>> torch.allclose(within[0, 4, 4], operator.to_dense()[0, middle, middle])
+            True
+        """
+        landmarks = self.at(self.landmarks)
+        scaled = landmarks.factor * landmarks.scaling.unsqueeze(1)  # (B, M, M)
+        within = scaled.mT @ scaled + torch.diag_embed(landmarks.remainder)
+        return within, spread(scaled.mT, self.factor, self.scaling)
+
+    @full_precision
     def differentiable_balancing(self) -> PixelScaling:
         """:attr:`balancing`, whose moment has no gradient, with one that has, recomputed from the factor."""
         if not self.factor.requires_grad:
@@ -260,11 +288,13 @@ class NonlocalOperator(Batch):
         """Compute ``W y``, also written ``operator @ image``. Paper: eq. (2).
 
         Args:
-            image: (B, C, H, W) of the guide's height and width, any number of channels, any floating-point dtype. A
-                batch of 1 on either side is broadcast.
+            image: (B, C, H, W) of the guide's height and width, (B, C, D, H, W) for a volume, or (B, C, N) with the
+                same points in a row; any number of channels, any floating-point dtype. A batch of 1 on either side is
+                broadcast.
 
         Returns:
-            (B, C, H, W) in the image's dtype, with the same mean as the image. Differentiable in image and operator.
+            (B, C, H, W), or the image's other dimensions, in its dtype, with the same mean as the image. Differentiable
+            in image and operator.
 
         Raises:
             TypeError, ValueError: if ``image`` is not a finite floating-point tensor of that size.
@@ -276,23 +306,22 @@ class NonlocalOperator(Batch):
 
     @full_precision
     def powers(self, image: Tensor, order: int) -> Tensor:
-        """Compute ``W y, ..., W^k y``, (B, k, C, H, W), in the operator's dtype; arguments and errors as in matmul."""
+        """Compute ``W y, ..., W^k y``, (B, k, C, ...), in the operator's dtype; arguments and errors as in matmul."""
         check_order(order)
-        check_image(image, "image", empty=True)
-        check_same_size(image, self.size, "image", "operator", self.factor)
+        check_fits(image, self.size, "image", "operator", self.factor, empty=True)
         folded = fold_batch(image.to(self.factor), self.factor.shape[0])
         if folded.numel() == 0:  # an empty batch
-            return image[:0].to(self.factor).unsqueeze(1).expand(-1, order, -1, -1, -1)
+            return image[:0].to(self.factor).unsqueeze(1).expand(-1, order, *image.shape[1:])
         planes = apply_powers(self.factor, self.scaling, self.remainder, folded, order, self.communicator, self.weights)
-        return unfold_batch(planes, image.shape[0], self.size)
+        return unfold_batch(planes, image.shape[0], image.shape[2:])
 
     @property
     def diagonal_share(self) -> Tensor:
-        """The weight r in [0, 1] with which a pixel keeps its own value where few pixels are similar, (B, 1, H, W)."""
+        """The weight r in [0, 1] with which a pixel keeps its own value where few pixels are similar, (B, 1, *size)."""
         return self.remainder.unflatten(1, self.size).unsqueeze(1)
 
     def row_sums(self) -> Tensor:
-        """Row sums of W, (B, 1, H, W): one everywhere, with an error of about :attr:`residual`."""
+        """Row sums of W, (B, 1, *size): one everywhere, with an error of about :attr:`residual`."""
         batch = self.factor.shape[0]
         return self.matmul(self.factor.new_ones(batch, 1, *self.size))
 
@@ -347,16 +376,16 @@ class NonlocalOperator(Batch):
         """
         batch, generator = self.factor.shape[0], torch.Generator().manual_seed(0)
         images = torch.randn(1, 2, *self.size, generator=generator, dtype=torch.float64).to(self.factor)
-        x, y = images.expand(batch, -1, -1, -1).split(1, dim=1)
+        x, y = images.expand(batch, *images.shape[1:]).split(1, dim=1)
         products = torch.cat([x * (self @ y), y * (self @ x)], dim=1).double().flatten(2)
         products = weighted(products, self.weights).sum(2)
         inner = self.communicator.sum(products)
-        lengths = self.communicator.sum(images.double().square().sum((0, 2, 3)))
+        lengths = self.communicator.sum(images[0].double().square().flatten(1).sum(1))
         highest, lowest = (self.communicator.max((sign * self.remainder).amax(1)) for sign in (1, -1))
         gram = shifted_gram(self.factor, root_weighted(self.scaling, self.weights), self.remainder, self.communicator)
         return Certificate(
             symmetry=((inner[:, 0] - inner[:, 1]).abs() / lengths.prod().sqrt()).tolist(),
-            row_sums=self.communicator.max((self.row_sums() - 1).abs().amax((1, 2, 3))).tolist(),
+            row_sums=self.communicator.max((self.row_sums() - 1).abs().flatten(1).amax(1)).tolist(),
             smallest_eigenvalue=(-lowest).tolist(),
             largest_eigenvalue=largest_eigenvalue(gram, highest, self.factor.dtype).tolist(),
         )
@@ -366,16 +395,15 @@ class NonlocalOperator(Batch):
     def diagnostics(self) -> Diagnostics:
         """Measure the quality of the operator, at several times the cost of the spectrum."""
         spectrum, certificate = self.spectrum(), self.certify()
-        vectors = spectrum.eigenvectors  # (B, R, H, W)
+        vectors = spectrum.eigenvectors.flatten(2)  # (B, R, N)
         rank = vectors.shape[1]
         errors = []
         for part, eigenvalues in zip(vectors.split(16, dim=1), spectrum.eigenvalues.split(16, dim=1), strict=True):
-            error = (self.matmul(part) - eigenvalues[:, :, None, None] * part).square().flatten(2)
+            error = (self.matmul(part) - eigenvalues.unsqueeze(2) * part).square()
             errors.append(weighted(error, self.weights).sum(2))
         residual = self.communicator.sum(torch.cat(errors, dim=1)).sqrt()
-        flat = vectors.flatten(2)
-        inner = self.communicator.sum(weighted(flat, self.weights) @ flat.mT)
-        occupied = torch.diag_embed(spectrum.support[:, :rank].to(flat))
+        inner = self.communicator.sum(weighted(vectors, self.weights) @ vectors.mT)
+        occupied = torch.diag_embed(spectrum.support[:, :rank].to(vectors))
         matrix = KernelMatrix(self.factor, self.diagonal, self.weights, self.communicator)
         kernel_sums = matrix.affinities(matrix.moment(torch.ones_like(self.scaling))) + self.diagonal
         if self.weights is not None:

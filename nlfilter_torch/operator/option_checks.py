@@ -69,17 +69,18 @@ def check_options(options: OperatorOptions) -> None:
 
 
 def check_bandwidths(
-    photometric: float | Tensor | str, spatial: SpatialBandwidth | None, batch: int | None = None
+    photometric: float | Tensor | str, spatial: SpatialBandwidth | None, batch: int | None = None, axes: int = 2
 ) -> None:
-    """Raise unless these are bandwidths, for all images or for each of a batch."""
+    """Raise unless these are bandwidths, for all images with so many axes or for each of a batch."""
     if isinstance(photometric, str):
         check_choice(photometric, "photometric_bandwidth", ("auto",), "pass it or a number")
     else:
         check_positive(photometric, "photometric_bandwidth", batch)
-    if isinstance(spatial, tuple | list) and len(spatial) != 2:
+    if isinstance(spatial, tuple | list) and len(spatial) != axes:
+        count, distances = ("two", "") if axes == 2 else ("three", "depth, ")
         raise ValueError(
-            "spatial_bandwidth must be a number, or two for vertical and horizontal distances, got "
-            f"{len(spatial)} in a {type(spatial).__name__}; pass two numbers"
+            f"spatial_bandwidth must be a number, or {count} for {distances}vertical and horizontal distances, got "
+            f"{len(spatial)} in a {type(spatial).__name__}; pass {count} numbers"
         )
     if spatial is not None:
         for bandwidth in bandwidths_of(spatial):

@@ -56,5 +56,5 @@ class OperatorOptions(Construction):
 
 
 def bandwidths_of(spatial: SpatialBandwidth | None) -> tuple[Any, ...]:
-    """The bandwidth of all distances, or those of vertical and of horizontal ones."""
+    """The bandwidth of all distances, or those along each axis."""
     return tuple(spatial) if isinstance(spatial, tuple | list) else (spatial,)

@@ -49,7 +49,7 @@ def choose(features: Tensor, size: Sequence[int], count: int, sampling: Sampling
     """As :func:`nlfilter_torch.operator.landmarks.choose`, with the random numbers as constants of the program."""
     with outside_modes():
         generator = torch.Generator().manual_seed(0)
-        drawn = candidate_pixels((size[0], size[1]), count, sampling, generator)
+        drawn = candidate_pixels(tuple(size), count, sampling, generator)
         few = draw_few(len(drawn), count, generator)
         draws = pivot_draws(count, generator).float()
     pixels, first = (torch.tensor(constant.tolist(), device=features.device) for constant in (drawn, few))

@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from nlfilter_torch.core.blocks import fold_batch, root_weighted, unfold_batch, weighted
-from nlfilter_torch.core.checks import check_coefficients, check_image, check_same_size, checked_response
+from nlfilter_torch.core.checks import check_coefficients, check_fits, checked_response
 from nlfilter_torch.core.communicator import ALONE, Communicator
 from nlfilter_torch.core.containers import Batch, loadable
 from nlfilter_torch.core.kernels.grams import compute_grams
@@ -99,7 +99,7 @@ class Spectrum(Batch, RitzPairs):
         support: (B, M) bool, which eigenvalues of T are above rounding.
         factor: (B, M, N), before scaling.
         scaling: d, (B, N).
-        size: (H, W).
+        size: (H, W), or that of the operator.
         largest: the first eigenvalue before it was clamped to 1, (B,).
         residual: that of the operator, (B,).
         weights: number of pixels that each point represents, (B, N), or None. Eigenvectors are orthonormal in the sum
@@ -111,7 +111,7 @@ class Spectrum(Batch, RitzPairs):
     eigenvalues: Tensor
     factor: Tensor
     scaling: Tensor
-    size: tuple[int, int]
+    size: tuple[int, ...]
     largest: Tensor
     residual: Tensor
     weights: Tensor | None = None
@@ -152,7 +152,7 @@ class Spectrum(Batch, RitzPairs):
 
     @property
     def eigenvectors(self) -> Tensor:
-        """(B, R, H, W), orthonormal over the pixels, in the order of the eigenvalues; zero for padded eigenvalues.
+        """(B, R, *size), orthonormal over the pixels, in the order of the eigenvalues; zero for padded eigenvalues.
 
         The first is constant and positive as far as the landmarks span the constant vector (exactly so for W; without
         completion to the tolerance of the balancing), also if the eigenvalue 1 is repeated. Differentiable, but with
@@ -175,7 +175,7 @@ class Spectrum(Batch, RitzPairs):
         return self._form(self.ritz.vectors)
 
     def _form(self, vectors: Tensor) -> Tensor:
-        """Form the eigenvectors (B, R, H, W) from those of T, (B, M, M)."""
+        """Form the eigenvectors (B, R, *size) from those of T, (B, M, M)."""
         rank = self.eigenvalues.shape[1]
         vectors = (vectors * self.support.unsqueeze(1))[:, :, :rank]
         vectors = self._constant_first(vectors)
@@ -189,7 +189,7 @@ class Spectrum(Batch, RitzPairs):
         To apply several responses to one image, or to learn one, compute ``F y`` once; see :func:`spectral_filter`.
 
         Args:
-            image: y, (B, C, H, W).
+            image: y, (B, C, *size) or (B, C, N).
 
         Returns:
             (B, C, M) in float64. Differentiable in image and operator.
@@ -197,15 +197,14 @@ class Spectrum(Batch, RitzPairs):
         Raises:
             TypeError, ValueError: if ``image`` is not a finite floating-point tensor of the spectrum's size.
         """
-        check_image(image, "image")
-        check_same_size(image, self.size, "image", "spectrum", self.factor)
+        check_fits(image, self.size, "image", "spectrum", self.factor)
         planes = fold_batch(image.to(self.factor), self.factor.shape[0])
         total = self.communicator.sum(moment(self.factor, self.mass.unsqueeze(1) * planes))  # (B, M, C)
         return unfold_batch(total.mT.unsqueeze(1), image.shape[0], (total.shape[1], 1))[:, 0, :, :, 0]
 
     @full_precision
     def synthesize(self, response: Response, coefficients: Tensor) -> Tensor:
-        """Compute ``V f(S) V^T y``, (B, C, H, W), from a response f and coefficients (B, C, M) of y."""
+        """Compute ``V f(S) V^T y``, (B, C, *size), from a response f and coefficients (B, C, M) of y."""
         check_coefficients(coefficients, self.factor)
         count = coefficients.shape[0]
         total = fold_batch(coefficients.unsqueeze(3), self.factor.shape[0])  # (B, C, M)
@@ -239,7 +238,7 @@ def compute_spectrum(
     factor: Tensor,
     scaling: Tensor,
     remainder: Tensor | None,
-    size: tuple[int, int],
+    size: tuple[int, ...],
     rank: int | None,
     residual: Tensor,
     communicator: Communicator = ALONE,

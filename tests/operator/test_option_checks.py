@@ -43,7 +43,7 @@ INT = "must be an int, got"
 ODD = "must be odd and at least 1, got"
 
 
-SQUARE = "must have shape (p, p) with odd p, got"
+SQUARE = "must have shape (p, p) with odd p, or (p, p, p) for volumes, got"
 
 
 BAD_OPTIONS: list[tuple[str, Any, type[Exception], str]] = [

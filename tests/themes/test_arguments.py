@@ -85,7 +85,7 @@ def test_other_arguments_of_a_wrong_type() -> None:
     sentence(lambda: FITTED.layers(GREY, halo=(4, 4)), "halo")
     sentence(lambda: enhance(IMAGE, ONES, IMAGE[0]), "regions")
     sentence(lambda: NonlocalFilter().forward(None), "image")
-    sentence(lambda: NonlocalFilter().sliders.combine(IMAGE), "layers")
+    sentence(lambda: NonlocalFilter().sliders.combine(IMAGE[0]), "layers")
     sentence(lambda: NonlocalFilter(residual=0.5).sliders.combine(IMAGE), "residual")
     sentence(lambda: SPECTRUM.synthesize(torch.sqrt, torch.ones(2, 3, 19)), "coefficients")
     sentence(lambda: OPERATOR.powers(IMAGE, 10**12), "order")

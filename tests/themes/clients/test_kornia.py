@@ -41,7 +41,7 @@ def test_between_augmentations_the_layer_filters_what_the_first_returns() -> Non
     torch.testing.assert_close(container(picture), layer()(picture.flip(3)).flip(2), atol=0, rtol=0)
 
 
-def test_four_dimensions_too_few_or_too_many_are_told() -> None:
-    for shape in ((12, 13), (1, 1, 3, 12, 13)):
-        with pytest.raises(ValueError, match=r"^image must have shape \(B, C, H, W\), got "):
+def test_dimensions_too_few_or_too_many_are_told() -> None:
+    for shape in ((12, 13), (1, 1, 1, 3, 12, 13)):
+        with pytest.raises(ValueError, match=r"^image must have shape \(B, C, H, W\) or \(B, C, D, H, W\), got "):
             layer()(torch.zeros(shape))
