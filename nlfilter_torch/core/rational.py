@@ -17,14 +17,13 @@ from torch import Tensor
 from nlfilter_torch.core.torch_internals import in_fake_mode
 
 DECADES = {torch.float64: 16, torch.float32: 12}  # smallest eigenvalues that are told from 0, 10^-DECADES
-PER_DECADE = 24  # nodes in each decade of the interval
-LINEAR = 256  # nodes that are spread over the interval as those of Chebyshev
+PER_DECADE = 16  # nodes in each decade of the interval
+LINEAR = 192  # nodes that are spread over the interval as those of Chebyshev
 ACCURATE = (*range(9), 10, 12, 14, 16, 20, 24, 32)  # degrees of polynomials that are nearly exact
 ROUGH = (40, 48, 64)
 POLES = (1, 2, 3, 4, 5, 6, 7, 8, 10, 12, 14, 16, 20, 24, 32)
-DEGREE = 3  # of the polynomial beside few poles, and beside MANY or more
-DEGREE_OF_MANY = 6
-MANY = 14
+DEGREE = 5  # of the polynomial beside poles
+FIRST, LAST = (1.0, 5.0), (0.03, 0.06, 0.15)  # first pole in units of the lower end of the interval, and last pole
 PINNED = 30.0  # weight of the node 1, so that constant images keep their value
 CUT = 1e-12  # singular values of the least-squares problem below this, relative to the largest, are dropped
 
@@ -105,8 +104,7 @@ def polynomial_forms(decades: int, degrees: tuple[int, ...]) -> list[RationalFor
 
 def pole_forms(decades: int, poles: int) -> list[RationalForm]:
     """Forms with this number of poles in a few arrangements."""
-    degree = DEGREE if poles < MANY else DEGREE_OF_MANY
-    return [rational_form(decades, degree, poles, first, last) for first in (1.0, 3.0) for last in (0.15, 0.7)]
+    return [rational_form(decades, DEGREE, poles, first, last) for first in FIRST for last in LAST]
 
 
 def best_form(values: Tensor, decades: int, tolerance: float, rounding: float) -> tuple[RationalForm, float] | None:
