@@ -128,6 +128,9 @@ def map_tensors(container: Container, function: Callable[[Tensor, Path], Tensor]
 
     The function takes a tensor and the names of the fields that lead to it.
     """
+    if torch.is_inference_mode_enabled():  # the copies are ordinary tensors, which later training may use
+        with torch.inference_mode(False), torch.no_grad():
+            return map_tensors(container, function)
     result: Container = _mapped(container, function, frozenset())
     return result
 
@@ -190,6 +193,9 @@ def joined(batches: Sequence[Container], counts: Sequence[int]) -> Container:
     Raises:
         ValueError: if anything but the entries of images differs.
     """
+    if torch.is_inference_mode_enabled():
+        with torch.inference_mode(False), torch.no_grad():
+            return joined(batches, counts)
     result: Container = _Joining(counts).join(batches, "")
     return result
 

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.core.precision import once_differentiable, uncompiled
-from nlfilter_torch.core.torch_internals import are_derived, is_transformed
+from nlfilter_torch.core.torch_internals import are_derived, for_each_gradient, in_transform
 
 # For eigenvalues with a relative distance below MEETING, f' at their midpoint is used: the truncation error, in f''',
 # and the cancellation error are then both near 1e-10. For eigenvalues below FLOOR the distance is relative to FLOOR,
@@ -59,11 +59,11 @@ class SymmetricMatrix:
         gains = function(points)
         meeting = MEETING.get(gains.dtype, MEETING[torch.float32])
         values = torch.where(support, gains.to(points), torch.zeros_like(points))
-        if not self.matrix.requires_grad:
+        if not self.matrix.requires_grad or in_transform():
             constant = (self.vectors * values.unsqueeze(-2)) @ self.vectors.mT
             if not are_derived([self.matrix]):
                 return constant
-            change = self.matrix - self.matrix.detach()  # zero, with a forward-mode derivative
+            change = self.matrix - self.matrix.detach()  # zero, with a derivative
             inner = self.vectors.mT @ ((change + change.mT) / 2) @ self.vectors
             return (
                 constant
@@ -111,7 +111,7 @@ def divided_differences(
 
 def slope(function: Callable[[Tensor], Tensor], points: Tensor) -> Tensor:
     """Derivative of f at ``points`` (B, ...); f may differ between the images of a batch."""
-    if is_transformed(points):  # in torch.func
+    if in_transform():
         gradient: Tensor = torch.func.grad(lambda flat: function(flat).sum())(points.detach().flatten(1))
         return gradient.view_as(points)
     with torch.enable_grad():
@@ -130,6 +130,7 @@ class _SpectralFunction(torch.autograd.Function):
         return (vectors * values.unsqueeze(-2)) @ vectors.mT
 
     @staticmethod
+    @for_each_gradient
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         vectors, differences, _ = ctx.saved_tensors

@@ -24,6 +24,12 @@ def working_dtype(tensor: Tensor) -> torch.dtype:
     return torch.float64 if tensor.dtype == torch.float64 else torch.float32
 
 
+def trainable(tensor: Tensor) -> Tensor:
+    """The tensor, or a copy if it was made in inference mode: autograd refuses to save such tensors."""
+    inference = not torch.compiler.is_compiling() and tensor.is_inference() and not torch.is_inference_mode_enabled()
+    return tensor.clone() if inference else tensor
+
+
 def per_image(value: float | Tensor, like: Tensor, dimensions: int) -> Tensor:
     """A number or a tensor of shape () or (B,), as (1 or B, 1, ...) in the dtype and on the device of ``like``."""
     return torch.as_tensor(value, dtype=like.dtype, device=like.device).reshape(-1, *[1] * (dimensions - 1))

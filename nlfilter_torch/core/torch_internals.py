@@ -10,15 +10,27 @@ for an accelerator, and is impossible for tensors without data: on the device "m
 of steps.
 """
 
-from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass
 from functools import lru_cache, wraps
 from typing import Any, ParamSpec, TypeVar, cast
 
 import torch
 import torch.distributed as dist
 from torch import Tensor
-from torch._C._functorch import is_functorch_wrapped_tensor, peek_interpreter_stack
+from torch._C._functorch import (
+    _add_batch_dim,
+    _remove_batch_dim,
+    get_unwrapped,
+    is_batchedtensor,
+    is_functorch_wrapped_tensor,
+    is_gradtrackingtensor,
+    is_legacy_batchedtensor,
+    maybe_get_level,
+    peek_interpreter_stack,
+)
+from torch._functorch.pyfunctorch import temporarily_clear_interpreter_stack
 from torch._subclasses.fake_tensor import FakeTensor
 from torch.autograd import forward_ad
 from torch.utils._python_dispatch import _disable_current_modes
@@ -124,37 +136,138 @@ def is_fake(tensor: Tensor) -> bool:
     return is_fake_tensor(tensor) or in_fake_mode()
 
 
-def refuse_transforms(name: str, *values: object) -> None:
-    """Raise if one of ``values``, the first called ``name``, is transformed in a way that operators cannot be built."""
+def outside_transforms(function: Callable[P, R]) -> Callable[P, R]:
+    """Run a function of tensors that ``torch.func`` does not transform as if it were called before the transforms.
+
+    In inference mode it returns ordinary tensors, which later training may use.
+
+    A transform of what is computed from the result then sees a constant. Arguments that are transformed are left to
+    the function, which refuses them by :func:`refuse_transforms`. Those that were computed inside a transform, but do
+    not depend on what it varies, are constants, too.
+    """
+
+    @wraps(function)
+    def wrapper(*args: P.args, **kwargs: P.kwargs) -> R:
+        if torch.compiler.is_compiling():
+            return function(*args, **kwargs)
+        if torch.is_inference_mode_enabled():
+            with torch.inference_mode(False), torch.no_grad():
+                return function(*args, **kwargs)
+        if not (in_transform() or in_forward_mode()):
+            return function(*args, **kwargs)
+        args, kwargs = tree_map_only(Tensor, _without_wrapper, (args, kwargs))
+        with temporarily_clear_interpreter_stack(), _outside_batches():
+            return function(*args, **kwargs)
+
+    return wrapper
+
+
+@contextmanager
+def _outside_batches() -> Iterator[None]:
+    """Leave the older ``vmap`` of ``torch.autograd.functional``, in which no random numbers may be drawn."""
+    levels = _batch_level()
+    for _ in range(levels):
+        torch._C._vmapmode_decrement_nesting()
+    try:
+        yield
+    finally:
+        for _ in range(levels):
+            torch._C._vmapmode_increment_nesting()
+
+
+def _batch_level() -> int:
+    """Number of nested calls of the older ``vmap``, which can only be asked for by starting another."""
+    level = torch._C._vmapmode_increment_nesting() - 1
+    torch._C._vmapmode_decrement_nesting()
+    return level
+
+
+def _without_wrapper(tensor: Tensor) -> Tensor:
+    """The tensor inside the wrappers of derivatives of ``torch.func`` that it does not depend on."""
+    while is_gradtrackingtensor(tensor) and not are_derived([tensor]):
+        tensor = get_unwrapped(tensor)
+    return tensor
+
+
+def for_each_gradient(backward: Callable[..., Any]) -> Callable[..., Any]:
+    """Call the backward pass of an autograd Function once for each of a batch of gradients.
+
+    Batches come from ``is_grads_batched`` and ``vectorize``, and from ``vmap`` of ``torch.autograd.grad``.
+    """
+
+    @wraps(backward)
+    def wrapper(ctx: Any, *gradients: Tensor) -> Any:
+        if torch.compiler.is_compiling() or not any(map(_is_batched, gradients)):
+            return backward(ctx, *gradients)
+        batched = [_Level.of(gradient) for gradient in gradients]
+        level = next(level for level in batched if level is not None)
+        first = next(g for g, known in zip(gradients, batched, strict=True) if known is not None)
+        size = level.without(first, 1).shape[0]
+        slices = zip(*[level.without(gradient, size).unbind() for gradient in gradients], strict=True)
+        results = zip(*[backward(ctx, *part) for part in slices], strict=True)
+        return tuple(level.stacked(parts) for parts in results)
+
+    return wrapper
+
+
+def _is_batched(tensor: Tensor) -> bool:
+    return is_batchedtensor(tensor) or is_legacy_batchedtensor(tensor)
+
+
+@dataclass(frozen=True)
+class _Level:
+    """A level of batching, of ``torch.func`` or of the older one that batched gradients use."""
+
+    legacy: bool
+    number: int
+
+    @staticmethod
+    def of(tensor: Tensor) -> "_Level | None":
+        """The innermost level at which a tensor is batched."""
+        if is_batchedtensor(tensor):
+            return _Level(False, maybe_get_level(tensor))
+        if not is_legacy_batchedtensor(tensor):
+            return None
+        return _Level(True, _batch_level())
+
+    def without(self, tensor: Tensor, size: int) -> Tensor:
+        """The entries of a batch, in the first dimension; copies if the tensor is not batched."""
+        remove = torch._remove_batch_dim if self.legacy else _remove_batch_dim
+        return remove(tensor, self.number, size, 0)
+
+    def stacked(self, parts: tuple[Any, ...]) -> Tensor | None:
+        """A batch of tensors, or None."""
+        if parts[0] is None:
+            return None
+        add = torch._add_batch_dim if self.legacy else _add_batch_dim
+        # Gradients that are stored as factors become ordinary tensors.
+        return add(torch.stack([part.formed() if hasattr(part, "formed") else part for part in parts]), 0, self.number)
+
+
+def refuse_transforms(**values: object) -> None:
+    """Raise if one of these arguments is transformed in a way that operators cannot be built."""
     if torch.compiler.is_compiling():
         return
     # These three checks take less than a microsecond.
     if is_traced():
         raise TypeError(
-            f"{name} must not be traced by torch.jit.trace while an operator is built, got a traced tensor; "
-            "use torch.export.export, or trace only the application of an operator built before"
+            f"{next(iter(values))} must not be traced by torch.jit.trace while an operator is built, got a traced "
+            "tensor; use torch.export.export, or trace only the application of an operator built before"
         )
-    if not in_forward_mode() and not in_transform():
-        return
-    transformed = any(is_transformed(value) for value in values if isinstance(value, Tensor))
-    if transformed:
-        raise TypeError(
-            f"{name} must not be transformed by torch.func (vmap, grad, jvp) while an operator is built, got a "
-            "transformed tensor; pass a batch, and take derivatives with torch.autograd.grad"
-        )
-    if in_transform():
-        raise TypeError(
-            f"{name} must not be used to build an operator inside torch.func (vmap, grad, jvp), got a call in it; "
-            "build the operator before, and transform a function of its application"
-        )
-    for value in values:
-        if not isinstance(value, Tensor):
-            continue
-        if forward_ad.unpack_dual(value).tangent is not None:
-            raise TypeError(
-                f"{name} must have no forward-mode derivative while an operator is built, got a tensor with a tangent; "
-                "use reverse mode, with torch.autograd.grad"
-            )
+    for name, value in values.items():
+        for tensor in value if isinstance(value, tuple) else (value,):
+            if not isinstance(tensor, Tensor):
+                continue
+            if is_transformed(tensor):
+                raise TypeError(
+                    f"{name} must not be transformed by torch.func (vmap, grad, jvp) while an operator is built, got a "
+                    "transformed tensor; pass a batch, and take derivatives with torch.autograd.grad"
+                )
+            if in_forward_mode() and forward_ad.unpack_dual(tensor).tangent is not None:
+                raise TypeError(
+                    f"{name} must have no forward-mode derivative while an operator is built, got a tensor with a "
+                    "tangent; use reverse mode, with torch.autograd.grad"
+                )
 
 
 def register(

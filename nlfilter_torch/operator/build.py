@@ -20,8 +20,8 @@ from nlfilter_torch.core.checks import (
     warn_of_scale,
 )
 from nlfilter_torch.core.communicator import ALONE, Communicator, all_gather_shapes
-from nlfilter_torch.core.precision import full_precision, uncompiled, uncompiled_with, working_dtype
-from nlfilter_torch.core.torch_internals import is_hidden, refuse_transforms
+from nlfilter_torch.core.precision import full_precision, trainable, uncompiled, uncompiled_with, working_dtype
+from nlfilter_torch.core.torch_internals import is_hidden, outside_transforms, refuse_transforms
 from nlfilter_torch.operator.assignment import Assignment
 from nlfilter_torch.operator.counting import assign_among_counted, extended, has_values, hidden_points
 from nlfilter_torch.operator.eigenvalue_bound import exceeds, is_bounded, limiter, shifted_gram, slack
@@ -73,6 +73,7 @@ def _largest(guide: Tensor) -> Tensor:
 
 
 @uncompiled_with("generator", "group", "weights")
+@outside_transforms
 @full_precision
 def nonlocal_operator(
     guide: Tensor,
@@ -175,6 +176,7 @@ def operator_from_guide(guide: Tensor, options: OperatorOptions) -> NonlocalOper
     return (_built_uncompiled if drawn else _built)(guide, options)
 
 
+@outside_transforms
 @full_precision
 def _built(guide: Tensor, options: OperatorOptions) -> NonlocalOperator:
     _check_guide(guide, options)
@@ -188,8 +190,13 @@ def _check_guide(guide: Tensor, options: OperatorOptions) -> None:
     """Raise an error for an invalid guide or option."""
     if isinstance(guide, NonlocalOperator):
         raise TypeError("guide must be a torch.Tensor, got a NonlocalOperator, which is built already; use it as it is")
-    spatial = bandwidths_of(options.spatial_bandwidth)
-    refuse_transforms("guide", guide, options.photometric_bandwidth, *spatial, options.patch_weights, options.landmarks)
+    refuse_transforms(
+        guide=guide,
+        photometric_bandwidth=options.photometric_bandwidth,
+        spatial_bandwidth=bandwidths_of(options.spatial_bandwidth),
+        patch_weights=options.patch_weights,
+        landmarks=options.landmarks,
+    )
     check_image(guide, "guide", empty=True, dimensions=(4, 5))
     check_options(options)
     axes, window = guide.ndim - 2, options.patch_weights
@@ -203,7 +210,7 @@ def _check_guide(guide: Tensor, options: OperatorOptions) -> None:
 
 def _from_guide(guide: Tensor, options: OperatorOptions, weights: Tensor | None = None) -> NonlocalOperator:
     """Build an operator from a checked guide, checked options and weights (B, 1, H, W)."""
-    guide = reduce_channels(guide.to(working_dtype(guide)), options.guide_channels)
+    guide = reduce_channels(trainable(guide).to(working_dtype(guide)), options.guide_channels)
     communicator = all_gather_shapes(guide, options.group)
     size = tuple(guide.shape[2:])  # of the rows of this rank
     patch_weights = communicator.copy_to_group(options.patch_weights)
@@ -242,6 +249,7 @@ def _bandwidth(
 
 
 @uncompiled
+@outside_transforms
 @full_precision
 def operator_from_features(
     features: Tensor,
@@ -287,7 +295,7 @@ def operator_from_features(
         >>> bool((smoothed - 1).abs().max() < 1e-4)
         True
     """
-    refuse_transforms("features", features, landmarks)
+    refuse_transforms(features=features, weights=weights, landmarks=landmarks)
     check_features(features, "features", empty=True)
     method = Construction(
         num_landmarks=num_landmarks,

@@ -26,7 +26,7 @@ from nlfilter_torch.core.checks import (
 from nlfilter_torch.core.communicator import Communicator, all_gather_shapes
 from nlfilter_torch.core.kernels.columns import large_empty
 from nlfilter_torch.core.precision import Gradients, full_precision, once_differentiable, per_image, working_dtype
-from nlfilter_torch.core.torch_internals import is_hidden
+from nlfilter_torch.core.torch_internals import for_each_gradient, is_hidden
 from nlfilter_torch.operator.hidden import fill_hidden
 from nlfilter_torch.operator.options import GuideChannels, SpatialBandwidth, bandwidths_of
 
@@ -205,6 +205,7 @@ class _ScaledPatches(torch.autograd.Function):
         return features.flatten(last + 1).flatten(1, last)
 
     @staticmethod
+    @for_each_gradient
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> Gradients:
         padded, scale = ctx.saved_tensors

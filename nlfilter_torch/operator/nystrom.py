@@ -17,7 +17,7 @@ from torch import Tensor
 from nlfilter_torch.core.kernels.columns import columns, columns_backward
 from nlfilter_torch.core.low_rank import factors_of
 from nlfilter_torch.core.precision import once_differentiable
-from nlfilter_torch.core.torch_internals import is_hidden, register
+from nlfilter_torch.core.torch_internals import for_each_gradient, is_hidden, register
 from nlfilter_torch.operator.options import Completion
 
 CANCELLATION = 1e-7  # error of a squared distance above which distances are not computed from matrix products
@@ -87,6 +87,7 @@ class _NystromFactor(torch.autograd.Function):
         return factor, diagonal, scale
 
     @staticmethod
+    @for_each_gradient
     @once_differentiable
     def backward(ctx: Any, grad_factor: Tensor, grad_diagonal: Tensor, _: Tensor) -> tuple[Tensor | None, ...]:
         features, landmarks, inverse, factor, scale = ctx.saved_tensors

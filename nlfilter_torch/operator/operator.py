@@ -18,7 +18,8 @@ from nlfilter_torch.core.communicator import ALONE, Communicator
 from nlfilter_torch.core.containers import Batch, loadable
 from nlfilter_torch.core.kernels.tall_skinny import moment, spread
 from nlfilter_torch.core.layouts import in_format_of
-from nlfilter_torch.core.precision import full_precision, uncompiled
+from nlfilter_torch.core.precision import full_precision, trainable, uncompiled
+from nlfilter_torch.core.torch_internals import outside_transforms, refuse_transforms
 from nlfilter_torch.operator.assignment import Assignment
 from nlfilter_torch.operator.eigenvalue_bound import largest_eigenvalue, shifted_gram
 from nlfilter_torch.operator.features import GuideFeatures
@@ -222,6 +223,7 @@ class NonlocalOperator(Batch):
         before = (*balancing.before, *[balancing.moment] * (rounds - len(balancing.before)))
         return replace(self, kernel=kernel, weights=weights, balancing=replace(balancing, before=before))
 
+    @outside_transforms
     @full_precision
     def at(self, features: Tensor) -> Columns:
         """Compute the columns of any points from their own features and from sums over the image.
@@ -236,6 +238,7 @@ class NonlocalOperator(Batch):
             TypeError, ValueError: if ``features`` is not a finite floating-point tensor with the operator's D, or its
                 batch size does not fit.
         """
+        refuse_transforms(features=features, operator=self.factor)
         check_features(features, "features", self.kernel.landmarks.shape[1])
         images, batch = len(self.factor), len(features)
         if 1 not in (images, batch) and images != batch:
@@ -309,7 +312,7 @@ class NonlocalOperator(Batch):
         """Compute ``W y, ..., W^k y``, (B, k, C, ...), in the operator's dtype; arguments and errors as in matmul."""
         check_order(order)
         check_fits(image, self.size, "image", "operator", self.factor, empty=True)
-        folded = fold_batch(image.to(self.factor), self.factor.shape[0])
+        folded = fold_batch(trainable(image).to(self.factor), self.factor.shape[0])
         if folded.numel() == 0:  # an empty batch
             return image[:0].to(self.factor).unsqueeze(1).expand(-1, order, *image.shape[1:])
         planes = apply_powers(self.factor, self.scaling, self.remainder, folded, order, self.communicator, self.weights)
@@ -343,6 +346,7 @@ class NonlocalOperator(Batch):
         return weighted(scaled.mT @ scaled, self.weights) + torch.diag_embed(self.remainder)
 
     @uncompiled
+    @outside_transforms
     @full_precision
     def spectrum(self, rank: int | None = None) -> Spectrum:
         """Compute the leading eigenvalues and eigenvectors. Paper: eq. (3), (4).

@@ -11,6 +11,7 @@ from nlfilter_torch.core.communicator import ALONE, Communicator
 from nlfilter_torch.core.kernels.tall_skinny import moment, spread
 from nlfilter_torch.core.low_rank import outer_product
 from nlfilter_torch.core.precision import once_differentiable
+from nlfilter_torch.core.torch_internals import for_each_gradient, in_transform
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +43,8 @@ def apply_powers(
     Differentiable in operator and image. If the operator needs no gradient, differentiable any number of times in the
     image, also in forward mode.
     """
-    if torch.is_grad_enabled() and (factor.requires_grad or scaling.requires_grad or remainder.requires_grad):
+    derived = torch.is_grad_enabled() and not in_transform()  # which needs ordinary operations
+    if derived and (factor.requires_grad or scaling.requires_grad or remainder.requires_grad):
         result: Tensor = _Powers.apply(factor, scaling, remainder, image, order, communicator, weights)  # type: ignore[no-untyped-call]
         return result
     images, _ = _powers(factor, scaling, remainder, image, order, communicator, weights)
@@ -83,6 +85,7 @@ class _Powers(torch.autograd.Function):
         return torch.stack(images[1:], dim=1)
 
     @staticmethod
+    @for_each_gradient
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         factor, scaling, remainder, weights, *rest = ctx.saved_tensors

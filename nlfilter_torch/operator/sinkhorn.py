@@ -32,7 +32,7 @@ from nlfilter_torch.core.communicator import ALONE, Communicator
 from nlfilter_torch.core.kernels.tall_skinny import gather, spread
 from nlfilter_torch.core.low_rank import outer_product
 from nlfilter_torch.core.precision import once_differentiable
-from nlfilter_torch.core.torch_internals import is_hidden, register
+from nlfilter_torch.core.torch_internals import for_each_gradient, is_hidden, register
 from nlfilter_torch.core.warning import warn
 from nlfilter_torch.operator.eigenvalue_bound import ALWAYS, exceeds, shifted_gram, slack
 from nlfilter_torch.operator.scaling import (
@@ -135,6 +135,7 @@ class _ImplicitScaling(torch.autograd.Function):
         return scaling
 
     @staticmethod
+    @for_each_gradient
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         factor, diagonal, scaling, moment, inverse, weights = ctx.saved_tensors

@@ -21,7 +21,7 @@ from nlfilter_torch.core.containers import Batch, loadable
 from nlfilter_torch.core.kernels.grams import compute_grams
 from nlfilter_torch.core.kernels.tall_skinny import moment, spread
 from nlfilter_torch.core.matrix_function import SymmetricMatrix
-from nlfilter_torch.core.precision import full_precision
+from nlfilter_torch.core.precision import full_precision, trainable
 from nlfilter_torch.core.torch_internals import is_hidden
 
 # Eigenvalues of G below this, relative to the largest, are rounding errors.
@@ -198,7 +198,7 @@ class Spectrum(Batch, RitzPairs):
             TypeError, ValueError: if ``image`` is not a finite floating-point tensor of the spectrum's size.
         """
         check_fits(image, self.size, "image", "spectrum", self.factor)
-        planes = fold_batch(image.to(self.factor), self.factor.shape[0])
+        planes = fold_batch(trainable(image).to(self.factor), self.factor.shape[0])
         total = self.communicator.sum(moment(self.factor, self.mass.unsqueeze(1) * planes))  # (B, M, C)
         return unfold_batch(total.mT.unsqueeze(1), image.shape[0], (total.shape[1], 1))[:, 0, :, :, 0]
 

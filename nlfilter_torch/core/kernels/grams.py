@@ -8,7 +8,7 @@ from torch import Tensor
 from nlfilter_torch.core.blocks import SWEPT, buffered_blocks, pixel_blocks, strip_count, strips
 from nlfilter_torch.core.kernels.library import by_rows, kernel, run_on_factor
 from nlfilter_torch.core.precision import once_differentiable
-from nlfilter_torch.core.torch_internals import register
+from nlfilter_torch.core.torch_internals import for_each_gradient, register
 
 NEGLIGIBLE = 1e-15  # entries of F in float32 that count as zero: their products would be denormal, which is slow
 
@@ -96,6 +96,7 @@ class _Grams(torch.autograd.Function):
         return _exact_or_quick(factor, scaling, remainder, count, exact)
 
     @staticmethod
+    @for_each_gradient
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         factor, scaling, remainder = ctx.saved_tensors

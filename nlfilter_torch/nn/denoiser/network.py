@@ -17,7 +17,7 @@ from nlfilter_torch.core.inner import EVERYWHERE, Inner
 from nlfilter_torch.core.kernels.convolution import SLOPE, channels_last, convolve
 from nlfilter_torch.core.layouts import in_format_of
 from nlfilter_torch.core.precision import full_precision
-from nlfilter_torch.core.torch_internals import refuse_transforms
+from nlfilter_torch.core.torch_internals import outside_transforms, refuse_transforms
 from nlfilter_torch.filtering.filters import detail_layers
 from nlfilter_torch.nn.denoiser.colours import join_colours, split_colours
 from nlfilter_torch.nn.denoiser.noise import noise_map
@@ -112,6 +112,7 @@ class NonlocalDenoiser(nn.Module):
         denoiser.load_state_dict({name: value.to(device, dtype) for name, value in weights.items()}, assign=True)
         return denoiser.eval()
 
+    @outside_transforms
     def forward(self, noisy: Tensor, noise: float | Tensor, *, turns: int = 1) -> Tensor:
         """Remove noise.
 
@@ -129,7 +130,7 @@ class NonlocalDenoiser(nn.Module):
         Raises:
             TypeError, ValueError: if an argument has the wrong shape or is not finite, or noise is negative.
         """
-        refuse_transforms("noisy", noisy, noise)
+        refuse_transforms(noisy=noisy, noise=noise, weights=tuple(self.parameters()))
         if isinstance(noisy, Tensor) and noisy.ndim == 3:
             is_map = isinstance(noise, Tensor) and noise.ndim == 3
             batched = noise.unsqueeze(0) if is_map else noise  # type: ignore[union-attr]
