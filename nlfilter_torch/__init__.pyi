@@ -32,6 +32,7 @@ from .operator.features import estimate_bandwidth as estimate_bandwidth
 from .operator.operator import Certificate as Certificate
 from .operator.operator import Diagnostics as Diagnostics
 from .operator.operator import NonlocalOperator as NonlocalOperator
+from .operator.padding import pad_images as pad_images
 from .operator.spectrum import Spectrum as Spectrum
 from .photo.edits.abstract import abstract as abstract
 from .photo.edits.colorize import colorize as colorize

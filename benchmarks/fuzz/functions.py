@@ -213,6 +213,7 @@ FUNCTIONS = {
     "NonlocalOperator.cat": Function(
         lambda operator, image: nlf.NonlocalOperator.cat([operator, operator])[0] @ image[:1], OPERATOR | IMAGE, {}
     ),
+    "pad_images": Function(nlf.pad_images, {"images": lambda scene: list(scene.image(3))}, {}),
     "collate": Function(_collated, {"samples": lambda scene: [scene.operator, scene.operator]}, {}),
     "polynomial_filter": Function(nlf.polynomial_filter, OPERATOR | IMAGE | ALPHA, RESIDUAL),
     "detail_layers": Function(nlf.detail_layers, OPERATOR | IMAGE, ORDER),

@@ -73,7 +73,7 @@ def _padding(side: int) -> Iterable[Figure]:
             moved = max(moved, float((without[inside] - alone @ image).abs().max()) * 255)
         precision = str(dtype).removeprefix("torch.")
         for kind, difference in worst.items():
-            yield Figure(f"padding moves {kind}, {precision}, {', '.join(PICTURES)}", difference, LIMIT)
+            yield Figure(f"padding moves {kind}, {precision}", difference, LIMIT)
         yield Figure(f"padding without weights moves W y, {precision}", moved, unit="levels")
 
 

@@ -23,7 +23,7 @@ from nlfilter_torch.core.communicator import ALONE, Communicator, all_gather_sha
 from nlfilter_torch.core.precision import full_precision, trainable, uncompiled, uncompiled_with, working_dtype
 from nlfilter_torch.core.torch_internals import is_hidden, outside_transforms, refuse_transforms
 from nlfilter_torch.operator.assignment import Assignment
-from nlfilter_torch.operator.counting import assign_among_counted, extended, has_values, hidden_points
+from nlfilter_torch.operator.counting import assign_among_counted, extended, hidden_points
 from nlfilter_torch.operator.eigenvalue_bound import exceeds, is_bounded, limiter, shifted_gram, slack
 from nlfilter_torch.operator.features import (
     GuideFeatures,
@@ -440,9 +440,12 @@ def _landmarks(
     weights: Tensor | None,
 ) -> tuple[Tensor, Assignment | None]:
     """:func:`landmarks_by`, from the points that count alone where weights are 0."""
-    if weights is None or not has_values(weights):
-        return landmarks_by(method, features, size, count, communicator)
-    if hidden_points(weights) is None or not isinstance(method.landmarks, str) or communicator.size > 1:
+    if (
+        weights is None
+        or hidden_points(weights) is None
+        or not isinstance(method.landmarks, str)
+        or communicator.size > 1
+    ):
         return landmarks_by(method, features, size, count, communicator, weights)
     return assign_among_counted(features, size, count, method.landmarks, method.generator, weights)
 

@@ -12,7 +12,6 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.core.kernels.tall_skinny import spread
-from nlfilter_torch.core.torch_internals import is_fake
 from nlfilter_torch.operator.assignment import Assignment
 from nlfilter_torch.operator.landmarks import assign_landmarks
 from nlfilter_torch.operator.options import Sampling
@@ -23,14 +22,9 @@ OWN = 1e-3
 FEW = 1e-6  # affinities to all that counts, below which a point of weight 0 keeps its value
 
 
-def has_values(weights: Tensor) -> bool:
-    """Whether weights can be read, perhaps by waiting for an accelerator, unlike those of a tensor without data."""
-    return not is_fake(weights) and weights.device.type != "meta"
-
-
 def hidden_points(weights: Tensor | None) -> Tensor | None:
-    """The points of weight 0, (B, N) bool; None if there are none, or if values cannot be read."""
-    if weights is None or not has_values(weights):
+    """The points of weight 0, (B, N) bool; None if there are none. Reads values."""
+    if weights is None:
         return None
     hidden = weights == 0
     return hidden if bool(hidden.any()) else None

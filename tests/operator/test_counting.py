@@ -189,11 +189,6 @@ def test_equal_weights_are_none() -> None:
     assert hidden_points(ones.flatten(1)) is None
 
 
-def test_shapes_alone_are_enough() -> None:
-    image, weights = torch.rand(2, 3, 8, 9, device="meta"), torch.rand(2, 1, 8, 9, device="meta")
-    assert (nonlocal_operator(image, num_landmarks=4, weights=weights) @ image).shape == (2, 3, 8, 9)
-
-
 @pytest.mark.parametrize(
     ("weights", "error", "sentence"),
     [

@@ -42,6 +42,7 @@ def cancels(landmarks: Tensor) -> bool:
     """
     if landmarks.dtype != torch.float32 or is_hidden(landmarks):
         return False
+    landmarks = landmarks.detach()
     largest = (landmarks - landmarks.mean(dim=2, keepdim=True)).square().sum(1).max()
     return not float(largest) * torch.finfo(torch.float32).eps < CANCELLATION
 

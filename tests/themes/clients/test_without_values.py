@@ -99,6 +99,7 @@ CASES: dict[str, Case] = {
     "NonlocalAffinity": lambda x: nlf.NonlocalAffinity(num_landmarks=20)(x.image()).factor,
     "NonlocalBlock": lambda x: block_on(x.device)(x.image()),
     "NonlocalDenoiser": lambda x: nlf.NonlocalDenoiser.trained(device=x.device)(x.image(), 0.1),
+    "pad_images": lambda x: nlf.pad_images([x.image()[0], x.image()[0, :, 1:]])[0],
     "collate": lambda x: nlf.collate([(x.operator(), x.image()[0])] * 2)[0][1] @ x.image(),
     "Portable": lambda x: nlf.Portable(nlf.NonlocalFilter(learn=(), num_landmarks=20))(x.image(), alpha=x.zeros(4)),
     "PolynomialSliders": lambda x: nlf.PolynomialSliders(learn=())(x.operator(), x.image(), x.zeros(4)),
@@ -107,6 +108,9 @@ CASES: dict[str, Case] = {
 READS: dict[str, Case] = {
     "certify": lambda x: x.operator().certify(),
     "diagnostics": lambda x: x.operator().diagnostics(),
+    "nonlocal_operator": lambda x: nlf.nonlocal_operator(
+        x.image(), num_landmarks=9, weights=torch.ones_like(x.image()[:, :1])
+    ),
     "operator_from_features": lambda x: x.points(weights=torch.ones(50, device=x.device)),
     "fit_alpha": lambda x: nlf.fit_alpha(x.operator(), x.image(), x.image()),
     "apply_look": lambda x: nlf.apply_look(x.image(), alpha=x.zeros(4)),
