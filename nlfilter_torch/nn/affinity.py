@@ -7,7 +7,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from nlfilter_torch.core.checks import check_choice, check_image
+from nlfilter_torch.core.checks import check_choice, check_image, check_pixel_weights
 from nlfilter_torch.core.communicator import check_group
 from nlfilter_torch.core.precision import working_dtype
 from nlfilter_torch.nn.held import HeldAssignment, HeldFeatures, Hold
@@ -156,7 +156,7 @@ class NonlocalAffinity(Learnable):
         return self._build(guide, self.landmarks, self.photometric_bandwidth, weights)
 
     @torch.no_grad()
-    def renew(self, guide: Tensor | None = None) -> None:
+    def renew(self, guide: Tensor | None = None, weights: Tensor | None = None) -> None:
         """Choose the landmarks that are held anew, by the sampling, number and generator of the layer.
 
         Args:
@@ -165,6 +165,8 @@ class NonlocalAffinity(Learnable):
                 bandwidths counts if it is ``"auto"``; in distributed training, call this before the layer is wrapped,
                 with the same guides on all ranks. With ``hold="assignment"``, None forgets the assignment, and the next
                 call makes a new one.
+            weights: (B, 1, H, W), how much each pixel of the guides counts, 0 for padding, from which no landmarks are
+                made.
 
         Raises:
             TypeError, ValueError: if the layer holds no landmarks, or the guide is missing or invalid.
@@ -176,7 +178,7 @@ class NonlocalAffinity(Learnable):
         if isinstance(self.held, HeldAssignment):
             self.held.forget()
             if guide is not None:
-                self(guide)
+                self(guide, weights)
             return
         if guide is None:
             raise ValueError("guide must be images to choose landmarks from if hold is 'features', got None; pass some")
@@ -184,12 +186,19 @@ class NonlocalAffinity(Learnable):
         check_image(guide, "guide")
         bandwidth = self.photometric_bandwidth
         if isinstance(bandwidth, str):
-            bandwidth = estimate_bandwidth(guide, guide_channels=self.guide_channels).mean()
+            bandwidth = estimate_bandwidth(guide, guide_channels=self.guide_channels, weights=weights).mean()
         recipe = self._recipe(bandwidth, guide)
-        features = recipe(guide).transpose(0, 1).flatten(1).unsqueeze(0)  # (1, D, B N), of all images
+        counts = None if weights is None else check_pixel_weights(weights, guide)
+        features = recipe(guide, counts=None if counts is None else counts > 0)
+        features = features.transpose(0, 1).flatten(1).unsqueeze(0)  # (1, D, B N), of all images
         size = (guide.shape[0] * guide.shape[2], guide.shape[3])
+        if counts is not None:
+            counts = counts.flatten()
+            kept = counts.nonzero().squeeze(1)
+            features, counts, size = features[:, :, kept], counts[kept].unsqueeze(0), (1, len(kept))
         count = min(self.num_landmarks, features.shape[2])
-        self.held.keep(choose_landmarks(features, size, count, self.landmarks, self.generator), recipe)
+        chosen = choose_landmarks(features, size, count, self.landmarks, self.generator, weights=counts)
+        self.held.keep(chosen, recipe)
 
     def _held(self, hold: Hold | None, landmarks: Landmarks) -> HeldAssignment | HeldFeatures | None:
         """What the layer keeps from call to call, from the arguments of the constructor."""

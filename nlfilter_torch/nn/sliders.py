@@ -215,9 +215,9 @@ class NonlocalFilter(nn.Module):
         )
         self.sliders = PolynomialSliders(alpha, residual=residual, learn=names.intersection(LEARNABLE))
 
-    def renew(self, guide: Tensor | None = None) -> None:
+    def renew(self, guide: Tensor | None = None, weights: Tensor | None = None) -> None:
         """Choose the landmarks that are held anew; see :meth:`NonlocalAffinity.renew`."""
-        self.affinity.renew(guide)
+        self.affinity.renew(guide, weights)
 
     def forward(
         self,

@@ -13,7 +13,7 @@ from torch.utils.checkpoint import checkpoint
 
 from nlfilter_torch import NonlocalAffinity, NonlocalFilter, nonlocal_operator
 from nlfilter_torch.nn.held import HeldAssignment, HeldFeatures, Hold
-from tests.layers import ALPHA, backward, everything, image
+from tests.layers import ALPHA, OPTIONS, backward, everything, image
 from tests.problems import noise, picture, seeded
 
 HOLDS: tuple[Hold, ...] = ("assignment", "features")
@@ -273,3 +273,16 @@ def test_what_cannot_be_held_is_one_clear_sentence(call: Callable[[], object], m
     with pytest.raises(ValueError, match=message) as caught:
         call()
     assert re.fullmatch(r"\w+ must .+, got .+; .+", str(caught.value))
+
+
+@pytest.mark.parametrize("hold", ["features", "assignment"])
+def test_padding_has_no_part_in_renewal(hold: Hold) -> None:
+    guide, layers = image(3), []
+    padded = torch.nn.functional.pad(guide, (0, 5, 0, 4), value=9.0)
+    weights = torch.nn.functional.pad(torch.ones_like(guide[:, :1]), (0, 5, 0, 4))
+    for arguments in ((guide,), (padded, weights)):
+        built = NonlocalFilter(ALPHA, hold=hold, landmarks="random", **OPTIONS)
+        built.renew(*arguments)
+        layers.append(built)
+    alone, other = layers[0](guide), layers[1](padded, weights=weights)
+    torch.testing.assert_close(other[..., : guide.shape[2], : guide.shape[3]], alone, atol=1e-5, rtol=0)

@@ -12,6 +12,7 @@ from nlfilter_torch import (
     estimate_bandwidth,
     nonlocal_operator,
     operator_from_features,
+    pad_images,
     polynomial_filter,
     propagate_strokes,
     segment_mask,
@@ -216,3 +217,18 @@ def test_strokes_on_hidden_pixels_alone_are_refused() -> None:
         propagate_strokes(spectrum, image, strokes)
     with pytest.raises(ValueError, match="region must hold a pixel of positive weight"):
         diffusion_mask(spectrum, strokes)
+
+
+@pytest.mark.parametrize(
+    "options", [{"photometric_bandwidth": 0.5}, {"spatial_bandwidth": 4.0, "landmarks": "uniform"}]
+)
+def test_volumes_are_padded_too(options: dict[str, Any]) -> None:
+    options = options | {"patch_size": 3, "num_landmarks": 30}
+    volumes = [noise(1, 6, 8, 9, seed=1), noise(1, 9, 10, 12, seed=2)]
+    batch, weights = pad_images(volumes)
+    operator = nonlocal_operator(batch, weights=weights, **options)
+    for number, volume in enumerate(volumes):
+        passed = options | {"landmarks": operator.landmarks[number : number + 1]}
+        alone = nonlocal_operator(volume[None], **passed) @ volume[None]
+        inside = tuple(map(slice, volume.shape[1:]))
+        torch.testing.assert_close((operator @ batch)[(number, slice(None), *inside)], alone[0])
