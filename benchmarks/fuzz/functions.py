@@ -238,7 +238,7 @@ FUNCTIONS = {
     "estimate_noise": Function(nlf.estimate_noise, IMAGE, {}),
     "diffusion_map": Function(nlf.diffusion_map, SPECTRUM | TIME, {}),
     "diffusion_mask": Function(nlf.diffusion_mask, SPECTRUM | REGION, TIME | WIDTH | NEGATIVE),
-    "segment_mask": Function(nlf.segment_mask, SPECTRUM | REGIONS, TIME),
+    "segment_mask": Function(nlf.segment_mask, SPECTRUM | REGIONS, TIME | {"temperature": _number(0, 8)}),
     "refine": Function(nlf.refine, LOGITS | {"guide": _image(1, 3, 2)}, REFINED | AFFINITY_OF_GUIDE),
     "compose_alpha": Function(nlf.compose_alpha, {"masks": REGION["region"]} | ROWS, {}),
     "filter_regions": Function(nlf.filter_regions, OPERATOR | IMAGE | {"masks": REGION["region"]} | ROWS, RESIDUAL),
@@ -375,7 +375,9 @@ FUNCTIONS = {
         {name: kind for name, kind in (REFINED | AFFINITY_OF_GUIDE).items() if name != "generator"}
         | {"strength": _plain(0.1, 10), "margin": _plain(0.5, 5), "learn": _one_of((), ("strength", "margin"))},
     ),
-    "SegmentMask": Function(_segment_module, SPECTRUM | REGIONS, {"time": NUMBERS["time"]}),
+    "SegmentMask": Function(
+        _segment_module, SPECTRUM | REGIONS, {"time": NUMBERS["time"], "temperature": _plain(0, 8)}
+    ),
 }
 
 

@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.core.blocks import CACHED, block_length, for_planes, weighted
-from nlfilter_torch.core.checks import check_fits, check_instance, check_positive
+from nlfilter_torch.core.checks import check_fits, check_instance, check_positive, check_values
 from nlfilter_torch.core.kernels.tall_skinny import moment, spread
 from nlfilter_torch.core.precision import full_precision, per_image
 from nlfilter_torch.core.torch_internals import is_hidden
@@ -167,7 +167,9 @@ def region_weights(spectrum: Spectrum, region: Tensor, *, name: str = "region") 
 
 
 @full_precision
-def segment_mask(spectrum: Spectrum, regions: Tensor, *, time: float | Tensor = 1.0) -> Tensor:
+def segment_mask(
+    spectrum: Spectrum, regions: Tensor, *, time: float | Tensor = 1.0, temperature: float | Tensor = 0.0
+) -> Tensor:
     """Partition an image into K segments by k-means in the diffusion map, initialised with the regions' centres.
 
     Paper: Sec. V-A, Figs. 14-16.
@@ -176,22 +178,45 @@ def segment_mask(spectrum: Spectrum, regions: Tensor, *, time: float | Tensor = 
         spectrum: of the operator.
         regions: (B, K, H, W), non-negative weights of the pixels of K regions.
         time: diffusion time t > 0; larger values give more weight to coarse structure.
+        temperature: T >= 0, a number or a tensor of shape () or (B,). 0 gives a hard partition; otherwise the mask of
+            a centre at diffusion distance D is the softmax of ``-D^2 / T`` over the centres.
 
     Returns:
-        (B, K, H, W) of zeros and ones, in the regions' dtype, with exactly one 1 per pixel. A cluster that loses all
-        its pixels keeps its centre. Not differentiable.
+        (B, K, H, W) in [0, 1], in the regions' dtype, with a sum of 1 in every pixel; at temperature 0 zeros and ones,
+        which have no gradient. A cluster that loses all its pixels keeps its centre. For a positive temperature
+        differentiable in time, temperature and spectrum, with the final clusters held fixed.
 
     Raises:
-        TypeError, ValueError: if ``regions`` does not fit, is negative or has an empty region, or ``time`` is not
-            positive.
+        TypeError, ValueError: if ``regions`` does not fit, is negative or has an empty region, ``time`` is not
+            positive, or ``temperature`` is negative.
     """
     check_instance(spectrum, Spectrum, "spectrum", "take operator.spectrum()")
     check_positive(time, "time", spectrum.factor.shape[0])
-    return segment(spectrum, regions, time)
+    check_values(temperature, "temperature", "not negative", spectrum.factor.shape[0])
+    hard = segment(spectrum, regions, time)
+    if not isinstance(temperature, Tensor) and temperature == 0:
+        return hard
+    return _soft(spectrum, hard, regions, time, temperature)
+
+
+def _soft(
+    spectrum: Spectrum, hard: Tensor, regions: Tensor, time: float | Tensor, temperature: float | Tensor
+) -> Tensor:
+    """The softmax over the centres of clusters, in the regions' dtype, given the clusters (B, K, H, W)."""
+    members = hard.flatten(2).to(spectrum.factor)
+    weights = region_weights(spectrum, regions, name="regions").expand(len(spectrum.factor), -1, -1)
+    sizes = spectrum.communicator.sum(weighted(members, spectrum.weights).sum(2, dtype=torch.float64)).unsqueeze(1)
+    exponent = per_image(time, spectrum.root, 2)
+    basis = spectrum.basis(lambda eigenvalues: eigenvalues.pow(exponent))
+    means = _sums(spectrum, basis, members) / sizes.clamp(min=1e-12)
+    centres = torch.where(sizes == 0, _sums(spectrum, basis, weights), means)
+    score = 2 * per_image(spectrum.pixels, spectrum.factor, 3) * _closeness(spectrum, basis, centres)
+    memberships = (score / per_image(temperature, score, 3).clamp(min=NARROWEST)).softmax(1)
+    return memberships.unflatten(2, hard.shape[2:]).to(regions.dtype)
 
 
 def segment(spectrum: Spectrum, regions: Tensor, time: float | Tensor, valid: Tensor | None = None) -> Tensor:
-    """:func:`segment_mask`; regions that are not ``valid`` (B, K) get no pixels."""
+    """:func:`segment_mask` at temperature 0; regions that are not ``valid`` (B, K) get no pixels."""
     exponent = per_image(time, spectrum.root, 2)
     with torch.no_grad():
         weights = region_weights(spectrum, regions, name="regions").expand(len(spectrum.factor), -1, -1)  # (B, K, N)
@@ -218,10 +243,15 @@ def _sums(spectrum: Spectrum, basis: Tensor, weights: Tensor) -> Tensor:
     return basis @ spectrum.communicator.sum(moment(spectrum.factor, spectrum.mass.unsqueeze(1) * weights))
 
 
+def _closeness(spectrum: Spectrum, basis: Tensor, centres: Tensor) -> Tensor:
+    """Half the squared distances (B, K, N) to centres (B, M, K), negative and without the square of the coordinates."""
+    inner = spread((centres.mT @ basis).to(spectrum.factor), spectrum.factor, spectrum.scaling)
+    return inner - 0.5 * centres.square().sum(1).to(inner).unsqueeze(2)
+
+
 def _nearest(spectrum: Spectrum, basis: Tensor, centres: Tensor, valid: Tensor | None) -> Tensor:
     """Index (B, N) of the nearest valid centre (B, M, K) for every pixel, in the coordinates ``basis @ F``."""
-    inner = spread((centres.mT @ basis).to(spectrum.factor), spectrum.factor, spectrum.scaling)
-    score = inner - 0.5 * centres.square().sum(1).to(inner).unsqueeze(2)
+    score = _closeness(spectrum, basis, centres)
     if valid is not None:
         score = score.masked_fill(~valid.unsqueeze(2), -torch.inf)
     return score.max(1).indices  # ten times as fast as argmax

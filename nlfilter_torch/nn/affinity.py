@@ -29,6 +29,8 @@ from nlfilter_torch.operator.options import (
     Sampling,
 )
 
+AffinityOption = Literal["photometric_bandwidth", "spatial_bandwidth", "patch_weights"]
+
 
 class NonlocalAffinity(Learnable):
     """Layer that builds an operator from a guide by :func:`nonlocal_operator`, with the same options.
@@ -90,7 +92,7 @@ class NonlocalAffinity(Learnable):
         generator: torch.Generator | None = OperatorOptions.generator,
         group: Any = OperatorOptions.group,
         hold: Hold | None = None,
-        learn: Collection[str] = (),
+        learn: AffinityOption | Collection[AffinityOption] = (),
     ) -> None:
         super().__init__()
         names = check_learn(learn, tuple(self.learnable))

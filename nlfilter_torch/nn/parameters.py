@@ -2,12 +2,14 @@
 
 import math
 from collections.abc import Collection, Mapping, Sequence
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeVar
 
 import torch
 from torch import Tensor, nn
 
 from nlfilter_torch.core.checks import check_number, check_positive, described
+
+Option = TypeVar("Option", bound=str)
 
 
 class Learnable(nn.Module):
@@ -107,7 +109,7 @@ class UnitWindow(nn.Module):
         return "x".join(map(str, self.logits.shape))
 
 
-def check_learn(learn: Collection[str], choices: Sequence[str], called: str = "learn") -> frozenset[str]:
+def check_learn(learn: Option | Collection[Option], choices: Sequence[Option], called: str = "learn") -> frozenset[str]:
     """Return the names in ``learn``; raise unless they are among ``choices``. Errors use the name ``called``."""
     is_collection = isinstance(learn, Collection) and not isinstance(learn, Tensor)
     if not is_collection or any(not isinstance(name, str) for name in learn):

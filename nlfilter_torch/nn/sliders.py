@@ -8,21 +8,26 @@ from torch import Tensor, nn
 
 from nlfilter_torch.core.checks import (
     check_alpha,
+    check_finite,
     check_fits,
     check_image,
+    check_number,
     check_tensor,
     check_unit_range,
     check_values,
     described,
 )
 from nlfilter_torch.filtering.filters import filter_regions, polynomial_filter, weigh_layers
-from nlfilter_torch.nn.affinity import NonlocalAffinity
+from nlfilter_torch.nn.affinity import AffinityOption, NonlocalAffinity
 from nlfilter_torch.nn.held import Hold
 from nlfilter_torch.nn.parameters import check_learn
 from nlfilter_torch.operator.operator import NonlocalOperator
 from nlfilter_torch.operator.options import AUTO, Completion, GuideChannels, Landmarks, OperatorOptions
 
-LEARNABLE = ("alpha", "residual")
+SliderOption = Literal["alpha", "residual"]
+LEARNABLE: tuple[SliderOption, ...] = ("alpha", "residual")
+ALPHA: tuple[SliderOption] = ("alpha",)
+BUILDING: tuple[AffinityOption, ...] = ("photometric_bandwidth", "spatial_bandwidth", "patch_weights")
 
 
 class PolynomialSliders(nn.Module):
@@ -52,7 +57,7 @@ class PolynomialSliders(nn.Module):
         alpha: Sequence[float] | Sequence[Sequence[float]] = (1.0, 1.0, 1.0, 1.0),
         *,
         residual: float | None = None,
-        learn: Collection[str] = ("alpha",),
+        learn: SliderOption | Collection[SliderOption] = ALPHA,
     ) -> None:
         super().__init__()
         names = check_learn(learn, LEARNABLE)
@@ -162,27 +167,43 @@ class NonlocalFilter(nn.Module):
         """Sliders (k+1,) or (K, k+1), parameter or buffer."""
         return self.sliders.alpha
 
+    @alpha.setter
+    def alpha(self, value: Tensor | Sequence[float] | Sequence[Sequence[float]]) -> None:
+        _assign(self.sliders.alpha, value, "alpha")
+
     @property
     def residual(self) -> Tensor | None:
         """Weight of the part that the eigenvectors do not capture, (1,), or None for alpha_1."""
         return self.sliders.residual
+
+    @residual.setter
+    def residual(self, value: Tensor | float) -> None:
+        _assign(self.sliders.residual, value, "residual")
 
     @property
     def photometric_bandwidth(self) -> float | Literal["auto"] | Tensor:
         """Number or ``"auto"``; a tensor of shape () if it is learned."""
         return self.affinity.photometric_bandwidth
 
+    @photometric_bandwidth.setter
+    def photometric_bandwidth(self, value: float | Literal["auto"]) -> None:
+        self.affinity.photometric_bandwidth = value
+
     @property
     def spatial_bandwidth(self) -> float | Tensor | None:
         """Number of pixels or None; a tensor of shape () if it is learned."""
         return self.affinity.spatial_bandwidth
+
+    @spatial_bandwidth.setter
+    def spatial_bandwidth(self, value: float | None) -> None:
+        self.affinity.spatial_bandwidth = value
 
     def __init__(
         self,
         alpha: Sequence[float] | Sequence[Sequence[float]] = (1.0, 1.0, 1.0, 1.0),
         *,
         residual: float | None = None,
-        learn: Collection[str] = ("alpha",),
+        learn: SliderOption | AffinityOption | Collection[SliderOption | AffinityOption] = ALPHA,
         patch_size: int = OperatorOptions.patch_size,
         photometric_bandwidth: float | Literal["auto"] = AUTO,
         spatial_bandwidth: float | None = None,
@@ -197,7 +218,7 @@ class NonlocalFilter(nn.Module):
         hold: Hold | None = None,
     ) -> None:
         super().__init__()
-        names = check_learn(learn, (*LEARNABLE, *NonlocalAffinity.learnable))
+        names = check_learn(learn, (*LEARNABLE, *BUILDING))
         self.affinity = NonlocalAffinity(
             patch_size=patch_size,
             photometric_bandwidth=photometric_bandwidth,
@@ -211,9 +232,9 @@ class NonlocalFilter(nn.Module):
             generator=generator,
             group=group,
             hold=hold,
-            learn=names.intersection(NonlocalAffinity.learnable),
+            learn=[name for name in BUILDING if name in names],
         )
-        self.sliders = PolynomialSliders(alpha, residual=residual, learn=names.intersection(LEARNABLE))
+        self.sliders = PolynomialSliders(alpha, residual=residual, learn=[name for name in LEARNABLE if name in names])
 
     def renew(self, guide: Tensor | None = None, weights: Tensor | None = None) -> None:
         """Choose the landmarks that are held anew; see :meth:`NonlocalAffinity.renew`."""
@@ -271,6 +292,31 @@ class NonlocalFilter(nn.Module):
         if mask is None:
             return filtered
         return torch.lerp(image, filtered, mask.to(image))
+
+
+def _assign(parameter: Tensor | None, value: object, name: str) -> None:
+    """Copy values into a parameter or buffer of a layer's sliders."""
+    if parameter is None:
+        raise ValueError(
+            f"{name} must be a number in the constructor to be changed later, got None there; "
+            f"construct the layer with {name}=1.0, for example"
+        )
+    values = _sliders(value).to(parameter) if name == "alpha" else _number(value).to(parameter)
+    if values.shape != parameter.shape:
+        raise ValueError(
+            f"{name} must keep its shape, {tuple(parameter.shape)}, got {tuple(values.shape)}; "
+            f"construct a layer with other sliders, or pass alpha= in the call"
+        )
+    check_finite(values, name)
+    with torch.no_grad():
+        parameter.copy_(values)
+
+
+def _number(value: object) -> Tensor:
+    """The weight of the residual, (1,)."""
+    if not isinstance(value, Tensor):
+        check_number(value, "residual")
+    return torch.as_tensor(value, dtype=torch.float64).detach().reshape(-1)
 
 
 def _as_batch(tensor: Tensor | None) -> Tensor | None:

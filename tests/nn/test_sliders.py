@@ -1,14 +1,21 @@
 """The layers: results equal to those of the functions, and parameters that can be saved, moved and learned."""
 
 import copy
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 import torch
 from torch import nn
 
+import nlfilter_torch
 from nlfilter_torch import (
     DiffusionMask,
     Look,
+    NonlocalAffinity,
     NonlocalFilter,
     PolynomialSliders,
     SegmentMask,
@@ -157,3 +164,60 @@ def test_a_padded_batch_is_filtered_as_its_images_are(changed: dict[str, object]
         size = (slice(None), slice(small.shape[2]), slice(small.shape[3]))
         torch.testing.assert_close(filtered[number][size], layer(small)[0], atol=1e-5, rtol=0)
         torch.testing.assert_close(layer(batch[number], weights=weights[number]), filtered[number], atol=1e-5, rtol=0)
+
+
+def test_values_are_assigned_through_the_layer() -> None:
+    layer = NonlocalFilter(
+        (2.0, 1.0, 1.0), residual=0.5, photometric_bandwidth=0.2, learn=("alpha", "photometric_bandwidth")
+    )
+    parameters = list(layer.parameters())
+    layer.alpha, layer.residual = (3.0, 2.0, 1.0), 0.7
+    layer.photometric_bandwidth, layer.spatial_bandwidth = 0.3, 9.0
+    assert layer.sliders.alpha.tolist() == [3.0, 2.0, 1.0]
+    assert layer.residual is not None
+    torch.testing.assert_close(layer.residual, torch.tensor([0.7]))
+    torch.testing.assert_close(layer.affinity.photometric_bandwidth, torch.tensor(0.3))
+    assert layer.affinity.spatial_bandwidth == 9.0
+    assert all(before is after for before, after in zip(parameters, layer.parameters(), strict=True))
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("alpha", (1.0, 2.0), r"alpha must keep its shape, \(4,\), got \(2,\); construct a layer"),
+        ("alpha", "bright", "alpha must be numbers or rows of numbers"),
+        ("alpha", [float("nan")] * 4, "alpha must be finite"),
+        ("residual", 1.0, "residual must be a number in the constructor to be changed later, got None there"),
+        ("photometric_bandwidth", -1.0, "photometric_bandwidth must be positive"),
+    ],
+)
+def test_assigned_values_that_do_not_fit_are_refused(name: str, value: object, message: str) -> None:
+    layer = NonlocalFilter(photometric_bandwidth=0.2, learn=("alpha", "photometric_bandwidth"))
+    with pytest.raises((TypeError, ValueError), match=message):
+        setattr(layer, name, value)
+
+
+def test_a_misspelt_option_names_the_class_that_was_called() -> None:
+    for layer in (NonlocalFilter, NonlocalAffinity, PolynomialSliders, SegmentMask):
+        with pytest.raises(TypeError, match=rf"^{layer.__name__}\.__init__\(\) got .*'num_landmark'"):
+            layer(num_landmark=32)  # type: ignore[call-arg, operator]
+
+
+@pytest.mark.slow
+def test_type_checkers_refuse_misspelt_names(tmp_path: Path) -> None:
+    lines = [
+        "NonlocalFilter(num_landmark=32)",
+        'NonlocalFilter(patch_size="5")',
+        'NonlocalFilter(learn=("bandwidth",))',
+        'NonlocalAffinity(learn=["alpha"])',
+        'SegmentMask(learn=("width",))',
+    ]
+    legal = 'NonlocalFilter(learn=("alpha", "spatial_bandwidth"), spatial_bandwidth=3.0).alpha = (1.0, 2.0)'
+    script = tmp_path / "user.py"
+    script.write_text("\n".join(["from nlfilter_torch import *", *lines, legal, ""]))
+    root = Path(nlfilter_torch.__file__).parents[1]
+    command = [sys.executable, "-m", "mypy", "--strict", "--config-file=", str(script)]
+    environment = os.environ | {"MYPYPATH": str(root)}
+    output = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False).stdout
+    refused = {int(number) for number in re.findall(r"user.py:(\d+): error", output)}
+    assert refused == set(range(2, 2 + len(lines))), output
