@@ -21,8 +21,8 @@ from nlfilter_torch.core.checks import (
 from nlfilter_torch.core.kernels.tall_skinny import spread
 from nlfilter_torch.core.layouts import in_format_of, shaped_as
 from nlfilter_torch.core.precision import full_precision, per_image
+from nlfilter_torch.operator.columns import Columns
 from nlfilter_torch.operator.operator import NonlocalOperator
-from nlfilter_torch.operator.products import Columns
 
 
 def detail_layers(operator: NonlocalOperator, image: Tensor, *, order: int = 3) -> Tensor:

@@ -21,11 +21,12 @@ from nlfilter_torch.core.layouts import in_format_of
 from nlfilter_torch.core.precision import full_precision, trainable, uncompiled
 from nlfilter_torch.core.torch_internals import outside_transforms, refuse_transforms
 from nlfilter_torch.operator.assignment import Assignment
+from nlfilter_torch.operator.columns import Columns
 from nlfilter_torch.operator.eigenvalue_bound import largest_eigenvalue, shifted_gram
 from nlfilter_torch.operator.features import GuideFeatures
 from nlfilter_torch.operator.nystrom import nystrom_factor
 from nlfilter_torch.operator.options import Completion
-from nlfilter_torch.operator.products import Columns, apply_powers
+from nlfilter_torch.operator.products import apply_powers
 from nlfilter_torch.operator.scaling import KernelMatrix, PixelScaling
 from nlfilter_torch.operator.spectrum import Spectrum, compute_spectrum
 

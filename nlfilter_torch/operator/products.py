@@ -1,6 +1,5 @@
-"""Columns of ``W = F^T F + diag(r)``, where F = factor diag(d), and products with it. Paper: eq. (13)."""
+"""Products with ``W = F^T F + diag(r)``, where F = factor diag(d). Paper: eq. (13)."""
 
-from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -12,21 +11,6 @@ from nlfilter_torch.core.kernels.tall_skinny import moment, spread
 from nlfilter_torch.core.low_rank import outer_product
 from nlfilter_torch.core.precision import once_differentiable
 from nlfilter_torch.core.torch_internals import for_each_gradient, in_transform
-
-
-@dataclass(frozen=True, eq=False)
-class Columns:
-    """The columns of some points: ``W_ij = d_i u_i . u_j d_j``, plus r_i where i = j.
-
-    Attributes:
-        factor: u, (B, M, n).
-        scaling: d, (B, n).
-        remainder: r, (B, n).
-    """
-
-    factor: Tensor
-    scaling: Tensor
-    remainder: Tensor
 
 
 def apply_powers(

@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from nlfilter_torch.core.blocks import fold_batch, root_weighted, unfold_batch, weighted
-from nlfilter_torch.core.checks import check_coefficients, check_fits, checked_response
+from nlfilter_torch.core.checks import check_coefficients, check_fits, check_instance, checked_response
 from nlfilter_torch.core.communicator import ALONE, Communicator
 from nlfilter_torch.core.containers import Batch, loadable
 from nlfilter_torch.core.kernels.grams import compute_grams
@@ -23,6 +23,7 @@ from nlfilter_torch.core.kernels.tall_skinny import moment, spread
 from nlfilter_torch.core.matrix_function import SymmetricMatrix
 from nlfilter_torch.core.precision import full_precision, trainable
 from nlfilter_torch.core.torch_internals import is_hidden
+from nlfilter_torch.operator.columns import Columns
 
 # Eigenvalues of G below this, relative to the largest, are rounding errors.
 CUT = {torch.float32: 1e-5, torch.float64: 1e-9}
@@ -176,11 +177,49 @@ class Spectrum(Batch, RitzPairs):
 
     def _form(self, vectors: Tensor) -> Tensor:
         """Form the eigenvectors (B, R, *size) from those of T, (B, M, M)."""
-        rank = self.eigenvalues.shape[1]
-        vectors = (vectors * self.support.unsqueeze(1))[:, :, :rank]
-        vectors = self._constant_first(vectors)
-        basis = (self.root @ vectors).mT.to(self.factor) @ self.factor  # (B, R, N)
+        basis = self._rows(vectors) @ self.factor  # (B, R, N)
         return (basis * self.scaling.unsqueeze(1)).unflatten(2, self.size)
+
+    def _rows(self, vectors: Tensor) -> Tensor:
+        """Rows (B, R, M) whose product with the scaled factor is the eigenvectors, from those of T, (B, M, M)."""
+        vectors = (vectors * self.support.unsqueeze(1))[:, :, : self.eigenvalues.shape[1]]
+        return (self.root @ self._constant_first(vectors)).mT.to(self.factor)
+
+    @full_precision
+    def eigenvectors_at(self, columns: Columns) -> Tensor:
+        """Extend the eigenvectors to points that the operator was not made from, (B, R, n).
+
+        The eigenvectors are functions of the features of a point, and this evaluates them; at the operator's own points
+        they are :attr:`eigenvectors`. Times ``sqrt(N) eigenvalues^t`` they are the coordinates of
+        :func:`diffusion_map`.
+
+        Args:
+            columns: of the points, by :meth:`NonlocalOperator.at`.
+
+        Returns:
+            (B, R, n). Differentiable, with the limits of :attr:`eigenvectors`.
+
+        Raises:
+            TypeError, ValueError: if ``columns`` are not those of an operator with as many landmarks.
+
+        Example:
+            >>> from nlfilter_torch import operator_from_features
+            >>> points = torch.rand(1, 2, 300, generator=torch.Generator().manual_seed(0))
+            >>> operator = operator_from_features(points / 0.3, size=(300,), num_landmarks=20)
+            >>> spectrum = operator.spectrum(rank=4)
+            >>> again = spectrum.eigenvectors_at(operator.at(points[..., :10] / 0.3))
+            >>> torch.allclose(again, spectrum.eigenvectors[:, :, 0, :10], atol=1e-4)
+            True
+        """
+        check_instance(columns, Columns, "columns", "take operator.at(features)")
+        if columns.factor.shape[1] != self.factor.shape[1]:
+            raise ValueError(
+                f"columns must be of an operator with {self.factor.shape[1]} landmarks, got "
+                f"{columns.factor.shape[1]}; take them from the operator of the spectrum"
+            )
+        recorded = torch.is_grad_enabled() and self.ritz.matrix.requires_grad
+        vectors = torch.linalg.eigh(self.ritz.matrix).eigenvectors.flip(-1) if recorded else self.ritz.vectors
+        return spread(self._rows(vectors), columns.factor, columns.scaling)
 
     @full_precision
     def coefficients(self, image: Tensor) -> Tensor:

@@ -13,7 +13,7 @@ from nlfilter_torch import (
     operator_from_features,
     polynomial_filter,
 )
-from nlfilter_torch.operator.products import Columns
+from nlfilter_torch.operator.columns import Columns
 from tests.problems import build, guides, noise, options, picture, seeded
 
 

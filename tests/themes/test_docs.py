@@ -47,7 +47,7 @@ def test_there_are_pages() -> None:
 @pytest.mark.filterwarnings("ignore:The number of training batches")
 @pytest.mark.parametrize("page", DOCS, ids=lambda page: page.path.stem)
 def test_code_and_commands_run(page: Page, folder: Path) -> None:
-    for name in CLIENTS if page.path.stem == "clients" else ():
+    for name in {"clients": CLIENTS, "points": ("nilearn", "sklearn")}.get(page.path.stem, ()):
         pytest.importorskip(name)
     assert {kind for kind, _ in page.blocks()} <= {"python", "sh", "text", "{toctree}"}
     with torch.random.fork_rng():

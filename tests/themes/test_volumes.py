@@ -378,3 +378,29 @@ def test_nystrom_blocks_have_a_gradient() -> None:
         return operator.nystrom_blocks()
 
     assert torch.autograd.gradcheck(blocks, (guide,), atol=1e-6)
+
+
+@pytest.mark.parametrize("completion", ["diagonal", "none"])
+@pytest.mark.parametrize("batch", [1, 2])
+def test_eigenvectors_are_functions_of_the_features(completion: Any, batch: int) -> None:
+    points = noise(batch, 2, 200) / 0.3
+    operator = nlf.operator_from_features(points, size=(200,), num_landmarks=20, completion=completion)
+    spectrum = operator.spectrum()
+    extended = spectrum.eigenvectors_at(operator.at(points[..., ::5]))
+    torch.testing.assert_close(extended, spectrum.eigenvectors.flatten(2)[..., ::5], atol=1e-7, rtol=0)
+    with pytest.raises(ValueError, match=r"^columns must be of an operator with 20 landmarks, got 7; take them"):
+        spectrum.eigenvectors_at(nlf.operator_from_features(points, size=(200,), num_landmarks=7).at(points))
+    with pytest.raises(TypeError, match=r"^columns must be a Columns, got Tensor; take operator.at\(features\)"):
+        spectrum.eigenvectors_at(points)  # type: ignore[arg-type]
+
+
+def test_extended_eigenvectors_have_a_gradient() -> None:
+    points, others = noise(1, 2, 30).requires_grad_(), noise(1, 2, 5, seed=1)
+
+    def extended(source: Tensor, at: Tensor) -> Tensor:
+        operator = nlf.operator_from_features(
+            source / 0.3, size=(30,), num_landmarks=5, landmarks="uniform", tolerance=1e-13
+        )
+        return operator.spectrum().eigenvectors_at(operator.at(at / 0.3)).square()  # whatever the sign
+
+    assert torch.autograd.gradcheck(extended, (points, others.requires_grad_()), atol=1e-5)

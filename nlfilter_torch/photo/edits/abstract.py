@@ -12,9 +12,9 @@ from torch import Tensor
 
 from nlfilter_torch.core.checks import check_count, check_reach
 from nlfilter_torch.core.inner import Inner
+from nlfilter_torch.operator.columns import Columns
 from nlfilter_torch.operator.features import blur, blur_margin
 from nlfilter_torch.operator.options import Completion, GuideChannels, Sampling
-from nlfilter_torch.operator.products import Columns
 from nlfilter_torch.photo.declared.declaration import Edit
 from nlfilter_torch.photo.declared.parameters import ABSTRACT
 from nlfilter_torch.photo.edits.synthesis import synthesize

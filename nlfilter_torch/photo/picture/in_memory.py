@@ -14,8 +14,8 @@ from nlfilter_torch.core.precision import full_precision, working_dtype
 from nlfilter_torch.filtering.filters import detail_layers
 from nlfilter_torch.filtering.scribbles import check_painted
 from nlfilter_torch.operator.build import operator_from_guide
+from nlfilter_torch.operator.columns import Columns
 from nlfilter_torch.operator.operator import NonlocalOperator
-from nlfilter_torch.operator.products import Columns
 from nlfilter_torch.operator.spectrum import RitzPairs, Spectrum
 from nlfilter_torch.photo.picture.drawn import Drawn
 from nlfilter_torch.photo.picture.edit import PhotoEdit

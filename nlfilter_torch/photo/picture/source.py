@@ -14,9 +14,9 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.core.kernels.grams import compute_grams
+from nlfilter_torch.operator.columns import Columns
 from nlfilter_torch.operator.features import blur, blur_margin, reduce_channels
 from nlfilter_torch.operator.options import OperatorOptions
-from nlfilter_torch.operator.products import Columns
 from nlfilter_torch.operator.spectrum import RitzPairs
 from nlfilter_torch.photo.picture.drawn import M
 from nlfilter_torch.photo.picture.pixels import Fitted as Fitted

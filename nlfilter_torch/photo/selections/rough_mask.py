@@ -14,9 +14,9 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.filtering.scribbles import fit_strokes
+from nlfilter_torch.operator.columns import Columns
 from nlfilter_torch.operator.features import blur
 from nlfilter_torch.operator.options import OperatorOptions
-from nlfilter_torch.operator.products import Columns
 from nlfilter_torch.photo.picture.colour import LIGHTNESS, hundredths_of_lab
 from nlfilter_torch.photo.picture.resizing import block_means, enlarged
 from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles, scribbled_blocks

@@ -9,9 +9,9 @@ from torch import Tensor
 
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.filtering.filters import layers_of_columns
+from nlfilter_torch.operator.columns import Columns
 from nlfilter_torch.operator.features import reduce_channels
 from nlfilter_torch.operator.operator import Kernel
-from nlfilter_torch.operator.products import Columns
 from nlfilter_torch.operator.scaling import PixelScaling
 from nlfilter_torch.operator.spectrum import RitzPairs
 from nlfilter_torch.photo.picture.source import SAMPLE, Blocks, Pixels, Planes, sampled_pairs, sampled_places

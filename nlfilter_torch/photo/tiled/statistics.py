@@ -23,8 +23,8 @@ from torch import Tensor
 from nlfilter_torch.core.kernels.grams import sum_grams
 from nlfilter_torch.core.kernels.tall_skinny import moment, positive_root, spread
 from nlfilter_torch.core.warning import warn
+from nlfilter_torch.operator.columns import Columns
 from nlfilter_torch.operator.eigenvalue_bound import exceeds, limiter, shift, slack
-from nlfilter_torch.operator.products import Columns
 from nlfilter_torch.operator.scaling import LARGEST, PixelScaling, scaling_from_moment
 
 CONVERGED = {

@@ -2,8 +2,8 @@
 
 import torch
 
+from nlfilter_torch.operator.columns import Columns
 from nlfilter_torch.operator.options import OperatorOptions
-from nlfilter_torch.operator.products import Columns
 from nlfilter_torch.photo.picture.in_memory import InMemory
 from nlfilter_torch.photo.picture.source import (
     Guide,
