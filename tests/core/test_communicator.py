@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable
 from dataclasses import asdict
 from datetime import timedelta
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +30,7 @@ from nlfilter_torch import (
     polynomial_filter,
     propagate_strokes,
     segment_mask,
+    spectral_filter,
 )
 from nlfilter_torch.core.communicator import ALONE, RowCommunicator, all_gather_shapes
 from tests.problems import noise, picture, seeded
@@ -216,12 +218,38 @@ def sliders(rows: slice, group: Any, dtype: torch.dtype) -> Results:
     }
 
 
+def functions(rows: slice, group: Any, dtype: torch.dtype) -> Results:
+    """f(W) by a polynomial, by poles and by the method of Lanczos, and f on the eigenvectors, with all gradients."""
+    result = {}
+    for name in ("smooth", "root", "kink", "spectrum"):
+        guide = picture("coffee", HEIGHT, WIDTH, dtype)[:, :, rows].clone().requires_grad_()
+        image = picture("chelsea", HEIGHT, WIDTH, dtype)[:, :, rows].clone().requires_grad_()
+        number = torch.tensor(0.4, dtype=dtype, requires_grad=True)
+        operator = nonlocal_operator(guide, photometric_bandwidth=0.2, num_landmarks=12, group=group)
+        response = partial(RESPONSES[name], number)
+        filtered = spectral_filter(operator.spectrum() if name == "spectrum" else operator, image, response)
+        (filtered * noise(1, 1, HEIGHT, WIDTH, seed=1, dtype=dtype)[:, :, rows]).sum().backward()
+        result |= {f"rows {name}": filtered, f"rows guide {name}": guide.grad, f"rows image {name}": image.grad}
+        if name != "spectrum":  # on the eigenvectors the gradient of a parameter is that of the rank's own rows
+            result[f"number {name}"] = number.grad
+    return {name: value.detach() for name, value in result.items() if value is not None}
+
+
+RESPONSES: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
+    "smooth": lambda number, values: torch.exp(number * values),
+    "root": lambda number, values: values**number,
+    "kink": lambda number, values: (values - number).relu() + number * values,
+    "spectrum": lambda number, values: values**number,
+}
+
+
 # Some gradients have errors above 1e-4 in float32 even in one process: the inverse Cholesky factor amplifies rounding.
 PROBLEMS: dict[str, tuple[Problem, torch.dtype, float]] = {
     "filtering": (filtering, torch.float64, 1e-9),
     "filtering in float32": (filtering, torch.float32, 1e-5),
     "options": (options, torch.float64, 1e-9),
     "layer": (layer, torch.float64, 1e-9),
+    "functions": (functions, torch.float64, 1e-9),
     "painting": (painting, torch.float64, 1e-9),
     "sliders": (sliders, torch.float64, 1e-9),
     "fitted": (fitted, torch.float64, 1e-9),
