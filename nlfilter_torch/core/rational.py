@@ -118,7 +118,7 @@ def best_form(values: Tensor, decades: int, tolerance: float, rounding: float) -
         tolerance: of the error relative to the largest value.
         rounding: relative error of the terms.
     """
-    strict = max(tolerance / 100, 8 * rounding)
+    strict = max(tolerance / 300, 8 * rounding)
     for form in polynomial_forms(decades, ACCURATE):
         error = form.error(values, form.coefficients(values), rounding)
         if error <= strict:
