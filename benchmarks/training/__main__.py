@@ -12,6 +12,7 @@ from benchmarks.training.figures import Figure, table
 TOPICS: dict[str, str] = {  # name of a module of this package: what it measures
     "points": "a scan beside 3-D nonlocal means, and coordinates of points beside SpectralEmbedding",
     "block": "the non-local block beside the usual one: accuracy of a small task, time and memory",
+    "floors": "operators of small images and of many landmarks, in floors",
     "functions": "f(W) of any response: error, methods, and cost at a megapixel",
     "sizes": "padded batches, and exported and compiled layers for images of any size",
 }
