@@ -60,8 +60,8 @@ def test_compiled_layer_gives_the_same() -> None:
 
 @pytest.mark.client(
     "`torch.compile(fullgraph=True)`",
-    "building included, for images of any size with `dynamic=True`; a `generator`, a `group`, `residual` and spectra "
-    "break the graph",
+    "building included, for images of any size with `dynamic=True`; a `generator`, a `group`, `weights`, `residual` "
+    "and spectra break the graph",
 )
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.*autograd.function.Function.* should not be instantiated:DeprecationWarning")
