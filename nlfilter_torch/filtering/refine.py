@@ -62,7 +62,7 @@ class RefineOptions(MeanField):
     patch_size: int = 1
     photometric_bandwidth: float | Tensor | Literal["auto"] = AUTO
     spatial_bandwidth: SpatialBandwidth | Literal["auto"] | None = AUTO
-    num_landmarks: int = 200
+    num_landmarks: int = 250
     landmarks: Sampling = "kmeans"
     guide_channels: GuideChannels = "all"
     generator: torch.Generator | None = None
