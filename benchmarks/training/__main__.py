@@ -15,6 +15,7 @@ TOPICS: dict[str, str] = {  # name of a module of this package: what it measures
     "floors": "operators of small images and of many landmarks, in floors",
     "functions": "f(W) of any response: error, methods, and cost at a megapixel",
     "sizes": "padded batches, and exported and compiled layers for images of any size",
+    "refinement": "coarse segmentations refined, beside kornia, OpenCV and a dense CRF; bad bandwidths",
 }
 
 

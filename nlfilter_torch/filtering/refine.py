@@ -5,7 +5,7 @@ a dense conditional random field (P. Kraehenbuehl, V. Koltun, "Efficient Inferen
 Edge Potentials", 2011), with balanced affinities in place of a filter on a lattice.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import torch
@@ -38,8 +38,8 @@ KINDS = ("logits", "probabilities", "mask", "trimap")
 STRENGTH, MARGIN, CAUTION = 4.0, 2.5, 0.2  # defaults, chosen on composites of five classes
 FLOOR = 1e-6  # of probabilities, whose logarithms are taken
 STEEPEST = 100.0  # largest factor of logits, so that noise on constant ones is not taken for classes
-PHOTOMETRIC = 0.6  # bandwidth, relative to that of estimate_bandwidth, which is made for detail
-SPATIAL = 0.63  # bandwidth, relative to the width of the transitions between classes
+PHOTOMETRIC = 0.5  # bandwidth, relative to that of estimate_bandwidth, which is made for detail
+SPATIAL = 0.55  # bandwidth, relative to the width of the transitions between classes
 NARROWEST, WIDEST = 1 / 20, 1 / 6  # spatial bandwidth, relative to the short side
 CONFIDENT = 4  # power of probabilities that makes confident pixels count most
 
@@ -52,7 +52,7 @@ class MeanField:
     strength: float | Tensor = STRENGTH
     margin: float | Tensor | None = MARGIN
     compatibility: Tensor | None = None
-    caution: float | Tensor | None = CAUTION
+    caution: float | Tensor | Literal["auto"] | None = AUTO
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -79,7 +79,7 @@ def refine(
     strength: float | Tensor = RefineOptions.strength,
     margin: float | Tensor | None = RefineOptions.margin,
     compatibility: Tensor | None = RefineOptions.compatibility,
-    caution: float | Tensor | None = RefineOptions.caution,
+    caution: float | Tensor | Literal["auto"] | None = RefineOptions.caution,
     patch_size: int = RefineOptions.patch_size,
     photometric_bandwidth: float | Tensor | Literal["auto"] = RefineOptions.photometric_bandwidth,
     spatial_bandwidth: SpatialBandwidth | Literal["auto"] | None = RefineOptions.spatial_bandwidth,
@@ -110,10 +110,11 @@ def refine(
             identity. A mask or a single logit has two classes, the background first.
         caution: positive, a number or a tensor of shape () or (B,): if refinement takes more than this share of the
             doubt that the input itself has about its confident pixels, averaged over classes, then input and result are
-            blended, so that bad bandwidths do little harm; None takes the result as it is.
+            blended, so that bad bandwidths do little harm. None takes the result as it is; ``"auto"`` is 0.2 if a
+            bandwidth or an operator is passed, and None if both bandwidths are chosen from the data.
         patch_size: as for :func:`nonlocal_operator`.
-        photometric_bandwidth: as for :func:`nonlocal_operator`; ``"auto"`` is 0.6 times :func:`estimate_bandwidth`.
-        spatial_bandwidth: as for :func:`nonlocal_operator`; ``"auto"`` is 0.63 times the mean width of the transitions
+        photometric_bandwidth: as for :func:`nonlocal_operator`; ``"auto"`` is 0.5 times :func:`estimate_bandwidth`.
+        spatial_bandwidth: as for :func:`nonlocal_operator`; ``"auto"`` is 0.55 times the mean width of the transitions
             between the classes of the input, within 1/20 and 1/6 of the short side. Both are constants for gradients.
         num_landmarks: as for :func:`nonlocal_operator`.
         landmarks: as for :func:`nonlocal_operator`.
@@ -157,6 +158,7 @@ def refine(
     communicator = guide.communicator if isinstance(guide, NonlocalOperator) else ALONE
     images = _check_guide(logits, guide, options)
     _check_options(options, logits, images)
+    options = _with_caution(options, isinstance(guide, NonlocalOperator))
     unary = _scaled(_as_logits(logits, kind), confidence, options.margin, communicator)
     if not isinstance(guide, NonlocalOperator):
         guide = build_operator(guide, unary, confidence, options)
@@ -181,7 +183,7 @@ def mean_field(operator: NonlocalOperator, unary: Tensor, confidence: Tensor | N
             message = torch.einsum("ij,bjhw->bihw", options.compatibility.to(message), message)
         energies = trusted + strength * message
         probabilities = energies.softmax(1)
-    if options.caution is not None:
+    if options.caution is not None and not isinstance(options.caution, str):
         share = _share_of_result(start, probabilities, confidence, options.caution, operator.communicator)
         energies = torch.lerp(trusted.expand_as(energies), energies, share)
     return energies.log_softmax(1)
@@ -296,6 +298,14 @@ def _known(trimap: Tensor) -> Tensor:
     return (trimap <= 0) | (trimap >= 1)
 
 
+def _with_caution(options: RefineOptions, built: bool) -> RefineOptions:
+    """Choose the caution where it is ``"auto"``; ``built`` says whether the operator was passed."""
+    if not isinstance(options.caution, str):
+        return options
+    chosen = isinstance(options.photometric_bandwidth, str) and isinstance(options.spatial_bandwidth, str)
+    return replace(options, caution=None if chosen and not built else CAUTION)
+
+
 def _check_input(values: Tensor, kind: Kind) -> None:
     """Raise unless the input is what its kind says."""
     check_choice(kind, "kind", KINDS, "say what the first argument is")
@@ -356,7 +366,10 @@ def _check_options(options: RefineOptions, values: Tensor, images: int) -> None:
     check_count(options.steps, "steps", most=1000)
     check_values(options.strength, "strength", "not negative", images)
     for name in ("margin", "caution"):
-        if (value := getattr(options, name)) is not None:
+        value = getattr(options, name)
+        if name == "caution" and isinstance(value, str):
+            check_choice(value, name, (AUTO,), "pass it, a number or None")
+        elif value is not None:
             check_positive(value, name, images)
     if isinstance(options.spatial_bandwidth, str):
         check_choice(options.spatial_bandwidth, "spatial_bandwidth", (AUTO,), "pass it, a number of pixels or None")

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from nlfilter_torch.core.checks import check_choice, check_count, check_positive
-from nlfilter_torch.filtering.refine import CAUTION, KINDS, MARGIN, STRENGTH, Kind, RefineOptions, refine
+from nlfilter_torch.filtering.refine import KINDS, MARGIN, STRENGTH, Kind, RefineOptions, refine
 from nlfilter_torch.nn.parameters import Learnable, check_learn, positive_option
 from nlfilter_torch.operator.operator import NonlocalOperator
 from nlfilter_torch.operator.option_checks import check_bandwidths, check_options
@@ -25,7 +25,8 @@ class Refine(Learnable):
         steps: as for :func:`refine`.
         strength: a positive number.
         margin: a positive number, or None.
-        caution: a positive number, or None, with which nothing holds learned parameters back.
+        caution: a positive number, ``"auto"`` as for :func:`refine`, or None, with which nothing holds learned
+            bandwidths back.
         patch_size: as for :func:`nonlocal_operator`.
         photometric_bandwidth: a positive number in units of the guide, or ``"auto"``.
         spatial_bandwidth: a positive number of pixels, None or ``"auto"``.
@@ -67,7 +68,7 @@ class Refine(Learnable):
         steps: int = RefineOptions.steps,
         strength: float = STRENGTH,
         margin: float | None = MARGIN,
-        caution: float | None = CAUTION,
+        caution: float | Literal["auto"] | None = AUTO,
         patch_size: int = RefineOptions.patch_size,
         photometric_bandwidth: float | Literal["auto"] = AUTO,
         spatial_bandwidth: float | Literal["auto"] | None = AUTO,
@@ -81,7 +82,9 @@ class Refine(Learnable):
         names = check_learn(learn, LEARNABLE)
         check_choice(kind, "kind", KINDS, "say what the first argument is")
         check_count(steps, "steps", most=1000)
-        if caution is not None:
+        if isinstance(caution, str):
+            check_choice(caution, "caution", (AUTO,), "pass it, a number or None")
+        elif caution is not None:
             check_positive(caution, "caution")
         check_options(OperatorOptions(num_landmarks=num_landmarks, landmarks=landmarks, guide_channels=guide_channels))
         self.kind: Kind = kind

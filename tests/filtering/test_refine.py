@@ -125,6 +125,15 @@ def test_operator_replaces_the_guide() -> None:
     torch.testing.assert_close(refine(logits, operator), expected)
 
 
+def test_caution_is_for_bandwidths_that_are_passed() -> None:
+    image, _, logits = scene()
+    torch.testing.assert_close(refine(logits, image), refine(logits, image, caution=None))
+    bandwidths: dict[str, Any] = {"photometric_bandwidth": 1.0, "spatial_bandwidth": 30.0}
+    torch.testing.assert_close(refine(logits, image, **bandwidths), refine(logits, image, caution=0.2, **bandwidths))
+    operator = nonlocal_operator(image, spatial_bandwidth=30.0)
+    torch.testing.assert_close(refine(logits, operator), refine(logits, operator, caution=0.2))
+
+
 def test_identity_is_the_default_compatibility() -> None:
     image, _, logits = scene()
     torch.testing.assert_close(refine(logits, image, compatibility=torch.eye(3)), refine(logits, image))
@@ -195,7 +204,7 @@ BAD: list[tuple[dict[str, Any], type[Exception], str]] = [
     ({"steps": 0}, ValueError, "steps must be at least 1, got 0"),
     ({"strength": -1.0}, ValueError, "strength must be at least 0 and finite, got -1.0"),
     ({"margin": 0.0}, ValueError, "margin must be positive and finite, got 0.0"),
-    ({"caution": "much"}, TypeError, "caution must be a number or a tensor, got str"),
+    ({"caution": "much"}, ValueError, "caution must be one of 'auto', got 'much'; pass it, a number or None"),
     ({"compatibility": torch.eye(3)}, ValueError, "compatibility must have shape (4, 4), got (3, 3); pass a row"),
     ({"compatibility": torch.eye(4) * float("nan")}, ValueError, "compatibility must be finite"),
     ({"spatial_bandwidth": "wide"}, ValueError, "spatial_bandwidth must be one of 'auto', got 'wide'"),
