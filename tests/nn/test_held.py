@@ -238,6 +238,21 @@ def test_with_a_generator_each_renewal_draws_other_landmarks() -> None:
     assert not torch.equal(held(image()), first)
 
 
+@pytest.mark.parametrize("hold", HOLDS)
+@pytest.mark.parametrize("bandwidth", [0.2, "auto"])
+def test_padding_gives_no_landmarks(hold: Hold, bandwidth: float | str) -> None:
+    guide = image()
+    padded, weights = torch.zeros(2, 3, 15, 18), torch.zeros(2, 1, 15, 18)
+    padded[..., :12, :13], weights[..., :12, :13] = guide, 1
+    first, second = (
+        NonlocalAffinity(photometric_bandwidth=bandwidth, num_landmarks=156, hold=hold)  # type: ignore[arg-type]
+        for _ in range(2)
+    )
+    first.renew(guide[:1])
+    second.renew(padded[:1], weights[:1])
+    torch.testing.assert_close(second(padded[:1], weights[:1]).landmarks, first(guide[:1]).landmarks)
+
+
 def test_landmarks_that_are_held_are_shown() -> None:
     assert "landmarks='kmeans', hold='features'" in repr(layer("features"))
     assert "hold" not in repr(layer(None))
