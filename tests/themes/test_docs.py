@@ -57,6 +57,17 @@ def test_code_and_commands_run(page: Page, folder: Path) -> None:
         assert main(arguments) == 0
 
 
+def test_training_begins_with_a_path_for_newcomers() -> None:
+    """From installation to a trained layer in 20 lines, which :func:`test_code_and_commands_run` runs."""
+    (shell, install), (language, code), *_ = PAGES["training"].blocks()
+    assert (shell, language) == ("sh", "python")
+    assert install.startswith("pip install")
+    lines = [line for line in (install + code).splitlines() if line.strip()]
+    assert len(lines) <= 20
+    assert "optimizer.step()" in code
+    assert PAGES["training"].text.index(install) < 200
+
+
 @pytest.mark.parametrize("page", DOCS, ids=lambda page: page.path.stem)
 def test_links_modules_and_targets_are_there(page: Page) -> None:
     for target in page.targets():
