@@ -20,7 +20,7 @@ from torch import Tensor
 from nlfilter_torch.core.blocks import fold_batch, unfold_batch
 from nlfilter_torch.core.checks import check_fits, check_instance, check_values, checked_response
 from nlfilter_torch.core.layouts import in_format_of
-from nlfilter_torch.core.precision import full_precision, uncompiled, working_dtype
+from nlfilter_torch.core.precision import full_precision, trainable, uncompiled, working_dtype
 from nlfilter_torch.core.rational import DECADES, RationalForm, best_form, interval_nodes, pole_forms
 from nlfilter_torch.core.torch_internals import is_fake, is_transformed
 from nlfilter_torch.core.warning import warn
@@ -92,7 +92,7 @@ def apply_function(
     check_values(tolerance, "tolerance", "positive")
     response = checked_response(response, dtype=working_dtype(image) if isinstance(image, Tensor) else None)
     check_fits(image, operator.size, "image", "operator", operator.factor, empty=True)
-    planes = fold_batch(image.to(operator.factor), operator.factor.shape[0])
+    planes = fold_batch(trainable(image).to(operator.factor), operator.factor.shape[0])
     if planes.numel() == 0:
         return FunctionProduct(image.clone(), 0, 0, 0.0)
     parts = operator.factor, operator.scaling, operator.remainder

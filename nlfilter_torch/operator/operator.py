@@ -321,11 +321,11 @@ class NonlocalOperator(Batch):
 
     @property
     def diagonal_share(self) -> Tensor:
-        """The weight r in [0, 1] with which a pixel keeps its own value where few pixels are similar, (B, 1, *size)."""
+        """The weight r in [0, 1] with which a pixel keeps its own value where few pixels are similar, (B, 1, ...)."""
         return self.remainder.unflatten(1, self.size).unsqueeze(1)
 
     def row_sums(self) -> Tensor:
-        """Row sums of W, (B, 1, *size): one everywhere, with an error of about :attr:`residual`."""
+        """Row sums of W, (B, 1, ...): one everywhere, with an error of about :attr:`residual`."""
         batch = self.factor.shape[0]
         return self.matmul(self.factor.new_ones(batch, 1, *self.size))
 

@@ -153,7 +153,7 @@ class Spectrum(Batch, RitzPairs):
 
     @property
     def eigenvectors(self) -> Tensor:
-        """(B, R, *size), orthonormal over the pixels, in the order of the eigenvalues; zero for padded eigenvalues.
+        """(B, R, ...), orthonormal over the pixels, in the order of the eigenvalues; zero for padded eigenvalues.
 
         The first is constant and positive as far as the landmarks span the constant vector (exactly so for W; without
         completion to the tolerance of the balancing), also if the eigenvalue 1 is repeated. Differentiable, but with
@@ -176,7 +176,7 @@ class Spectrum(Batch, RitzPairs):
         return self._form(self.ritz.vectors)
 
     def _form(self, vectors: Tensor) -> Tensor:
-        """Form the eigenvectors (B, R, *size) from those of T, (B, M, M)."""
+        """Form the eigenvectors (B, R, ...) from those of T, (B, M, M)."""
         basis = self._rows(vectors) @ self.factor  # (B, R, N)
         return (basis * self.scaling.unsqueeze(1)).unflatten(2, self.size)
 
@@ -228,7 +228,7 @@ class Spectrum(Batch, RitzPairs):
         To apply several responses to one image, or to learn one, compute ``F y`` once; see :func:`spectral_filter`.
 
         Args:
-            image: y, (B, C, *size) or (B, C, N).
+            image: y, (B, C, ...) or (B, C, N).
 
         Returns:
             (B, C, M) in float64. Differentiable in image and operator.
@@ -243,7 +243,7 @@ class Spectrum(Batch, RitzPairs):
 
     @full_precision
     def synthesize(self, response: Response, coefficients: Tensor) -> Tensor:
-        """Compute ``V f(S) V^T y``, (B, C, *size), from a response f and coefficients (B, C, M) of y."""
+        """Compute ``V f(S) V^T y``, (B, C, ...), from a response f and coefficients (B, C, M) of y."""
         check_coefficients(coefficients, self.factor)
         count = coefficients.shape[0]
         total = fold_batch(coefficients.unsqueeze(3), self.factor.shape[0])  # (B, C, M)

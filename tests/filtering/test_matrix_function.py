@@ -88,6 +88,22 @@ def test_batches_channels_and_weights(response: str) -> None:
     )
 
 
+@pytest.mark.parametrize("response", ["power 0.5", "exp", "kink"])
+def test_pixels_that_do_not_count_change_nothing(response: str) -> None:
+    features, image = noise(1, 2, 48), noise(1, 2, 6, 8, seed=1)
+    weights = torch.ones(1, 48, dtype=torch.float64)
+    weights[:, 40:] = 0
+    landmarks = features[:, :, :40:4]
+    padded = operator_from_features(features, size=(6, 8), landmarks=landmarks, weights=weights)
+    valid = operator_from_features(features[:, :, :40], size=(5, 8), landmarks=landmarks)
+    result, wanted = (
+        apply_function(operator, planes, RESPONSES[response]).image
+        for operator, planes in ((padded, image), (valid, image[:, :, :5]))
+    )
+    assert result.isfinite().all()
+    torch.testing.assert_close(result[:, :, :5], wanted, atol=1e-4, rtol=0)
+
+
 @pytest.mark.parametrize("response", ["power 0.1", "exp", "kink"])
 def test_degenerate_images(response: str) -> None:
     for image in (torch.full((1, 1, 1, 1), 0.4), torch.full((1, 3, 5, 4), 0.4), torch.zeros(1, 1, 4, 4)):
