@@ -1,16 +1,19 @@
 """Volumes and points: operators of guides (B, C, D, H, W), operators of any size, and values (B, C, N)."""
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+import torch.distributed as dist
 from torch import Tensor
 
 import nlfilter_torch as nlf
 from nlfilter_torch.operator.features import GuideFeatures, gradients, pad_border, patch_window
 from tests import reference
+from tests.ranks import run_ranks
 
 SIZE = (4, 5, 6)
 OPTIONS: dict[str, Any] = {"patch_size": 3, "photometric_bandwidth": 0.4, "num_landmarks": 30}
@@ -404,3 +407,34 @@ def test_extended_eigenvectors_have_a_gradient() -> None:
         return operator.spectrum().eigenvectors_at(operator.at(at / 0.3)).square()  # whatever the sign
 
     assert torch.autograd.gradcheck(extended, (points, others.requires_grad_()), atol=1e-5)
+
+
+SLICES = (slice(0, 3), slice(3, 4))  # of the two ranks
+
+
+def filter_slices(rank: int, folder: str) -> None:
+    """One of the processes, which holds some slices of a volume."""
+    torch.set_num_threads(1)
+    dist.init_process_group("gloo", init_method=f"file://{folder}/rendezvous", rank=rank, world_size=2)
+    try:
+        own = noise(1, 1, *SIZE)[:, :, SLICES[rank]].requires_grad_()
+        operator = nlf.nonlocal_operator(own, **OPTIONS | {"photometric_bandwidth": "auto"}, spatial_bandwidth=3.0,
+                                         group=dist.group.WORLD)  # fmt: skip
+        filtered = operator @ own
+        filtered.square().sum().backward()
+        torch.save((filtered.detach(), own.grad), f"{folder}/{rank}.pt")
+    finally:
+        dist.destroy_process_group()
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not dist.is_available() or not dist.is_gloo_available(), reason="this torch has no gloo")
+def test_slices_on_two_ranks_give_what_the_volume_gives(tmp_path: Path) -> None:
+    run_ranks(filter_slices, (str(tmp_path),), 2)
+    parts = [torch.load(tmp_path / f"{rank}.pt", weights_only=True) for rank in range(2)]
+    whole = noise(1, 1, *SIZE).requires_grad_()
+    operator = nlf.nonlocal_operator(whole, **OPTIONS | {"photometric_bandwidth": "auto"}, spatial_bandwidth=3.0)
+    expected = operator @ whole
+    expected.square().sum().backward()
+    torch.testing.assert_close(torch.cat([part[0] for part in parts], dim=2), expected.detach(), atol=1e-9, rtol=0)
+    torch.testing.assert_close(torch.cat([part[1] for part in parts], dim=2), whole.grad, atol=1e-8, rtol=0)
