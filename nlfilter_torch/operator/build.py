@@ -113,7 +113,7 @@ def nonlocal_operator(
             landmarks is held, and the landmarks move smoothly with guide and bandwidths; for any other, its landmarks
             are taken as they are, as constants. Or ``operator.assignment``, which refuses guides of another size. Or
             features (B, D, M) or (1, D, M), such as ``operator.landmarks``, divided by the bandwidths like those of the
-            pixels; differentiable. ``num_landmarks`` is then their number.
+            pixels; differentiable. ``num_landmarks`` is then ignored.
         completion: ``"diagonal"`` corrects the diagonal of the kernel to 1; ``"none"`` is the paper's method, which
             fails at small bandwidths.
         guide_channels: ``"luminance"`` reduces a guide of three channels to one, ``"all"`` compares all of them. A

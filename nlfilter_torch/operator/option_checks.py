@@ -31,7 +31,7 @@ SAMPLINGS = (
 def check_construction(options: Construction) -> None:
     """Raise an error for an invalid option."""
     check_count(options.num_landmarks, "num_landmarks")
-    check_landmarks(options.landmarks, options.num_landmarks)
+    check_landmarks(options.landmarks)
     check_choice(options.completion, "completion", ("diagonal", "none"))
     if options.tolerance is not None:
         check_number(options.tolerance, "tolerance", "pass a float or None")
@@ -40,19 +40,12 @@ def check_construction(options: Construction) -> None:
         check_instance(options.generator, torch.Generator, "generator", "create one with torch.Generator()")
 
 
-def check_landmarks(landmarks: Landmarks, num_landmarks: int) -> None:
-    """Raise unless this is a name of a sampling, or landmarks whose number does not contradict ``num_landmarks``."""
-    if not isinstance(landmarks, Tensor | Assignment | HasLandmarks):
-        check_choice(landmarks, "landmarks", ("kmeans", "uniform", "random"), SAMPLINGS)
-        return
+def check_landmarks(landmarks: Landmarks) -> None:
+    """Raise unless this is a name of a sampling, an assignment, features (B, D, M), or has landmarks."""
     if isinstance(landmarks, Tensor):
         check_features(landmarks, "landmarks")
-    count = count_of(landmarks)
-    if num_landmarks not in (count, Construction.num_landmarks):
-        raise ValueError(
-            f"num_landmarks must be the number of the landmarks that are passed, {count}, got "
-            f"{described(num_landmarks)}; leave it out"
-        )
+    elif not isinstance(landmarks, Assignment | HasLandmarks):
+        check_choice(landmarks, "landmarks", ("kmeans", "uniform", "random"), SAMPLINGS)
 
 
 def count_of(landmarks: Tensor | Assignment | HasLandmarks) -> int:
