@@ -56,6 +56,7 @@ from nlfilter_torch.operator.sinkhorn import (
     sinkhorn_in_rounds,
     warn_of_residual,
 )
+from nlfilter_torch.operator.traps import warn_of_scale_of_features, warn_of_units
 
 
 def _is_small(bandwidth: float | Tensor | str) -> bool:
@@ -100,7 +101,9 @@ def nonlocal_operator(
     Args:
         guide: (B, C, H, W), finite, usually in [0, 1]; an image, or the feature map of a network. A volume, such as a
             scan, is (B, C, D, H, W). On CPUs, a guide of 1 or 3 channels with values above 16 causes a warning if the
-            bandwidth is ``"auto"`` or below 1, since it is probably in [0, 255].
+            bandwidth is ``"auto"`` or below 1, since it is probably in [0, 255]. So do bandwidths from 4 to 64
+            for such a guide in [0, 1], 3 or 4 channels in the last dimension, and a guide of other channels whose scale
+            makes W nearly the identity or the mean.
         patch_size: p, odd, at most 101; the image is reflected at its border. Patches of volumes have p^3 voxels.
         photometric_bandwidth: h_y in units of the guide (10 / 255 is ten grey levels), a positive number, a tensor of
             shape () or (B,), or ``"auto"``: :func:`estimate_bandwidth`, a constant for gradients.
@@ -167,7 +170,10 @@ def nonlocal_operator(
         guide = torch.where(weights > 0, guide, 0.0)  # large values there are no mistake
     if not is_hidden(guide) and _is_small(photometric_bandwidth):
         warn_of_scale(guide, "guide")
-    return _from_guide(guide, options, weights)
+    warn_of_units(guide, photometric_bandwidth)
+    operator = _from_guide(guide, options, weights)
+    warn_of_scale_of_features(operator, guide, photometric_bandwidth)
+    return operator
 
 
 def operator_from_guide(guide: Tensor, options: OperatorOptions) -> NonlocalOperator:
