@@ -216,7 +216,8 @@ BUILDERS: list[Callable[[Tensor], Tensor]] = [
 def test_transforms_of_building_are_refused_in_one_sentence(
     transform: Callable[..., object], build: Callable[[Tensor], Tensor]
 ) -> None:
-    with pytest.raises(TypeError, match=r"^(guide|features) must .* while an operator is built, got .*; \w+") as caught:
+    message = r"^(guide|features|photometric_bandwidth) must .* while an operator is built, got .*; \w+"
+    with pytest.raises(TypeError, match=message) as caught:
         transform(build)
     assert "\n" not in str(caught.value)
 
