@@ -172,7 +172,8 @@ def nonlocal_operator(
         warn_of_scale(guide, "guide")
     warn_of_units(guide, photometric_bandwidth)
     operator = _from_guide(guide, options, weights)
-    warn_of_scale_of_features(operator, guide, photometric_bandwidth)
+    if completion == "diagonal" and weights is None and operator.communicator.size == 1:
+        warn_of_scale_of_features(operator.scaling, guide, photometric_bandwidth)
     return operator
 
 

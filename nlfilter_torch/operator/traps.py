@@ -4,7 +4,6 @@ from torch import Tensor
 
 from nlfilter_torch.core.torch_internals import is_hidden
 from nlfilter_torch.core.warning import warn
-from nlfilter_torch.operator.operator import NonlocalOperator
 
 GREY_LEVELS = (4.0, 64.0)  # usual bandwidths in grey levels; where values end at 1, larger ones ask for the mean
 WHITE = 1.05
@@ -37,18 +36,18 @@ def warn_of_units(guide: Tensor, bandwidth: float | Tensor | str) -> None:
         )
 
 
-def warn_of_scale_of_features(operator: NonlocalOperator, guide: Tensor, bandwidth: float | Tensor | str) -> None:
+def warn_of_scale_of_features(scaling: Tensor, guide: Tensor, bandwidth: float | Tensor | str) -> None:
     """Warn if W is nearly the identity or the mean for a guide of features, whose gradients then vanish.
 
-    The trace of W is the sum of d^2: N for the identity, 1 for the mean.
+    The trace of a W with a corrected diagonal is the sum of d^2, for the scaling d (B, N): N for the identity, 1 for
+    the mean.
     """
-    constant = isinstance(bandwidth, str) or guide.shape[1] in (1, 3) or operator.weights is not None
-    if constant or len(guide) == 0 or is_hidden(guide) or is_hidden(operator.scaling) or operator.communicator.size > 1:
+    if isinstance(bandwidth, str) or guide.shape[1] in (1, 3) or len(guide) == 0 or is_hidden(scaling):
         return
-    pixels = operator.scaling.shape[1]
-    traces = operator.scaling.detach().square().sum(1)
-    if operator.kernel.completion != "diagonal" or pixels < LEAST_SIDE**2:
+    pixels = scaling.shape[1]
+    if pixels < LEAST_SIDE**2:
         return
+    traces = scaling.detach().square().sum(1)
     if bool((traces > (1 - NEARLY) * pixels).all()):
         warn(
             "guide must have differences near photometric_bandwidth, got so large ones that no two pixels are similar; "
