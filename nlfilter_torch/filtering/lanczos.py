@@ -19,6 +19,7 @@ from nlfilter_torch.core.checks import Response
 from nlfilter_torch.core.communicator import Communicator
 from nlfilter_torch.core.matrix_function import MEETING, divided_differences
 from nlfilter_torch.core.precision import once_differentiable
+from nlfilter_torch.core.torch_internals import for_each_gradient
 from nlfilter_torch.operator.pixel_matrix import PixelMatrix
 
 CHUNK = 16  # steps between two estimates of the error
@@ -175,6 +176,7 @@ class _KrylovProduct(torch.autograd.Function):
         return space.combine(gains).to(planes)
 
     @staticmethod
+    @for_each_gradient
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         factor, scaling, remainder, planes, gains, weights = ctx.saved_tensors

@@ -69,7 +69,9 @@ def apply_function(
         image: y, (B, C, H, W).
         response: f, an elementwise function (B, R) to (B, R) of eigenvalues in [0, 1], in the image's dtype (at least
             float32); may have parameters.
-        tolerance: of the error, relative to the largest gain; see :class:`FunctionProduct`.
+        tolerance: of the error, relative to the largest gain; see :class:`FunctionProduct`. Where values cannot be
+            read, as in ``torch.func`` and on fake tensors, a fixed rational function takes the place of f, whose error
+            is unknown, and large for responses with steps.
 
     Returns:
         The product; ``image`` is differentiable in image, operator and the parameters of ``response``, once if the

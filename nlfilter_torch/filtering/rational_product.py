@@ -8,6 +8,7 @@ from torch import Tensor
 from nlfilter_torch.core.communicator import Communicator
 from nlfilter_torch.core.precision import once_differentiable
 from nlfilter_torch.core.rational import RationalForm
+from nlfilter_torch.core.torch_internals import for_each_gradient
 from nlfilter_torch.operator.pixel_matrix import PixelMatrix
 
 
@@ -84,6 +85,7 @@ class _RationalProduct(torch.autograd.Function):
         return _product(matrix, planes, shifts, inverses, coefficients)
 
     @staticmethod
+    @for_each_gradient
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         factor, scaling, remainder, planes, coefficients, shifts, inverses, weights = ctx.saved_tensors

@@ -134,6 +134,17 @@ def test_gradients(response: str) -> None:
     assert torch.autograd.gradcheck(filtered, leaves, atol=1e-6)
 
 
+@pytest.mark.parametrize("response", ["power 0.1", "kink"])
+def test_batched_gradients(response: str) -> None:
+    guide = noise(1, 1, 8, 8).requires_grad_()
+    result = apply_function(nonlocal_operator(guide, num_landmarks=6), guide.detach(), RESPONSES[response]).image
+    gradients = noise(3, *result.shape, seed=2)
+    singly = torch.stack([torch.autograd.grad(result, guide, gradient, retain_graph=True)[0] for gradient in gradients])
+    batched = torch.autograd.grad(result, guide, gradients, is_grads_batched=True)[0]
+    assert singly.abs().max() > 1e-3
+    torch.testing.assert_close(batched, singly)
+
+
 @pytest.mark.filterwarnings("ignore:.*torch.jit.script.* is deprecated:DeprecationWarning")  # in torch.func itself
 def test_transforms_for_a_fixed_operator() -> None:
     operator, image = nonlocal_operator(IMAGE, num_landmarks=20), IMAGE.expand(2, -1, -1, -1)
