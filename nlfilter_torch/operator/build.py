@@ -22,7 +22,7 @@ from nlfilter_torch.core.checks import (
 from nlfilter_torch.core.communicator import ALONE, Communicator, all_gather_shapes
 from nlfilter_torch.core.precision import full_precision, trainable, uncompiled, uncompiled_with, working_dtype
 from nlfilter_torch.core.torch_internals import is_hidden, outside_transforms, refuse_transforms
-from nlfilter_torch.operator.assignment import Assignment, Layout
+from nlfilter_torch.operator.assignment import Assignment
 from nlfilter_torch.operator.counting import assign_among_counted, extended, hidden_points
 from nlfilter_torch.operator.eigenvalue_bound import exceeds, is_bounded, limiter, shifted_gram, slack
 from nlfilter_torch.operator.features import (
@@ -43,6 +43,7 @@ from nlfilter_torch.operator.options import (
     Construction,
     GuideChannels,
     Landmarks,
+    Layout,
     OperatorOptions,
     Sampling,
     SpatialBandwidth,

@@ -6,9 +6,9 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.core.communicator import ALONE, Communicator
-from nlfilter_torch.operator.assignment import Assignment, Layout
+from nlfilter_torch.operator.assignment import Assignment
 from nlfilter_torch.operator.landmarks import assign_landmarks, choose_in_graph, landmarks_of
-from nlfilter_torch.operator.options import Construction
+from nlfilter_torch.operator.options import Construction, Layout
 
 
 def landmarks_by(

@@ -20,8 +20,8 @@ from nlfilter_torch.core.kernels.clusters import (
     squared_distances,
 )
 from nlfilter_torch.core.torch_internals import register
-from nlfilter_torch.operator.assignment import Assignment, Layout
-from nlfilter_torch.operator.options import Sampling
+from nlfilter_torch.operator.assignment import Assignment
+from nlfilter_torch.operator.options import Layout, Sampling
 from nlfilter_torch.operator.orientation import canonical_points, mixture, orientation_of, source_pixels, whole_sums
 
 CAPTURED = 1e-4  # a point whose residual on the unit diagonal is below this counts as captured

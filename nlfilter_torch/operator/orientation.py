@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from nlfilter_torch.operator.assignment import Layout
+from nlfilter_torch.operator.options import Layout
 
 LEVELS = 1 << 12  # steps to which values are rounded; sums along a row are then exact in float64
 HASHED = 1 << 12  # number of different pseudo-random weights

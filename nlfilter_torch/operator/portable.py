@@ -17,7 +17,6 @@ from torch.overrides import TorchFunctionMode
 from nlfilter_torch.core.kernels.clusters import UNCOVERED, best_trial, odds, pick
 from nlfilter_torch.core.kernels.columns import PLAIN_EXPONENT, SMALLEST_EXPONENT
 from nlfilter_torch.core.torch_internals import outside_modes
-from nlfilter_torch.operator.assignment import Layout
 from nlfilter_torch.operator.landmarks import (
     CAPTURED,
     DRAWN_SINGLY,
@@ -30,7 +29,7 @@ from nlfilter_torch.operator.landmarks import (
     pivot_draws,
 )
 from nlfilter_torch.operator.nystrom import JITTER
-from nlfilter_torch.operator.options import Sampling
+from nlfilter_torch.operator.options import Layout, Sampling
 from nlfilter_torch.operator.sinkhorn import LARGEST_SCALING, SMALLEST_SUM, TRUSTED, Rounds, chebyshev_weights
 
 SWEEPS = 16

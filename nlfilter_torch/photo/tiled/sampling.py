@@ -16,7 +16,6 @@ from torch import Tensor
 
 from nlfilter_torch.core.blocks import stratified
 from nlfilter_torch.core.checks import check_choice
-from nlfilter_torch.operator.assignment import Layout
 from nlfilter_torch.operator.columns import Columns
 from nlfilter_torch.operator.features import (
     GuideFeatures,
@@ -30,7 +29,7 @@ from nlfilter_torch.operator.landmarks import candidate_pixels, condense
 from nlfilter_torch.operator.nystrom import inverse_cholesky
 from nlfilter_torch.operator.operator import Kernel
 from nlfilter_torch.operator.option_checks import check_bandwidths, check_construction, landmark_count
-from nlfilter_torch.operator.options import Completion, Construction, GuideChannels, Sampling, SpatialBandwidth
+from nlfilter_torch.operator.options import Completion, Construction, GuideChannels, Layout, Sampling, SpatialBandwidth
 from nlfilter_torch.operator.orientation import (
     ORIENTATIONS,
     canonical_points,
