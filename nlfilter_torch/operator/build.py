@@ -43,12 +43,12 @@ from nlfilter_torch.operator.options import (
     Construction,
     GuideChannels,
     Landmarks,
-    Layout,
     OperatorOptions,
     Sampling,
     SpatialBandwidth,
     bandwidths_of,
 )
+from nlfilter_torch.operator.orientation import Layout
 from nlfilter_torch.operator.scaling import Balancing, KernelMatrix, PixelScaling
 from nlfilter_torch.operator.sinkhorn import (
     TOLERANCE,

@@ -28,7 +28,8 @@ from nlfilter_torch.core.kernels.columns import large_empty
 from nlfilter_torch.core.precision import Gradients, full_precision, once_differentiable, per_image, working_dtype
 from nlfilter_torch.core.torch_internals import for_each_gradient, is_hidden
 from nlfilter_torch.operator.hidden import fill_hidden
-from nlfilter_torch.operator.options import GuideChannels, Layout, SpatialBandwidth, bandwidths_of
+from nlfilter_torch.operator.options import GuideChannels, SpatialBandwidth, bandwidths_of
+from nlfilter_torch.operator.orientation import Layout
 
 FAINT_WEIGHT = 1e-12  # in place of patch weights of 0
 

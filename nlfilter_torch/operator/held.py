@@ -8,7 +8,8 @@ from torch import Tensor
 from nlfilter_torch.core.communicator import ALONE, Communicator
 from nlfilter_torch.operator.assignment import Assignment
 from nlfilter_torch.operator.landmarks import assign_landmarks, choose_in_graph, landmarks_of
-from nlfilter_torch.operator.options import Construction, Layout
+from nlfilter_torch.operator.options import Construction
+from nlfilter_torch.operator.orientation import Layout
 
 
 def landmarks_by(

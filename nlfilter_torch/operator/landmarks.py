@@ -21,8 +21,8 @@ from nlfilter_torch.core.kernels.clusters import (
 )
 from nlfilter_torch.core.torch_internals import register
 from nlfilter_torch.operator.assignment import Assignment
-from nlfilter_torch.operator.options import Layout, Sampling
-from nlfilter_torch.operator.orientation import canonical_points, mixture, orientation_of, source_pixels, whole_sums
+from nlfilter_torch.operator.options import Sampling
+from nlfilter_torch.operator.orientation import Layout, canonical_points, orientations, source_pixels
 
 CAPTURED = 1e-4  # a point whose residual on the unit diagonal is below this counts as captured
 # Candidates per landmark. More candidates or iterations move the centroids by less than their sampling error: at
@@ -133,20 +133,6 @@ def canonical_candidates(
         places = source_pixels(orientation, size, pixels, flipped=False)
         coordinates = communicator.columns(features[:, -2:].detach(), places.unsqueeze(1))
     return candidates, subset, canonical_points(subset, orientation, layout, coordinates)
-
-
-def orientations(features: Tensor, size: Sequence[int], layout: Layout, communicator: Communicator = ALONE) -> Tensor:
-    """The canonical orientations (B,) of images with features (B, D, N), whose rows here have ``size`` (h, W)."""
-    area = layout.patch * layout.patch
-    patches = features.shape[1] - 2 * layout.coordinates
-    values = mixture([features[:, plane].detach() for plane in range(area // 2, patches, area)])
-    ends = communicator.max(torch.stack([-values.amin(1), values.amax(1)], dim=1))  # (B, 2)
-    span = ends.sum(1, keepdim=True)
-    shares = (values + ends[:, :1]) / torch.where(span > 0, span, 1.0)
-    sums = whole_sums(
-        shares.unflatten(1, (size[0], size[1])), communicator.first_row, communicator.whole((size[0], size[1]))
-    )
-    return orientation_of(communicator.sum(sums))
 
 
 def landmarks_of(features: Tensor, assignment: Assignment, communicator: Communicator = ALONE) -> Tensor:

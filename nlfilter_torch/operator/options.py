@@ -58,16 +58,3 @@ class OperatorOptions(Construction):
 def bandwidths_of(spatial: SpatialBandwidth | None) -> tuple[Any, ...]:
     """The bandwidth of all distances, or those along each axis."""
     return tuple(spatial) if isinstance(spatial, tuple | list) else (spatial,)
-
-
-@dataclass(frozen=True)
-class Layout:
-    """Which features of a pixel belong to which place of its patch.
-
-    Attributes:
-        patch: width p of a patch; the features are C patches, row by row.
-        coordinates: whether row and column of the pixel follow.
-    """
-
-    patch: int
-    coordinates: bool

@@ -6,11 +6,12 @@ canonical orientation. An image and its mirror image share it, and hence have k-
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from nlfilter_torch.operator.options import Layout
+from nlfilter_torch.core.communicator import ALONE, Communicator
 
 LEVELS = 1 << 12  # steps to which values are rounded; sums along a row are then exact in float64
 HASHED = 1 << 12  # number of different pseudo-random weights
@@ -19,17 +20,31 @@ MOST_CHANNELS = 16  # of the guide that are looked at
 ONES, MOMENT, FIRST, SECOND = 0, 1, 2, 4  # rows of the weights along an axis
 
 
-def canonical_order(layout: Layout, size: int, device: torch.device) -> Tensor:
-    """Indices (8, D) of D = ``size`` features of a pixel in the order of each orientation of its patch."""
-    area, numbers = layout.patch * layout.patch, torch.arange(ORIENTATIONS, device=device)
-    patches = size - 2 * layout.coordinates
-    places = source_pixels(numbers, (layout.patch, layout.patch), torch.arange(area, device=device))
-    channels = torch.arange(0, patches, area, device=device).view(1, -1, 1)
-    indices = (places.unsqueeze(1) + channels).flatten(1)
-    if not layout.coordinates:
-        return indices
-    exchanged = (numbers // EXCHANGED).unsqueeze(1)
-    return torch.cat([indices, patches + exchanged, patches + 1 - exchanged], dim=1)
+@dataclass(frozen=True)
+class Layout:
+    """Which features of a pixel belong to which place of its patch.
+
+    Attributes:
+        patch: width p of a patch; the features are C patches, row by row.
+        coordinates: whether row and column of the pixel follow.
+    """
+
+    patch: int
+    coordinates: bool
+
+    def to_canonical(self, size: int, device: torch.device) -> Tensor:
+        """Indices (8, D) of D = ``size`` features of a pixel in the order of each orientation of its patch."""
+        area = self.patch * self.patch
+        patches = size - 2 * self.coordinates
+        places = source_pixels(
+            torch.arange(ORIENTATIONS, device=device), (self.patch, self.patch), torch.arange(area, device=device)
+        )
+        channels = torch.arange(0, patches, area, device=device).view(1, -1, 1)
+        indices = (places.unsqueeze(1) + channels).flatten(1)
+        if not self.coordinates:
+            return indices
+        exchanged = (torch.arange(ORIENTATIONS, device=device) // EXCHANGED).unsqueeze(1)
+        return torch.cat([indices, patches + exchanged, patches + 1 - exchanged], dim=1)
 
 
 def source_pixels(orientation: Tensor, size: Sequence[int], pixels: Tensor, *, flipped: bool = True) -> Tensor:
@@ -63,8 +78,22 @@ def canonical_points(subset: Tensor, orientation: Tensor, layout: Layout, coordi
     subset = subset.detach()
     if coordinates is not None:
         subset = torch.cat([subset[:, :-2], coordinates.detach()], dim=1)
-    order = canonical_order(layout, subset.shape[1], subset.device)[orientation]  # (B, D)
+    order = layout.to_canonical(subset.shape[1], subset.device)[orientation]  # (B, D)
     return subset.gather(1, order.unsqueeze(2).expand_as(subset))
+
+
+def orientations(features: Tensor, size: Sequence[int], layout: Layout, communicator: Communicator = ALONE) -> Tensor:
+    """The canonical orientations (B,) of images with features (B, D, N), whose rows here have ``size`` (h, W)."""
+    area = layout.patch * layout.patch
+    patches = features.shape[1] - 2 * layout.coordinates
+    values = _mixture([features[:, plane].detach() for plane in range(area // 2, patches, area)])
+    ends = communicator.max(torch.stack([-values.amin(1), values.amax(1)], dim=1))  # (B, 2)
+    span = ends.sum(1, keepdim=True)
+    shares = (values + ends[:, :1]) / torch.where(span > 0, span, 1.0)
+    sums = _sums(
+        shares.unflatten(1, (size[0], size[1])), communicator.first_row, communicator.whole((size[0], size[1]))
+    )
+    return orientation_of(communicator.sum(sums))
 
 
 def orientation_sums(rows: Tensor, first_row: int, size: Sequence[int]) -> Tensor:
@@ -72,7 +101,7 @@ def orientation_sums(rows: Tensor, first_row: int, size: Sequence[int]) -> Tenso
 
     The rows begin at ``first_row`` of an image of ``size`` (H, W).
     """
-    return whole_sums(mixture(list(rows.unbind(1))), first_row, size)
+    return _sums(_mixture(list(rows.unbind(1))), first_row, size)
 
 
 def orientation_of(sums: Tensor) -> Tensor:
@@ -93,7 +122,7 @@ def orientation_of(sums: Tensor) -> Tensor:
     return tied.argmax(1)
 
 
-def mixture(channels: Sequence[Tensor]) -> Tensor:
+def _mixture(channels: Sequence[Tensor]) -> Tensor:
     """Sum of up to :data:`MOST_CHANNELS` channels with different weights, in float64."""
     values = channels[0].double()
     for number, channel in enumerate(channels[1:MOST_CHANNELS], 2):
@@ -101,7 +130,7 @@ def mixture(channels: Sequence[Tensor]) -> Tensor:
     return values
 
 
-def whole_sums(shares: Tensor, first_row: int, size: Sequence[int]) -> Tensor:
+def _sums(shares: Tensor, first_row: int, size: Sequence[int]) -> Tensor:
     """Weighted sums (B, 6, 6) of shares (B, h, W) of the largest value, in whole numbers."""
     rows = torch.arange(shares.shape[1], device=shares.device) + first_row
     down, across = _weights(rows, size[0]), _weights(torch.arange(shares.shape[2], device=shares.device), size[1])

@@ -29,7 +29,8 @@ from nlfilter_torch.operator.landmarks import (
     pivot_draws,
 )
 from nlfilter_torch.operator.nystrom import JITTER
-from nlfilter_torch.operator.options import Layout, Sampling
+from nlfilter_torch.operator.options import Sampling
+from nlfilter_torch.operator.orientation import Layout
 from nlfilter_torch.operator.sinkhorn import LARGEST_SCALING, SMALLEST_SUM, TRUSTED, Rounds, chebyshev_weights
 
 SWEEPS = 16

@@ -8,12 +8,13 @@ from torch import Tensor
 
 from nlfilter_torch import NonlocalFilter, nonlocal_operator
 from nlfilter_torch.operator.features import GuideFeatures, unit_window
-from nlfilter_torch.operator.landmarks import canonical_candidates, orientations
-from nlfilter_torch.operator.options import Layout
+from nlfilter_torch.operator.landmarks import canonical_candidates
 from nlfilter_torch.operator.orientation import (
     ORIENTATIONS,
+    Layout,
     orientation_of,
     orientation_sums,
+    orientations,
     source_pixels,
 )
 from tests.images import hard_images, photograph

@@ -29,9 +29,10 @@ from nlfilter_torch.operator.landmarks import candidate_pixels, condense
 from nlfilter_torch.operator.nystrom import inverse_cholesky
 from nlfilter_torch.operator.operator import Kernel
 from nlfilter_torch.operator.option_checks import check_bandwidths, check_construction, landmark_count
-from nlfilter_torch.operator.options import Completion, Construction, GuideChannels, Layout, Sampling, SpatialBandwidth
+from nlfilter_torch.operator.options import Completion, Construction, GuideChannels, Sampling, SpatialBandwidth
 from nlfilter_torch.operator.orientation import (
     ORIENTATIONS,
+    Layout,
     canonical_points,
     orientation_of,
     orientation_sums,
