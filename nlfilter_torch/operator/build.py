@@ -48,7 +48,6 @@ from nlfilter_torch.operator.options import (
     SpatialBandwidth,
     bandwidths_of,
 )
-from nlfilter_torch.operator.orientation import Layout
 from nlfilter_torch.operator.scaling import Balancing, KernelMatrix, PixelScaling
 from nlfilter_torch.operator.sinkhorn import (
     TOLERANCE,
@@ -274,8 +273,7 @@ def operator_from_features(
     """Build the filter of any points from their features: landmarks, Nystrom factor, completion and balancing.
 
     Points may be the pixels of an image, every n-th of them, a weighted sample, the voxels of a volume, a point cloud.
-    :func:`nonlocal_operator` applies the same steps to the weighted patches of a guide. Its k-means landmarks turn with
-    the image; those of points depend on their order.
+    :func:`nonlocal_operator` applies the same steps to the weighted patches of a guide.
 
     Args:
         features: (B, D, N), already divided by bandwidths: the affinity of two points is ``exp(-|x_i - x_j|^2)``.
@@ -354,7 +352,7 @@ def sampled_operator(
     window = unit_window(patch_size, None).to(guide)
     recipe = GuideFeatures(window, photometric_bandwidth, spatial_bandwidth, "luminance")
     features, size = recipe(guide), (guide.shape[2], guide.shape[3])
-    chosen = choose_landmarks(features, size, num_landmarks, landmarks, generator, layout=recipe.layout)
+    chosen = choose_landmarks(features, size, num_landmarks, landmarks, generator)
     count = len(places)
     weights = guide.new_full((1, count), features.shape[2] / count)
     return _assemble(features[:, :, places], (1, count), method, recipe=recipe, weights=weights, chosen=chosen)
@@ -384,8 +382,7 @@ def _assemble(
         return _empty(features, size, count, method.completion, recipe)
     in_graph, assignment = torch.compiler.is_compiling(), None  # never with a generator, weights or a group
     if chosen is None:
-        layout = None if recipe is None else recipe.layout
-        chosen, assignment = _landmarks(method, features, whole, count, communicator, weights, layout)
+        chosen, assignment = _landmarks(method, features, whole, count, communicator, weights)
     inverse = inverse_cholesky(chosen)
     kernel = Kernel(chosen, inverse, method.completion, features=recipe, assignment=assignment)
     factor, diagonal = whole_kernel = kernel.factor(features)
@@ -448,12 +445,14 @@ def _landmarks(
     count: int,
     communicator: Communicator,
     weights: Tensor | None,
-    layout: Layout | None,
 ) -> tuple[Tensor, Assignment | None]:
     """:func:`landmarks_by`, from the points that count alone where weights are 0."""
-    if weights is None:
-        return landmarks_by(method, features, size, count, communicator, layout=layout)
-    if hidden_points(weights) is None or not isinstance(method.landmarks, str) or communicator.size > 1:
+    if (
+        weights is None
+        or hidden_points(weights) is None
+        or not isinstance(method.landmarks, str)
+        or communicator.size > 1
+    ):
         return landmarks_by(method, features, size, count, communicator, weights)
     return assign_among_counted(features, size, count, method.landmarks, method.generator, weights)
 

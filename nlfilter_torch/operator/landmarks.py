@@ -22,7 +22,6 @@ from nlfilter_torch.core.kernels.clusters import (
 from nlfilter_torch.core.torch_internals import register
 from nlfilter_torch.operator.assignment import Assignment
 from nlfilter_torch.operator.options import Sampling
-from nlfilter_torch.operator.orientation import Layout, canonical_points, orientations, source_pixels
 
 CAPTURED = 1e-4  # a point whose residual on the unit diagonal is below this counts as captured
 # Candidates per landmark. More candidates or iterations move the centroids by less than their sampling error: at
@@ -52,10 +51,9 @@ def choose_landmarks(
     generator: torch.Generator | None,
     communicator: Communicator = ALONE,
     weights: Tensor | None = None,
-    layout: Layout | None = None,
 ) -> Tensor:
     """The landmarks (B, D, M) of :func:`assign_landmarks`."""
-    return assign_landmarks(features, size, count, sampling, generator, communicator, weights, layout)[0]
+    return assign_landmarks(features, size, count, sampling, generator, communicator, weights)[0]
 
 
 def assign_landmarks(
@@ -66,7 +64,6 @@ def assign_landmarks(
     generator: torch.Generator | None,
     communicator: Communicator = ALONE,
     weights: Tensor | None = None,
-    layout: Layout | None = None,
 ) -> tuple[Tensor, Assignment]:
     """Choose or compute ``count`` landmarks; also return of which points they are made.
 
@@ -80,13 +77,11 @@ def assign_landmarks(
         communicator: ranks that the rows of the image are distributed over; N is then the number of pixels of this
             rank, and all ranks use what the first one draws.
         weights: (B, N), number of pixels that each point represents; k-means candidates are drawn in proportion to it.
-        layout: of the features, if they are those of an image: k-means then chooses the same patches of an image that
-            is flipped, transposed or rotated by 90 degrees. Not used with weights.
 
     Returns:
         (B, D, M), differentiable in the features (for k-means with the assignment held fixed), and the assignment. The
-        same pixels are drawn for all images of a batch, but for their orientations, so that a batch without weights
-        gives the same results as single calls.
+        same pixels are drawn for all images of a batch, so that a batch without weights gives the same results as
+        single calls.
     """
     generator = torch.Generator().manual_seed(0) if generator is None else generator
     points = math.prod(size)
@@ -98,41 +93,11 @@ def assign_landmarks(
         else candidate_pixels(size, count, sampling, generator)
     )
     pixels = communicator.broadcast(pixels.to(features.device))
-    if layout is not None and sampling == "kmeans" and weights is None:
-        candidates, subset, chosen = canonical_candidates(features, size, pixels, layout, communicator)
-    else:
-        candidates = pixels[None]
-        subset = communicator.columns(features, pixels)
-        chosen = subset.detach()
+    subset = communicator.columns(features, pixels)
     if len(pixels) == count:
-        return subset, Assignment(candidates, None, None, points)
-    start, assignment = clusters(chosen, count, generator, communicator)
-    return means_of_clusters(subset, start, assignment), Assignment(candidates, assignment, start, points)
-
-
-def canonical_candidates(
-    features: Tensor, size: Sequence[int], pixels: Tensor, layout: Layout, communicator: Communicator = ALONE
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Candidates with the numbers ``pixels`` (S,) in the canonical orientation of each image.
-
-    Args:
-        features: (B, D, N), of the rows here.
-        size: (H, W) of the whole image.
-        pixels: (S,).
-        layout: of the features.
-        communicator: ranks that the rows of the image are distributed over.
-
-    Returns:
-        Their indices (B, S) in the images, their features (B, D, S), and those for the canonical orientation.
-    """
-    width = size[1]
-    orientation = orientations(features, (features.shape[2] // width, width), layout, communicator)
-    candidates = source_pixels(orientation, size, pixels)
-    subset, coordinates = communicator.columns(features, candidates.unsqueeze(1)), None
-    if layout.coordinates:
-        places = source_pixels(orientation, size, pixels, flipped=False)
-        coordinates = communicator.columns(features[:, -2:].detach(), places.unsqueeze(1))
-    return candidates, subset, canonical_points(subset, orientation, layout, coordinates)
+        return subset, Assignment(pixels[None], None, None, points)
+    start, assignment = clusters(subset.detach(), count, generator, communicator)
+    return means_of_clusters(subset, start, assignment), Assignment(pixels[None], assignment, start, points)
 
 
 def landmarks_of(features: Tensor, assignment: Assignment, communicator: Communicator = ALONE) -> Tensor:
@@ -174,14 +139,11 @@ def _candidates_by_weight(weights: Tensor, count: int, generator: torch.Generato
     )
 
 
-def condense(subset: Tensor, count: int, generator: torch.Generator, points: Tensor | None = None) -> Tensor:
-    """Compute landmarks (B, D, M) from features (B, D, S) of the candidates: centroids if S > M.
-
-    Clusters are those of ``points`` (B, D, S), the features for the canonical orientation, if they are not None.
-    """
+def condense(subset: Tensor, count: int, generator: torch.Generator, communicator: Communicator = ALONE) -> Tensor:
+    """Compute landmarks (B, D, M) from features (B, D, S) of the candidates: centroids if S > M."""
     if subset.shape[2] == count:
         return subset
-    return means_of_clusters(subset, *clusters(subset.detach() if points is None else points, count, generator))
+    return means_of_clusters(subset, *clusters(subset.detach(), count, generator, communicator))
 
 
 def clusters(
@@ -323,44 +285,34 @@ def _sums_by_product(points: Tensor, assignment: Tensor, count: int) -> Tensor:
     return points @ members.scatter_(1, assignment.unsqueeze(1), 1.0).mT
 
 
-def _fake_choice(
-    features: Tensor, size: Sequence[int], count: int, sampling: str, patch: int, coordinates: bool
-) -> tuple[Tensor, ...]:
+def _fake_choice(features: Tensor, size: Sequence[int], count: int, sampling: str) -> tuple[Tensor, ...]:
     batch, candidates = features.shape[0], candidate_count(math.prod(size), count, sampling)
-    shapes = (batch, candidates), (batch, 1, count), (batch, candidates)
+    shapes = (candidates,), (batch, 1, count), (batch, candidates)
     return tuple(features.new_empty(shape, dtype=torch.long) for shape in shapes)
 
 
 @register(
-    "choose(Tensor features, SymInt[] size, int count, str sampling, int patch, bool coordinates)"
-    " -> (Tensor, Tensor, Tensor)",
+    "choose(Tensor features, SymInt[] size, int count, str sampling) -> (Tensor, Tensor, Tensor)",
     None,
     _fake_choice,
 )
-def choose(
-    features: Tensor, size: Sequence[int], count: int, sampling: Sampling, patch: int, coordinates: bool
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Choose candidates (B, S), initial centroids among them (B, 1, M) and their assignment to clusters (B, S).
-
-    ``patch`` and ``coordinates`` are the :class:`Layout` of the features; a width of 0 means that there is none.
-    """
-    layout = Layout(patch, coordinates) if patch else None
-    assignment = assign_landmarks(features, tuple(size), count, sampling, None, layout=layout)[1]
-    batch = (len(features), -1)
-    candidates = assignment.candidates.expand(*batch).contiguous()
-    if assignment.clusters is None or assignment.start is None:  # each is a cluster of its own
-        alone = torch.arange(count, device=features.device).expand(*batch)
-        return candidates, alone.unsqueeze(1).contiguous(), alone.contiguous()
-    return candidates, assignment.start, assignment.clusters
+def choose(features: Tensor, size: Sequence[int], count: int, sampling: Sampling) -> tuple[Tensor, Tensor, Tensor]:
+    """Choose candidates (S,), initial centroids among them (B, 1, M) and their assignment to clusters (B, S)."""
+    generator = torch.Generator().manual_seed(0)
+    pixels = candidate_pixels(tuple(size), count, sampling, generator).to(features.device)
+    if len(pixels) == count:  # each is a cluster of its own
+        alone = torch.arange(count, device=features.device).expand(len(features), -1)
+        return pixels, alone.unsqueeze(1).contiguous(), alone.contiguous()
+    start, assignment = clusters(ALONE.columns(features, pixels), count, generator)
+    return pixels, start, assignment
 
 
 def choose_in_graph(
-    features: Tensor, size: tuple[int, ...], count: int, sampling: Sampling, layout: Layout | None = None
+    features: Tensor, size: tuple[int, ...], count: int, sampling: Sampling
 ) -> tuple[Tensor, Assignment]:
     """:func:`assign_landmarks` in a form that can be compiled; chooses the same landmarks as without a generator."""
     # Nothing here depends on the size of the image, so that a program serves for all sizes.
-    patch, coordinates = (0, False) if layout is None else (layout.patch, layout.coordinates)
-    pixels, start, clusters = choose(features.detach(), size, count, sampling, patch, coordinates)
+    pixels, start, clusters = choose(features.detach(), size, count, sampling)
     means = sampling == "kmeans"
-    assignment = Assignment(pixels, clusters if means else None, start if means else None, features.shape[2])
+    assignment = Assignment(pixels[None], clusters if means else None, start if means else None, features.shape[2])
     return landmarks_of(features, assignment), assignment

@@ -19,7 +19,6 @@ from nlfilter_torch.core.blocks import stratified
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.operator.build import operator_from_features
 from nlfilter_torch.operator.features import GuideFeatures, estimate_bandwidth, reduce_channels, unit_window
-from nlfilter_torch.operator.landmarks import choose_landmarks
 from nlfilter_torch.operator.scaling import PixelScaling
 from nlfilter_torch.operator.spectrum import RitzPairs
 from nlfilter_torch.photo.declared.steps import Step, acting_steps
@@ -203,10 +202,6 @@ def learn_filter(pictures: Sequence[Picture], guide: Guide) -> LearntFilter:
     points, colours = torch.cat(features, dim=2), torch.cat(images, dim=2)
     weights = torch.full((1, points.shape[2]), pictures[0].pixels / points.shape[2], dtype=points.dtype)
     options["num_landmarks"] = min(options.get("num_landmarks", 100), points.shape[2])
-    if len(pictures) == 1 and count == pictures[0].pixels and options["landmarks"] == "kmeans":  # as for any picture
-        options["landmarks"] = choose_landmarks(
-            points, pictures[0].size, options["num_landmarks"], "kmeans", generator, layout=recipe.layout
-        )
     built = operator_from_features(points, size=(points.shape[2],), weights=weights[0], generator=generator, **options)
     pixels = (built.factor, built.diagonal, colours, weights)
     cuts = zip(*(part.split(CHUNK, dim=-1) for part in pixels), strict=True)
