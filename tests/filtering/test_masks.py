@@ -266,7 +266,7 @@ def test_one_set_of_regions_serves_every_image() -> None:
 
 def test_a_region_like_no_landmark_is_worth_a_warning() -> None:
     image, region = noise(1, 1, 32, 32), torch.zeros(1, 2, 32, 32)
-    few = nonlocal_operator(image, photometric_bandwidth=0.03).spectrum()
+    few = nonlocal_operator(image, photometric_bandwidth=0.03, landmarks="uniform").spectrum()
     best = few.factor[0].square().sum(0).argmax()
     region[0, 0].view(-1)[best], region[:, 1, 3, 7] = 1, 1  # a landmark, and a pixel like none
     with pytest.warns(UserWarning, match="region 1 resembles no landmark, so its mask may include"):

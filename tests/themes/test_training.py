@@ -91,6 +91,7 @@ def clean_and_noisy(step: int, generator: torch.Generator) -> tuple[Tensor, Tens
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:guide must have differences near:UserWarning")  # of bandwidths tried on purpose
 def test_a_thousand_steps_without_a_nan() -> None:
     generator = seeded(0)
     model = Denoiser(0)
