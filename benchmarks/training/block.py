@@ -110,7 +110,7 @@ def costs(quick: bool) -> Iterator[Figure]:
     yield Figure(f"{middle}x{middle}: time of a step, of the usual block's with fused attention", ratio, limit)
     growth = measured[largest][0] / measured[large][0] * (large / largest) ** 2
     name = f"{largest}x{largest}: time per pixel, of that of {large}x{large}"
-    yield Figure(name, growth, None if quick else 2.0)  # 256 MiB leave the cache
+    yield Figure(name, growth, None if quick else 1.5)
     yield Figure(f"{largest}x{largest}: time of a step", measured[largest][0], None, "s")
     matrix = largest**4 * 4 / 2**20
     yield Figure(f"{largest}x{largest}: memory of a step", measured[largest][1], limit and matrix / 1000, "MiB")
