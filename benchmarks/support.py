@@ -5,11 +5,11 @@
 Each test with the marker ``client("what", "how")`` is a row. Without a file the table is printed.
 """
 
-import argparse
 import ast
 from collections.abc import Iterator
-from itertools import dropwhile
 from pathlib import Path
+
+from benchmarks.page_table import print_or_replace
 
 TESTS = Path(__file__).parent.parent / "tests"
 HEAD = "| | | test |\n|---|---|---|\n"
@@ -39,17 +39,7 @@ def table() -> str:
 
 def main() -> None:
     """Print the table, or replace the table in a page."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("page", type=Path, nargs="?", help="Markdown page that contains the table")
-    page = parser.parse_args().page
-    if page is None:
-        print(table(), end="")
-        return
-    before, head, rest = page.read_text(encoding="utf-8").partition(HEAD)
-    if not head:
-        parser.error(f"{page} must have a table that begins with {HEAD.splitlines()[0]}; add these two lines")
-    after = "".join(dropwhile(lambda line: line.startswith("|"), rest.splitlines(keepends=True)))
-    page.write_text(f"{before}{table()}{after}", encoding="utf-8")
+    print_or_replace(__doc__, HEAD.splitlines()[0], table())
 
 
 if __name__ == "__main__":

@@ -6,18 +6,16 @@ Every cell is measured: derivatives of small filters in float64 by ``torch.func`
 compared with rows of ``torch.autograd.grad``. Without a file the table is printed.
 """
 
-import argparse
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
-from itertools import dropwhile
-from pathlib import Path
 
 import torch
 import torch.autograd.functional as functional
 from torch import Tensor, func
 
 import nlfilter_torch as nf
+from benchmarks.page_table import print_or_replace
 
 HEAD = "| derivative in | "
 BOTH = "alpha, `NonlocalFilter` that learns a bandwidth"
@@ -259,17 +257,7 @@ def table() -> str:
 
 def main() -> None:
     """Print the table, or replace the table in a page."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("page", type=Path, nargs="?", help="Markdown page that contains the table")
-    page = parser.parse_args().page
-    if page is None:
-        print(table(), end="")
-        return
-    before, start, rest = page.read_text(encoding="utf-8").partition(HEAD)
-    if not start:
-        parser.error(f"{page} must have a table that begins with {HEAD}; add this line")
-    after = "".join(dropwhile(lambda line: line.startswith("|"), f"|{rest}".splitlines(keepends=True)))
-    page.write_text(f"{before}{table()}{after}", encoding="utf-8")
+    print_or_replace(__doc__, HEAD, table())
 
 
 if __name__ == "__main__":

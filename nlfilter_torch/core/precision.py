@@ -17,11 +17,17 @@ from torch import Tensor
 Gradients = tuple[Tensor | None, ...]
 P = ParamSpec("P")
 R = TypeVar("R")
+LARGEST_VALUE = 1e9  # limit of values that are squared
 
 
 def working_dtype(tensor: Tensor) -> torch.dtype:
     """Return float64 for float64 tensors, float32 for all others."""
     return torch.float64 if tensor.dtype == torch.float64 else torch.float32
+
+
+def squarable(values: Tensor) -> Tensor:
+    """Limit values so that products of four of them are finite numbers of single precision."""
+    return values.clamp(-LARGEST_VALUE, LARGEST_VALUE)
 
 
 def trainable(tensor: Tensor) -> Tensor:

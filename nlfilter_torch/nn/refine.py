@@ -1,6 +1,7 @@
 """A layer that aligns coarse logits or masks with the edges of an image."""
 
 from collections.abc import Collection
+from functools import partial
 from types import MappingProxyType
 from typing import Literal
 
@@ -117,19 +118,8 @@ class Refine(Learnable):
             guide: the image, or its operator, which replaces the layer's own options of the operator.
             confidence: (B, 1, H, W) in [0, 1], as for :func:`refine`.
         """
-        if isinstance(guide, NonlocalOperator):
-            return refine(
-                logits,
-                guide,
-                kind=self.kind,
-                confidence=confidence,
-                steps=self.steps,
-                strength=self.strength,
-                margin=self.margin,
-                compatibility=self.compatibility,
-                caution=self.caution,
-            )
-        return refine(
+        refined = partial(
+            refine,
             logits,
             guide,
             kind=self.kind,
@@ -139,6 +129,10 @@ class Refine(Learnable):
             margin=self.margin,
             compatibility=self.compatibility,
             caution=self.caution,
+        )
+        if isinstance(guide, NonlocalOperator):
+            return refined()
+        return refined(
             patch_size=self.patch_size,
             photometric_bandwidth=self.photometric_bandwidth,
             spatial_bandwidth=self.spatial_bandwidth,

@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from nlfilter_torch.core.checks import check_image, check_same_size, check_values
-from nlfilter_torch.core.precision import full_precision, per_image, working_dtype
+from nlfilter_torch.core.precision import full_precision, per_image, squarable, working_dtype
 from nlfilter_torch.operator.features import reduce_channels
 from nlfilter_torch.operator.options import GuideChannels
 
@@ -22,7 +22,6 @@ TEXTURE_RATIO = 1.1  # ratio to the expected variance above which a group is ass
 MIN_IMPROVEMENT = 0.15  # decrease of the squared relative errors that is required of a dependence on brightness
 MIN_FLOOR_RATIO = 0.02  # least ratio of the variance in the dark to the growth of variance up to white
 MIN_VARIANCE = 1e-12
-LARGEST_VALUE = 1e9  # limit of values that are squared
 
 
 @dataclass(frozen=True)
@@ -109,7 +108,7 @@ def measured_noise(size: tuple[int, int], colours: Tensor, channels: GuideChanne
     """
     if min(size) < 3:
         return torch.zeros(3, len(colours), dtype=colours.dtype)
-    windows = _windows(size, colours.clamp(-LARGEST_VALUE, LARGEST_VALUE), channels)
+    windows = _windows(size, squarable(colours), channels)
     light = windows.mean((2, 3))
     response = _response(windows)
     # Clipping truncates the noise: windows with many clipped pixels come last.

@@ -25,7 +25,7 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.core.checks import check_count, check_patch_size, check_positive
-from nlfilter_torch.core.precision import per_image
+from nlfilter_torch.core.precision import per_image, squarable
 from nlfilter_torch.filtering.masks import segment
 from nlfilter_torch.filtering.scribbles import fit_strokes
 from nlfilter_torch.operator.columns import Columns
@@ -36,7 +36,6 @@ from nlfilter_torch.photo.declared.declaration import Edit
 from nlfilter_torch.photo.declared.parameters import COLORIZE
 from nlfilter_torch.photo.picture.colour import (
     group_colours,
-    limited,
     merge_luminance,
     region_means,
     split_luminance,
@@ -228,7 +227,7 @@ class Colorize(PhotoEdit):
         distance = COLORIZE["spatial_bandwidth"].distance(self.spatial_bandwidth, small)
         mean = per_image(cast(float | Tensor, distance), ratio, 1)  # not None, whose place a share of the size takes
         operators = Operators(self, viewed, (mean / ratio.sqrt(), mean * ratio.sqrt()))
-        wanted = limited(split_luminance(scribbles.shown.unsqueeze(2))[1]).squeeze(2)  # (B, 3, n)
+        wanted = squarable(split_luminance(scribbles.shown.unsqueeze(2))[1]).squeeze(2)  # (B, 3, n)
         if self.method == "kmeans":
             return _coloured(source, viewed, self._segments(operators, scribbles, wanted))
         return _coloured(source, viewed, Estimates.of(operators, scribbles, wanted[:, ::2], self.strength))

@@ -6,13 +6,13 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
+from nlfilter_torch.core.precision import squarable
 from nlfilter_torch.operator.options import Completion, Sampling
 from nlfilter_torch.photo.declared.declaration import Edit
 from nlfilter_torch.photo.declared.parameters import RECOLOR
 from nlfilter_torch.photo.picture.colour import (
     dot,
     group_colours,
-    limited,
     merge_luminance,
     region_means,
     split_luminance,
@@ -201,8 +201,8 @@ class Recoloring:
             # Chroma of the object's part of a mixed pixel; inside the object, that of the pixel.
             object_chroma = torch.addcmul(chroma, 1 - share, sides.across)
             # The new colour takes the relative saturation of the old one, so that a white highlight stays white.
-            squared_saturation = limited(self.old[:, k]).square().sum(1)[:, None, None, None]
-            limited_chroma = limited(object_chroma)
+            squared_saturation = squarable(self.old[:, k]).square().sum(1)[:, None, None, None]
+            limited_chroma = squarable(object_chroma)
             product = (squared_saturation * dot(limited_chroma, limited_chroma)).clamp(min=EPSILON).sqrt()
             relative = (product + GREY_CHROMA**2) / (squared_saturation + GREY_CHROMA**2)
             changed = torch.addcmul(changed, share * relative.clamp(0.0, 1.5), self.colours[:, k, :, None, None])

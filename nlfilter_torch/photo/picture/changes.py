@@ -5,9 +5,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from nlfilter_torch.core.precision import per_image
+from nlfilter_torch.core.precision import per_image, squarable
 from nlfilter_torch.operator.features import blur, reduce_channels
-from nlfilter_torch.photo.picture.colour import limited
 
 VARIANCE_SIGMA = 2.0  # standard deviation in pixels of the Gaussian window for the local variance
 EPSILON = 1e-12
@@ -28,7 +27,7 @@ def limit_by_activity(changes: Tensor, activity: Tensor, threshold: float | Tens
 
 def activity(image: Tensor) -> Tensor:
     """Local variance (B, 1, H, W) of the luminance of an image."""
-    grey = limited(reduce_channels(image, "luminance").mean(1, keepdim=True))
+    grey = squarable(reduce_channels(image, "luminance").mean(1, keepdim=True))
     mean, square = blur(torch.cat([grey, grey.square()], dim=1), VARIANCE_SIGMA).chunk(2, dim=1)
     return (square - mean.square()).clamp(min=0)
 

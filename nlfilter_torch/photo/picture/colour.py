@@ -9,7 +9,6 @@ from torch import Tensor
 from nlfilter_torch.operator.features import reduce_channels
 
 LIGHTNESS = 0.3  # weight of lightness relative to hue and saturation: a fold in a red cloth is still red
-LARGEST_VALUE = 1e9  # limit of values that are squared
 CHUNK = 8192  # pixels converted at once by one thread
 VECTOR_LENGTH = 64  # a multiple of the SIMD width in floats
 
@@ -75,11 +74,6 @@ def dot(a: Tensor, b: Tensor, dim: int = 1) -> Tensor:
     for part_a, part_b in rest:
         total = torch.addcmul(total, part_a, part_b)
     return total
-
-
-def limited(values: Tensor) -> Tensor:
-    """Limit values so that products of four of them are finite numbers of single precision."""
-    return values.clamp(-LARGEST_VALUE, LARGEST_VALUE)
 
 
 def group_colours(chroma: Tensor, weights: Tensor) -> tuple[Tensor, Tensor, Tensor]:

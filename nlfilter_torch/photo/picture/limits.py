@@ -12,9 +12,10 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from nlfilter_torch.core.precision import squarable
 from nlfilter_torch.core.torch_internals import is_hidden
 from nlfilter_torch.operator.features import reduce_channels
-from nlfilter_torch.photo.picture.colour import limited, split_luminance
+from nlfilter_torch.photo.picture.colour import split_luminance
 
 HEADROOM_SHARE = 0.9  # share of its headroom towards white or black that a channel may use
 LEVEL = 1 / 255  # distance kept from white and black, an 8-bit level, so that rounding does not clip
@@ -157,7 +158,7 @@ def _chroma(image: Tensor, moved: Tensor, restraint: float | Tensor, curve: Tens
     if moved.shape[1] == image.shape[1]:
         return image.new_zeros(len(image), 3, *image.shape[2:])
     less, more = _saturation(image, _bent(_before(image, moved), _restrained(image, moved, restraint), curve))
-    colours = limited(split_luminance(image)[1])
+    colours = squarable(split_luminance(image)[1])
     chroma = colours.square().sum(1, keepdim=True).clamp(min=EPSILON).sqrt()
     return torch.cat([-less * chroma, more * chroma, chroma], dim=1)
 
