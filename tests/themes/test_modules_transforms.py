@@ -90,7 +90,7 @@ def test_a_compiled_layer_takes_other_sizes_without_compiling_again() -> None:
     fast = torch.compile(layer, backend="aot_eager", fullgraph=True, dynamic=True)
     fast(noise(2, 3, 24, 32, dtype=torch.float32))
     with torch.compiler.set_stance("fail_on_recompile"):
-        for shape in ((3, 3, 40, 29), (2, 3, 96, 80)):
+        for shape in ((3, 3, 40, 29), (2, 3, 96, 90), (2, 3, 150, 130)):
             picture = noise(*shape, dtype=torch.float32)
             expected, result = layer(picture), fast(picture)
             torch.testing.assert_close(result, expected, atol=1e-5, rtol=0)

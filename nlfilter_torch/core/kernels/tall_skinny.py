@@ -15,6 +15,7 @@ from nlfilter_torch.core.torch_internals import register
 FEW = range(1, 9)  # numbers of rows for which the kernels in C are fastest
 MOST_SPREAD = 9  # with more rows than this, undivided products are no slower
 MOST_GATHERED = 24
+COMPILED_BLOCKS = 8  # of the sums of a compiled program, for images of any size
 
 
 def _compiled_spread(rows: Tensor, factor: Tensor, scaling: Tensor | None = None) -> Tensor | None:
@@ -91,10 +92,13 @@ def moment(factor: Tensor, images: Tensor) -> Tensor:
 
     A float32 sum over a million pixels would lose the difference between row sums of 1 and 1.001.
     """
-    batch, landmarks, _ = factor.shape
-    step = block_length(batch, factor.device, SWEPT)
+    batch, landmarks, pixels = factor.shape
     total = factor.new_zeros(batch, landmarks, images.shape[1], dtype=torch.float64)
     # Splitting, unlike slicing, keeps the backward pass linear in the number of blocks.
+    if torch.compiler.is_compiling():  # a number of blocks that depends on the size would compile each number anew
+        step = -(-pixels // COMPILED_BLOCKS)
+    else:
+        step = block_length(batch, factor.device, SWEPT)
     for rows, part in zip(factor.split(step, dim=2), images.split(step, dim=2), strict=True):
         total = total + gather(part, rows).mT
     return total
