@@ -95,10 +95,9 @@ def moment(factor: Tensor, images: Tensor) -> Tensor:
     batch, landmarks, pixels = factor.shape
     total = factor.new_zeros(batch, landmarks, images.shape[1], dtype=torch.float64)
     # Splitting, unlike slicing, keeps the backward pass linear in the number of blocks.
-    if torch.compiler.is_compiling():  # a number of blocks that depends on the size would compile each number anew
-        step = -(-pixels // COMPILED_BLOCKS)
-    else:
-        step = block_length(batch, factor.device, SWEPT)
+    # A number of blocks that depends on the size would be compiled anew for each number.
+    compiled = torch.compiler.is_compiling()
+    step = -(-pixels // COMPILED_BLOCKS) if compiled else block_length(batch, factor.device, SWEPT)
     for rows, part in zip(factor.split(step, dim=2), images.split(step, dim=2), strict=True):
         total = total + gather(part, rows).mT
     return total
