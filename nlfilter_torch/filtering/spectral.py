@@ -120,7 +120,8 @@ def _coefficients(spectrum: Spectrum, image: Tensor, coefficients: Tensor | None
 
 def _with_remainder(spectrum: Spectrum, image: Tensor, response: Response, coefficients: Tensor) -> Tensor:
     """``V f(S) V^T y + f(r) (y - V V^T y)``: W multiplies by r what the factor maps to 0."""
-    captured, filtered = (shaped_as(image, spectrum.synthesize(f, coefficients)) for f in (torch.ones_like, response))
+    parts = spectrum.synthesize_each((torch.ones_like, response), coefficients)
+    captured, filtered = (shaped_as(image, part) for part in parts)
     remainder = torch.zeros_like(spectrum.scaling) if spectrum.remainder is None else spectrum.remainder
     gain = response(remainder.clamp(0.0, 1.0)).unflatten(1, image.shape[2:]).unsqueeze(1)
     check_finite(gain, "response")

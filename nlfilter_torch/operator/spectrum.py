@@ -244,12 +244,17 @@ class Spectrum(Batch, RitzPairs):
     @full_precision
     def synthesize(self, response: Response, coefficients: Tensor) -> Tensor:
         """Compute ``V f(S) V^T y``, (B, C, ...), from a response f and coefficients (B, C, M) of y."""
+        return self.synthesize_each((response,), coefficients)[0]
+
+    def synthesize_each(self, responses: Sequence[Response], coefficients: Tensor) -> tuple[Tensor, ...]:
+        """:meth:`synthesize` for several responses, in one read of the factor."""
         check_coefficients(coefficients, self.factor)
         count = coefficients.shape[0]
         total = fold_batch(coefficients.unsqueeze(3), self.factor.shape[0])  # (B, C, M)
-        filtered = total @ self.gain(response).mT
+        filtered = torch.cat([total @ self.gain(response).mT for response in responses], dim=1)
         planes = spread(filtered.to(self.factor), self.factor, self.scaling)
-        return unfold_batch(planes.unsqueeze(1), count, self.size)[:, 0]
+        parts = planes.chunk(len(responses), dim=1)
+        return tuple(unfold_batch(part.unsqueeze(1), count, self.size)[:, 0] for part in parts)
 
     def _constant_first(self, vectors: Tensor) -> Tensor:
         """Reflect the eigenvectors (B, M, R) of the eigenvalue 1 so that the first of them is the constant image."""
