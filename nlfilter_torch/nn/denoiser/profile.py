@@ -1,0 +1,157 @@
+"""The noise of a photograph by scale, plane and brightness, which tells noise of cameras from white noise."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from nlfilter_torch.core.checks import check_image, check_same_size
+from nlfilter_torch.core.precision import full_precision, per_image, working_dtype
+from nlfilter_torch.nn.denoiser.colours import split_colours
+
+KNOTS = 6  # brightnesses at which levels are known: 0, 0.2, ... 1
+STIFFNESS = 4  # number of blocks that outweigh the assumption that variances at neighbouring knots are the same
+STIFFEST = 1e-4  # the same as a share of all blocks, which keeps the fit well-conditioned
+
+
+@dataclass(frozen=True)
+class NoiseProfile:
+    """Noise by scale, plane and brightness.
+
+    Cameras smooth and compress the noise of their sensors, so that it is coarser than white noise, most of all in
+    colour. The level at scale s is the standard deviation of the noise's means over blocks of s x s pixels, times s:
+    white noise has the same level at every scale.
+
+    Attributes:
+        levels: (B, S, 2, K), not negative, in units of the image: at S scales (:attr:`SCALES`), of the luminance (mean
+            of the channels) and of the colour differences (of unit norm, root mean square of both), at K brightnesses
+            from 0 to 1, linear in between. Grey images have no colour differences: their levels are 0.
+        light: mean brightness (B,) of the photograph.
+
+    Example:
+        >>> profile = NoiseProfile.white(torch.tensor([0.1]))
+        >>> profile.levels.shape, profile.level, profile.coarseness
+        (torch.Size([1, 5, 2, 6]), tensor([0.1000]), tensor([1.]))
+    """
+
+    SCALES: ClassVar[tuple[int, ...]] = (1, 2, 4, 8, 16)
+    levels: Tensor
+    light: Tensor
+
+    @classmethod
+    def white(cls, level: Tensor, *, channels: int = 3) -> "NoiseProfile":
+        """Return white noise with standard deviation ``level`` (B,) in every channel, at every brightness."""
+        planes = [level / 3**0.5, level] if channels == 3 else [level, torch.zeros_like(level)]
+        levels = torch.stack(planes, dim=1)[:, None, :, None].expand(-1, len(cls.SCALES), -1, KNOTS)
+        return cls(levels, torch.full_like(level, 0.5))
+
+    @property
+    def level(self) -> Tensor:
+        """Standard deviation (B,) of a pixel's channels, at the mean brightness."""
+        return self._deviation(0)
+
+    @property
+    def coarseness(self) -> Tensor:
+        """Level (B,) at scale 4 over that at scale 1, at the mean brightness: 1 for white noise, up to 4 for blotches.
+
+        1 where there is no noise.
+        """
+        fine, coarse = self._deviation(0), self._deviation(2)
+        return torch.where(fine > 0, coarse / torch.where(fine > 0, fine, 1.0), 1.0)
+
+    def scaled(self, factor: float | Tensor) -> "NoiseProfile":
+        """Return noise that is stronger by a factor, a number or a tensor of shape () or (B,)."""
+        return replace(self, levels=self.levels * per_image(factor, self.levels, 4))
+
+    @full_precision
+    def at(self, image: Tensor, scales: Sequence[int] = SCALES) -> Tensor:
+        """Levels at the pixels of an image (B, C, H, W), by the mean brightness of 5x5 pixels.
+
+        Returns:
+            (B, 2 S, H, W): luminance and colour differences at the first of the scales, then at the next.
+        """
+        light = F.avg_pool2d(image.detach(), 5, 1, padding=2, count_include_pad=False).mean(1, keepdim=True)
+        positions = light.clamp(0, 1) * (KNOTS - 1)
+        chosen = self.levels[:, [self.SCALES.index(scale) for scale in scales]].to(image)
+        first, *others = chosen.flatten(1, 2).unbind(2)
+        # Linear interpolation, as a sum of ramps between the knots: their slopes are constant.
+        levels, previous = first[..., None, None].expand(-1, -1, *image.shape[-2:]), first
+        for knot, values in enumerate(others):
+            levels = levels + (values - previous)[..., None, None] * (positions - knot).clamp(0, 1)
+            previous = values
+        return levels
+
+    def _deviation(self, scale: int) -> Tensor:
+        """Root mean square (B,) of a pixel's channels at the scale of that index, at the mean brightness."""
+        position = self.light.clamp(0, 1) * (KNOTS - 1)
+        below = position.floor().clamp(max=KNOTS - 2)
+        share = (position - below)[:, None]
+        places = below.long()[:, None, None].expand(-1, 2, 1)
+        levels = self.levels[:, scale]
+        ends = levels.gather(2, places).squeeze(2), levels.gather(2, places + 1).squeeze(2)
+        luminance, colour = torch.lerp(ends[0], ends[1], share).square().unbind(1)
+        # The differences have coefficients of unit norm: their variances are shared by the three channels.
+        return (luminance + 2 / 3 * colour).sqrt()
+
+
+@torch.no_grad()
+@full_precision
+def profile_of_difference(noisy: Tensor, clean: Tensor) -> NoiseProfile:
+    """Measure the noise of a photograph as its difference from a clean one.
+
+    Args:
+        noisy: (B, C, H, W), in [0, 1] apart from the noise.
+        clean: the same photograph without noise.
+
+    Returns:
+        The noise. At brightnesses that do not occur, levels are those of the nearest ones that do. Levels at scale s
+        are uncertain by 1 / sqrt(2 n) of their value, with n the number of blocks of s x s pixels.
+
+    Raises:
+        TypeError, ValueError: if an image is not a finite floating-point (B, C, H, W) tensor, or sizes differ.
+
+    Example:
+        >>> clean = torch.full((1, 3, 64, 64), 0.4)
+        >>> noise = torch.randn(1, 3, 64, 64, generator=torch.Generator().manual_seed(0))
+        >>> profile_of_difference(clean + 0.1 * noise, clean).level.round(decimals=2)
+        tensor([0.1000])
+    """
+    check_image(noisy, "noisy")
+    check_image(clean, "clean", batch=noisy.shape[0], channels=noisy.shape[1])
+    check_same_size(clean, (noisy.shape[-2], noisy.shape[-1]), "clean", "noisy")
+    dtype = working_dtype(noisy)
+    picture = clean.to(dtype)
+    planes = _planes_of(noisy.to(dtype) - picture)
+    light = picture.mean(1, keepdim=True).clamp(0, 1)
+    levels = [_levels(planes, light, scale) for scale in NoiseProfile.SCALES]
+    return NoiseProfile(torch.stack(levels, dim=1), light.mean((1, 2, 3)))
+
+
+def _planes_of(difference: Tensor) -> tuple[Tensor, Tensor]:
+    """Luminance and colour differences of a difference of images; channels of other than 3 count as luminances."""
+    if difference.shape[1] != 3:
+        return difference, torch.zeros_like(difference[:, :1])
+    planes, _ = split_colours(difference, difference[:, :1].abs())
+    return planes[:, :1], planes[:, 1:]
+
+
+def _levels(planes: tuple[Tensor, Tensor], light: Tensor, scale: int) -> Tensor:
+    """Levels (B, 2, K) of block means at a scale, from planes (B, n, H, W) and the brightness (B, 1, H, W).
+
+    Variances that are linear between the knots are fitted by least squares.
+    """
+    size = [min(scale, length) for length in light.shape[-2:]]
+    stride = [max(1, length // 2) for length in size]
+    knots = torch.arange(KNOTS, dtype=light.dtype, device=light.device)
+    positions = F.avg_pool2d(light, size, stride) * (KNOTS - 1)
+    weights = (1 - (positions - knots.view(1, -1, 1, 1)).abs()).clamp(min=0)  # (B, K, h, w)
+    energies = [F.avg_pool2d(plane, size, stride).square().mean(1, keepdim=True) for plane in planes]
+    squares = torch.einsum("bkhw,blhw->bkl", weights, weights)
+    slopes = torch.eye(KNOTS).to(light).diff(dim=0)
+    sums = torch.stack([(weights * energy).sum((2, 3)) for energy in energies], dim=2)
+    stiffness = (STIFFEST * squares.sum((1, 2), keepdim=True)).clamp(min=STIFFNESS)
+    variances = torch.linalg.solve(squares + stiffness * (slopes.mT @ slopes), sums).mT
+    return (variances.clamp(min=0) * (size[0] * size[1])).sqrt()
