@@ -1,0 +1,1 @@
+"""Comparison of denoisers on photographs, public sets and repeated patterns: ``python -m benchmarks.denoising``."""
