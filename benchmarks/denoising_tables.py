@@ -1,16 +1,18 @@
 """Tables of denoisers: ``python -m benchmarks.denoising_tables FILE [--docs FILE]``.
 
 FILE is the JSON of ``python -m benchmarks.denoising --out FILE``. Prints means over photographs of PSNR in dB, SSIM and
-CPU seconds, and writes them between the markers of ``--docs``.
+CPU seconds, and writes them between the markers of ``--docs``. Those of a public set (``--set``) are printed beside
+published figures, and have markers of their own.
 """
 
 import argparse
 import json
 import statistics
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from benchmarks.denoising.sets import set_table
 from benchmarks.report import between, table
 from nlfilter_torch.photo.io.writing import open_beside
 
@@ -48,17 +50,34 @@ def tables(results: Results, figures: Sequence[tuple[str, str, str]]) -> str:
     return "\n\n".join(parts)
 
 
+def tables_of(content: Mapping[str, Any]) -> str:
+    """The tables of a file, with published figures if it is of a public set."""
+    if "set" not in content:
+        return tables(dict(content), [("", "psnr", ".2f"), ("SSIM", "ssim", ".3f"), ("CPU s", "seconds", ".1f")])
+    kinds = dict.fromkeys(key.split(", ")[0] for key in content["results"])
+    return "\n\n".join(set_table(content, kind, quoted=True) for kind in kinds)
+
+
+def markers_of(content: Mapping[str, Any]) -> tuple[str, str]:
+    """The lines of a page between which the tables of a file are."""
+    if "set" not in content:
+        return MARKERS
+    begin, end = (marker.replace("denoising", content["set"].lower(), 1) for marker in MARKERS)
+    return begin, end
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """Print the tables, and write them to files."""
     parser = argparse.ArgumentParser(description="Tables from the comparison of denoisers.")
     parser.add_argument("file", type=Path, help="JSON of python -m benchmarks.denoising")
     parser.add_argument("--docs", type=Path, help="file in which the text between the markers becomes the tables")
     options = parser.parse_args(arguments)
-    results: Results = json.loads(options.file.read_text())
-    text = tables(results, [("", "psnr", ".2f"), ("SSIM", "ssim", ".3f"), ("CPU s", "seconds", ".1f")])
+    content = json.loads(options.file.read_text())
+    text = tables_of(content)
     if options.docs is not None:
+        page = between(options.docs.read_text(), text, *markers_of(content))
         with open_beside(options.docs) as stream:
-            stream.write(between(options.docs.read_text(), text, *MARKERS).encode())
+            stream.write(page.encode())
     print(text)
 
 

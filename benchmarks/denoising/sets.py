@@ -12,6 +12,7 @@ import statistics
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from textwrap import fill
 from typing import Any
 
 import numpy as np
@@ -162,7 +163,7 @@ def set_table(content: Mapping[str, Any], kind: str, *, quoted: bool) -> str:
     pictures = next(iter(results[f"{kind}, {levels[0]}"].values()))
     sources = dict.fromkeys(entry.source for entry in entries)
     notes = [f"Means over {len(pictures)} pictures.", *(f"{source}: {SOURCES[source]}." for source in sources)]
-    return f"{table(header, rows)}\n\n{' '.join(notes)}"
+    return f"{table(header, rows)}\n\n{fill(' '.join(notes), 120, break_on_hyphens=False)}"
 
 
 def _measured_row(content: Mapping[str, Any], kind: str, method: str, levels: Sequence[int]) -> list[str]:

@@ -10,9 +10,9 @@ import torch.nn.functional as F
 from safetensors.torch import load_file
 from torch import Tensor
 
-from benchmarks import denoising, denoising_tables, train_denoiser
+from benchmarks import train_denoiser
 from benchmarks.denoiser_crops import LARGEST, PICTURES, RIGHT_HALVES, Crops
-from benchmarks.denoising import HELD_OUT, LEFT_HALVES, Case, decibels, scenes, table, with_noise
+from benchmarks.denoising.cases import HELD_OUT, LEFT_HALVES
 from benchmarks.train_denoiser import EXPECTED, PlainDenoiser, Training, errors, loss_of, main, rate_at
 from nlfilter_torch import NonlocalDenoiser
 
@@ -175,55 +175,6 @@ def test_textures_are_up_to_the_given_contrast() -> None:
 
 def test_nothing_that_is_judged_is_trained_on() -> None:
     assert set(PICTURES) & set(HELD_OUT) == set(RIGHT_HALVES) == set(LEFT_HALVES)
-
-
-def test_scores_are_decibels_of_the_squared_error(capsys: pytest.CaptureFixture[str]) -> None:
-    clean = torch.full((1, 1, 16, 16), 0.5)
-    case = Case("grey", clean, clean + 0.1, 0.1)
-    rows = table({"noisy": lambda case: case.noisy, "half": lambda case: case.noisy - 0.05}, [case])
-    assert rows["noisy"]["grey"].psnr == pytest.approx(20, abs=1e-4)
-    assert rows["half"]["grey"].psnr == pytest.approx(26.0206, abs=1e-3)
-    assert capsys.readouterr().out.splitlines()[1].split()[:3] == ["noisy", "20.00", "20.00"]
-    assert decibels(0.01) == pytest.approx(20)
-
-
-def test_scenes_are_grey_or_in_colour_and_have_noise_of_their_own() -> None:
-    grey, coloured = (scenes(None, kind, quick=False) for kind in ("grey", "colour"))
-    assert tuple(grey) == HELD_OUT
-    assert "camera" not in coloured
-    assert all(picture.shape[1] == 1 for picture in grey.values())
-    first, second = (with_noise(grey["camera"], 0.1, number) for number in (0, 1))
-    assert not torch.equal(first, second)
-    assert float((first - grey["camera"]).std()) == pytest.approx(0.1, rel=0.01)
-
-
-def test_the_benchmark_runs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    out = tmp_path / "figures.json"
-    denoising.main(["--quick", "--noise", "25", "--methods", "noisy", "ours", "--wrong", "--out", str(out)])
-    figures = json.loads(out.read_text())
-    assert set(figures) == {"grey, 25", "colour, 25"}
-    assert figures["grey, 25"]["ours"]["camera"]["psnr"] > figures["grey, 25"]["noisy"]["camera"]["psnr"]
-    printed = capsys.readouterr().out
-    assert "estimated noise" in printed
-    denoising.main(["--quick", "--noise", "25", "--kinds", "grey", "--methods", "rule", "--out", str(out)])
-    assert set(json.loads(out.read_text())["grey, 25"]) == {"noisy", "ours", "rule"}
-
-    page = tmp_path / "page.md"
-    page.write_text("above\n{}\n{}\nbelow".format(*denoising_tables.MARKERS))
-    denoising_tables.main([str(out), "--docs", str(page)])
-    lines = page.read_text().splitlines()
-    assert (lines[0], lines[-1]) == ("above", "below")
-    row = next(line for line in lines if line.startswith("| ours"))
-    mean = sum(result["psnr"] for result in figures["grey, 25"]["ours"].values()) / 2
-    assert f"{mean:.2f}" in row
-
-
-def test_a_file_without_the_markers_of_the_tables_is_refused(tmp_path: Path) -> None:
-    page, figures = tmp_path / "page.md", tmp_path / "figures.json"
-    page.write_text("no markers")
-    figures.write_text('{"grey, 25": {"ours": {"camera": {"psnr": 30.0, "ssim": 0.9, "seconds": 1.0}}}}')
-    with pytest.raises(ValueError, match="the file must hold the lines '<!-- denoising"):
-        denoising_tables.main([str(figures), "--docs", str(page)])
 
 
 @pytest.mark.parametrize(
