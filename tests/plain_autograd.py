@@ -11,7 +11,7 @@ from torch import Tensor
 
 from nlfilter_torch.core.kernels.columns import SMALLEST_EXPONENT
 from nlfilter_torch.operator.features import GuideFeatures, patch_window
-from nlfilter_torch.operator.landmarks import choose_landmarks
+from nlfilter_torch.operator.landmarks import assign_landmarks
 from nlfilter_torch.operator.nystrom import JITTER
 
 RELAXATION = 2.0 / 3.0
@@ -60,7 +60,7 @@ def plain_filter(
     weights = patch_window(patch_size).to(guide) if patch_weights is None else patch_weights / patch_weights.sum()
     features = GuideFeatures(weights, photometric_bandwidth, spatial_bandwidth, "all")(guide)
     size = (guide.shape[2], guide.shape[3])
-    landmarks = choose_landmarks(features, size, num_landmarks, "kmeans", None)
+    landmarks, _ = assign_landmarks(features, size, num_landmarks, "kmeans", None)
     between = affinity(landmarks.double(), landmarks.double())  # (B, M, M), in float64 as it is badly conditioned
     identity = torch.eye(num_landmarks, dtype=torch.float64)
     lower = torch.linalg.cholesky(between + JITTER * identity)

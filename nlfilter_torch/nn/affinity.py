@@ -15,7 +15,7 @@ from nlfilter_torch.nn.parameters import Learnable, UnitWindow, check_learn, pos
 from nlfilter_torch.operator.assignment import Assignment
 from nlfilter_torch.operator.build import nonlocal_operator
 from nlfilter_torch.operator.features import GuideFeatures, estimate_bandwidth, unit_window
-from nlfilter_torch.operator.landmarks import choose_landmarks
+from nlfilter_torch.operator.landmarks import assign_landmarks
 from nlfilter_torch.operator.operator import NonlocalOperator
 from nlfilter_torch.operator.option_checks import check_options, count_of
 from nlfilter_torch.operator.options import (
@@ -199,7 +199,7 @@ class NonlocalAffinity(Learnable):
             kept = counts.nonzero().squeeze(1)
             features, counts, size = features[:, :, kept], counts[kept].unsqueeze(0), (1, len(kept))
         count = min(self.num_landmarks, features.shape[2])
-        chosen = choose_landmarks(features, size, count, self.landmarks, self.generator, weights=counts)
+        chosen, _ = assign_landmarks(features, size, count, self.landmarks, self.generator, weights=counts)
         self.held.keep(chosen, recipe)
 
     def _held(self, hold: Hold | None, landmarks: Landmarks) -> HeldAssignment | HeldFeatures | None:

@@ -34,7 +34,7 @@ from nlfilter_torch.operator.features import (
     unit_window,
 )
 from nlfilter_torch.operator.held import landmarks_by
-from nlfilter_torch.operator.landmarks import choose_landmarks
+from nlfilter_torch.operator.landmarks import assign_landmarks
 from nlfilter_torch.operator.nystrom import inverse_cholesky
 from nlfilter_torch.operator.operator import Kernel, NonlocalOperator
 from nlfilter_torch.operator.option_checks import check_bandwidths, check_construction, check_options, landmark_count
@@ -352,7 +352,7 @@ def sampled_operator(
     window = unit_window(patch_size, None).to(guide)
     recipe = GuideFeatures(window, photometric_bandwidth, spatial_bandwidth, "luminance")
     features, size = recipe(guide), (guide.shape[2], guide.shape[3])
-    chosen = choose_landmarks(features, size, num_landmarks, landmarks, generator)
+    chosen, _ = assign_landmarks(features, size, num_landmarks, landmarks, generator)
     count = len(places)
     weights = guide.new_full((1, count), features.shape[2] / count)
     return _assemble(features[:, :, places], (1, count), method, recipe=recipe, weights=weights, chosen=chosen)

@@ -43,19 +43,6 @@ LARGEST = 1e16  # limit of features: sums of their squares do not overflow float
 MANY = 1 << 24  # a permutation of more pixels than this would take more memory than the image
 
 
-def choose_landmarks(
-    features: Tensor,
-    size: tuple[int, ...],
-    count: int,
-    sampling: Sampling,
-    generator: torch.Generator | None,
-    communicator: Communicator = ALONE,
-    weights: Tensor | None = None,
-) -> Tensor:
-    """The landmarks (B, D, M) of :func:`assign_landmarks`."""
-    return assign_landmarks(features, size, count, sampling, generator, communicator, weights)[0]
-
-
 def assign_landmarks(
     features: Tensor,
     size: tuple[int, ...],

@@ -26,7 +26,7 @@ from nlfilter_torch.operator.eigenvalue_bound import largest_eigenvalue, shifted
 from nlfilter_torch.operator.features import GuideFeatures
 from nlfilter_torch.operator.nystrom import nystrom_factor
 from nlfilter_torch.operator.options import Completion
-from nlfilter_torch.operator.products import apply_powers
+from nlfilter_torch.operator.pixel_matrix import PixelMatrix
 from nlfilter_torch.operator.scaling import KernelMatrix, PixelScaling
 from nlfilter_torch.operator.spectrum import Spectrum, compute_spectrum
 
@@ -316,8 +316,8 @@ class NonlocalOperator(Batch):
         folded = fold_batch(trainable(image).to(self.factor), self.factor.shape[0])
         if folded.numel() == 0:  # an empty batch
             return image[:0].to(self.factor).unsqueeze(1).expand(-1, order, *image.shape[1:])
-        planes = apply_powers(self.factor, self.scaling, self.remainder, folded, order, self.communicator, self.weights)
-        return unfold_batch(planes, image.shape[0], image.shape[2:])
+        matrix = PixelMatrix(self.factor, self.scaling, self.remainder, self.communicator, self.weights)
+        return unfold_batch(matrix.powers(folded, order), image.shape[0], image.shape[2:])
 
     @property
     def diagonal_share(self) -> Tensor:

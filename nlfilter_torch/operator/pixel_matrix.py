@@ -1,4 +1,4 @@
-"""W of some points as a matrix: products, solutions of shifted systems, and the gradient of both.
+"""W of some points as a matrix: products, powers, solutions of shifted systems, and their gradients. Paper: eq. (13).
 
 With ``W = D U^T U D Omega + R`` (scaling D, weights Omega of the points, diagonal part R), the identity of Woodbury
 gives ``(W + t I)^-1 y = (R + t)^-1 (y - D U^T C^-1 U D Omega (R + t)^-1 y)`` with the M x M matrix
@@ -6,6 +6,7 @@ gives ``(W + t I)^-1 y = (R + t)^-1 (y - D U^T C^-1 U D Omega (R + t)^-1 y)`` wi
 """
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -15,7 +16,8 @@ from nlfilter_torch.core.communicator import Communicator
 from nlfilter_torch.core.kernels.grams import compute_grams
 from nlfilter_torch.core.kernels.tall_skinny import moment, spread
 from nlfilter_torch.core.low_rank import outer_product
-from nlfilter_torch.core.torch_internals import is_hidden
+from nlfilter_torch.core.precision import once_differentiable
+from nlfilter_torch.core.torch_internals import for_each_gradient, in_transform, is_hidden
 
 SMALL = 1 << 17  # pixels up to which Gram matrices are summed in float64 throughout
 ROWS = 8  # images in one product; the kernels in C are fastest for at most so many
@@ -64,7 +66,31 @@ class PixelMatrix:
 
     def product(self, planes: Tensor) -> Tensor:
         """``W y`` for planes y, (B, C, N)."""
-        return torch.addcmul(self._spread(self._sums(planes)), self.remainder.unsqueeze(1), planes)
+        return self._product(planes, self._sums(planes))
+
+    def _product(self, planes: Tensor, sums: Tensor) -> Tensor:
+        """:meth:`product`, from the sums of the planes."""
+        return torch.addcmul(self._spread(sums), self.remainder.unsqueeze(1), planes)
+
+    def powers(self, planes: Tensor, order: int) -> Tensor:
+        """``W y, W^2 y, ..., W^k y``, (B, k, C, N), for planes y, (B, C, N); of W itself, not of its transpose.
+
+        Differentiable in W and the planes. If W needs no gradient, differentiable any number of times in the planes,
+        also in forward mode.
+        """
+        if self.needs_gradient and not in_transform():  # which needs ordinary operations
+            parts = self.factor, self.scaling, self.remainder
+            result: Tensor = _Powers.apply(*parts, self.communicator, self.weights, planes, order)  # type: ignore[no-untyped-call]
+            return result
+        return torch.stack(self.powers_and_sums(planes, order)[0][1:], dim=1)
+
+    def powers_and_sums(self, planes: Tensor, order: int) -> tuple[list[Tensor], list[Tensor]]:
+        """The k + 1 planes ``y, ..., W^k y``, and the sums (B, M, C) of all but the last, as ordinary operations."""
+        images, sums = [planes], []
+        for _ in range(order):
+            sums.append(self._sums(images[-1]).to(self.factor))
+            images.append(self._product(images[-1], sums[-1]))
+        return images, sums
 
     def capacitances(self, shifts: Tensor) -> Tensor:
         """Inverses of C for positive shifts (J,), (B, J, M, M) in float64; without a gradient."""
@@ -122,3 +148,45 @@ class PixelMatrix:
         grad_scaling = (left * spread(moments.mT, self.factor) + summed * spread(totals.mT, self.factor)).sum(1)
         grad_factor = outer_product(torch.cat([moments, totals], dim=2), torch.cat([d * left, d * summed], dim=1))
         return grad_factor, grad_scaling, (left * right).sum(1)
+
+
+class _Powers(torch.autograd.Function):
+    """Powers of W with a single matrix product as gradient of the factor; autograd would form 2k full matrices.
+
+    With ``P_i = W P_(i-1)`` and, backwards, ``A_(i-1) = G_(i-1) + W^T A_i``, the loss changes by ``sum_i A_i^T dW
+    P_(i-1)``. Weights multiply the columns of W.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, *arguments: Any) -> Tensor:
+        *parts, planes, order = arguments
+        images, moments = PixelMatrix(*parts).powers_and_sums(planes, order)
+        factor, scaling, remainder, ctx.communicator, weights = parts
+        ctx.save_for_backward(factor, scaling, remainder, weights, *images, *moments)
+        return torch.stack(images[1:], dim=1)
+
+    @staticmethod
+    @for_each_gradient
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        factor, scaling, remainder, weights, *rest = ctx.saved_tensors
+        order = len(rest) // 2
+        images, moments = rest[: order + 1], rest[order + 1 :]
+        d, r = scaling.unsqueeze(1), remainder.unsqueeze(1)
+        grad_scaling, grad_remainder = torch.zeros_like(scaling), torch.zeros_like(remainder)
+        left, right = [], []  # columns (B, M, C) and rows (B, C, N) whose product is the gradient of the factor
+        adjoint = torch.zeros_like(images[0])
+        for i in range(order, 0, -1):
+            adjoint = adjoint + grad[:, i - 1]
+            before = images[i - 1]
+            total = ctx.communicator.sum(moment(factor, d * adjoint)).to(factor)
+            affinity = spread(total.mT, factor)  # the image of the adjoint, before scaling
+            summed = weighted(before, weights)
+            # The scaling multiplies the factor on both sides; each side contributes a product with the other.
+            grad_scaling += (adjoint * spread(moments[i - 1].mT, factor) + summed * affinity).sum(1)
+            grad_remainder += (adjoint * before).sum(1)
+            left += [moments[i - 1], total]
+            right += [d * adjoint, d * summed]
+            adjoint = weighted(d * affinity, weights) + r * adjoint
+        grad_factor = outer_product(torch.cat(left, dim=2), torch.cat(right, dim=1))
+        return grad_factor, grad_scaling, grad_remainder, None, None, adjoint, None

@@ -12,9 +12,9 @@ from nlfilter_torch.operator.landmarks import (
     _pivots,
     _sums_by_product,
     _sums_in_order,
+    assign_landmarks,
     candidate_pixels,
     choose_in_graph,
-    choose_landmarks,
     condense,
 )
 from nlfilter_torch.operator.nystrom import inverse_cholesky, nystrom_factor
@@ -27,6 +27,10 @@ SAMPLINGS = ("kmeans", "uniform", "random")
 
 def seeded(seed: int = 0) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
+
+
+def choose_landmarks(*arguments: Any) -> torch.Tensor:
+    return assign_landmarks(*arguments)[0]
 
 
 def cloud(batch: int = 1, pixels: int = HEIGHT * WIDTH, seed: int = 0) -> torch.Tensor:

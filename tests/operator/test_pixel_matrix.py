@@ -2,11 +2,14 @@
 
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 from torch import Tensor
+from torch.autograd import gradgradcheck
 
-from nlfilter_torch import NonlocalOperator, operator_from_features
+from nlfilter_torch import NonlocalOperator, nonlocal_operator, operator_from_features, polynomial_filter
 from nlfilter_torch.operator.pixel_matrix import PixelMatrix
-from tests.problems import noise
+from tests.problems import build, guides, noise, options
 
 SHIFTS = torch.tensor([1e-9, 1e-4, 0.3], dtype=torch.float64)
 
@@ -71,3 +74,41 @@ def test_the_gradient_is_that_of_autograd(weighted: bool) -> None:
         grads: tuple[Tensor, ...] = matrix.gradient(left, right)
     for part, grad in zip(parts, grads, strict=True):
         torch.testing.assert_close(part.grad, grad + torch.zeros_like(part))
+
+
+@given(guide=guides(), chosen=options, channels=st.integers(1, 4))
+def test_product_is_that_of_the_dense_matrix_and_keeps_the_mean(
+    guide: torch.Tensor, chosen: dict[str, object], channels: int
+) -> None:
+    operator = build(guide, **chosen)
+    image = noise(guide.shape[0], channels, *guide.shape[2:], seed=1)
+    filtered = operator @ image
+    dense = (operator.to_dense() @ image.flatten(2).mT).mT.reshape(image.shape)
+    torch.testing.assert_close(filtered, dense, atol=1e-10, rtol=0)
+    torch.testing.assert_close(operator.matmul(image), filtered, atol=0, rtol=0)
+    torch.testing.assert_close(filtered.mean((2, 3)), image.mean((2, 3)), atol=1e-6, rtol=0)
+
+
+SIZE = (5, 4)
+ALPHA = (3.0, 0.5, 2.0, 1.05)
+# Without completion, the method itself breaks down at a small bandwidth.
+BANDWIDTHS = {"diagonal": 0.2, "none": 0.8}
+
+
+def small(channels: int = 1, seed: int = 0, batch: int = 1) -> Tensor:
+    return noise(batch, channels, *SIZE, seed=seed).requires_grad_()
+
+
+def small_operator(guide: Tensor, completion: str, **options: object) -> NonlocalOperator:
+    options = {"photometric_bandwidth": BANDWIDTHS[completion], "num_landmarks": 7, "patch_size": 3} | options
+    return nonlocal_operator(guide, completion=completion, guide_channels="all", **options)  # type: ignore[arg-type]
+
+
+def test_second_derivatives_in_image_and_alpha_of_a_fitted_operator() -> None:
+    operator = small_operator(small().detach(), "diagonal")
+    alpha = torch.tensor(ALPHA, dtype=torch.float64, requires_grad=True)
+
+    def call(image: Tensor, alpha: Tensor) -> Tensor:
+        return polynomial_filter(operator, image, alpha).square()
+
+    assert gradgradcheck(call, (small(seed=1), alpha))

@@ -49,10 +49,10 @@ def test_distance_does_not_count_unless_asked_for() -> None:
 
 def test_equal_frames_count_as_one(monkeypatch: pytest.MonkeyPatch) -> None:
     """Several equal references give the same result as one: balancing, means and noise are averages."""
-    monkeypatch.setattr("nlfilter_torch.operator.build.choose_landmarks", lambda features, *_: features[:, :, :1900:48])
-    monkeypatch.setattr(
-        "nlfilter_torch.operator.held.assign_landmarks", lambda features, *_: (features[:, :, :1900:48], None)
-    )
+    for module in ("build", "held"):
+        monkeypatch.setattr(
+            f"nlfilter_torch.operator.{module}.assign_landmarks", lambda features, *_: (features[:, :, :1900:48], None)
+        )
     frame = crop(90, 190)
     for step in STEPS:
         single, three = (FilmEdit((step,), [frame] * count, PASSES)(frame) for count in (1, 3))

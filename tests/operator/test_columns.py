@@ -1,20 +1,14 @@
-"""Columns of W, and products with it."""
+"""Columns of W."""
 
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
-from torch import Tensor
-from torch.autograd import gradgradcheck
 
 from nlfilter_torch import (
-    NonlocalOperator,
     nonlocal_operator,
     operator_from_features,
-    polynomial_filter,
 )
 from nlfilter_torch.operator.columns import Columns
-from tests.problems import build, guides, noise, options, picture, seeded
+from tests.problems import noise, picture, seeded
 
 
 def test_one_operator_evaluates_a_batch_of_points_and_several_operators_one_set() -> None:
@@ -67,45 +61,3 @@ def test_columns_are_differentiable_in_the_features_of_the_operator() -> None:
         step[0, 0, index] = 1e-5
         wanted = float(total(points + step) - total(points - step)) / 2e-5
         assert float(result[0, 0, index]) == pytest.approx(wanted, rel=1e-4, abs=1e-7)
-
-
-@given(guide=guides(), chosen=options, channels=st.integers(1, 4))
-def test_product_is_that_of_the_dense_matrix_and_keeps_the_mean(
-    guide: torch.Tensor, chosen: dict[str, object], channels: int
-) -> None:
-    operator = build(guide, **chosen)
-    image = noise(guide.shape[0], channels, *guide.shape[2:], seed=1)
-    filtered = operator @ image
-    dense = (operator.to_dense() @ image.flatten(2).mT).mT.reshape(image.shape)
-    torch.testing.assert_close(filtered, dense, atol=1e-10, rtol=0)
-    torch.testing.assert_close(operator.matmul(image), filtered, atol=0, rtol=0)
-    torch.testing.assert_close(filtered.mean((2, 3)), image.mean((2, 3)), atol=1e-6, rtol=0)
-
-
-SIZE = (5, 4)
-
-
-ALPHA = (3.0, 0.5, 2.0, 1.05)
-
-
-# Without completion, the method itself breaks down at a small bandwidth.
-BANDWIDTHS = {"diagonal": 0.2, "none": 0.8}
-
-
-def small(channels: int = 1, seed: int = 0, batch: int = 1) -> Tensor:
-    return noise(batch, channels, *SIZE, seed=seed).requires_grad_()
-
-
-def small_operator(guide: Tensor, completion: str, **options: object) -> NonlocalOperator:
-    options = {"photometric_bandwidth": BANDWIDTHS[completion], "num_landmarks": 7, "patch_size": 3} | options
-    return nonlocal_operator(guide, completion=completion, guide_channels="all", **options)  # type: ignore[arg-type]
-
-
-def test_second_derivatives_in_image_and_alpha_of_a_fitted_operator() -> None:
-    operator = small_operator(small().detach(), "diagonal")
-    alpha = torch.tensor(ALPHA, dtype=torch.float64, requires_grad=True)
-
-    def call(image: Tensor, alpha: Tensor) -> Tensor:
-        return polynomial_filter(operator, image, alpha).square()
-
-    assert gradgradcheck(call, (small(seed=1), alpha))
