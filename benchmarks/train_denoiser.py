@@ -33,7 +33,16 @@ from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from benchmarks.denoiser_crops import CONTRASTS, MISSTATED, Crops
-from nlfilter_torch.nn.denoiser.network import PASSES, PLANES, SLOPE, WIDTH, Layer, NonlocalDenoiser, shapes_of
+from nlfilter_torch.nn.denoiser.network import (
+    PASSES,
+    PLANES,
+    SLOPE,
+    WIDTH,
+    Layer,
+    NonlocalDenoiser,
+    level_planes,
+    shapes_of,
+)
 from nlfilter_torch.nn.denoiser.weights import read_weights
 from nlfilter_torch.photo.io.writing import open_beside
 from nlfilter_torch.photo.plotting import save_figure
@@ -164,7 +173,7 @@ class Training:
     def denoise(self, model: nn.Module, noisy: Tensor, told: Tensor) -> Tensor:
         """Denoise crops as in training."""
         with torch.autocast("cpu", torch.bfloat16, enabled=self.half):
-            noise: Tensor = model.estimate_noise(noisy, told)  # type: ignore[operator]
+            noise: Tensor = model.estimate_noise(noisy, level_planes(told, noisy))  # type: ignore[operator]
         return noisy - noise
 
     def without_rim(self, crops: Tensor) -> Tensor:

@@ -9,21 +9,28 @@ from nlfilter_torch.core.precision import full_precision, working_dtype
 
 
 @full_precision
-def split_colours(image: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
-    """Split an image into luminance and two colour differences (B, 3, H, W); return them and their noise (B, 2, H, W).
+def split_colours(image: Tensor) -> Tensor:
+    """Split an image (B, 1 or 3, H, W) into luminance and two colour differences (B, 3, H, W).
 
     The luminance is the mean of the channels. The differences have coefficients of unit norm; for a grey image they are
-    0 and free of noise.
+    0.
     """
     if image.shape[1] == 1:
         nothing = torch.zeros_like(image)
-        return torch.cat([image, nothing, nothing], dim=1), torch.cat([noise, torch.zeros_like(noise)], dim=1)
-    planes = torch.einsum("pc,bchw->bphw", _mixture(image), image)
+        return torch.cat([image, nothing, nothing], dim=1)
+    return torch.einsum("pc,bchw->bphw", _mixture(image), image)
+
+
+@full_precision
+def split_noise(noise: Tensor, channels: int) -> Tensor:
+    """Levels (B, 2, H, W) of luminance and colour differences, from those of white noise (B, 1 or C, H, W)."""
+    if channels == 1:
+        return torch.cat([noise, torch.zeros_like(noise)], dim=1)
     if noise.shape[1] == 1:
-        return planes, torch.cat([noise / math.sqrt(3), noise], dim=1)
+        return torch.cat([noise / math.sqrt(3), noise], dim=1)
     variance = noise.to(working_dtype(noise)).square()
     deviation = torch.cat([variance.sum(1, keepdim=True) / 9, variance.mean(1, keepdim=True)], dim=1)
-    return planes, deviation.clamp(min=1e-30).sqrt().to(noise)
+    return deviation.clamp(min=1e-30).sqrt().to(noise)
 
 
 @full_precision

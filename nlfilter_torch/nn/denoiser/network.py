@@ -19,8 +19,9 @@ from nlfilter_torch.core.layouts import in_format_of
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.core.torch_internals import outside_transforms, refuse_transforms
 from nlfilter_torch.filtering.filters import detail_layers
-from nlfilter_torch.nn.denoiser.colours import join_colours, split_colours
+from nlfilter_torch.nn.denoiser.colours import join_colours, split_colours, split_noise
 from nlfilter_torch.nn.denoiser.noise import noise_map
+from nlfilter_torch.nn.denoiser.profile import NoiseProfile
 from nlfilter_torch.nn.denoiser.tiles import in_tiles
 from nlfilter_torch.nn.denoiser.weights import read_weights
 from nlfilter_torch.operator.build import operator_from_features
@@ -31,6 +32,7 @@ WIDTH, FEATURES, ORDER = 48, 20, 3  # channels of the network and of the guide; 
 BEFORE, AFTER = (1, 2, 3, 4), (3,)  # dilations before and after the filter; the receptive field of a pass is 33x33
 PASSES = 2
 PLANES, LEVELS = 3, 2  # colour planes, and noise levels for them
+SCALES = (1, 2, 4)  # sides in pixels of the blocks whose noise the network is told
 PIXELS, ROUGH_PIXELS = 85, 200  # pixels per landmark, in the last pass and in those before it
 BANDWIDTHS = (0.15, 12.0)  # initial bandwidths: of the guide, and in pixels
 FAINT = 1 / 255  # noise level below which filtering is reduced in proportion
@@ -51,7 +53,7 @@ class Layer(nn.Conv2d):
 
 
 class NonlocalDenoiser(nn.Module):
-    """Denoiser for grey or colour images with noise of known strength, which may vary from pixel to pixel.
+    """Denoiser for grey or colour images with noise of known strength, which may vary by pixel and by scale.
 
     A convolutional network computes two things at every pixel: a guide, from which :func:`operator_from_features`
     builds W, and sliders for a filter that averages pixels with similar guides. The filter removes most of the noise,
@@ -80,7 +82,7 @@ class NonlocalDenoiser(nn.Module):
         super().__init__()
         check_count(passes, "passes")
         self.passes = passes
-        self.first = nn.Conv2d(PLANES + LEVELS, WIDTH, 3, padding=1)
+        self.first = nn.Conv2d(PLANES + LEVELS * len(SCALES), WIDTH, 3, padding=1)
         self.before = nn.ModuleList(Layer(WIDTH, WIDTH, dilation) for dilation in BEFORE)
         self.guide = Layer(WIDTH, FEATURES + LEVELS * (ORDER + 1))
         self.log_bandwidths = nn.Parameter(torch.tensor([math.log(bandwidth) for bandwidth in BANDWIDTHS]))
@@ -113,14 +115,15 @@ class NonlocalDenoiser(nn.Module):
         return denoiser.eval()
 
     @outside_transforms
-    def forward(self, noisy: Tensor, noise: float | Tensor, *, turns: int = 1) -> Tensor:
+    def forward(self, noisy: Tensor, noise: float | Tensor | NoiseProfile, *, turns: int = 1) -> Tensor:
         """Remove noise.
 
         Args:
             noisy: (B, C, H, W), in [0, 1] apart from the noise, or one image (C, H, W). Three channels are treated as
                 colours; any other number of channels are denoised one by one.
-            noise: standard deviation of the noise in units of the image: a number, (B,), or a map (B, 1 or C, H, W).
-                More than 100/255 counts as 100/255. Where it is 0 in all channels the image is unchanged.
+            noise: standard deviation of white noise in units of the image: a number, (B,), or a map (B, 1 or C, H, W);
+                or the profile of other noise. More than 100/255 counts as 100/255. Where it is 0 in all channels the
+                image is unchanged.
             turns: 1, 2 or 4: number of results to average, each from the image rotated by a different angle. More take
                 longer and are better by about 0.1 dB.
 
@@ -138,18 +141,19 @@ class NonlocalDenoiser(nn.Module):
         check_photograph(noisy, "noisy")
         dtype = self.log_bandwidths.dtype
         image = noisy.to(dtype)
-        levels = noise_map(noise, image)
-        return in_format_of(image - self.estimate_in_tiles(image, levels, turns), noisy)
+        return in_format_of(image - self.estimate_in_tiles(image, level_planes(noise, image), turns), noisy)
 
-    def estimate_in_tiles(self, image: Tensor, noise: Tensor, turns: int, inner: Inner = EVERYWHERE) -> Tensor:
-        """Estimate the noise of an image (B, C, H, W) from its levels (B, 1 or C, H, W), both in the weights' dtype.
+    def estimate_in_tiles(self, image: Tensor, levels: Tensor, turns: int, inner: Inner = EVERYWHERE) -> Tensor:
+        """Estimate the noise of an image (B, C, H, W) from its :func:`level_planes`, both in the weights' dtype.
 
         Values outside ``inner`` are unspecified.
         """
         check_count(turns, "turns")
         if turns not in (1, 2, 4):
             raise ValueError(f"turns must be 1, 2 or 4, got {described(turns)}; 1 is fastest")
-        return in_tiles(image, noise, partial(self._mean_estimate, range(0, 4, 4 // turns)), inner)
+        pictures = _one_by_one(image)
+        estimate = in_tiles(pictures, levels, partial(self._mean_estimate, range(0, 4, 4 // turns)), inner)
+        return estimate.view_as(image)
 
     def _mean_estimate(self, quarters: range, tile: Tensor, levels: Tensor) -> Tensor:
         """Mean of the estimates of a tile's noise, each from the tile rotated by so many quarters of a turn."""
@@ -159,19 +163,18 @@ class NonlocalDenoiser(nn.Module):
         ]
         return torch.stack(estimates).mean(0)
 
-    def estimate_noise(self, noisy: Tensor, noise: Tensor) -> Tensor:
+    def estimate_noise(self, noisy: Tensor, levels: Tensor) -> Tensor:
         """Estimate the noise without dividing the image: called with crops in training, with tiles otherwise.
 
         Args:
-            noisy: (B, C, H, W).
-            noise: (B, 1 or C, H, W).
+            noisy: (B, 1 or 3, H, W).
+            levels: (B, 6, H, W), as from :func:`level_planes`.
         """
-        if noisy.shape[1] not in (1, 3):
-            channels = (planes.flatten(0, 1).unsqueeze(1) for planes in (noisy, noise.expand_as(noisy)))
-            return self.estimate_noise(*channels).view_as(noisy)
         scale = (noisy.detach().abs().amax((1, 2, 3), keepdim=True) / BRIGHTEST).clamp(min=1.0)
-        planes, levels = split_colours(noisy / scale, (noise / scale).clamp(max=NOISIEST))
-        seen = torch.cat([_centred(planes), 10 * levels], dim=1)
+        planes = split_colours(noisy / scale)
+        levels, *coarser = _bounded(levels / scale, noisy.shape[1]).split(LEVELS, dim=1)
+        # White noise has equal levels at all scales: what the network learns of their differences does not affect it.
+        seen = torch.cat([_centred(planes), 10 * levels, *(10 * (other - levels) for other in coarser)], dim=1)
         first = self.first(channels_last(seen))
         levels = levels[:, (0, 1, 1)]
         pixels, *others = [ROUGH_PIXELS] * (self.passes - 1) + [PIXELS]
@@ -235,6 +238,49 @@ class NonlocalDenoiser(nn.Module):
 def shapes_of(denoiser: NonlocalDenoiser) -> dict[str, tuple[int, ...]]:
     """Names and shapes of the weights."""
     return {name: tuple(value.shape) for name, value in denoiser.named_parameters()}
+
+
+def level_planes(noise: float | Tensor | NoiseProfile, image: Tensor, name: str = "noise") -> Tensor:
+    """Expand noise to levels at each pixel of an image (B, C, H, W), as the network is told them.
+
+    Args:
+        noise: standard deviation of white noise, a number, (B,) or a map (B, 1 or C, H, W), or the profile of noise.
+        image: its channels count as images of their own unless they are 1 or 3.
+        name: of the argument, in errors.
+
+    Returns:
+        (B or B * C, 6, H, W): levels of luminance and colour differences at the first of :data:`SCALES`, then at the
+        next.
+    """
+    channels = image.shape[1]
+    if isinstance(noise, NoiseProfile):
+        if channels in (1, 3):
+            return noise.at(image, SCALES)
+        levels = noise.at(image, SCALES).unflatten(1, (-1, LEVELS))
+        grey = torch.stack([levels[:, :, 0], torch.zeros_like(levels[:, :, 0])], dim=2).flatten(1, 2)
+        return grey.repeat_interleave(channels, dim=0)
+    levels = noise_map(noise, image, name)
+    if channels not in (1, 3):
+        levels, channels = levels.expand_as(image).flatten(0, 1).unsqueeze(1), 1
+    return split_noise(levels, channels).repeat(1, len(SCALES), 1, 1)
+
+
+def deviation_of(levels: Tensor) -> Tensor:
+    """Standard deviation (B, 1, H, W) of the noise of each channel, from :func:`level_planes`; no gradient."""
+    luminance, colour = levels.detach()[:, :LEVELS].square().split(1, dim=1)
+    return (luminance + 2 / 3 * colour).sqrt()  # the variances of two differences of unit norm, in three channels
+
+
+def _one_by_one(image: Tensor) -> Tensor:
+    """The channels (B * C, 1, H, W) of an image, unless it is grey or in colour."""
+    return image if image.shape[1] in (1, 3) else image.flatten(0, 1).unsqueeze(1)
+
+
+def _bounded(levels: Tensor, channels: int) -> Tensor:
+    """Reduce levels (B, 6, H, W) at all scales where those of a pixel exceed :data:`NOISIEST` per channel."""
+    limit = levels.new_tensor([NOISIEST / math.sqrt(channels), NOISIEST]).view(1, -1, 1, 1)
+    excess = (levels[:, :LEVELS] / limit).clamp(min=1.0)
+    return levels / excess.repeat(1, len(SCALES), 1, 1)
 
 
 def _centred(planes: Tensor) -> Tensor:

@@ -134,7 +134,7 @@ def _planes_of(difference: Tensor) -> tuple[Tensor, Tensor]:
     """Luminance and colour differences of a difference of images; channels of other than 3 count as luminances."""
     if difference.shape[1] != 3:
         return difference, torch.zeros_like(difference[:, :1])
-    planes, _ = split_colours(difference, difference[:, :1].abs())
+    planes = split_colours(difference)
     return planes[:, :1], planes[:, 1:]
 
 

@@ -15,8 +15,9 @@ from nlfilter_torch.core.inner import Inner
 from nlfilter_torch.core.precision import per_image
 from nlfilter_torch.core.torch_internals import cached_constants
 from nlfilter_torch.filtering.filters import weigh_layers
-from nlfilter_torch.nn.denoiser.network import NonlocalDenoiser
-from nlfilter_torch.nn.denoiser.noise import Noise, noise_map
+from nlfilter_torch.nn.denoiser.network import NonlocalDenoiser, deviation_of, level_planes
+from nlfilter_torch.nn.denoiser.noise import Noise
+from nlfilter_torch.nn.denoiser.profile import NoiseProfile
 from nlfilter_torch.nn.denoiser.tiles import STEP
 from nlfilter_torch.operator.options import Completion, GuideChannels, Sampling
 from nlfilter_torch.photo.declared.declaration import Edit
@@ -194,16 +195,17 @@ def first_channel(pixels: Pixels) -> Tensor:
 class NetworkDenoising:
     """Denoising by the network, with tiles at the same positions in memory and for a picture read by rows."""
 
-    noise: float | Tensor | Noise
+    noise: float | Tensor | Noise | NoiseProfile
     strength: float | Tensor
 
     def __call__(self, image: Tensor, _: Tensor, inner: Inner) -> Tensor:
         """Denoise an image."""
-        noise = self.noise
-        level = noise.at(image) if isinstance(noise, Noise) else noise_map(noise, image, "noise_level")
-        level = level * per_image(self.strength, level, 4)
-        level = torch.where(level < NEGLIGIBLE_NOISE, torch.zeros_like(level), level)
-        return image - _network(image.device, image.dtype).estimate_in_tiles(image, level, turns=1, inner=inner)
+        noise = self.noise.at(image) if isinstance(self.noise, Noise) else self.noise
+        levels = level_planes(noise, image, "noise_level")
+        strength = per_image(self.strength, levels, 4).expand(len(image), -1, -1, -1)
+        levels = levels * strength.repeat_interleave(len(levels) // len(image), dim=0)
+        levels = torch.where(deviation_of(levels) < NEGLIGIBLE_NOISE, torch.zeros_like(levels), levels)
+        return image - _network(image.device, image.dtype).estimate_in_tiles(image, levels, turns=1, inner=inner)
 
 
 def _energy(layers: Planes, pixels: Pixels) -> Tensor:
