@@ -85,6 +85,15 @@ def in_fake_mode() -> bool:
     return torch._C._get_dispatch_mode(_FAKE) is not None
 
 
+def has_modes() -> bool:
+    """Whether a mode is active that changes or watches operations, in this thread alone.
+
+    Autocasting, transforms and forward derivatives, tracing, and modes that users write (which count operations, say).
+    """
+    written = torch._C._len_torch_dispatch_stack() + torch._C._len_torch_function_stack() > 0
+    return written or torch.is_autocast_enabled("cpu") or in_transform() or in_forward_mode() or is_traced()
+
+
 def outside_modes() -> AbstractContextManager[Any]:
     """Context in which constants of an exported program are computed as ordinary tensors, outside its fake mode."""
     return _disable_current_modes()

@@ -18,6 +18,7 @@ from nlfilter_torch.core.kernels.convolution import SLOPE, channels_last, convol
 from nlfilter_torch.core.layouts import in_format_of
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.core.torch_internals import outside_transforms, refuse_transforms
+from nlfilter_torch.core.workers import threads_for
 from nlfilter_torch.filtering.filters import detail_layers
 from nlfilter_torch.nn.denoiser.colours import join_colours, split_colours, split_noise
 from nlfilter_torch.nn.denoiser.noise import noise_map
@@ -152,7 +153,9 @@ class NonlocalDenoiser(nn.Module):
         if turns not in (1, 2, 4):
             raise ValueError(f"turns must be 1, 2 or 4, got {described(turns)}; 1 is fastest")
         pictures = _one_by_one(image)
-        estimate = in_tiles(pictures, levels, partial(self._mean_estimate, range(0, 4, 4 // turns)), inner)
+        function = partial(self._mean_estimate, range(0, 4, 4 // turns))
+        workers = threads_for(pictures, levels, *self.parameters())
+        estimate = in_tiles(pictures, levels, function, inner, workers=workers)
         return estimate.view_as(image)
 
     def _mean_estimate(self, quarters: range, tile: Tensor, levels: Tensor) -> Tensor:

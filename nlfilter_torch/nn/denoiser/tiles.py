@@ -1,26 +1,35 @@
 """Division of an image into overlapping tiles, whose results are blended."""
 
 from collections.abc import Callable
+from functools import partial
 from itertools import groupby, product
 
 import torch
 from torch import Tensor
 
 from nlfilter_torch.core.inner import EVERYWHERE, Inner
+from nlfilter_torch.core.workers import in_order
 
 SIDE, STEP = 96, 80  # size and spacing of tiles, in pixels
 SMALLEST = 56  # size of the last tile of a row or column, at least
 BORDER = 8  # width in pixels of the border added to images, so that their own border does not affect results
 TILE_BATCH = 4  # tiles processed at once; more leave the cache of the processor
+Window = tuple[slice, slice]
 
 
 def in_tiles(
-    image: Tensor, noise: Tensor, function: Callable[[Tensor, Tensor], Tensor], inner: Inner = EVERYWHERE
+    image: Tensor,
+    noise: Tensor,
+    function: Callable[[Tensor, Tensor], Tensor],
+    inner: Inner = EVERYWHERE,
+    *,
+    workers: int = 1,
 ) -> Tensor:
     """Apply a function to an image (B, C, H, W) and its noise in overlapping tiles, or at once if the image is small.
 
     Tiles are ``STEP`` pixels apart, starting at the upper left corner. Their weights fall to 0 in the outermost pixels,
-    so that borders of tiles are not visible. Only tiles that contain pixels of ``inner`` are computed.
+    so that borders of tiles are not visible. Only tiles that contain pixels of ``inner`` are computed. More than one of
+    the ``workers`` compute several groups of tiles at once, each in its own thread and without gradients.
     """
     height, width = image.shape[-2:]
     down, across = _divided(height), _divided(width)
@@ -29,18 +38,33 @@ def in_tiles(
     rest = (..., slice(BORDER, BORDER + height), slice(BORDER, BORDER + width))
     if len(down) == len(across) == 1:
         return function(image, noise)[rest]
-    down, across = _needed(down, inner[0], height), _needed(across, inner[1], width)
+    groups = _grouped(_needed(down, inner[0], height), _needed(across, inner[1], width))
+    computed = partial(_computed, function, image, noise)
+    workers = min(workers, len(groups))
     total, weight = torch.zeros_like(image), image.new_zeros(image.shape[-2:])
-    for (height, width), tiles in groupby(sorted(product(down, across), key=_size), key=_size):
-        fade = torch.outer(_profile(height), _profile(width)).to(image)
-        windows = [(..., *tile) for tile in tiles]
-        for first in range(0, len(windows), TILE_BATCH):
-            group = windows[first : first + TILE_BATCH]
-            results = function(*(torch.cat([planes[window] for window in group]) for planes in (image, noise)))
-            for window, tile in zip(group, results.split(len(image)), strict=True):
-                total[window] += fade * tile
-                weight[window] += fade
+    results = map(computed, groups) if workers == 1 else in_order(computed, groups, workers)
+    for group, result in zip(groups, results, strict=True):
+        fade = torch.outer(*map(_profile, _size(group[0]))).to(image)
+        for tile, part in zip(group, result.split(len(image)), strict=True):
+            total[(..., *tile)] += fade * part
+            weight[tile] += fade
     return total[rest] / weight[rest].clamp(min=torch.finfo(weight.dtype).tiny)
+
+
+def _grouped(down: list[slice], across: list[slice]) -> list[list[Window]]:
+    """The tiles in groups of equal size, which are computed together."""
+    groups = []
+    for _, windows in groupby(sorted(product(down, across), key=_size), key=_size):
+        tiles = list(windows)
+        groups += [tiles[first : first + TILE_BATCH] for first in range(0, len(tiles), TILE_BATCH)]
+    return groups
+
+
+def _computed(
+    function: Callable[[Tensor, Tensor], Tensor], image: Tensor, noise: Tensor, group: list[Window]
+) -> Tensor:
+    """The function of a group of tiles, one after another along the first axis."""
+    return function(*(torch.cat([planes[(..., *tile)] for tile in group]) for planes in (image, noise)))
 
 
 def _divided(length: int) -> list[slice]:
@@ -57,7 +81,7 @@ def _needed(tiles: list[slice], inner: slice, length: int) -> list[slice]:
     return [tile for tile in tiles if tile.start < last + BORDER and first + BORDER < tile.stop]
 
 
-def _size(tile: tuple[slice, slice]) -> tuple[int, int]:
+def _size(tile: Window) -> tuple[int, int]:
     return tile[0].stop - tile[0].start, tile[1].stop - tile[1].start
 
 

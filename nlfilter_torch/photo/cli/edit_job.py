@@ -9,6 +9,7 @@ from pathlib import Path
 import typer
 from torch import Tensor
 
+from nlfilter_torch.core.workers import single_threaded
 from nlfilter_torch.photo.cli import editing, options
 from nlfilter_torch.photo.cli.changes import ChangeMeter, squared_difference, write_map
 from nlfilter_torch.photo.cli.editing import Job, pixels_of, rows_of
@@ -25,7 +26,6 @@ from nlfilter_torch.photo.picture.source import Source, seeded
 from nlfilter_torch.photo.tiled.pictures import Picture, RowSource, stored_as
 from nlfilter_torch.photo.tiled.source import Tiled
 from nlfilter_torch.photo.tiled.tiles import Tiling
-from nlfilter_torch.photo.tiled.workers import single_threaded
 
 
 @dataclass(frozen=True)

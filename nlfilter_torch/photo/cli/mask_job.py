@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
+from nlfilter_torch.core.workers import single_threaded
 from nlfilter_torch.photo.cli import editing, options
 from nlfilter_torch.photo.cli.edit_job import Opener, as_rows
 from nlfilter_torch.photo.cli.editing import pixels_of, rows_of
@@ -35,7 +36,6 @@ from nlfilter_torch.photo.selections.mask import RegionMask
 from nlfilter_torch.photo.tiled.pictures import Picture
 from nlfilter_torch.photo.tiled.scribbles import region_rows
 from nlfilter_torch.photo.tiled.source import Tiled
-from nlfilter_torch.photo.tiled.workers import single_threaded
 
 PLANE_BYTES = 16  # per pixel, of a mask that is computed in tiles but written at once
 

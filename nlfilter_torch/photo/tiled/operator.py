@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.core.precision import full_precision
+from nlfilter_torch.core.workers import in_order
 from nlfilter_torch.filtering.filters import layers_of_columns
 from nlfilter_torch.operator.columns import Columns
 from nlfilter_torch.operator.features import reduce_channels
@@ -41,7 +42,6 @@ from nlfilter_torch.photo.tiled.statistics import (
     limiter_by_passes,
     sum_up,
 )
-from nlfilter_torch.photo.tiled.workers import in_order
 
 SAMPLE_BLOCKS = 8  # blocks that a sample is split into, to be shared among workers
 

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.core.precision import full_precision
+from nlfilter_torch.core.workers import in_order
 from nlfilter_torch.photo.declared.steps import Step, acting_steps
 from nlfilter_torch.photo.edits.applying import fit_step, scribbles_of
 from nlfilter_torch.photo.picture.resizing import resized
@@ -24,7 +25,6 @@ from nlfilter_torch.photo.tiled.sampling import ColumnCache, GuidePicture, Repor
 from nlfilter_torch.photo.tiled.scribbles import RowPainter
 from nlfilter_torch.photo.tiled.source import Tiled
 from nlfilter_torch.photo.tiled.tiles import Passes, Statistics, intermediate
-from nlfilter_torch.photo.tiled.workers import in_order
 
 STRIP_PIXELS = 1 << 15  # pixels of a rectangle that one worker computes at a time
 

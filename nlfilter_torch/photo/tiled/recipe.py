@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from nlfilter_torch.core.workers import single_threaded
 from nlfilter_torch.photo.declared.steps import Step, acting_steps
 from nlfilter_torch.photo.edits.applying import fit_step, scribbles_of
 from nlfilter_torch.photo.picture.changes import blend_edited
@@ -14,7 +15,6 @@ from nlfilter_torch.photo.tiled.pictures import Picture, Rows, RowSource, Tile, 
 from nlfilter_torch.photo.tiled.scribbles import RowPainter
 from nlfilter_torch.photo.tiled.source import Tiled
 from nlfilter_torch.photo.tiled.tiles import TILE_PIXELS, Passes, TileEdit, Tiling
-from nlfilter_torch.photo.tiled.workers import single_threaded
 
 
 def edit_rows(passes: Passes, source: RowSource, steps: Sequence[Step], name: str) -> Rows:

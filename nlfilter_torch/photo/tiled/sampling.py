@@ -16,6 +16,7 @@ from torch import Tensor
 
 from nlfilter_torch.core.blocks import stratified
 from nlfilter_torch.core.checks import check_choice
+from nlfilter_torch.core.workers import in_order, single_threaded
 from nlfilter_torch.operator.columns import Columns
 from nlfilter_torch.operator.features import (
     GuideFeatures,
@@ -34,7 +35,6 @@ from nlfilter_torch.operator.sinkhorn import sinkhorn_balance
 from nlfilter_torch.photo.picture.source import Guide
 from nlfilter_torch.photo.tiled.pictures import Picture, Tile
 from nlfilter_torch.photo.tiled.statistics import Block, Result
-from nlfilter_torch.photo.tiled.workers import in_order, single_threaded
 
 PILOT = 1 << 15  # pixels of the first sample: their factor, 13 MB at m = 100, is balanced in memory
 PILOT_TOLERANCE = 1e-3  # tolerance of its balancing, which is an initial guess

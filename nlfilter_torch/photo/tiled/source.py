@@ -13,6 +13,7 @@ from torch import Tensor
 from nlfilter_torch.core.checks import check_count
 from nlfilter_torch.core.inner import Inner
 from nlfilter_torch.core.precision import full_precision
+from nlfilter_torch.core.workers import Result, in_order, single_threaded
 from nlfilter_torch.operator.eigenvalue_bound import is_bounded
 from nlfilter_torch.photo.picture.ends import ends_of
 from nlfilter_torch.photo.picture.in_memory import InMemory
@@ -30,7 +31,6 @@ from nlfilter_torch.photo.tiled.scribbles import (
     region_rows,
 )
 from nlfilter_torch.photo.tiled.tiles import TILE_PIXELS, Passes, Tiling, cacheable_pixels, rows_that_fit
-from nlfilter_torch.photo.tiled.workers import Result, in_order, single_threaded
 
 UNUSED_OPTIONS = ("tolerance", "group", "patch_weights")  # which no edit sets
 CACHED_SHARE = 1 / 16  # largest share of the memory for planes that an edit reuses

@@ -3,6 +3,7 @@
 import numpy as np
 import torch
 
+from nlfilter_torch.core.workers import single_threaded
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.edits.applying import fit_step, scribbles_of
 from nlfilter_torch.photo.picture.drawn import Drawn
@@ -11,7 +12,6 @@ from nlfilter_torch.photo.tiled.sampling import Report, in_silence
 from nlfilter_torch.photo.tiled.scribbles import RowPainter
 from nlfilter_torch.photo.tiled.source import Tiled
 from nlfilter_torch.photo.tiled.tiles import SAMPLE, Passes, Statistics, check_target, fill
-from nlfilter_torch.photo.tiled.workers import single_threaded
 
 
 def stream(

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.core.checks import check_choice, check_count
+from nlfilter_torch.core.workers import in_order
 from nlfilter_torch.photo.tiled import sampling
 from nlfilter_torch.photo.tiled.pictures import (
     FLOAT32,
@@ -27,7 +28,6 @@ from nlfilter_torch.photo.tiled.pictures import (
     transparency,
 )
 from nlfilter_torch.photo.tiled.sampling import Report, in_silence
-from nlfilter_torch.photo.tiled.workers import in_order
 
 SAMPLE = 1 << 16  # pixels; docs/scale.md shows the effect of more or fewer
 TILE_PIXELS = 1 << 17  # longer tiles are no faster

@@ -1,7 +1,7 @@
 """Several tiles at once, each in its own thread: the short operations on a tile are not worth dividing among threads.
 
 OpenMP divides every operation among threads that busy-wait for each other, so that most of the time is spent waiting if
-another program is busy. Tiled edits therefore divide the picture among threads, not single operations.
+another program is busy. Tiled edits and the denoiser therefore divide the picture among threads, not single operations.
 """
 
 from collections import deque
@@ -12,6 +12,9 @@ from threading import Barrier, Lock
 from typing import TypeVar
 
 import torch
+from torch import Tensor
+
+from nlfilter_torch.core.torch_internals import has_modes, is_hidden
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -44,6 +47,18 @@ def in_order(function: Callable[[Item], Result], items: Iterable[Item], workers:
                 yield waiting.popleft().result()
         while waiting:
             yield waiting.popleft().result()
+
+
+def threads_for(*tensors: Tensor) -> int:
+    """Number of threads that may compute parts of a result from these tensors, each by itself: for :func:`in_order`.
+
+    As many as an operation is divided among, but 1 for derivatives, on accelerators, and where a mode of torch that
+    holds for the calling thread alone may change results.
+    """
+    differentiable = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)
+    if differentiable or has_modes() or any(map(is_hidden, tensors)):
+        return 1
+    return torch.get_num_threads()
 
 
 def _begin(threads: int, started: Barrier) -> None:

@@ -7,10 +7,11 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from nlfilter_torch.core.kernels import library
 from nlfilter_torch.core.kernels.tall_skinny import moment, spread
-from nlfilter_torch.photo.tiled.workers import in_order, single_threaded
+from nlfilter_torch.core.workers import in_order, single_threaded, threads_for
 
 
 @pytest.fixture(autouse=True)
@@ -43,6 +44,28 @@ def test_single_threaded_holds_for_the_calling_thread_and_its_workers() -> None:
     assert (torch.get_num_threads(), of_new_thread()) == (6, 6)
     with single_threaded(1):  # no other work runs then
         assert torch.get_num_threads() == 6
+
+
+class Watching(TorchDispatchMode):
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        return func(*args, **(kwargs or {}))
+
+
+def test_threads_are_for_plain_operations_on_cpus_without_derivatives() -> None:
+    plain, weight = torch.ones(2), torch.ones(2, requires_grad=True)
+    assert threads_for(plain) == 6
+    assert threads_for(plain, weight) == 1
+    with torch.no_grad():
+        assert threads_for(plain, weight) == 6
+    assert threads_for(plain, torch.ones(2, device="meta")) == 1
+    with torch.autocast("cpu"):
+        assert threads_for(plain) == 1
+    with Watching():
+        assert threads_for(plain) == 1
+    with torch.device("cpu"):
+        assert threads_for(plain) == 1
+    assert torch.func.vmap(lambda tensor: tensor * threads_for(plain))(plain).tolist() == [1, 1]
+    assert threads_for(plain) == 6
 
 
 @pytest.fixture
