@@ -12,8 +12,9 @@ from benchmarks.denoising import methods, published, sets
 from benchmarks.denoising.__main__ import main
 from benchmarks.denoising.cases import HELD_OUT, Case, decibels, scenes, with_noise
 from benchmarks.denoising.measuring import table
-from benchmarks.denoising_tables import MARKERS
+from benchmarks.denoising_tables import MARKERS, markers_of, tables_of
 from benchmarks.denoising_tables import main as write_tables
+from benchmarks.report import between
 
 
 def test_scores_are_decibels_of_the_squared_error(capsys: pytest.CaptureFixture[str]) -> None:
@@ -63,6 +64,9 @@ def test_a_file_without_the_markers_of_the_tables_is_refused(tmp_path: Path) -> 
     figures.write_text('{"grey, 25": {"ours": {"camera": {"psnr": 30.0, "ssim": 0.9, "seconds": 1.0}}}}')
     with pytest.raises(ValueError, match="the file must hold the lines '<!-- denoising"):
         write_tables([str(figures), "--docs", str(page)])
+
+
+DOCS = Path(__file__).parents[2] / "docs"
 
 
 def folder_of(path: Path, count: int, *, coloured: bool = True, side: int = 24) -> Path:
@@ -182,3 +186,9 @@ def test_bm3d_is_left_out_where_it_is_not_installed(
     monkeypatch.setattr("benchmarks.denoising.methods.find_spec", lambda name: None)
     assert list(methods.available(["noisy", "BM3D"])) == ["noisy"]
     assert "bm3d is not installed" in capsys.readouterr().out
+
+
+def test_the_tables_of_the_docs_are_those_of_their_file() -> None:
+    content = json.loads((DOCS / "kodak24.json").read_text())
+    page = (DOCS / "training.md").read_text()
+    assert between(page, tables_of(content), *markers_of(content)) == page
