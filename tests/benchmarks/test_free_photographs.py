@@ -8,9 +8,16 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from benchmarks.denoiser_training import packages, pictures
+from benchmarks.denoiser_training import free_photographs, packages
+from benchmarks.denoiser_training.free_photographs import (
+    LARGEST_SCALE,
+    PIXELS,
+    SETS,
+    SMALLEST_SCALE,
+    photographs,
+    scale_of,
+)
 from benchmarks.denoiser_training.packages import contents, licence, resources, unpacked
-from benchmarks.denoiser_training.pictures import LARGEST_SCALE, PIXELS, SETS, SMALLEST_SCALE, photographs, scale_of
 
 COPYRIGHT = """Format: https://www.debian.org/doc/packaging-manuals/copyright-format/1.0/
 
@@ -107,11 +114,11 @@ def test_the_command_prepares_the_photographs_of_a_list(
     (tmp_path / "packages" / "some").mkdir(parents=True)
     (tmp_path / "packages" / "some" / "a.png").write_bytes(image(100))
     rows = [
-        pictures.Photograph("training", "first", "some", "a.png", "CC0-1.0", repeated=False),
-        pictures.Photograph("choosing", "second", "some", "absent.png", "CC0-1.0", repeated=False),
+        free_photographs.Photograph("training", "first", "some", "a.png", "CC0-1.0", repeated=False),
+        free_photographs.Photograph("choosing", "second", "some", "absent.png", "CC0-1.0", repeated=False),
     ]
-    monkeypatch.setattr(pictures, "photographs", lambda: rows)
-    pictures.main(["--out", str(tmp_path)])
+    monkeypatch.setattr(free_photographs, "photographs", lambda: rows)
+    free_photographs.main(["--out", str(tmp_path)])
     printed = capsys.readouterr().out
     assert "absent.png is not in this version of some, and is left out" in printed
     assert "training: 1 photographs" in printed

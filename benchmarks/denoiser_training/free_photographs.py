@@ -1,10 +1,10 @@
-"""Clean photographs under free licences, from Debian's packages: ``python -m benchmarks.denoiser_training.pictures``.
+"""Clean photographs under free licences: ``python -m benchmarks.denoiser_training.free_photographs --out FOLDER``.
 
-``pictures.tsv`` beside this file names every photograph with its set (training, choosing or reporting), package, path,
-licence and whether it shows repeated patterns. The command downloads and unpacks the packages (nothing is installed),
-reduces each photograph until compression has left no traces (:data:`BITS`), writes ``OUT/SET/NAME.png`` and prints what
-there is. Nothing else may be trained on or chosen by photographs of the reporting set; two photographs of the same
-building are in the same set.
+``free_photographs.tsv`` beside this file names every photograph with its set (training, choosing or reporting), its
+package of Debian, path and licence, and whether it shows repeated patterns. The command downloads and unpacks packages
+(nothing is installed), reduces each photograph until compression has left no traces (:data:`BITS`), writes
+``OUT/SET/NAME.png`` and prints what there is. Nothing may be trained on or chosen by photographs of the reporting set;
+photographs of the same building are in the same set.
 
 The training takes a folder, such as ``OUT/training``, beside scikit-image's photographs; it reduces pictures further.
 """
@@ -74,7 +74,9 @@ def prepared(data: bytes) -> Image.Image:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Prepare the photographs and list them with their licences."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.denoiser_training.pictures", description=main.__doc__)
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.denoiser_training.free_photographs", description=main.__doc__
+    )
     parser.add_argument("--out", type=Path, required=True, help="folder for OUT/SET/NAME.png")
     parser.add_argument("--packages", type=Path, help="folder of unpacked packages; default OUT/packages")
     options = parser.parse_args(arguments)
