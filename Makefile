@@ -110,27 +110,11 @@ QUICK := \
 	'memory --side 128 --repeats 1' \
 	'fuzz --cases 20'
 
-# Trains the denoiser from scratch, first one pass of it, on small crops and then in two parts on larger ones, and then
-# both passes, and copies its weights, results and learning curves: 10 hours on one core with AMX, two to three times as
-# long without. A stopped training is resumed.
-TRAIN := OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.train_denoiser
-PARTS := out/denoiser
+# Trains the denoiser further, from the weights of the package, on the pictures of scikit-image and on all of a folder:
+# make train PICTURES=folder. A stopped training is resumed; out/denoiser holds its state, weights and curve.
+PICTURES ?=
 train: $(VENV)/.installed-test
-	$(TRAIN) --half --passes 1 --out $(PARTS)/first
-	$(TRAIN) --half --passes 1 --start $(PARTS)/first/denoiser.safetensors --steps 38000 --fall 0.65 --side 80 --seed 1 \
-	--out $(PARTS)/second
-	$(TRAIN) --half --passes 1 --start $(PARTS)/second/denoiser.safetensors --steps 31000 --fall 1.0 --side 80 --seed 2 \
-	--textured 0.25 --out $(PARTS)/third
-	$(TRAIN) --start $(PARTS)/third/denoiser.safetensors --steps 11500 --fall 1.0 --rate 0.002 --seed 40 \
-	--textured 0.2 --out $(PARTS)/fourth
-	$(TRAIN) --start $(PARTS)/fourth/denoiser.safetensors --steps 6000 --fall 1.0 --rate 0.002 --side 80 --rim 8 \
-	--seed 50 --textured 0.25 --contrast 80 --misstated 0.25 --out $(PARTS)/fifth
-	$(TRAIN) --start $(PARTS)/fifth/denoiser.safetensors --steps 1900 --fall 1.0 --rate 0.001 --side 80 --rim 8 \
-	--seed 52 --textured 0.25 --contrast 80 --misstated 0.15 --out $(PARTS)
-	cp $(PARTS)/denoiser.safetensors nlfilter_torch/nn/denoiser/
-	cp $(PARTS)/denoiser.json docs/
-	cp $(PARTS)/curve.png docs/denoiser.png
-	for part in first second third fourth fifth; do cp $(PARTS)/$$part/curve.png docs/denoiser_$$part.png; done
+	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.denoiser_training --half $(if $(PICTURES),--pictures "$(PICTURES)")
 
 # The pictures of the README and of docs/.
 pictures: $(VENV)/.installed

@@ -9,7 +9,7 @@ BM3D, CBM3D      package ``bm3d``, which may be used for non-commercial purposes
 scikit-image     ``denoise_nl_means``, cycle-spun wavelets, and ``denoise_tv_chambolle`` with the best of five weights
                  for each photograph;
 OpenCV           ``fastNlMeansDenoising`` on 8 bits, with the best of four strengths for each photograph;
-plain            the network without the filter, with ``--plain FILE`` of ``benchmarks.train_denoiser --plain``.
+plain            the network without the filter, with ``--plain FILE`` of ``benchmarks.denoiser_training --plain``.
 
 ``--methods``, ``--noise`` and ``--kinds`` select a part of it; results are added to the file ``--out``, from which
 ``python -m benchmarks.denoising_tables`` makes tables. ``--weights FILE`` evaluates other weights than those of the

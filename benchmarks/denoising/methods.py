@@ -73,7 +73,7 @@ def best(case: Case, results: Iterable[Tensor]) -> Tensor:
 @cache
 def network(path: Path | None, *, plain: bool = False, turns: int = 1) -> Method:
     """The trained network from a file or from the package, given the noise level."""
-    from benchmarks.train_denoiser import PlainDenoiser
+    from benchmarks.denoiser_training.training import PlainDenoiser
 
     kind = PlainDenoiser if plain else NonlocalDenoiser
     denoiser = kind.trained() if path is None else kind.trained(path)

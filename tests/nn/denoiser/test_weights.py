@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from benchmarks.train_denoiser import PlainDenoiser
+from benchmarks.denoiser_training.training import PlainDenoiser
 from nlfilter_torch import NonlocalDenoiser
 from nlfilter_torch.nn.denoiser import network as module
 from nlfilter_torch.nn.denoiser.network import TRAINED
