@@ -17,6 +17,7 @@ from torch import Tensor
 NODES = (-1.4991056, -0.6824930, -0.2120550, 0.2120550, 0.6824930, 1.4991056)
 ENTRIES = 4096  # of the table by which tone curves are inverted
 RADII = 0.7, 1.4, 2.8, 5.6  # pixels; of the scales at which noise in luminance is reduced
+WIDEST = 2.0  # pixels; radius up to which a Gaussian is convolved
 WINDOW = 9  # side of windows in which the noise is measured
 
 
@@ -77,13 +78,22 @@ def _sums(values: Tensor, side: int, dim: int) -> Tensor:
 
 
 def blurred(planes: Tensor, radius: float) -> Tensor:
-    """Blur planes with a Gaussian of a standard deviation in pixels."""
+    """Blur planes with a Gaussian of a standard deviation in pixels; a wide one is replaced by two boxes."""
+    if radius > WIDEST:
+        half = round((math.sqrt(6 * radius**2 + 1) - 1) / 2)
+        return box(box(planes, half), half)
     reach = max(1, math.ceil(3 * radius))
-    places = torch.arange(-reach, reach + 1).to(planes)
-    weights = (-0.5 * (places / radius) ** 2).exp()
-    weights = weights / weights.sum()
-    padded = F.pad(planes, (reach, reach, reach, reach), mode="reflect").flatten(0, 1)[:, None]
-    return F.conv2d(F.conv2d(padded, weights.view(1, 1, 1, -1)), weights.view(1, 1, -1, 1)).view_as(planes)
+    weights = [math.exp(-0.5 * (place / radius) ** 2) for place in range(reach + 1)]
+    total = weights[0] + 2 * sum(weights[1:])
+    planes = F.pad(planes, (reach, reach, reach, reach), mode="reflect")
+    for dim in (-1, -2):
+        length = planes.shape[dim] - 2 * reach
+        mean = weights[0] / total * planes.narrow(dim, reach, length)
+        for place in range(1, reach + 1):  # faster than a convolution of single planes
+            both = planes.narrow(dim, reach - place, length) + planes.narrow(dim, reach + place, length)
+            mean = mean.add(both, alpha=weights[place] / total)
+        planes = mean
+    return planes
 
 
 def cored(light: Tensor, strength: float, fall: float, floor: float) -> Tensor:
@@ -129,12 +139,16 @@ def smoothed_colour(planes: Tensor, radius: int, share: float, edges: float) -> 
 
 
 def median_colour(planes: Tensor, share: float) -> Tensor:
-    """Replace a share of Cb and Cr by medians over 3x3 of every second pixel, chosen on the noisy shot."""
+    """Replace a share of Cb and Cr by medians of three, across and then down, every second pixel, of the noisy shot."""
     light, colour = planes[:, :1], planes[:, 1:]
-    near = F.unfold(F.pad(colour, (2, 2, 2, 2), mode="reflect"), 3, dilation=2)
-    near = near.view(2, 2, 9, *colour.shape[-2:])
-    middle = near[1].median(1, keepdim=True).indices.expand(2, -1, -1, -1, -1)
-    return torch.cat([light, torch.lerp(colour, near.gather(2, middle)[:, :, 0], share)], dim=1)
+    near = F.pad(colour, (2, 2, 2, 2), mode="reflect")
+    for dim in (-1, -2):
+        length = near.shape[dim] - 4
+        before, middle, after = (near.narrow(dim, start, length) for start in (0, 2, 4))
+        is_middle = (before[1] <= middle[1]) == (middle[1] <= after[1])
+        is_before = (middle[1] <= before[1]) == (before[1] <= after[1])
+        near = torch.where(is_middle, middle, torch.where(is_before, before, after))
+    return torch.cat([light, torch.lerp(colour, near, share)], dim=1)
 
 
 def sharpened(planes: Tensor, amount: float, radius: float) -> Tensor:
