@@ -1,4 +1,4 @@
-"""Clean crops: randomly augmented parts of pictures, and synthetic patterns."""
+"""Clean crops: randomly augmented parts of pictures, and drawn patterns."""
 
 import math
 
@@ -7,9 +7,11 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from benchmarks.denoiser_training.draws import Draws
+from benchmarks.denoiser_training.patterns import pattern
 from benchmarks.denoiser_training.pictures import Pictures
 
-PATTERNS, BLENDED, TEXTURED = 0.08, 0.15, 0.25  # shares of crops: drawn; of two crops; with an added texture
+REPEATED, REGIONS = 0.08, 0.06  # shares of crops with a drawn pattern: of repeated cells; of regions, lines or shades
+BLENDED, TEXTURED = 0.15, 0.25  # shares of crops: of two crops; with an added texture
 CONTRASTS = 2 / 255, 80 / 255  # range of the standard deviation of added textures
 
 
@@ -27,7 +29,7 @@ class Crops:
 
     def crop(self, *, grey: bool) -> Tensor:
         """A crop (1 or 3, side, side), in [0, 1] up to rounding."""
-        crop = self._pattern() if self.draws.chance(PATTERNS) else self._cut()
+        crop = self._drawn()
         if self.draws.chance(BLENDED):
             crop = self._blend(crop, self._cut())
         if self.draws.chance(TEXTURED):
@@ -39,6 +41,13 @@ class Crops:
             contrast = self.draws.number(0.5, 1.0)
             crop = contrast * crop + (1 - contrast) * self.draws.number()
         return 1 - crop if self.draws.chance(0.1) else crop
+
+    def _drawn(self) -> Tensor:
+        """A picture or a pattern, (1 or 3, side, side)."""
+        kind = self.draws.number()
+        if kind < REPEATED:
+            return pattern(self.side, self.draws.generator)
+        return self._pattern() if kind < REPEATED + REGIONS else self._cut()
 
     def _cut(self) -> Tensor:
         return self.pictures.cut(self.draws, self.side)

@@ -20,7 +20,7 @@ MISSTATED = 0.25  # share of examples whose given levels are not the actual ones
 RATIOS = 0.75, 1.35  # range of given over actual levels, in these
 UNEVEN = 0.12  # deviation of the logarithm of this ratio between scales, and luminance and colour, of cameras
 FAINTEST = 2 / 255  # levels that are told of clean crops, at most
-MARGIN = 16  # pixels around a crop in which the noise of a camera is measured, too
+MARGIN = 8  # pixels around a crop in which the noise of a camera is measured, too
 
 
 @dataclass(frozen=True)
