@@ -15,14 +15,14 @@ ROUNDS, RANGE, SPREAD = 4, 0.08, 3.0  # of the bilateral filter: iterations, ran
 
 
 def figure_18(size: int = SIZE) -> tuple[Figure, Numbers]:
-    """W^k y with k = 0.1 (b), with edge lines and quantised tones (c), and a bilateral filter with both (d).
+    """W^k y with k = 0.3 (b), with edge lines and quantised tones (c), and a bilateral filter with both (d).
 
     (d) is the method of the paper's [30]. The lower row shows a part of each, magnified three times.
     """
     image, scale = scene("astronaut", size)
     panels = {
         "(a) photograph": image,
-        "(b) k = 0.1": abstract(image),
+        "(b) k = 0.3": abstract(image),
         "(c) with lines and tones": abstract(image, edges=LINES, tones=TONES),
         "(d) bilateral, lines and tones": winnemoeller(image),
     }

@@ -30,6 +30,7 @@ DOMAINS: dict[str, tuple[str, Callable[[Any], Any], str]] = {
     "positive": ("positive and finite", lambda v: v > 0, "pass a positive number"),
     "not negative": ("at least 0 and finite", lambda v: v >= 0, "pass 0 or more"),
     "share": ("in [0, 1]", lambda v: (v >= 0) & (v <= 1), "clamp it"),
+    "up to 10": ("in [0, 10]", lambda v: (v >= 0) & (v <= 10), "clamp it"),
     "below 1": ("in [0, 1)", lambda v: (v >= 0) & (v < 1), "clamp it"),
     "finite": ("finite", lambda v: v == v, "pass a finite number"),
 }

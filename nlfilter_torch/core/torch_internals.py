@@ -121,7 +121,12 @@ def default_store() -> Any:
 
 def is_hidden(tensor: Tensor) -> bool:
     """Whether reading values would wait (accelerators) or is impossible (fake, compiling, in ``torch.func``)."""
-    return tensor.device.type != "cpu" or torch.compiler.is_compiling() or is_transformed(tensor) or is_fake(tensor)
+    return tensor.device.type != "cpu" or is_unreadable(tensor)
+
+
+def is_unreadable(tensor: Tensor) -> bool:
+    """Whether reading values is impossible: without storage, fake, compiling, in ``torch.func``."""
+    return tensor.is_meta or torch.compiler.is_compiling() or is_transformed(tensor) or is_fake(tensor)
 
 
 def cached_constants(function: Callable[P, R]) -> Callable[P, R]:

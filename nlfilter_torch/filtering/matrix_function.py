@@ -22,7 +22,7 @@ from nlfilter_torch.core.checks import check_fits, check_instance, check_values,
 from nlfilter_torch.core.layouts import in_format_of
 from nlfilter_torch.core.precision import full_precision, trainable, uncompiled, working_dtype
 from nlfilter_torch.core.rational import DECADES, RationalForm, best_form, interval_nodes, pole_forms
-from nlfilter_torch.core.torch_internals import is_fake, is_transformed
+from nlfilter_torch.core.torch_internals import is_unreadable
 from nlfilter_torch.core.warning import warn
 from nlfilter_torch.filtering.lanczos import STEPS, krylov_product, ritz_space
 from nlfilter_torch.filtering.rational_product import rational_product
@@ -102,7 +102,7 @@ def apply_function(
     decades, seen = _decades(matrix)
     nodes = interval_nodes(decades).to(planes.device).expand(len(planes), -1)
     values = response(nodes)
-    seen = seen and not any(map(_is_unreadable, (values, planes)))
+    seen = seen and not any(map(is_unreadable, (values, planes)))
     rounding = torch.finfo(torch.promote_types(working_dtype(image), planes.dtype)).eps / 2
     rounding = max(rounding, torch.finfo(planes.dtype).eps / 2, torch.finfo(values.dtype).eps / 2)
     form: RationalForm | None = pole_forms(decades, UNSEEN_POLES)[0]
@@ -128,15 +128,10 @@ def _decades(matrix: PixelMatrix) -> tuple[int, bool]:
     W less its diagonal part r is positive semi-definite, so that no eigenvalue is below the smallest r.
     """
     most = DECADES[matrix.remainder.dtype]
-    if _is_unreadable(matrix.remainder):
+    if is_unreadable(matrix.remainder):
         return most, False
     least = -float(matrix.communicator.max(-matrix.remainder.amin(1)).max())
     return (most if least <= 10.0**-most else min(max(math.ceil(-math.log10(least)), 1), most)), True
-
-
-def _is_unreadable(tensor: Tensor) -> bool:
-    """Whether values cannot be read; those on accelerators can, at the price of waiting for them."""
-    return tensor.device.type == "meta" or is_fake(tensor) or is_transformed(tensor)
 
 
 def _by_lanczos(

@@ -55,6 +55,21 @@ def _product(matrix: PixelMatrix, planes: Tensor, shifts: Tensor, inverses: Tens
     return total
 
 
+def pole_terms(matrix: PixelMatrix, planes: Tensor, form: RationalForm) -> Tensor:
+    """``t_j (W + t_j)^-1 y`` for all poles, (B, J, C, N); without a gradient in W."""
+    shifts = form.shifts.to(planes)
+    return matrix.solve(planes, shifts, matrix.capacitances(shifts))
+
+
+def weigh_poles(planes: Tensor, terms: Tensor, weights: Tensor) -> Tensor:
+    """``w_0 y + sum_j w_j y_j`` for planes y, (B, C, N), terms y_j, (B, J, C, N), and weights (B, 1 + J)."""
+    weights = weights.to(planes)[:, :, None, None]
+    total = weights[:, 0] * planes
+    for j in range(terms.shape[1]):
+        total = torch.addcmul(total, weights[:, 1 + j], terms[:, j])
+    return total
+
+
 def _chebyshev(matrix: PixelMatrix, planes: Tensor, degree: int) -> list[Tensor]:
     """``T_k(2 W - 1) y`` for k from 0 to ``degree``."""
     terms = [planes]

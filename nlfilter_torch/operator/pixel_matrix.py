@@ -102,18 +102,10 @@ class PixelMatrix:
 
     def _capacitance(self, shift: Tensor) -> Tensor:
         """Inverse of C for one shift, (B, M, M)."""
-        factor, remainder = self.factor.detach(), self.remainder.detach()
-        scaling = root_weighted(self.scaling.detach(), self.weights) * (remainder + shift).rsqrt()
-        exact = factor.shape[2] <= SMALL and factor.dtype == torch.float32
-        gram = self.communicator.sum(compute_grams(factor, scaling, None, 1, exact=exact))[:, 0]
-        unit = torch.eye(gram.shape[1], dtype=gram.dtype, device=gram.device)
-        if not is_hidden(gram):
-            triangle, failure = torch.linalg.cholesky_ex(unit + gram)
-            if not bool(failure.any()):
-                return torch.cholesky_inverse(triangle)
-        # Rounding may leave a Gram matrix with negative eigenvalues, if the shift is far below the largest eigenvalue.
-        values, vectors = torch.linalg.eigh((gram + gram.mT) / 2)
-        return (vectors / (1 + values.clamp(min=0.0)).unsqueeze(-2)) @ vectors.mT
+        factor, scaling = self.factor.detach(), root_weighted(self.scaling.detach(), self.weights)
+        exact = sums_exactly(factor.dtype, factor.shape[2])
+        gram = self.communicator.sum(shifted_gram(factor, scaling, self.remainder.detach(), shift, exact=exact))
+        return capacitance_inverse(gram)
 
     def solve(self, planes: Tensor, shifts: Tensor, capacitances: Tensor) -> Tensor:
         """``t_j (W + t_j I)^-1 y`` for all shifts, (B, J, C, N), for planes y (B, C, N).
@@ -130,7 +122,7 @@ class PixelMatrix:
     def _solve(self, planes: Tensor, shifts: Tensor, inverses: Tensor) -> Tensor:
         """:meth:`solve` for a few shifts, with one read of the factor in each direction."""
         count, channels = len(shifts), planes.shape[1]
-        lowered = shifts.view(1, -1, 1, 1) / (self.remainder[:, None, None] + shifts.view(1, -1, 1, 1))  # (B, J, 1, N)
+        lowered = shifted_remainder(self.remainder, shifts)
         sums = self._sums((lowered * planes.unsqueeze(1)).flatten(1, 2))  # (B, M, J C)
         sums = inverses @ sums.unflatten(2, (count, channels)).transpose(1, 2) / shifts.double().view(1, -1, 1, 1)
         smooth = self._spread(sums.transpose(1, 2).flatten(2)).unflatten(1, (count, channels))
@@ -190,3 +182,30 @@ class _Powers(torch.autograd.Function):
             adjoint = weighted(d * affinity, weights) + r * adjoint
         grad_factor = outer_product(torch.cat(left, dim=2), torch.cat(right, dim=1))
         return grad_factor, grad_scaling, grad_remainder, None, None, adjoint, None
+
+
+def sums_exactly(dtype: torch.dtype, pixels: int) -> bool:
+    """Whether Gram matrices of so many pixels are summed in float64."""
+    return dtype == torch.float32 and pixels <= SMALL
+
+
+def shifted_gram(factor: Tensor, scaling: Tensor, remainder: Tensor, shift: Tensor, *, exact: bool) -> Tensor:
+    """``U D^2 (R + t)^-1 U^T`` for a shift t, (B, M, M) in float64."""
+    return compute_grams(factor, scaling * (remainder + shift).rsqrt(), None, 1, exact=exact)[:, 0]
+
+
+def capacitance_inverse(gram: Tensor) -> Tensor:
+    """Inverse of I plus Gram matrices (..., M, M)."""
+    unit = torch.eye(gram.shape[-1], dtype=gram.dtype, device=gram.device)
+    if not is_hidden(gram):
+        triangle, failure = torch.linalg.cholesky_ex(unit + gram)
+        if not bool(failure.any()):
+            return torch.cholesky_inverse(triangle)
+    # Rounding may leave a Gram matrix with negative eigenvalues, if the shift is far below the largest eigenvalue.
+    values, vectors = torch.linalg.eigh((gram + gram.mT) / 2)
+    return (vectors / (1 + values.clamp(min=0.0)).unsqueeze(-2)) @ vectors.mT
+
+
+def shifted_remainder(remainder: Tensor, shifts: Tensor) -> Tensor:
+    """``t_j / (r + t_j)`` for shifts t, (B, J, 1, N)."""
+    return shifts.view(1, -1, 1, 1) / (remainder[:, None, None] + shifts.view(1, -1, 1, 1))

@@ -6,7 +6,7 @@ from torch import Tensor
 
 from nlfilter_torch import nonlocal_operator
 from nlfilter_torch.core.rational import rational_form
-from nlfilter_torch.filtering.rational_product import rational_product
+from nlfilter_torch.filtering.rational_product import pole_terms, rational_product, weigh_poles
 from nlfilter_torch.operator.pixel_matrix import PixelMatrix
 from tests.problems import noise
 
@@ -46,3 +46,11 @@ def test_gradients(degree: int, poles: int) -> None:
 def test_second_derivatives_for_a_fixed_operator() -> None:
     planes, coefficients = noise(2, 1, 30, seed=1).requires_grad_(), noise(2, 9, seed=2).requires_grad_()
     assert torch.autograd.gradgradcheck(lambda y, c: product(GUIDE, y, c, 3, 5), (planes, coefficients), atol=1e-6)
+
+
+def test_poles_are_weighed_after_their_systems_are_solved() -> None:
+    operator = nonlocal_operator(GUIDE, num_landmarks=7, photometric_bandwidth=0.4, landmarks="uniform")
+    planes, weights, form = noise(2, 3, 30, seed=1), noise(2, 5, seed=2), rational_form(6, 0, 4, 1.0, 0.15)
+    matrix = PixelMatrix(operator.factor, operator.scaling, operator.remainder, operator.communicator)
+    result = weigh_poles(planes, pole_terms(matrix, planes, form), weights)
+    torch.testing.assert_close(result, rational_product(matrix, planes, form, weights))

@@ -176,7 +176,7 @@ STROKES = {"strokes": paint(1, 0, 0, SPOT), "stroke_mask": SPOT}
         (defocus, RGB, {"focus_region": SPOT, "aperture": "square"}, "aperture must be one of 'disc', 'gaussian'"),
         (defocus, RGB[:, :2], {"focus_region": SPOT}, "image must have 1 or 3 channels, got 2"),
         (defocus, RGB, {"focus_region": SPOT[..., :9]}, "focus_region must have the height and width of the image"),
-        (abstract, RGB, {"power": -1.0}, "power must be at least 0 and finite, got -1"),
+        (abstract, RGB, {"power": -1.0}, r"power must be in \[0, 10\], got -1"),
         (abstract, RGB, {"edges": 2.0}, r"edges must be in \[0, 1\], got 2"),
         (abstract, RGB, {"edge_width": 0.0}, "edge_width must be positive"),
         (abstract, RGB, {"edge_width": 1e4}, "edge_width must be at most half the short side of the"),

@@ -26,7 +26,7 @@ MAX_LANDMARKS = 10_000
 Arguments = dict[str, Any]
 Kind = Literal["number", "count", "odd", "choice", "sliders"]
 Unit = Literal["", "levels", "lab", "px", "%", "gain"]
-Domain = Literal["positive", "not negative", "share", "below 1", "finite", "count", "choice"]
+Domain = Literal["positive", "not negative", "share", "up to 10", "below 1", "finite", "count", "choice"]
 
 #: Section in the help of a command for settings of the filter, which few users need.
 FILTER_PANEL = "Filter"

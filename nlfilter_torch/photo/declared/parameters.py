@@ -374,10 +374,10 @@ ABSTRACT = Edit(
     (
         number(
             "power",
-            0.1,
-            "How much detail is removed. 0: none, 0.1: all but outlines, 1: much more.",
+            0.3,
+            "How much detail is removed. 0: none, 0.3: all but outlines, 1: much more.",
             (0, 10),
-            domain="not negative",
+            domain="up to 10",
             zero_meaning="pass 0 to leave the image unchanged",
             idle=0.0,
             metavar="K",

@@ -31,8 +31,8 @@ class Step:
         values: names and values of the parameters that differ from their defaults, in the order of declaration.
 
     Example:
-        >>> Step("abstract", edges=1.0)["power"], Step("abstract", power=0.1).values
-        (0.1, ())
+        >>> Step("abstract", edges=1.0)["power"], Step("abstract", power=0.3).values
+        (0.3, ())
     """
 
     edit: str

@@ -11,11 +11,14 @@ from torch import Tensor
 from nlfilter_torch.core.checks import check_image, check_photograph, check_same_size, check_tensor, check_unit_range
 from nlfilter_torch.core.inner import EVERYWHERE
 from nlfilter_torch.core.precision import full_precision, working_dtype
+from nlfilter_torch.core.rational import RationalForm
 from nlfilter_torch.filtering.filters import detail_layers
+from nlfilter_torch.filtering.rational_product import pole_terms, rational_product, weigh_poles
 from nlfilter_torch.filtering.scribbles import check_painted
 from nlfilter_torch.operator.build import operator_from_guide
 from nlfilter_torch.operator.columns import Columns
 from nlfilter_torch.operator.operator import NonlocalOperator
+from nlfilter_torch.operator.pixel_matrix import PixelMatrix
 from nlfilter_torch.operator.spectrum import RitzPairs, Spectrum
 from nlfilter_torch.photo.picture.drawn import Drawn
 from nlfilter_torch.photo.picture.edit import PhotoEdit
@@ -204,6 +207,19 @@ class InMemoryOperator:
         """Compute :meth:`Spectrum.coefficients`."""
         values, spectrum = planes(self.source), cast(Spectrum, self.pairs)
         return kept_in(self.cache, "coefficients", [values], lambda: spectrum.coefficients(values))
+
+    def rational(self, planes: Planes, form: RationalForm, weights: Tensor) -> Planes:
+        """Compute :func:`rational_product`; with a cache, other weights take little time."""
+        values, operator = planes(self.source).flatten(2), self.operator
+        matrix = PixelMatrix(
+            operator.factor, operator.scaling, operator.remainder, operator.communicator, operator.weights
+        )
+        if matrix.needs_gradient:
+            result = rational_product(matrix, values, form, weights)
+        else:
+            terms = kept_in(self.cache, form, [values], partial(pole_terms, matrix, values, form))
+            result = weigh_poles(values, terms, weights)
+        return part_of(result.unflatten(2, self.source.size))
 
     def mean(self, planes: Planes) -> Tensor:
         """Means over all pixels."""

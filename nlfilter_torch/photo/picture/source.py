@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.core.kernels.grams import compute_grams
+from nlfilter_torch.core.rational import RationalForm
 from nlfilter_torch.operator.columns import Columns
 from nlfilter_torch.operator.features import blur, blur_margin, reduce_channels
 from nlfilter_torch.operator.options import OperatorOptions
@@ -88,6 +89,9 @@ class Operator(Protocol):
 
     def coefficients(self, planes: Planes) -> Tensor:
         """``F y``, (B, C, M), for planes y of the picture."""
+
+    def rational(self, planes: Planes, form: RationalForm, weights: Tensor) -> Planes:
+        """A rational function of W without a polynomial, for planes of the picture; ``weights`` are (B, 1 + J)."""
 
     def mean(self, planes: Planes) -> Tensor:
         """Means (B, C) of planes over the picture."""

@@ -29,7 +29,7 @@ from nlfilter_torch.photo.tiled.operator import TiledOperator, first_plane
 from nlfilter_torch.photo.tiled.pictures import Picture, RowSource
 from nlfilter_torch.photo.tiled.sampling import CHUNK, ColumnCache, GuidePicture, Pilot
 from nlfilter_torch.photo.tiled.source import Tiled
-from nlfilter_torch.photo.tiled.statistics import Block, Sums
+from nlfilter_torch.photo.tiled.statistics import Block, ShiftedSums, Sums
 from nlfilter_torch.photo.tiled.tiles import Passes
 
 # Pixels of all references together; half or twice as many would be as accurate.
@@ -85,6 +85,13 @@ class FrameOperator(TiledOperator):
 
     def _sums_of_references(self, planes: Planes, order: int) -> Sums:
         return self._summed_up(planes, order, self.over("Summing up"))
+
+    def shifted_sums(self, planes: Planes, shifts: Tensor) -> ShiftedSums:
+        """The sums over the references for shifted systems."""
+        return self.frame.cached_result(partial(self._shifted_of_references, planes, shifts))
+
+    def _shifted_of_references(self, planes: Planes, shifts: Tensor) -> ShiftedSums:
+        return self._shifted(planes, shifts, self.over("Summing up"))
 
     def mean(self, planes: Planes) -> Tensor:
         """Means over the references."""

@@ -7,12 +7,16 @@ from functools import cached_property, partial
 import torch
 from torch import Tensor
 
+from nlfilter_torch.core.kernels.tall_skinny import spread
 from nlfilter_torch.core.precision import full_precision
+from nlfilter_torch.core.rational import RationalForm
 from nlfilter_torch.core.workers import in_order
 from nlfilter_torch.filtering.filters import layers_of_columns
+from nlfilter_torch.filtering.rational_product import weigh_poles
 from nlfilter_torch.operator.columns import Columns
 from nlfilter_torch.operator.features import reduce_channels
 from nlfilter_torch.operator.operator import Kernel
+from nlfilter_torch.operator.pixel_matrix import shifted_remainder, sums_exactly
 from nlfilter_torch.operator.scaling import PixelScaling
 from nlfilter_torch.operator.spectrum import RitzPairs
 from nlfilter_torch.photo.picture.source import SAMPLE, Blocks, Pixels, Planes, sampled_pairs, sampled_places
@@ -36,11 +40,14 @@ from nlfilter_torch.photo.tiled.statistics import (
     Guess,
     Pass,
     Result,
+    ShiftedSums,
+    ShiftedTerms,
     Sums,
     Totals,
     balance_by_passes,
     limiter_by_passes,
     sum_up,
+    sum_up_shifted,
 )
 
 SAMPLE_BLOCKS = 8  # blocks that a sample is split into, to be shared among workers
@@ -156,6 +163,35 @@ class LayerPlanes:
         image = self.planes(pixels)
         layers = layers_of_columns(with_columns(pixels).columns(self.operator), self.coefficients, image.flatten(2))
         return layers.unflatten(-1, image.shape[-2:])
+
+
+@dataclass(frozen=True, eq=False)
+class RationalPlanes:
+    """A rational function of W without a polynomial, of planes y of the picture.
+
+    Attributes:
+        operator: W.
+        planes: y.
+        shifts: t, (J,).
+        weights: w, (1, 1 + J).
+        inner: coefficients of the factor in the solutions of the shifted systems, (1, J, M, C).
+    """
+
+    operator: "TiledOperator"
+    planes: Planes
+    shifts: Tensor
+    weights: Tensor
+    inner: Tensor
+
+    def __call__(self, pixels: Pixels) -> Tensor:
+        """The planes (1, C, h, W) at the pixels."""
+        image, columns = self.planes(pixels), with_columns(pixels).columns(self.operator)
+        planes, inner = image.flatten(2), self.inner.to(columns.factor)
+        rows = inner.transpose(2, 3).flatten(1, 2)  # (1, J C, M)
+        smooth = spread(rows, columns.factor, columns.scaling).unflatten(1, (len(self.shifts), -1))
+        lowered = shifted_remainder(columns.remainder, self.shifts.to(planes))
+        result = weigh_poles(planes, lowered * (planes.unsqueeze(1) - smooth), self.weights)
+        return result.unflatten(2, image.shape[-2:])
 
 
 @dataclass(frozen=True)
@@ -375,6 +411,21 @@ class TiledOperator:
     def coefficients(self, planes: Planes) -> Tensor:
         """``F y``."""
         return self.sums(planes, 1).coefficients()[:, 0].mT
+
+    def rational(self, planes: Planes, form: RationalForm, weights: Tensor) -> Planes:
+        """A rational function of W, from the sums for shifted systems."""
+        return RationalPlanes(self, planes, form.shifts, weights, self.shifted_sums(planes, form.shifts).inner())
+
+    @torch.no_grad()
+    @full_precision
+    def shifted_sums(self, planes: Planes, shifts: Tensor) -> ShiftedSums:
+        """Sums over all pixels for shifted systems: a sample, drawn for balancing, lacks rare pixels."""
+        self.prepare()
+        return self._shifted(planes, shifts, self._over_picture("Summing up"))
+
+    def _shifted(self, planes: Planes, shifts: Tensor, blocks: Pass) -> ShiftedSums:
+        exact = sums_exactly(self.guide.dtype, self.guide.pixels)
+        return sum_up_shifted(blocks, ShiftedTerms(partial(self._planes_and_columns, planes), shifts, exact))
 
     @torch.no_grad()
     @full_precision

@@ -25,6 +25,7 @@ from nlfilter_torch.core.kernels.tall_skinny import moment, positive_root, sprea
 from nlfilter_torch.core.warning import warn
 from nlfilter_torch.operator.columns import Columns
 from nlfilter_torch.operator.eigenvalue_bound import exceeds, limiter, shift, slack
+from nlfilter_torch.operator.pixel_matrix import capacitance_inverse, shifted_gram, shifted_remainder
 from nlfilter_torch.operator.scaling import LARGEST, PixelScaling, scaling_from_moment
 
 CONVERGED = {
@@ -226,6 +227,53 @@ class Guess:
             grams = sum_grams(factor, columns.scaling * block.weights.sqrt(), columns.remainder, 2)
         coefficients = sums[:, :, 1:].unflatten(2, (len(powers), -1)).transpose(1, 2)
         return columns, Totals(sums[:, :, :1], coefficients, grams)
+
+
+@dataclass(frozen=True)
+class ShiftedSums:
+    """What solves systems ``(W + t_j) x = y`` for a few shifts t, see :mod:`nlfilter_torch.operator.pixel_matrix`.
+
+    Attributes:
+        grams: ``F (R + t_j)^-1 F^T``, (1, J, M, M), float64.
+        moments: ``F (R + t_j)^-1 y``, (1, J, M, C), float64.
+    """
+
+    grams: Tensor
+    moments: Tensor
+
+    def inner(self) -> Tensor:
+        """Coefficients of the factor, (1, J, M, C): ``t_j x = t_j (R + t_j)^-1 (y - F^T c_j)``."""
+        return capacitance_inverse(self.grams) @ self.moments
+
+
+@dataclass(frozen=True)
+class ShiftedTerms:
+    """The sums of a block for shifts t, (J,); ``values`` computes its planes y (1, C, n) and its columns."""
+
+    values: Callable[[Block], tuple[Tensor, Columns]]
+    shifts: Tensor
+    exact: bool
+
+    def __call__(self, block: Block) -> ShiftedSums:
+        """Gram matrices and moments."""
+        planes, columns = self.values(block)
+        scaling, shifts = columns.scaling * block.weights.sqrt(), self.shifts.to(columns.remainder)
+        grams = [
+            shifted_gram(columns.factor, scaling, columns.remainder, shift, exact=self.exact)
+            for shift in shifts.unbind()
+        ]
+        lowered = shifted_remainder(columns.remainder, shifts) / shifts.view(1, -1, 1, 1)  # (1, J, 1, n)
+        mass = (columns.scaling * block.weights).unsqueeze(1)
+        moments = moment(columns.factor, (mass.unsqueeze(1) * lowered * planes.unsqueeze(1)).flatten(1, 2))
+        return ShiftedSums(torch.stack(grams, dim=1), moments.unflatten(2, (len(shifts), -1)).transpose(1, 2))
+
+
+def sum_up_shifted(blocks: Pass, terms: ShiftedTerms) -> ShiftedSums:
+    """Compute the sums for shifted systems, in one pass over blocks of pixels."""
+    grams, moments = torch.zeros(()), torch.zeros(())
+    for sums in blocks(terms):
+        grams, moments = grams + sums.grams, moments + sums.moments
+    return ShiftedSums(grams, moments)
 
 
 def sum_up(blocks: Pass, values: Callable[[Block], tuple[Tensor, Columns]], order: int) -> Sums:

@@ -76,7 +76,7 @@ def test_arguments_of_the_function_and_of_its_filter() -> None:
 
 def test_files_of_steps_have_defaults_only_on_request() -> None:
     step = Step("abstract", edges=0.5)
-    assert json.loads(step.to_json()) == {"edit": "abstract", "power": 0.1, "edges": 0.5}
+    assert json.loads(step.to_json()) == {"edit": "abstract", "power": 0.3, "edges": 0.5}
     complete = json.loads(step.to_json(complete=True))
     assert complete["tones"] is None
     assert set(complete) == {"edit", *(parameter.name for parameter in step.declared)}

@@ -1,15 +1,17 @@
 """Abstraction: power, tones, lines, and pixels unlike all others."""
 
+import pytest
 import torch
 
-from nlfilter_torch import abstract
+from nlfilter_torch import abstract, nonlocal_operator, spectral_filter
+from nlfilter_torch.photo.declared.parameters import ABSTRACT
 from tests.problems import colour, luminance
 
 
 def test_abstraction_fades_with_its_power() -> None:
     image = colour("chelsea", 48, 72)
     torch.testing.assert_close(abstract(image, power=0.0), image, atol=1e-5, rtol=0)
-    changes = [float((abstract(image, power=p) - image).square().mean().sqrt()) for p in (1e-5, 1e-3, 0.1, 1.0)]
+    changes = [float((abstract(image, power=p) - image).square().mean().sqrt()) for p in (1e-5, 1e-3, 0.3, 1.0, 2.5)]
     assert changes == sorted(changes)
     assert changes[0] < 1e-4
     assert changes[2] > 0.01
@@ -56,3 +58,30 @@ def test_channels_of_the_guide_can_be_chosen() -> None:
     edited = [abstract(image, num_landmarks=20, guide_channels=channels) for channels in ("all", "luminance")]
     torch.testing.assert_close(edited[0], abstract(image, num_landmarks=20), rtol=0, atol=0)
     assert not torch.equal(edited[0], edited[1])
+
+
+@pytest.mark.parametrize("power", [0.05, 0.3, 1.0, 2.5])
+def test_the_picture_is_that_of_a_power_of_the_filter(power: float) -> None:
+    image = colour("coffee", 60, 80)
+    operator = nonlocal_operator(
+        image,
+        photometric_bandwidth="auto",
+        spatial_bandwidth=ABSTRACT["spatial_bandwidth"].distance(None, (60, 80)),
+        patch_size=3,
+        num_landmarks=200,
+        guide_channels="all",
+    )
+    wanted = spectral_filter(operator, image, lambda values: values**power)
+    torch.testing.assert_close(abstract(image, power=power), wanted, atol=1 / 255, rtol=0)
+    powers = torch.tensor([power, 0.5])
+    both = abstract(image.expand(2, -1, -1, -1), power=powers)
+    torch.testing.assert_close(both[:1], wanted, atol=1 / 255, rtol=0)
+
+
+def test_no_pixel_leaves_the_range_of_the_picture() -> None:
+    for name in ("rocket", "coffee", "astronaut"):
+        image = colour(name, 96, 120)
+        edited = abstract(image, photometric_bandwidth=10 / 255)
+        assert edited.min() > image.min() - 1 / 255
+        assert edited.max() < image.max() + 1 / 255
+        assert not bool((edited < image - 50 / 255).any())
