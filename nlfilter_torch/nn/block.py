@@ -16,6 +16,8 @@ from nlfilter_torch.operator.option_checks import check_construction
 from nlfilter_torch.operator.options import SAMPLING, Construction, Sampling
 
 Norm = Literal["batch", "none"]
+BlockOption = Literal["temperature", "spatial_bandwidth"]
+LEARNABLE: tuple[BlockOption, ...] = get_args(BlockOption)
 
 LARGEST_EMBEDDING = 8  # default of embedding_channels: more of them need more landmarks
 FLAT = 1e-10  # mean square of a centred embedding with values up to 1, below which it counts as constant
@@ -82,10 +84,10 @@ class NonlocalBlock(Learnable):
         temperature: float = 2.0,
         spatial_bandwidth: float | None = None,
         norm: Norm = "batch",
-        learn: Collection[str] = ("temperature",),
+        learn: BlockOption | Collection[BlockOption] = LEARNABLE[:1],
     ) -> None:
         super().__init__()
-        names = check_learn(learn, tuple(self.learnable))
+        names = check_learn(learn, LEARNABLE)
         check_count(channels, "channels")
         inner = max(channels // 2, 1) if inner_channels is None else inner_channels
         embedding = min(max(channels // 2, 1), LARGEST_EMBEDDING) if embedding_channels is None else embedding_channels

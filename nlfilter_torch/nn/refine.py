@@ -3,7 +3,7 @@
 from collections.abc import Collection
 from functools import partial
 from types import MappingProxyType
-from typing import Literal
+from typing import Literal, get_args
 
 import torch
 from torch import Tensor, nn
@@ -15,7 +15,8 @@ from nlfilter_torch.operator.operator import NonlocalOperator
 from nlfilter_torch.operator.option_checks import check_bandwidths, check_options
 from nlfilter_torch.operator.options import AUTO, GuideChannels, OperatorOptions, Sampling
 
-LEARNABLE = ("strength", "margin", "compatibility", "photometric_bandwidth", "spatial_bandwidth")
+RefineOption = Literal["strength", "margin", "compatibility", "photometric_bandwidth", "spatial_bandwidth"]
+LEARNABLE: tuple[RefineOption, ...] = get_args(RefineOption)
 
 
 class Refine(Learnable):
@@ -77,7 +78,7 @@ class Refine(Learnable):
         landmarks: Sampling = RefineOptions.landmarks,
         guide_channels: GuideChannels = RefineOptions.guide_channels,
         classes: int | None = None,
-        learn: Collection[str] = ("strength", "margin"),
+        learn: RefineOption | Collection[RefineOption] = ("strength", "margin"),
     ) -> None:
         super().__init__()
         names = check_learn(learn, LEARNABLE)

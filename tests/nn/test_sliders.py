@@ -211,6 +211,9 @@ def test_type_checkers_refuse_misspelt_names(tmp_path: Path) -> None:
         'NonlocalFilter(learn=("bandwidth",))',
         'NonlocalAffinity(learn=["alpha"])',
         'SegmentMask(learn=("width",))',
+        'Refine(learn=("alpha",))',
+        'NonlocalBlock(4, learn="strength")',
+        'Look(learn=("curve",))',
     ]
     legal = 'NonlocalFilter(learn=("alpha", "spatial_bandwidth"), spatial_bandwidth=3.0).alpha = (1.0, 2.0)'
     script = tmp_path / "user.py"

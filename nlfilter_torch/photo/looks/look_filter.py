@@ -6,6 +6,7 @@ parameter but the image: looks are fitted to edits by least squares.
 
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
+from typing import Literal, get_args
 
 import torch
 from torch import Tensor
@@ -27,6 +28,7 @@ from nlfilter_torch.photo.picture.ends import ends_of
 BLURS = 6  # each twice as wide as the one before
 BAND_MARGIN = 2 * (2**BLURS - 1)  # pixels around a pixel that the widest depends on
 FLAT = 0.15  # standard deviation of luminance around a pixel at which half of a band counts as texture
+LookPart = Literal["alpha", "bands", "texture", "curves", "matrix", "saturation", "stretch", "local"]
 #: Parts of a look, with their shapes for one image; a letter is any length from 2 on.
 SHAPES: dict[str, tuple[int | str, ...]] = {
     "alpha": ("k+1",),
@@ -38,7 +40,7 @@ SHAPES: dict[str, tuple[int | str, ...]] = {
     "stretch": (KINDS,),
     "local": (STRENGTHS,),
 }
-NAMES = tuple(SHAPES)
+NAMES: tuple[LookPart, ...] = get_args(LookPart)
 #: Values at which these parts change nothing; they are not computed then.
 IDLE = {"alpha": 1.0, "bands": 1.0, "texture": 1.0, "stretch": 0.0, "local": 0.0}
 

@@ -27,7 +27,7 @@ from nlfilter_torch.operator.options import (
 )
 from nlfilter_torch.photo.declared.shading import LANDMARKS, LEVELS, NEAR
 from nlfilter_torch.photo.looks.histogram import KINDS, STRENGTHS
-from nlfilter_torch.photo.looks.look_filter import BLURS, NAMES, acts, check_part, filter_look
+from nlfilter_torch.photo.looks.look_filter import BLURS, NAMES, LookPart, acts, check_part, filter_look
 
 
 class Look(nn.Module):
@@ -77,7 +77,7 @@ class Look(nn.Module):
         self,
         parts: Mapping[str, Tensor] | None = None,
         *,
-        learn: Collection[str] = NAMES,
+        learn: LookPart | Collection[LookPart] = NAMES,
         knots: int = 17,
         patch_size: int = OperatorOptions.patch_size,
         photometric_bandwidth: float | Tensor | Literal["auto"] = LEVELS / 255,
@@ -162,7 +162,9 @@ class Look(nn.Module):
         """
         check_image(image, "image", channels=3)
         passed = (alpha, bands, texture, curves, matrix, saturation, stretch, local)
-        parts = {name: getattr(self, name) if part is None else part for name, part in zip(NAMES, passed, strict=True)}
+        parts: dict[str, Tensor] = {
+            name: getattr(self, name) if part is None else part for name, part in zip(NAMES, passed, strict=True)
+        }
         exact = image.to(working_dtype(image))
         if operator is None and acts(parts["alpha"]):
             operator = operator_from_guide(reduce_channels(exact, "luminance"), self._options(image))
