@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from nlfilter_torch.core.checks import check_choice, check_count, check_dtype, check_finite
 from nlfilter_torch.core.precision import full_precision, working_dtype
 from nlfilter_torch.nn.parameters import Learnable, check_learn, positive_option
-from nlfilter_torch.operator.build import operator_from_features
+from nlfilter_torch.operator.build import operator_from_points
 from nlfilter_torch.operator.option_checks import check_construction
 from nlfilter_torch.operator.options import SAMPLING, Construction, Sampling
 
@@ -132,12 +132,8 @@ class NonlocalBlock(Learnable):
         size = x.shape[2:]
         points = x.flatten(2)
         features = self._features(self.embedding(points), size)
-        operator = operator_from_features(
-            features,
-            size=(prod(size[:-1]), size[-1]),
-            num_landmarks=min(self.num_landmarks, points.shape[2]),
-            landmarks=self.landmarks,
-        )
+        method = Construction(num_landmarks=min(self.num_landmarks, points.shape[2]), landmarks=self.landmarks)
+        operator = operator_from_points(features, (prod(size[:-1]), size[-1]), method)
         values = self.value(points)
         attended = (operator @ values.unflatten(2, operator.size)).flatten(2)
         added: Tensor = self.norm(self.output(attended))

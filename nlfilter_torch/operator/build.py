@@ -22,8 +22,18 @@ from nlfilter_torch.core.checks import (
 from nlfilter_torch.core.communicator import ALONE, Communicator, all_gather_shapes
 from nlfilter_torch.core.precision import full_precision, trainable, uncompiled, uncompiled_with, working_dtype
 from nlfilter_torch.core.torch_internals import is_hidden, outside_transforms, refuse_transforms
+from nlfilter_torch.core.warning import warn
 from nlfilter_torch.operator.assignment import Assignment
 from nlfilter_torch.operator.counting import assign_among_counted, extended, hidden_points
+from nlfilter_torch.operator.coverage import (
+    FEW,
+    HALF,
+    LARGEST_SHARE,
+    LEAST_POINTS,
+    SAMPLED,
+    sampled_places,
+    share_above,
+)
 from nlfilter_torch.operator.eigenvalue_bound import exceeds, is_bounded, limiter, shifted_gram, slack
 from nlfilter_torch.operator.features import (
     GuideFeatures,
@@ -276,7 +286,9 @@ def operator_from_features(
     :func:`nonlocal_operator` applies the same steps to the weighted patches of a guide.
 
     Args:
-        features: (B, D, N), already divided by bandwidths: the affinity of two points is ``exp(-|x_i - x_j|^2)``.
+        features: (B, D, N), already divided by bandwidths: the affinity of two points is ``exp(-|x_i - x_j|^2)``. On
+            CPUs, 1,024 points or more cause a warning if the landmarks cover more than 15 % of them badly; see
+            :meth:`NonlocalOperator.badly_covered`.
         size: (H, W) with H * W = N, the shape of the images to filter; (D, H, W) for volumes, and so on; (N,), meaning
             (1, N), for unordered points. Values (B, C, N) can be filtered whatever the size.
         weights: (N,) or (B, N): how many identical pixels each point represents, 0 for points that do not count, which
@@ -302,8 +314,6 @@ def operator_from_features(
         >>> bool((smoothed - 1).abs().max() < 1e-4)
         True
     """
-    refuse_transforms(features=features, weights=weights, landmarks=landmarks)
-    check_features(features, "features", empty=True)
     method = Construction(
         num_landmarks=num_landmarks,
         landmarks=landmarks,
@@ -312,15 +322,48 @@ def operator_from_features(
         generator=generator,
         group=group,
     )
+    operator = operator_from_points(features, size, method, weights)
+    _warn_of_coverage(operator)
+    return operator
+
+
+@uncompiled
+@outside_transforms
+@full_precision
+def operator_from_points(
+    features: Tensor, size: tuple[int, ...], method: Construction, weights: Tensor | None = None
+) -> NonlocalOperator:
+    """:func:`operator_from_features` where a user did not choose the points: without the warning about landmarks."""
+    refuse_transforms(features=features, weights=weights, landmarks=method.landmarks)
+    check_features(features, "features", empty=True)
     check_construction(method)
     shape = check_size(size, features.shape[2])
     features = features.to(working_dtype(features))
     if weights is not None:
         weights = check_weights(weights, features)
-    communicator = all_gather_shapes(features.unflatten(2, shape), group)
+    communicator = all_gather_shapes(features.unflatten(2, shape), method.group)
     if weights is not None:
         check_counted(communicator.max(weights.amax(1)))
     return _assemble(features, shape, method, weights=weights, communicator=communicator)
+
+
+def _warn_of_coverage(operator: NonlocalOperator) -> None:
+    """Warn if the landmarks cover many points badly; not of few points, hidden values and distributed rows."""
+    points = operator.factor.shape[2]
+    if points < LEAST_POINTS or len(operator) == 0 or is_hidden(operator.factor) or operator.communicator.size > 1:
+        return
+    # Where the correction of the diagonal is below half, the row is not off by more: |K_ij - u_i . u_j|^2 <= c_i c_j.
+    uncertain = share_above(operator.diagonal.detach(), HALF, operator.weights)
+    worst, share = operator[int(uncertain.argmax())], float(uncertain.max())
+    for count in (FEW, SAMPLED):
+        if share <= LARGEST_SHARE:
+            return
+        share = float(worst.badly_covered(count))
+    if share > LARGEST_SHARE:
+        warn(
+            f"landmarks must resemble the points, got {operator.factor.shape[1]} of them that leave rows of W of "
+            f"{share:.0%} of the points off by more than half; use more landmarks, or a larger bandwidth"
+        )
 
 
 def _copy(value: float | Tensor) -> float | Tensor:
@@ -384,7 +427,8 @@ def _assemble(
     if chosen is None:
         chosen, assignment = _landmarks(method, features, whole, count, communicator, weights)
     inverse = inverse_cholesky(chosen)
-    kernel = Kernel(chosen, inverse, method.completion, features=recipe, assignment=assignment)
+    sample = None if in_graph else communicator.columns(features.detach(), _places(math.prod(whole), features))
+    kernel = Kernel(chosen, inverse, method.completion, features=recipe, assignment=assignment, sample=sample)
     factor, diagonal = whole_kernel = kernel.factor(features)
     if hidden is not None:  # set aside, with row sums of 1
         factor, diagonal = factor * ~hidden.unsqueeze(1), torch.where(hidden, 1.0, diagonal)
@@ -455,6 +499,11 @@ def _landmarks(
     ):
         return landmarks_by(method, features, size, count, communicator, weights)
     return assign_among_counted(features, size, count, method.landmarks, method.generator, weights)
+
+
+def _places(points: int, features: Tensor) -> Tensor:
+    """Numbers of the points whose features are kept, on the device of features."""
+    return sampled_places(points).to(features.device)
 
 
 def _least(weights: Tensor | None, communicator: Communicator) -> Tensor | None:

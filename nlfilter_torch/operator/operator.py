@@ -22,6 +22,7 @@ from nlfilter_torch.core.precision import full_precision, trainable, uncompiled
 from nlfilter_torch.core.torch_internals import outside_transforms, refuse_transforms
 from nlfilter_torch.operator.assignment import Assignment
 from nlfilter_torch.operator.columns import Columns
+from nlfilter_torch.operator.coverage import SAMPLED, SampledRows, sampled_places
 from nlfilter_torch.operator.eigenvalue_bound import largest_eigenvalue, shifted_gram
 from nlfilter_torch.operator.features import GuideFeatures
 from nlfilter_torch.operator.nystrom import nystrom_factor
@@ -44,6 +45,8 @@ class Kernel:
         limiter: (B, M, M) matrix by which the factor is multiplied so that no eigenvalue of W exceeds 1, or None.
         features: computes features of a guide; None if the operator was made from features.
         assignment: of which points the landmarks are made; None if they were passed as features.
+        sample: features (B, D, S) of the :func:`sampled_places` of the operator's own points; None in compiled
+            programs. Without a gradient.
     """
 
     landmarks: Tensor
@@ -52,6 +55,7 @@ class Kernel:
     limiter: Tensor | None = None
     features: GuideFeatures | None = None
     assignment: Assignment | None = None
+    sample: Tensor | None = None
 
     @property
     def recipe(self) -> GuideFeatures:
@@ -100,6 +104,7 @@ class Diagnostics:
         eigenvector_residual: largest ||W v - lambda v|| over the unit eigenvectors.
         orthogonality: largest deviation of V V^T from the identity.
         diagonal_share: mean of the diagonal part r of W, the weight with which a pixel keeps its own value.
+        badly_covered: share of the pixels that the landmarks cover badly; see :meth:`NonlocalOperator.badly_covered`.
     """
 
     pixels: int
@@ -113,6 +118,7 @@ class Diagnostics:
     eigenvector_residual: list[float]
     orthogonality: list[float]
     diagonal_share: list[float]
+    badly_covered: list[float]
 
 
 @dataclass(frozen=True)
@@ -202,12 +208,15 @@ class NonlocalOperator(Batch):
     def alike(cls, batches: Sequence[Self]) -> Sequence[Self]:
         """The operators, with weights and a limiter if one of them has these, and equally many rounds of balancing.
 
-        Without an assignment if theirs cannot be joined, so that the landmarks are kept as features.
+        Without an assignment if theirs cannot be joined, so that the landmarks are kept as features, and without a
+        sample of features if one of them has none.
         """
         weighted = any(operator.weights is not None for operator in batches)
         limited = any(operator.kernel.limiter is not None for operator in batches)
         rounds = max(len(operator.balancing.before) for operator in batches)
         assigned = len({operator.assignment and operator.assignment.kind for operator in batches}) == 1
+        if any(operator.kernel.sample is None for operator in batches):
+            batches = [replace(operator, kernel=replace(operator.kernel, sample=None)) for operator in batches]
         return [operator._explicit(weighted, limited, rounds, assigned) for operator in batches]
 
     def _explicit(self, weighted: bool, limited: bool, rounds: int, assigned: bool) -> Self:
@@ -397,6 +406,51 @@ class NonlocalOperator(Batch):
 
     @full_precision
     @torch.no_grad()
+    def badly_covered(self, sampled: int = SAMPLED) -> Tensor:
+        """Estimate the share of the points that the landmarks cover badly, by their weights: (B,), from 0 to 1.
+
+        A point counts as badly covered if more than half of the weight of its row of W lies at other points than in the
+        exact filter, in which every two points are compared: no landmark resembles those that resemble it. Other
+        landmarks, more of them, or a larger bandwidth lower the share. Points that resemble no other are not badly
+        covered: they keep their values in the exact filter, too.
+
+        Both filters are those of a sample of at most ``sampled`` points, so that the cost does not depend on the size
+        of the image: about 0.05 s on one core for 1024 points. Of similarities that are rarer than one in so many
+        points, none may be seen; with few points, shares of a few percent are noise. If there are at most 2048 points
+        in all, the sample is all of them, and the share is exact.
+
+        Args:
+            sampled: number of points, of the 1024 whose features are kept.
+
+        Returns:
+            (B,) in float64; NaN for an operator built by a compiled program, which keeps no features.
+
+        Raises:
+            TypeError, ValueError: if ``sampled`` is not a positive integer.
+
+        Example:
+            >>> from nlfilter_torch import operator_from_features
+            >>> generator = torch.Generator().manual_seed(0)
+            >>> centres = torch.randn(20, 8, generator=generator)
+            >>> points = (centres.repeat(50, 1) + 0.1 * torch.randn(1000, 8, generator=generator)).mT[None]
+            >>> few, many = (operator_from_features(points, size=(1000,), num_landmarks=m) for m in (10, 30))
+            >>> round(float(few.badly_covered()), 1), round(float(many.badly_covered()), 1)
+            (0.6, 0.0)
+        """
+        check_count(sampled, "sampled")
+        if self.kernel.sample is None:
+            return self.factor.new_full((len(self),), torch.nan, dtype=torch.float64)
+        points = self.communicator.pixels(self.factor.shape[2])
+        places = sampled_places(points).to(self.device)
+        weights = torch.ones_like(self.scaling) if self.weights is None else self.weights.expand_as(self.scaling)
+        planes = torch.stack([self.scaling, self.remainder, weights.to(self.scaling)], dim=1)
+        factor, planes = (self.communicator.columns(tensor, places) for tensor in (self.factor, planes))
+        scaling, remainder, weights = planes.unbind(1)
+        rows = SampledRows(self.kernel.sample, factor, scaling, remainder, weights, points / len(places))
+        return rows.thinned(sampled).badly_covered()
+
+    @full_precision
+    @torch.no_grad()
     def diagnostics(self) -> Diagnostics:
         """Measure the quality of the operator, at several times the cost of the spectrum."""
         spectrum, certificate = self.spectrum(), self.certify()
@@ -428,6 +482,7 @@ class NonlocalOperator(Batch):
             eigenvector_residual=residual.amax(1).tolist(),
             orthogonality=(inner - occupied).abs().amax((1, 2)).tolist(),
             diagonal_share=(self.communicator.sum(weighted(self.remainder, self.weights).sum(1)) / pixels).tolist(),
+            badly_covered=self.badly_covered().tolist(),
         )
 
 

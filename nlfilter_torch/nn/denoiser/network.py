@@ -25,7 +25,8 @@ from nlfilter_torch.nn.denoiser.noise import noise_map
 from nlfilter_torch.nn.denoiser.profile import NoiseProfile
 from nlfilter_torch.nn.denoiser.tiles import in_tiles
 from nlfilter_torch.nn.denoiser.weights import read_weights
-from nlfilter_torch.operator.build import operator_from_features
+from nlfilter_torch.operator.build import operator_from_points
+from nlfilter_torch.operator.options import Construction
 
 TRAINED = Path(__file__).with_name("denoiser.safetensors")
 
@@ -222,10 +223,10 @@ class NonlocalDenoiser(nn.Module):
         rows, columns = (torch.arange(n, device=guide.device, dtype=guide.dtype) for n in (height, width))
         alike, near = self.log_bandwidths.exp()
         places = torch.stack(torch.meshgrid(rows, columns, indexing="ij")).flatten(1) / near
-        operator = operator_from_features(
+        operator = operator_from_points(
             torch.cat([guide.flatten(2) / alike, places.expand(len(guide), -1, -1)], dim=1),
-            size=(height, width),
-            num_landmarks=max(1, height * width // pixels),
+            (height, width),
+            Construction(num_landmarks=max(1, height * width // pixels)),
         )
         # Cumulative sums: the sliders increase to 1 for the smooth layer, so that the filter computes means of pixels.
         sliders = logits.unflatten(1, (ORDER + 1, LEVELS)).softmax(1).cumsum(1)[:, :, (0, 1, 1)]

@@ -37,6 +37,7 @@ MEANINGS = {
     "eigenvector_residual": "largest error of an eigenvector",
     "orthogonality": "largest deviation of the eigenvectors from orthonormality",
     "diagonal_share": "average weight of a pixel in its own filtered value",
+    "badly_covered": "share of the pixels that have similar ones which the landmarks miss; lower with more landmarks",
     "captured_energy": "share of the picture's energy that the patterns capture (beta in the paper)",
 }
 

@@ -17,8 +17,9 @@ from torch import Tensor
 
 from nlfilter_torch.core.blocks import stratified
 from nlfilter_torch.core.precision import full_precision
-from nlfilter_torch.operator.build import operator_from_features
+from nlfilter_torch.operator.build import operator_from_points
 from nlfilter_torch.operator.features import GuideFeatures, estimate_bandwidth, reduce_channels, unit_window
+from nlfilter_torch.operator.options import Construction
 from nlfilter_torch.operator.scaling import PixelScaling
 from nlfilter_torch.operator.spectrum import RitzPairs
 from nlfilter_torch.photo.declared.steps import Step, acting_steps
@@ -209,7 +210,8 @@ def learn_filter(pictures: Sequence[Picture], guide: Guide) -> LearntFilter:
     points, colours = torch.cat(features, dim=2), torch.cat(images, dim=2)
     weights = torch.full((1, points.shape[2]), pictures[0].pixels / points.shape[2], dtype=points.dtype)
     options["num_landmarks"] = min(options.get("num_landmarks", 100), points.shape[2])
-    built = operator_from_features(points, size=(points.shape[2],), weights=weights[0], generator=generator, **options)
+    method = Construction(generator=generator, **options)
+    built = operator_from_points(points, (points.shape[2],), method, weights[0])
     pixels = (built.factor, built.diagonal, colours, weights)
     cuts = zip(*(part.split(CHUNK, dim=-1) for part in pixels), strict=True)
     blocks = [Block(factor, diagonal, image, weight) for factor, diagonal, image, weight in cuts]
