@@ -3,7 +3,7 @@
 import csv
 import statistics
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from io import StringIO
 from pathlib import Path
@@ -14,7 +14,7 @@ import torch.nn.functional as F
 from matplotlib.figure import Figure
 from safetensors.torch import save as as_bytes
 from torch import Tensor, nn
-from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
+from torch.optim.swa_utils import AveragedModel
 
 from benchmarks.denoiser_training.examples import SHARES, Examples, Source
 from benchmarks.denoiser_training.pictures import Pictures
@@ -32,7 +32,7 @@ EXPECTED = 0.55  # exponent with which the error of a denoiser grows with the no
 WARM_UP = 200  # steps over which the learning rate rises
 FALL = 0.5  # final share of the steps, over which the learning rate falls to zero along half a cosine
 LARGEST_GRADIENT = 0.5  # norm to which gradients are clipped
-MEAN_OVER = 1000  # time constant of the running mean of the weights, in steps
+LATE = 10  # the running mean of the weights is over the last 1/LATE of the steps, about
 EVERY = 250  # steps between checkpoints
 ASIDE, ASIDE_SEED = 16, 1_000_000  # examples of each kind set aside for judging, and their seed
 
@@ -94,6 +94,13 @@ def rate_at(step: int, steps: int) -> float:
     return 0.5 + 0.5 * float(torch.cos(torch.tensor(torch.pi * min(1.0, passed))))
 
 
+@torch.no_grad()
+def average_late(means: Sequence[Tensor], weights: Sequence[Tensor], number: Tensor | int) -> None:
+    """Update running means of weights after so many steps; the weight of step n is proportional to n ** (LATE - 1)."""
+    for mean, weight in zip(means, weights, strict=True):
+        mean.lerp_(weight, LATE / (LATE + float(number)))
+
+
 def new_denoiser(plan: Plan) -> NonlocalDenoiser:
     """Create a denoiser with weights drawn from a seed, or read from a file."""
     with torch.random.fork_rng(devices=[]):  # layers draw their weights from the global generator
@@ -115,7 +122,7 @@ class Training:
 
     def __init__(self, plan: Plan, pictures: Pictures, aside: Pictures) -> None:
         self.plan, self.model = plan, new_denoiser(plan)
-        self.mean = AveragedModel(self.model, multi_avg_fn=get_ema_multi_avg_fn(1 - 1 / MEAN_OVER))
+        self.mean = AveragedModel(self.model, multi_avg_fn=average_late)
         named = {name: weight for name, weight in self.model.named_parameters() if weight.requires_grad}
         bandwidths = [named.pop("log_bandwidths")] if "log_bandwidths" in named else []
         self.kernels = [

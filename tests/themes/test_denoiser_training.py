@@ -137,6 +137,13 @@ def test_the_rate_rises_stays_and_falls() -> None:
     assert rates[-1] < 1e-4
 
 
+def test_the_running_mean_is_over_the_last_steps() -> None:
+    mean = [torch.zeros(2)]
+    for step in range(2000):
+        training.average_late(mean, [torch.full((2,), float(step))], step)
+    assert mean[0].tolist() == pytest.approx([2000 * training.LATE / (training.LATE + 1)] * 2, rel=0.01)
+
+
 def test_loss_is_the_mean_error_over_what_the_noise_makes_expect() -> None:
     clean = torch.zeros(2, 1, 4, 4)
     denoised, noisy = (
