@@ -99,10 +99,15 @@ def as_file(picture: Tensor, like: Path) -> Tensor:
 def cut(picture: Tensor, camera: Camera, side: int, generator: torch.Generator) -> Tensor:
     """A random crop of a picture (3, H, W), as large as a camera needs; small pictures are mirrored."""
     before = camera.side_before(side)
-    lacks = [max(0, before - length) for length in picture.shape[-2:]]
-    picture = F.pad(picture[None], (0, lacks[1], 0, lacks[0]), mode="reflect")[0]
-    places = [int(torch.randint(length - before + 1, (), generator=generator)) for length in picture.shape[-2:]]
-    return picture[:, places[0] : places[0] + before, places[1] : places[1] + before]
+    rows, columns = (_mirrored(length, before, generator) for length in picture.shape[-2:])
+    return picture[:, rows][:, :, columns]
+
+
+def _mirrored(length: int, count: int, generator: torch.Generator) -> Tensor:
+    """A number of successive places from a random one on, which go back and forth where there are not so many."""
+    places = torch.arange(count) + int(torch.randint(max(length - count, 0) + 1, (), generator=generator))
+    places = places % max(2 * length - 2, 1)
+    return torch.minimum(places, 2 * length - 2 - places).clamp(min=0)
 
 
 @torch.no_grad()

@@ -197,6 +197,14 @@ def test_a_crop_of_another_size_is_refused() -> None:
         Camera().photograph(torch.rand(3, 48, 48), 48, generator())
 
 
+def test_crops_of_small_pictures_are_mirrored() -> None:
+    picture = torch.arange(3.0).view(1, 1, 3).expand(3, 200, 3)
+    crop = cut(picture, Camera(), 48, generator())
+    assert crop.shape == (3, 64, 64)
+    assert crop[0, 0, :9].tolist() == [0, 1, 2, 1, 0, 1, 2, 1, 0]
+    assert cut(torch.ones(3, 1, 1), Camera(), 48, generator()).eq(1).all()
+
+
 def test_statistics_of_white_noise_are_the_same_at_every_scale() -> None:
     clean = torch.rand(3, 1, 1).expand(3, 256, 256) * torch.linspace(0.5, 1, 256)
     values = statistics(clean, clean + 5 / 255 * torch.randn(3, 256, 256, generator=generator()))
