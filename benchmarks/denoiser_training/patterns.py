@@ -1,16 +1,24 @@
 """Drawn repeated patterns: facades, bricks, tiles, gratings, fabrics and text, seen at an angle, no two cells alike.
 
 Patterns of training and patterns held out for reporting (herringbone, scales, hexagons, meshes, plaids, digits) are two
-families without a common kind.
+families without a common kind. ``python -m benchmarks.denoiser_training.patterns --out FOLDER`` writes the set of
+repeated patterns to report on: drawn ones held out and, with ``--photographs FOLDER``, the photographs of the reporting
+set that repeat (:mod:`benchmarks.denoiser_training.free_photographs`).
 """
 
+import argparse
 import math
-from collections.abc import Callable
+import shutil
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import torch
 import torch.nn.functional as F
+from PIL import Image
 from torch import Tensor
+
+from benchmarks.denoiser_training.free_photographs import photographs
 
 FINER = 3  # pixels drawn for a pixel, in both directions
 PERIODS = 5.0, 40.0  # pixels of a cell
@@ -100,8 +108,8 @@ def tiles(lattice: Lattice) -> Tensor:
         middle, size = torch.rand(2, 2, generator=lattice.generator).tolist()
         square = ((across - middle[0]).abs(), (along - middle[1]).abs())
         width, height = (0.08 + 0.3 * length for length in size)
-        round_one = (square[0] / width).square() + (square[1] / height).square() < 1
-        shape = round_one if lattice.number() < 0.5 else (square[0] < width) & (square[1] < height)
+        ellipse = (square[0] / width).square() + (square[1] / height).square() < 1
+        shape = ellipse if lattice.number() < 0.5 else (square[0] < width) & (square[1] < height)
         picture = paint(picture, shape, lattice.colour())
     return paint(picture, (across < 0.05) | (along < 0.05), lattice.colour())
 
@@ -252,3 +260,30 @@ def _lattice(side: int, generator: torch.Generator) -> Lattice:
     along = (down * math.cos(angle) - right * math.sin(angle)) / depth
     across = across + 0.3 * (shear - 0.5) * along
     return Lattice(across / period + 8 * row, along / (period * 1.6 ** (2 * stretch - 1)) + 8 * column, generator)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Write the repeated patterns to report on."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.denoiser_training.patterns", description=main.__doc__)
+    parser.add_argument("--out", type=Path, required=True, help="folder of the patterns")
+    parser.add_argument("--photographs", type=Path, help="folder of the prepared photographs of the reporting set")
+    parser.add_argument("--count", type=int, default=3, help="patterns of each kind; default %(default)s")
+    parser.add_argument("--side", type=int, default=256, help="pixels of drawn patterns; default %(default)s")
+    options = parser.parse_args(arguments)
+    for name in ("count", "side"):
+        if getattr(options, name) < 1:
+            parser.error(f"--{name} must be at least 1, got {getattr(options, name)}")
+    options.out.mkdir(parents=True, exist_ok=True)
+    for number, kind in enumerate(kind for kind in APART for _ in range(options.count)):
+        picture = pattern(options.side, torch.Generator().manual_seed(number), kind=kind, held_out=True)
+        levels = (255 * picture).round().byte().permute(1, 2, 0).numpy()
+        Image.fromarray(levels).save(options.out / f"{kind}_{number % options.count}.png")
+    for photograph in photographs() if options.photographs else ():
+        file = options.photographs / f"{photograph.name}.png"
+        if photograph.set == "reporting" and photograph.repeated and file.exists():
+            shutil.copy(file, options.out)
+    print(f"{len(list(options.out.glob('*.png')))} pictures are in {options.out}")
+
+
+if __name__ == "__main__":
+    main()
