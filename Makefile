@@ -96,6 +96,7 @@ QUICK := \
 	'streaming_busy --quick' \
 	'app --side 96 --megapixels 0.05' \
 	'denoising --quick --megapixel' \
+	'denoising --quick --patterns --methods noisy ours' \
 	'looks --quick' \
 	'look_costs --quick' \
 	'detail --quick' \

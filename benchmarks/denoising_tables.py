@@ -2,7 +2,7 @@
 
 FILE is the JSON of ``python -m benchmarks.denoising --out FILE``. Prints means over photographs of PSNR in dB, SSIM and
 CPU seconds, and writes them between the markers of ``--docs``. Those of a public set (``--set``) are printed beside
-published figures, and have markers of their own.
+published figures; those of a set and of repeated patterns have markers of their own.
 """
 
 import argparse
@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from benchmarks.denoising.patterns import pattern_table
 from benchmarks.denoising.sets import set_table
 from benchmarks.report import between, table
 from nlfilter_torch.photo.io.writing import open_beside
@@ -52,6 +53,8 @@ def tables(results: Results, figures: Sequence[tuple[str, str, str]]) -> str:
 
 def tables_of(content: Mapping[str, Any]) -> str:
     """The tables of a file, with published figures if it is of a public set."""
+    if "patterns" in content:
+        return "\n\n".join(pattern_table(content, key) for key in content["results"])
     if "set" not in content:
         return tables(dict(content), [("", "psnr", ".2f"), ("SSIM", "ssim", ".3f"), ("CPU s", "seconds", ".1f")])
     kinds = dict.fromkeys(key.split(", ")[0] for key in content["results"])
@@ -60,9 +63,8 @@ def tables_of(content: Mapping[str, Any]) -> str:
 
 def markers_of(content: Mapping[str, Any]) -> tuple[str, str]:
     """The lines of a page between which the tables of a file are."""
-    if "set" not in content:
-        return MARKERS
-    begin, end = (marker.replace("denoising", content["set"].lower(), 1) for marker in MARKERS)
+    name = "patterns" if "patterns" in content else content.get("set", "denoising").lower()
+    begin, end = (marker.replace("denoising", name, 1) for marker in MARKERS)
     return begin, end
 
 

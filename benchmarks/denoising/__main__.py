@@ -21,6 +21,9 @@ and clean photographs. ``--megapixel`` measures only the CPU time and memory of 
 Urban100): it prints a table with the published figures of other denoisers beside those measured here, by the protocol
 that :mod:`benchmarks.denoising.sets` states. The set is recognised by the folder's name or by the number of pictures,
 unless ``--name`` tells it.
+
+``--patterns`` compares on repeated patterns that were kept aside from training (:mod:`benchmarks.denoising.patterns`):
+what the filter adds, beside non-local means, BM3D and, with ``--plain FILE``, the network without the filter.
 """
 
 import argparse
@@ -30,7 +33,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from benchmarks.denoising import sets
+from benchmarks.denoising import patterns, sets
 from benchmarks.denoising.cases import NOISE, Case, scenes, with_noise
 from benchmarks.denoising.claims import megapixel, misstated
 from benchmarks.denoising.measuring import table
@@ -46,6 +49,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--pictures", type=Path, help="folder of photographs; default: those of scikit-image")
     parser.add_argument("--set", type=Path, help="folder of a public set, compared by the literature's protocol")
     parser.add_argument("--name", choices=sets.NAMES, help="of the set, where it is not recognised")
+    parser.add_argument("--patterns", action="store_true", help="repeated patterns, drawn and of photographs")
     parser.add_argument("--published", action="store_true", help="figures of the literature in the table of a set")
     parser.add_argument(
         "--noise", type=float, nargs="+", help=f"noise levels in grey levels; default: {NOISE}; for a set {LEVELS}"
@@ -125,11 +129,24 @@ def compare_on_set(options: argparse.Namespace) -> None:
         print(f"\n{sets.set_table(content, kind, quoted=options.published)}")
 
 
+def compare_on_patterns(options: argparse.Namespace) -> None:
+    """Print a table of repeated patterns for each kind and level."""
+    kinds, levels = options.kinds or ("grey", "colour"), options.noise or (patterns.LEVEL,)
+    methods = chosen(options, patterns.COMPARED)
+    results = patterns.compare(methods, kinds, levels, options.pictures, quick=options.quick)
+    content = {"patterns": patterns.SEED, "results": results}
+    save(options.out, content)
+    for key in results:
+        print(f"\n{patterns.pattern_table(content, key)}")
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """Print the tables."""
     options = parse(arguments)
     if options.megapixel:
         megapixel((options.noise or NOISE)[0], quick=options.quick)
+    elif options.patterns:
+        compare_on_patterns(options)
     elif options.set is not None:
         compare_on_set(options)
     else:

@@ -8,7 +8,9 @@ import pytest
 import torch
 from PIL import Image
 
-from benchmarks.denoising import methods, published, sets
+from benchmarks.denoiser_training.free_photographs import photographs
+from benchmarks.denoiser_training.patterns import APART, TRAINED
+from benchmarks.denoising import methods, patterns, published, sets
 from benchmarks.denoising.__main__ import main
 from benchmarks.denoising.cases import HELD_OUT, Case, decibels, scenes, with_noise
 from benchmarks.denoising.measuring import table
@@ -180,6 +182,33 @@ def test_published_figures_are_of_known_sets_and_sources_and_fall_with_the_noise
     assert published.published("Kodak24", "grey") == ()
 
 
+def test_patterns_that_repeat_were_kept_aside(tmp_path: Path) -> None:
+    grey, coloured = (list(patterns.pictures(kind, None, quick=True)) for kind in ("grey", "colour"))
+    assert [name.split()[0] for name, _ in grey] == list(APART)
+    assert not set(APART) & set(TRAINED)
+    assert all(picture.shape[1:] == (1, 48, 48) for _, picture in grey)
+    assert all(0 <= float(picture.min()) <= float(picture.max()) <= 1 for _, picture in coloured)
+    (tmp_path / "reporting").mkdir()
+    wanted = [photograph for photograph in photographs() if photograph.set == "reporting" and photograph.repeated]
+    for photograph in wanted:
+        Image.new("RGB", (300, 270), "gray").save(tmp_path / "reporting" / f"{photograph.name}.png")
+    added = list(patterns.pictures("colour", tmp_path, quick=True))[len(coloured) :]
+    assert [name for name, _ in added] == [f"photographs {photograph.name}" for photograph in wanted]
+    assert all(picture.shape == (1, 3, 256, 256) for _, picture in added)
+    with pytest.raises(SystemExit, match="has none of them; prepare them by"):
+        main(["--patterns", "--quick", "--methods", "noisy", "--pictures", str(tmp_path / "reporting")])
+
+
+def test_the_lead_on_patterns_is_printed(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    out = tmp_path / "patterns.json"
+    main(["--patterns", "--quick", "--kinds", "grey", "--methods", "noisy", "ours", "--out", str(out)])
+    printed = capsys.readouterr().out
+    rows = json.loads(out.read_text())["results"]["grey, 25"]
+    means = {method: sum(values["psnr"] for values in row.values()) / len(APART) for method, row in rows.items()}
+    line = next(line for line in printed.splitlines() if line.startswith("| noisy"))
+    assert line.split("|")[-3:-1] == [f" {means['noisy']:.2f} ", f" {means['ours'] - means['noisy']:+.2f} "]
+
+
 def test_bm3d_is_left_out_where_it_is_not_installed(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -188,7 +217,8 @@ def test_bm3d_is_left_out_where_it_is_not_installed(
     assert "bm3d is not installed" in capsys.readouterr().out
 
 
-def test_the_tables_of_the_docs_are_those_of_their_file() -> None:
-    content = json.loads((DOCS / "kodak24.json").read_text())
+@pytest.mark.parametrize("name", ["kodak24", "patterns"])
+def test_the_tables_of_the_docs_are_those_of_their_file(name: str) -> None:
+    content = json.loads((DOCS / f"{name}.json").read_text())
     page = (DOCS / "training.md").read_text()
     assert between(page, tables_of(content), *markers_of(content)) == page
