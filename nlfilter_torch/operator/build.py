@@ -427,7 +427,8 @@ def _assemble(
     if chosen is None:
         chosen, assignment = _landmarks(method, features, whole, count, communicator, weights)
     inverse = inverse_cholesky(chosen)
-    sample = None if in_graph else communicator.columns(features.detach(), _places(math.prod(whole), features))
+    alone = not in_graph and communicator.size == 1  # ranks send each other nothing that only diagnostics need
+    sample = communicator.columns(features.detach(), _places(math.prod(whole), features)) if alone else None
     kernel = Kernel(chosen, inverse, method.completion, features=recipe, assignment=assignment, sample=sample)
     factor, diagonal = whole_kernel = kernel.factor(features)
     if hidden is not None:  # set aside, with row sums of 1

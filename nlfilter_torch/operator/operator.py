@@ -46,7 +46,7 @@ class Kernel:
         features: computes features of a guide; None if the operator was made from features.
         assignment: of which points the landmarks are made; None if they were passed as features.
         sample: features (B, D, S) of the :func:`sampled_places` of the operator's own points; None in compiled
-            programs. Without a gradient.
+            programs, and if rows are distributed. Without a gradient.
     """
 
     landmarks: Tensor
@@ -423,7 +423,7 @@ class NonlocalOperator(Batch):
             sampled: number of points, of the 1024 whose features are kept.
 
         Returns:
-            (B,) in float64; NaN for an operator built by a compiled program, which keeps no features.
+            (B,) in float64; NaN for an operator built by a compiled program or over ranks, which keeps no features.
 
         Raises:
             TypeError, ValueError: if ``sampled`` is not a positive integer.

@@ -188,6 +188,7 @@ def painting(rows: slice, group: Any, dtype: torch.dtype) -> Results:
     assert figures.pop("pixels") == HEIGHT * WIDTH
     figures.pop("balancing_steps")  # samples of the ranks differ from those of the whole image
     figures.pop("num_landmarks")
+    figures.pop("badly_covered")  # not measured over ranks
     result = {"rows spread": spread, "rows guide": guide.grad, "rows values": values.grad}
     result |= {name: leaf.grad for name, leaf in leaves.items()}
     result |= {
