@@ -291,6 +291,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
     parser = argparse.ArgumentParser(prog="python -m benchmarks.denoiser_training.cameras", description=main.__doc__)
     parser.add_argument("--compare", type=Path, required=True, help="folder of pairs NAME_real.JPG and NAME_mean.JPG")
+    parser.add_argument("--leave-out", nargs="+", default=(), help="beginnings of names of pairs that are not read")
     parser.add_argument("--pictures", type=Path, help="folder of clean photographs; default: those of scikit-image")
     parser.add_argument("--count", type=int, default=100, help="number of simulated cameras; default %(default)s")
     parser.add_argument("--held-out", action="store_true", help="cameras that training never draws")
@@ -299,7 +300,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for name in ("count", "seed"):
         if getattr(options, name) < (name == "count"):
             parser.error(f"--{name} must be at least {int(name == 'count')}, got {getattr(options, name)}")
-    print(comparison.compared(options.compare, options.pictures, options.count, options.seed, options.held_out))
+    print(
+        comparison.compared(
+            options.compare,
+            options.pictures,
+            options.count,
+            options.seed,
+            held_out=options.held_out,
+            left_out=options.leave_out,
+        )
+    )
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
 """Statistics of noise, by which simulated cameras are compared to pairs of photographs."""
 
 import io
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -52,17 +53,21 @@ def _by_brightness(clean: Tensor, noise: Tensor) -> dict[str, float]:
     return {"dark over middle": dark / middle, "bright over middle": bright / middle}
 
 
-def pairs(folder: Path, left_out: frozenset[str] = frozenset()) -> dict[str, tuple[Tensor, Tensor]]:
-    """Pairs (clean, noisy) of a folder with ``NAME_mean.*`` and ``NAME_real.*``, (3, H, W) each."""
-    paths = {path.stem.removesuffix("_real"): path for path in sorted(folder.iterdir()) if path.stem.endswith("_real")}
+def pairs(folder: Path, left_out: Sequence[str] = ()) -> dict[str, tuple[Tensor, Tensor]]:
+    """Pairs (clean, noisy) of a folder with ``NAME_mean.*`` and ``NAME_real.*``, (3, H, W) each.
+
+    Args:
+        folder: of the pairs.
+        left_out: beginnings of names that are left out, such as those of scenes.
+    """
+    names = {path.stem.removesuffix("_real"): path for path in sorted(folder.iterdir()) if path.stem.endswith("_real")}
+    paths = {name: path for name, path in names.items() if not name.startswith(tuple(left_out))}
     if not paths:
         raise SystemExit(
             f"{folder} must hold pairs NAME_mean.JPG and NAME_real.JPG, but holds none; name another folder"
         )
     return {
-        name: (read(path.with_name(path.name.replace("_real", "_mean"))), read(path))
-        for name, path in paths.items()
-        if name not in left_out
+        name: (read(path.with_name(path.name.replace("_real", "_mean"))), read(path)) for name, path in paths.items()
     }
 
 
@@ -111,9 +116,11 @@ def _mirrored(length: int, count: int, generator: torch.Generator) -> Tensor:
 
 
 @torch.no_grad()
-def compared(folder: Path, photographs: Path | None, count: int, seed: int, held_out: bool) -> str:
+def compared(
+    folder: Path, photographs: Path | None, count: int, seed: int, *, held_out: bool, left_out: Sequence[str] = ()
+) -> str:
     """The table of simulated noise beside that of the pairs of a folder, whose kind of file the simulated ones have."""
-    real = pairs(folder)
+    real = pairs(folder, left_out)
     clean = [picture[0] for picture in pictures(photographs, LARGEST, CLEAN).values()]
     like = next(path for path in sorted(folder.iterdir()) if path.stem.endswith("_real"))
     values = simulated(clean, count, seed, held_out=held_out, like=like)

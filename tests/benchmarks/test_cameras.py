@@ -227,6 +227,8 @@ def test_the_command_compares_pairs_of_a_folder(tmp_path: Path, capsys: pytest.C
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) == 20
     assert "inside" in lines[0]
+    with pytest.raises(SystemExit, match="must hold pairs"):
+        cameras.main(["--compare", str(tmp_path), "--leave-out", "a"])
     with pytest.raises(SystemExit):
         cameras.main(["--compare", str(tmp_path), "--count", "0"])
     assert "--count must be at least 1, got 0" in capsys.readouterr().err
