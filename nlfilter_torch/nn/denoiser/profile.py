@@ -28,7 +28,7 @@ class NoiseProfile:
     Attributes:
         levels: (B, S, 2, K), not negative, in units of the image: at S scales (:attr:`SCALES`), of the luminance (mean
             of the channels) and of the colour differences (of unit norm, root mean square of both), at K brightnesses
-            from 0 to 1, linear in between. Grey images have no colour differences: their levels are 0.
+            from 0 to 1, their squares linear in between. Grey images have no colour differences: levels of 0.
         light: mean brightness (B,) of the photograph.
 
     Example:
@@ -43,10 +43,12 @@ class NoiseProfile:
 
     @classmethod
     def white(cls, level: Tensor, *, channels: int = 3) -> "NoiseProfile":
-        """Return white noise with standard deviation ``level`` (B,) in every channel, at every brightness."""
+        """Return white noise with standard deviation ``level`` (B,), or (B, K) by brightness, in every channel."""
+        if level.ndim == 1:
+            level = level[:, None].expand(-1, KNOTS)
         planes = [level / 3**0.5, level] if channels == 3 else [level, torch.zeros_like(level)]
-        levels = torch.stack(planes, dim=1)[:, None, :, None].expand(-1, len(cls.SCALES), -1, KNOTS)
-        return cls(levels, torch.full_like(level, 0.5))
+        levels = torch.stack(planes, dim=1)[:, None].expand(-1, len(cls.SCALES), -1, -1)
+        return cls(levels, torch.full_like(level[:, 0], 0.5))
 
     @property
     def level(self) -> Tensor:
@@ -76,13 +78,13 @@ class NoiseProfile:
         light = F.avg_pool2d(image.detach(), 5, 1, padding=2, count_include_pad=False).mean(1, keepdim=True)
         positions = light.clamp(0, 1) * (KNOTS - 1)
         chosen = self.levels[:, [self.SCALES.index(scale) for scale in scales]].to(image)
-        first, *others = chosen.flatten(1, 2).unbind(2)
+        first, *others = chosen.flatten(1, 2).square().unbind(2)
         # Linear interpolation, as a sum of ramps between the knots: their slopes are constant.
-        levels, previous = first[..., None, None].expand(-1, -1, *image.shape[-2:]), first
+        squares, previous = first[..., None, None].expand(-1, -1, *image.shape[-2:]), first
         for knot, values in enumerate(others):
-            levels = levels + (values - previous)[..., None, None] * (positions - knot).clamp(0, 1)
+            squares = squares + (values - previous)[..., None, None] * (positions - knot).clamp(0, 1)
             previous = values
-        return levels
+        return squares.clamp(min=0).sqrt()
 
     def _deviation(self, scale: int) -> Tensor:
         """Root mean square (B,) of a pixel's channels at the scale of that index, at the mean brightness."""
@@ -90,9 +92,9 @@ class NoiseProfile:
         below = position.floor().clamp(max=KNOTS - 2)
         share = (position - below)[:, None]
         places = below.long()[:, None, None].expand(-1, 2, 1)
-        levels = self.levels[:, scale]
-        ends = levels.gather(2, places).squeeze(2), levels.gather(2, places + 1).squeeze(2)
-        luminance, colour = torch.lerp(ends[0], ends[1], share).square().unbind(1)
+        squares = self.levels[:, scale].square()
+        ends = squares.gather(2, places).squeeze(2), squares.gather(2, places + 1).squeeze(2)
+        luminance, colour = torch.lerp(ends[0], ends[1], share).unbind(1)
         # The differences have coefficients of unit norm: their variances are shared by the three channels.
         return (luminance + 2 / 3 * colour).sqrt()
 

@@ -41,7 +41,7 @@ class ChangeMeter:
 
 
 def write_map(map_of: Callable[[Tensor], Tensor], rows: Rows, path: Path) -> None:
-    """Write what a function computes from a photograph as a grey picture, at :data:`MAP_DEPTH`.
+    """Write what a function computes from a photograph as a picture, at :data:`MAP_DEPTH`.
 
     The function depends on :data:`AROUND` pixels around each.
     """

@@ -204,7 +204,8 @@ DENOISE = Edit(
         *filter_parameters(share=0.2, landmarks=200),
     ),
     hint="Estimates the noise and removes as much of it as you choose.",
-    map_help="Also write a picture of the standard deviation of the noise at every pixel; white is 64 grey levels.",
+    map_help="Also write a picture of the noise at every pixel: blue is its standard deviation, green and red those of "
+    "means of 2x2 and 4x4 pixels, times 2 and 4. White noise is grey, coarse noise red; 255 is 64 grey levels.",
     filter_condition=Condition(
         "method", "rule", "has no effect on the network; add --method rule to denoise by the filter alone"
     ),

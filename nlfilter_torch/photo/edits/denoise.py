@@ -15,6 +15,7 @@ from nlfilter_torch.core.inner import Inner
 from nlfilter_torch.core.precision import per_image
 from nlfilter_torch.core.torch_internals import cached_constants
 from nlfilter_torch.filtering.filters import weigh_layers
+from nlfilter_torch.nn.denoiser.estimate import white_profile
 from nlfilter_torch.nn.denoiser.network import NonlocalDenoiser, deviation_of, level_planes
 from nlfilter_torch.nn.denoiser.noise import Noise
 from nlfilter_torch.nn.denoiser.profile import NoiseProfile
@@ -22,7 +23,7 @@ from nlfilter_torch.nn.denoiser.tiles import STEP
 from nlfilter_torch.operator.options import Completion, GuideChannels, Sampling
 from nlfilter_torch.photo.declared.declaration import Edit
 from nlfilter_torch.photo.declared.parameters import DENOISE
-from nlfilter_torch.photo.edits.noise import noise_of
+from nlfilter_torch.photo.edits.noise import noise_of, profile_of
 from nlfilter_torch.photo.edits.synthesis import remainder
 from nlfilter_torch.photo.picture.drawn import Drawn, M
 from nlfilter_torch.photo.picture.edit import FilteredEdit
@@ -37,6 +38,9 @@ ORDER = 2
 LEVELS = 255  # grey levels of white
 VISIBLE_LEVELS = 0.5  # change in grey levels that is hardly visible: the rounding error of eight bits
 WHITE_LEVELS = 64  # standard deviation in grey levels that is white in a map of the noise
+COARSE = 1.2  # coarseness from which noise is called coarse
+EVEN = 0.02  # relative difference between the levels in black and white below which they are the same
+NO_ESTIMATE = ": too small, too few colours or too much black and white to estimate noise, which --noise-level sets"
 NEGLIGIBLE_NOISE = 0.1 / LEVELS  # noise level below what 8 bits resolve; the image is returned unchanged
 
 
@@ -64,7 +68,8 @@ def denoise(
     Args:
         image: (B, C, H, W); with C = 3 it is RGB.
         noise_level: standard deviation of white noise, in units of the image, a number or a tensor of shape () or (B,);
-            for the network also a map (B, 1 or C, H, W). None estimates it, and its growth with brightness.
+            for the network also a map (B, 1 or C, H, W). None estimates it: for the network by scale, colour and
+            brightness (:func:`noise_profile`), since the noise of cameras is not white, for the rule as white noise.
         strength: factor of the noise level, a number or a tensor of shape () or (B,): 0 changes nothing, more than 1
             smooths more. For the network, more than 100/255 counts as 100/255 of noise.
         method: ``"network"`` or ``"rule"``. All further arguments are for the rule.
@@ -113,7 +118,7 @@ class Denoise(FilteredEdit):
 
     declared: ClassVar[Edit] = DENOISE
     reports_change: ClassVar[bool] = True
-    noise_level: float | Tensor | Noise | None
+    noise_level: float | Tensor | Noise | NoiseProfile | None
     strength: float | Tensor
     method: Method
     guide_channels: GuideChannels = "all"
@@ -123,9 +128,9 @@ class Denoise(FilteredEdit):
         DENOISE.check(source.batch, strength=self.strength, method=self.method)
         check_count(self.num_landmarks, "num_landmarks")
         is_map = isinstance(self.noise_level, Tensor) and self.noise_level.ndim == 4
-        if not isinstance(self.noise_level, Noise) and not is_map:
+        if not isinstance(self.noise_level, (Noise, NoiseProfile)) and not is_map:
             DENOISE.check(source.batch, noise_level=self.noise_level)
-        noise = noise_of(source) if self.noise_level is None else self.noise_level
+        noise = self._estimated(source) if self.noise_level is None else self.noise_level
         if self.method == "network":
             if is_map:
                 source.check_all_in_memory(
@@ -136,7 +141,7 @@ class Denoise(FilteredEdit):
             raise ValueError(
                 "noise_level must be a number or have shape (B,) for method rule, got a map; use method network"
             )
-        level = noise.level if isinstance(noise, Noise) else torch.as_tensor(noise, dtype=source.dtype)
+        level = noise.level if isinstance(noise, (Noise, NoiseProfile)) else torch.as_tensor(noise, dtype=source.dtype)
         level = level.reshape(-1) * torch.as_tensor(self.strength, dtype=source.dtype).reshape(-1)
         return self._fit_rule(source, level)
 
@@ -153,31 +158,52 @@ class Denoise(FilteredEdit):
 
     def measured(self, source: Source[M]) -> Self:
         """Return the edit with the noise of the picture, if its level is not set."""
-        return replace(self, noise_level=noise_of(source)) if self.noise_level is None else self
+        return replace(self, noise_level=self._estimated(source)) if self.noise_level is None else self
+
+    def _estimated(self, source: Source[M]) -> Noise | NoiseProfile:
+        return profile_of(source) if self.method == "network" else noise_of(source)
 
     def map_of(self, image: Tensor) -> Tensor:
-        """Standard deviation of the noise, 1 at :data:`WHITE_LEVELS`."""
-        deviation = self._noise.at(image).square().mean(1, keepdim=True).sqrt()
-        return (deviation * (LEVELS / WHITE_LEVELS)).clamp(0, 1)
+        """Levels (B, 3, H, W) of the noise at scales 4, 2 and 1 as red, green and blue, 1 at :data:`WHITE_LEVELS`."""
+        luminance, colour = self._noise.at(image, (4, 2, 1)).square().unflatten(1, (3, 2)).unbind(2)
+        return ((luminance + 2 / 3 * colour).sqrt() * (LEVELS / WHITE_LEVELS)).clamp(0, 1)
 
     @property
-    def _noise(self) -> Noise:
-        if isinstance(self.noise_level, Noise):
+    def _noise(self) -> NoiseProfile:
+        if isinstance(self.noise_level, NoiseProfile):
             return self.noise_level
-        return Noise.even(torch.as_tensor([self.noise_level]))
+        noise = self.noise_level
+        return white_profile(noise if isinstance(noise, Noise) else Noise.even(torch.as_tensor([noise])))
 
     def summary(self, change: float) -> str:
         """The noise, measured or set, and how much the pixels changed."""
         noise, level = self._noise, LEVELS * float(self._noise.level)
-        ends = [LEVELS * float((noise.floor + light * noise.gain).sqrt()) for light in (0.0, 1.0)]
-        spread = f" ({ends[0]:.2f} in black, {ends[1]:.2f} in white)" if noise.gain > 0 else ""
-        estimated = isinstance(self.noise_level, Noise)
-        text = f"denoise: {'estimated' if estimated else 'given'} noise of {level:.2f} grey levels{spread}"
+        estimated = isinstance(self.noise_level, (Noise, NoiseProfile))
+        text = f"denoise: {'estimated' if estimated else 'given'} noise of {level:.2f} grey levels{_described(noise)}"
         if level < LEVELS * NEGLIGIBLE_NOISE:
-            return f"{text}, less than {LEVELS * NEGLIGIBLE_NOISE:.1f}; no pixel changed"
+            hint = NO_ESTIMATE if estimated and not bool(noise.levels.any()) else ""
+            return f"{text}, less than {LEVELS * NEGLIGIBLE_NOISE:.1f}; no pixel changed{hint}"
         weak = "" if change >= VISIBLE_LEVELS else ", which is barely visible"
         remedy = "; --strength 2 removes more" if weak and estimated and 0 < float(self.strength) < 2 else ""
         return f"{text}; {super().summary(change)}{weak}{remedy}"
+
+
+def _described(noise: NoiseProfile) -> str:
+    """How noise depends on scale, or else on brightness."""
+    coarseness = float(noise.coarseness)
+    if coarseness >= COARSE:
+        return f", {coarseness:.1f} times as much as white noise in means of 4x4 pixels"
+    dark, bright = (LEVELS * float(replace(noise, light=torch.full_like(noise.light, end)).level) for end in (0, 1))
+    return f" ({dark:.2f} in black, {bright:.2f} in white)" if abs(dark - bright) > EVEN * max(dark, bright) else ""
+
+
+def _as_trained(noise: NoiseProfile) -> NoiseProfile:
+    """Noise as the network is told it: as white noise, of the level between scales 2 and 4.
+
+    Of the noise that is left, most is coarse; finer noise is removed with it.
+    """
+    levels = (noise.levels[:, 1:2] * noise.levels[:, 2:3]).sqrt()
+    return replace(noise, levels=levels.expand_as(noise.levels))
 
 
 @cached_constants
@@ -201,6 +227,7 @@ class NetworkDenoising:
     def __call__(self, image: Tensor, _: Tensor, inner: Inner) -> Tensor:
         """Denoise an image."""
         noise = self.noise.at(image) if isinstance(self.noise, Noise) else self.noise
+        noise = _as_trained(noise) if isinstance(noise, NoiseProfile) else noise
         levels = level_planes(noise, image, "noise_level")
         strength = per_image(self.strength, levels, 4).expand(len(image), -1, -1, -1)
         levels = levels * strength.repeat_interleave(len(levels) // len(image), dim=0)

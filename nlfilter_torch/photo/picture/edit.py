@@ -75,7 +75,7 @@ class PhotoEdit(ABC):
         return f"pixels changed by {change:.2f} grey levels (RMS)"
 
     def map_of(self, image: Tensor) -> Tensor:
-        """The map (B, 1, H, W) in [0, 1] of what the edit estimates, for those that declare one; see :meth:`measured`.
+        """The map (B, 3, H, W) in [0, 1] of what the edit estimates, for those that declare one; see :meth:`measured`.
 
         It depends on at most two pixels around each.
         """

@@ -50,7 +50,7 @@ def test_estimated_noise_and_the_change_are_printed(
 def test_nothing_to_do(tmp_path: Path, capsys: pytest.CaptureFixture[str], tiled: bool) -> None:
     photo, out = write(tmp_path / "in.tif", 0.0), tmp_path / "out.tif"
     assert main(["denoise", str(photo), str(out), "--landmarks", "40"]) == 0
-    assert "less than 0.1; no pixel changed\n" in capsys.readouterr().out
+    assert "estimated noise of 0.00 grey levels, less than 0.1; no pixel changed: " in capsys.readouterr().out
     np.testing.assert_array_equal(pixels(photo), pixels(out))
 
 
