@@ -18,8 +18,11 @@ from .filtering.spectral import captured_energy as captured_energy
 from .filtering.spectral import spectral_filter as spectral_filter
 from .nn.affinity import NonlocalAffinity as NonlocalAffinity
 from .nn.block import NonlocalBlock as NonlocalBlock
+from .nn.denoiser.estimate import noise_profile as noise_profile
 from .nn.denoiser.network import NonlocalDenoiser as NonlocalDenoiser
 from .nn.denoiser.noise import estimate_noise as estimate_noise
+from .nn.denoiser.profile import NoiseProfile as NoiseProfile
+from .nn.denoiser.profile import profile_of_difference as profile_of_difference
 from .nn.masks import DiffusionMask as DiffusionMask
 from .nn.masks import SegmentMask as SegmentMask
 from .nn.portable import Portable as Portable

@@ -64,6 +64,8 @@ def of_tones(photo: Tensor, grey: Tensor, dtype: torch.dtype) -> Calls:
         "denoise: rule": lambda: with_gradients(cleaned, rough, levels),
         "estimate_noise": lambda: nf.estimate_noise(rough),
         "estimate_noise: grey": lambda: nf.estimate_noise(grey),
+        "noise_profile": lambda: nf.noise_profile(rough).levels,
+        "profile_of_difference": lambda: nf.profile_of_difference(rough, grey.expand_as(rough)).levels,
         "abstract": lambda: with_gradients(flattened, pair, levels),
         "abstract: options": lambda: nf.abstract(photo, edges=1.0, edge_width=1.0, patch_size=5, viewing_size=0, **FEW),
         "filter_frames": lambda: list(nf.filter_frames(pair.split(1), alpha, references=[photo], **FEW)),

@@ -40,6 +40,7 @@ OF_IMAGES: dict[str, Callable[[Any], object]] = {
     "nonlocal_operator": lambda x: nf.nonlocal_operator(x, **FEW),
     "estimate_bandwidth": nf.estimate_bandwidth,
     "estimate_noise": nf.estimate_noise,
+    "noise_profile": nf.noise_profile,
     "matmul": lambda x: BUILT @ x,
     "detail_layers": lambda x: nf.detail_layers(BUILT, x),
     "polynomial_filter": lambda x: nf.polynomial_filter(BUILT, x, ONES),

@@ -328,6 +328,7 @@ def test_a_layer_holds_the_assignment_of_a_volume(volume: Tensor) -> None:
         (lambda op, x: nlf.enhance(x, 2.0), r"image must have shape \(B, C, H, W\), got .*; index or flatten"),
         (lambda op, x: nlf.denoise(x), r"image must have shape \(B, C, H, W\), got .*; index or flatten"),
         (lambda op, x: nlf.estimate_noise(x), r"image must have shape \(B, C, H, W\), got .*; index or flatten"),
+        (lambda op, x: nlf.noise_profile(x), r"image must have shape \(B, C, H, W\), got .*; index or flatten"),
     ],
 )
 def test_what_does_not_fit_is_refused_in_one_sentence(

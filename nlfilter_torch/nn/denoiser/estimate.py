@@ -58,8 +58,8 @@ def noise_profile(image: Tensor) -> NoiseProfile:
         image: (B, C, H, W), in [0, 1] apart from the noise; with C = 3 it is RGB, otherwise channels are grey images.
 
     Returns:
-        The noise. It is 0 where none can be told: in pictures smaller than 3x3, almost all black or white, or with few
-        colours (drawings, dithered pictures). No gradient is propagated.
+        A :class:`NoiseProfile`: 0 where none can be told, which is in pictures smaller than 3x3, almost all black or
+        white, or with few colours (drawings, dithered pictures). No gradient is propagated.
 
     Raises:
         TypeError, ValueError: if ``image`` is not a finite floating-point (B, C, H, W) tensor.
@@ -77,8 +77,11 @@ def noise_profile(image: Tensor) -> NoiseProfile:
 
 
 def profile_places(size: tuple[int, int]) -> Tensor:
-    """Ascending row-major indices (n,) of the pixels from which the noise of a picture (H, W) is estimated."""
-    return torch.cat([window_pixels(size).flatten(), window_places(size)]).unique()
+    """Ascending row-major indices (n,) of the pixels from which the noise of a picture (H, W) is estimated.
+
+    Pixels that are looked at several times occur as often.
+    """
+    return torch.cat([window_pixels(size).flatten(), window_places(size)]).sort().values
 
 
 def profile_of_measured(measured: Tensor) -> NoiseProfile:

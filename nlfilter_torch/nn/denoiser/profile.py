@@ -26,7 +26,7 @@ class NoiseProfile:
     white noise has the same level at every scale.
 
     Attributes:
-        levels: (B, S, 2, K), not negative, in units of the image: at S scales (:attr:`SCALES`), of the luminance (mean
+        levels: (B, S, 2, K), not negative, in units of the image: at S scales (``SCALES``), of the luminance (mean
             of the channels) and of the colour differences (of unit norm, root mean square of both), at K brightnesses
             from 0 to 1, their squares linear in between. Grey images have no colour differences: levels of 0.
         light: mean brightness (B,) of the photograph.
@@ -52,14 +52,14 @@ class NoiseProfile:
 
     @property
     def level(self) -> Tensor:
-        """Standard deviation (B,) of a pixel's channels, at the mean brightness."""
+        """Standard deviation of a pixel's channels (B,), at the mean brightness."""
         return self._deviation(0)
 
     @property
     def coarseness(self) -> Tensor:
-        """Level (B,) at scale 4 over that at scale 1, at the mean brightness: 1 for white noise, up to 4 for blotches.
+        """How coarse the noise is (B,), from 1 for white noise to 4 for blotches; 1 where there is no noise.
 
-        1 where there is no noise.
+        It is the level at scale 4 over that at scale 1, at the mean brightness.
         """
         fine, coarse = self._deviation(0), self._deviation(2)
         return torch.where(fine > 0, coarse / torch.where(fine > 0, fine, 1.0), 1.0)
@@ -73,7 +73,7 @@ class NoiseProfile:
         """Levels at the pixels of an image (B, C, H, W), by the mean brightness of 5x5 pixels.
 
         Returns:
-            (B, 2 S, H, W): luminance and colour differences at the first of the scales, then at the next.
+            Planes (B, 2 S, H, W), of luminance and colour differences at the first of the scales, then at the next.
         """
         light = F.avg_pool2d(image.detach(), 5, 1, padding=2, count_include_pad=False).mean(1, keepdim=True)
         positions = light.clamp(0, 1) * (KNOTS - 1)

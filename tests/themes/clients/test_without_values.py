@@ -90,6 +90,8 @@ CASES: dict[str, Case] = {
     "adjust_tone": lambda x: nlf.adjust_tone(x.image()),
     "denoise": lambda x: nlf.denoise(x.image()),
     "estimate_noise": lambda x: nlf.estimate_noise(x.image()),
+    "noise_profile": lambda x: nlf.noise_profile(x.image()).levels,
+    "profile_of_difference": lambda x: nlf.profile_of_difference(x.image(), x.image()).levels,
     "abstract": lambda x: nlf.abstract(x.image()),
     "filter_frames": lambda x: next(nlf.filter_frames([x.image()], x.zeros(4), references=[x.image()])),
     "DiffusionMask": lambda x: nlf.DiffusionMask()(x.spectrum(), x.mask()),
@@ -128,6 +130,7 @@ CLASSES = {
     "Diagnostics",
     "FittedLook",
     "FunctionProduct",
+    "NoiseProfile",
     "NonlocalOperator",
     "Spectrum",
 }  # results of functions
@@ -168,7 +171,14 @@ def test_backward_reads_no_value(case: str) -> None:
     if result.requires_grad:
         result.sum().backward()
     else:
-        assert case in ("estimate_bandwidth", "estimate_noise", "segment_mask", "SegmentMask")
+        assert case in (
+            "estimate_bandwidth",
+            "estimate_noise",
+            "noise_profile",
+            "profile_of_difference",
+            "segment_mask",
+            "SegmentMask",
+        )
 
 
 @pytest.mark.slow
