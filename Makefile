@@ -97,6 +97,7 @@ QUICK := \
 	'app --side 96 --megapixels 0.05' \
 	'denoising --quick --megapixel' \
 	'denoising --quick --patterns --methods noisy ours' \
+	'real_noise --quick' \
 	'looks --quick' \
 	'look_costs --quick' \
 	'detail --quick' \

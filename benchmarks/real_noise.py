@@ -30,7 +30,6 @@ from nlfilter_torch import denoise
 from nlfilter_torch.nn.denoiser.colours import split_colours
 from nlfilter_torch.nn.denoiser.estimate import noise_profile
 from nlfilter_torch.nn.denoiser.profile import NoiseProfile, profile_of_difference
-from nlfilter_torch.photo.edits.denoise import Denoise
 
 LISTED = Path(__file__).with_name("camera_noise.txt")
 ENDINGS = {"_real": "_mean", "_noisy": "_clean"}
@@ -105,7 +104,7 @@ def row_of(name: str, noisy: Tensor, clean: Tensor, peers: Sequence[str]) -> Row
     results = {
         "noisy": noisy,
         "ours": denoise(noisy),
-        "told the profile": _told(noisy, truth),
+        "told the profile": denoise(noisy, noise_level=truth),
         "told the deviation": denoise(noisy, noise_level=deviation),
     }
     case = Case(name, clean, noisy, deviation)
@@ -119,13 +118,6 @@ def _noise(noisy: Tensor, clean: Tensor) -> Tensor:
     """The difference without its mean: the light of shots differs a little."""
     difference = noisy - clean
     return difference - difference.mean((2, 3), keepdim=True)
-
-
-def _told(noisy: Tensor, profile: NoiseProfile) -> Tensor:
-    """``denoise`` with a given profile."""
-    from nlfilter_torch.photo.picture.in_memory import edit_image
-
-    return edit_image(Denoise(noise_level=profile, strength=1.0, method="network"), noisy)
 
 
 def show(rows: Sequence[Row]) -> None:

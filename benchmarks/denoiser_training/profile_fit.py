@@ -10,7 +10,7 @@ from torch import Tensor
 
 from nlfilter_torch.nn.denoiser.estimate import FAINTEST, HIDDEN, INPUTS, SHAPES, inputs_of, network
 
-STEPS, BATCH, RATE, DECAY = 6000, 256, 3e-3, 0.1
+STEPS, BATCH, RATE, DECAY = 8000, 256, 3e-3, 0.1
 BLUR, DROPOUT = 0.05, 0.1  # noise of the inputs; share of hidden numbers that are 0, in training
 NOISY, CLEAN = 0.7, 0.4  # grey levels above and below which a picture counts as noisy or clean
 WEIGHTS = (1.0, 1.0, 1.0, 0.7, 0.5)  # of the scales: true levels of coarse ones are uncertain

@@ -30,7 +30,8 @@ INPUTS = SCALES * KINDS * 2 * len(QUANTILES) + SCALES + KNOTS
 HIDDEN = 96
 OUTPUTS = SCALES * PLANES + 1  # logarithms of levels, and one number that tells noise from texture
 FAINTEST = 0.2  # grey levels that are added to levels before the logarithm
-DOUBTFUL, CERTAIN = -1.0, 0.0  # of the number: up to the first it is texture, from the second on it is noise
+CERTAIN = -0.5, 0.5  # of the number: up to the first it is texture, from the second on it is noise
+HIDING = 1.1, 1.4  # coarseness of noise from which the mask for white noise does not see it
 AGREEING, DIFFERENT = 0.8, 0.65  # ratios to the level of white noise: it is white above the first, not below the second
 SPREAD = 0.02  # weight of levels at the next brightness, where a picture has few pixels of its own
 SHAPES = {
@@ -151,11 +152,18 @@ def _levels(windows: Tensor, white: Tensor) -> Tensor:
         levels = levels * levels.new_tensor([1, 0])[:, None]
     levels = _spread(levels, share)
     # White noise is measured more exactly by its own rule, whose mask hardly responds to coarser noise.
-    ratio = _deviation(white, share) / _deviation(levels[0], share).clamp(min=1e-12)
-    camera = ((AGREEING - ratio) / (AGREEING - DIFFERENT)).clamp(0, 1)
-    certainty = (((numbers * share).sum() - DOUBTFUL) / (CERTAIN - DOUBTFUL)).clamp(0, 1)
-    levels = torch.lerp(white.expand_as(levels), levels, camera * certainty)
+    fine, coarse = (_deviation(values, share).clamp(min=1e-12) for values in (levels[0], levels[2]))
+    different = _rising(-_deviation(white, share) / fine, (-AGREEING, -DIFFERENT))
+    # Noise that is hardly coarser than white noise would show in that rule: what does not show is texture.
+    hidden = _rising(coarse / fine, HIDING)
+    certain = _rising((numbers * share).sum(), CERTAIN)
+    levels = torch.lerp(white.expand_as(levels), levels, different * hidden * certain)
     return torch.where((share.sum() > 0) & ~has_few_colours(windows), levels, 0.0)
+
+
+def _rising(value: Tensor, limits: tuple[float, float]) -> Tensor:
+    """0 up to the first limit, 1 from the second on."""
+    return ((value - limits[0]) / (limits[1] - limits[0])).clamp(0, 1)
 
 
 def _deviation(levels: Tensor, share: Tensor) -> Tensor:

@@ -47,7 +47,7 @@ NEGLIGIBLE_NOISE = 0.1 / LEVELS  # noise level below what 8 bits resolve; the im
 def denoise(
     image: Tensor,
     *,
-    noise_level: float | Tensor | None = DENOISE.defaults["noise_level"],
+    noise_level: float | Tensor | NoiseProfile | None = DENOISE.defaults["noise_level"],
     strength: float | Tensor = DENOISE.defaults["strength"],
     method: Method = DENOISE.defaults["method"],
     photometric_bandwidth: float | Tensor | None = None,
@@ -68,8 +68,8 @@ def denoise(
     Args:
         image: (B, C, H, W); with C = 3 it is RGB.
         noise_level: standard deviation of white noise, in units of the image, a number or a tensor of shape () or (B,);
-            for the network also a map (B, 1 or C, H, W). None estimates it: for the network by scale, colour and
-            brightness (:func:`noise_profile`), since the noise of cameras is not white, for the rule as white noise.
+            for the network also a map (B, 1 or C, H, W) or a :class:`NoiseProfile`. None estimates it: for the network
+            by :func:`noise_profile`, since the noise of cameras is not white, for the rule as white noise.
         strength: factor of the noise level, a number or a tensor of shape () or (B,): 0 changes nothing, more than 1
             smooths more. For the network, more than 100/255 counts as 100/255 of noise.
         method: ``"network"`` or ``"rule"``. All further arguments are for the rule.
@@ -131,12 +131,17 @@ class Denoise(FilteredEdit):
         if not isinstance(self.noise_level, (Noise, NoiseProfile)) and not is_map:
             DENOISE.check(source.batch, noise_level=self.noise_level)
         noise = self._estimated(source) if self.noise_level is None else self.noise_level
+        if isinstance(noise, NoiseProfile) and len(noise.levels) not in (1, source.batch):
+            raise ValueError(
+                f"noise_level must be the profile of 1 or {source.batch} images, got {len(noise.levels)}; select some"
+            )
         if self.method == "network":
             if is_map:
                 source.check_all_in_memory(
                     "noise_level must be a number for a picture processed in tiles, got a map; denoise it in memory"
                 )
-            return Fitted(first_channel, NetworkDenoising(noise, self.strength), margin=2 * STEP, step=STEP)
+            told = _as_trained(noise) if isinstance(noise, NoiseProfile) else noise
+            return Fitted(first_channel, NetworkDenoising(told, self.strength), margin=2 * STEP, step=STEP)
         if is_map:
             raise ValueError(
                 "noise_level must be a number or have shape (B,) for method rule, got a map; use method network"
@@ -227,7 +232,6 @@ class NetworkDenoising:
     def __call__(self, image: Tensor, _: Tensor, inner: Inner) -> Tensor:
         """Denoise an image."""
         noise = self.noise.at(image) if isinstance(self.noise, Noise) else self.noise
-        noise = _as_trained(noise) if isinstance(noise, NoiseProfile) else noise
         levels = level_planes(noise, image, "noise_level")
         strength = per_image(self.strength, levels, 4).expand(len(image), -1, -1, -1)
         levels = levels * strength.repeat_interleave(len(levels) // len(image), dim=0)

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from nlfilter_torch import denoise, estimate_noise
+from nlfilter_torch import NoiseProfile, denoise, estimate_noise
 from tests.problems import colour
 
 
@@ -42,3 +42,13 @@ def test_images_of_a_batch_that_differ_in_rank_are_denoised_as_alone() -> None:
     both = denoise(images, noise_level=4 / 255)
     for i in range(2):
         torch.testing.assert_close(both[i : i + 1], denoise(images[i : i + 1], noise_level=4 / 255), atol=1e-6, rtol=0)
+
+
+def test_noise_may_be_told_as_a_profile() -> None:
+    image = colour("rocket", 48, 64)
+    noisy = image + 0.05 * torch.randn(image.shape, generator=torch.Generator().manual_seed(0))
+    white = NoiseProfile.white(torch.tensor([0.05]))
+    torch.testing.assert_close(denoise(noisy, noise_level=white), denoise(noisy, noise_level=0.05), atol=1e-5, rtol=0)
+    assert torch.equal(denoise(noisy, noise_level=white.scaled(0.0)), noisy)
+    with pytest.raises(ValueError, match="noise_level must be the profile of 1 or 1 images, got 2; select"):
+        denoise(noisy, noise_level=NoiseProfile.white(torch.tensor([0.05, 0.1])))

@@ -8,13 +8,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from nlfilter_torch import nonlocal_operator, region_mask
+from nlfilter_torch import estimate_noise, noise_profile, nonlocal_operator, region_mask
 from nlfilter_torch.filtering.filters import filter_regions
-from nlfilter_torch.nn.denoiser.noise import estimate_noise
 from nlfilter_torch.operator.features import reduce_channels
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.declared.steps import Step
-from nlfilter_torch.photo.edits.noise import noise_of
+from nlfilter_torch.photo.edits.noise import noise_of, profile_of
 from nlfilter_torch.photo.picture.colour import edit_luminance
 from nlfilter_torch.photo.tiled import sampling
 from nlfilter_torch.photo.tiled.pictures import Picture
@@ -94,3 +93,4 @@ def test_noise_is_estimated_by_rows_as_in_memory() -> None:
     image = problems.cat()
     tiled = Tiled(Picture(rows_of(image)), Passes("float32"))
     assert torch.equal(noise_of(tiled).level, estimate_noise(image))
+    assert torch.equal(profile_of(tiled).levels, noise_profile(image).levels)
