@@ -13,6 +13,7 @@ from nlfilter_torch.core.workers import in_order
 SIDE, STEP = 96, 80  # size and spacing of tiles, in pixels
 SMALLEST = 56  # size of the last tile of a row or column, at least
 BORDER = 8  # width in pixels of the border added to images, so that their own border does not affect results
+MOST_WORKERS = 8  # threads that compute tiles at once; each takes about 100 MB, and the others help them
 TILE_BATCH = 4  # tiles processed at once; more leave the cache of the processor
 Window = tuple[slice, slice]
 
@@ -40,7 +41,7 @@ def in_tiles(
         return function(image, noise)[rest]
     groups = _grouped(_needed(down, inner[0], height), _needed(across, inner[1], width))
     computed = partial(_computed, function, image, noise)
-    workers = min(workers, len(groups))
+    workers = min(workers, len(groups), MOST_WORKERS)
     total, weight = torch.zeros_like(image), image.new_zeros(image.shape[-2:])
     results = map(computed, groups) if workers == 1 else in_order(computed, groups, workers)
     for group, result in zip(groups, results, strict=True):

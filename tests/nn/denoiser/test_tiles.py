@@ -1,5 +1,7 @@
 """Tiles of the denoiser."""
 
+from threading import get_ident
+
 import pytest
 import torch
 from torch import Tensor
@@ -50,3 +52,15 @@ def test_an_error_in_a_tile_is_raised_in_the_calling_thread() -> None:
     for workers in (1, 3):
         with pytest.raises(ArithmeticError, match="of a tile"):
             in_tiles(image, image, fails, workers=workers)
+
+
+def test_few_threads_are_used_since_each_needs_memory() -> None:
+    seen: set[int] = set()
+
+    def watched(image: Tensor, noise: Tensor) -> Tensor:
+        seen.add(get_ident())
+        return noise
+
+    image = torch.zeros(1, 1, 900, 900)
+    in_tiles(image, image, watched, workers=50)
+    assert len(seen) <= tiles.MOST_WORKERS
