@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nlfilter_torch.core.torch_internals import is_hidden
+from nlfilter_torch.core.torch_internals import is_hidden, refuse_transforms
 from nlfilter_torch.core.warning import warn
 
 FLOATING = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
@@ -433,6 +433,12 @@ def check_pixel_weights(weights: Tensor, guide: Tensor, group: object = None) ->
             "counts, got a tensor; build the operator without a group"
         )
     check_tensor(weights, "weights")
+    refuse_transforms(weights=weights)
+    if torch.compiler.is_exporting():
+        raise ValueError(
+            "weights must be None in an exported program, since the number of pixels that count is read to choose "
+            "landmarks, got a tensor; export with dynamic sizes instead of padding, or compile with torch.compile"
+        )
     check_dtype(weights, "weights", "convert it with weights.float()")
     batch, _, *size = guide.shape
     if tuple(weights.shape) not in ((1, 1, *size), (batch, 1, *size)):

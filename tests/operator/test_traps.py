@@ -17,11 +17,7 @@ TRAPS: dict[str, tuple[Tensor, dict[str, Any], str]] = {
     "grey levels": (IMAGE, {"photometric_bandwidth": 20.0}, "photometric_bandwidth must be in units of the guide, wh"),
     "learned": (IMAGE, {"photometric_bandwidth": torch.tensor([20.0])}, "photometric_bandwidth must be in units"),
     "channels last": (IMAGE.permute(0, 2, 3, 1), {}, "guide must have its channels in the second dimension, got"),
-    "too large": (
-        100 * FEATURES,
-        {"photometric_bandwidth": 0.2},
-        "guide must have .* no two pixels are similar",
-    ),
+    "too large": (10 * FEATURES, {"photometric_bandwidth": 0.2}, "guide must have .* no two pixels are similar"),
     "too small": (FEATURES / 100, {"photometric_bandwidth": 1.0}, "guide must have .* all pixels are alike; lower"),
 }
 

@@ -192,3 +192,9 @@ def test_jvp_and_hessian_in_image_and_sliders_of_a_fitted_operator() -> None:
     layers = detail_layers(operator, picture).flatten(2)[0]
     result = hessian(lambda a: polynomial_filter(operator, picture, a).square().sum() / 2)(alpha)
     torch.testing.assert_close(result, layers @ layers.mT, atol=1e-4, rtol=1e-4)
+
+
+def test_exported_programs_refuse_weights_in_one_sentence() -> None:
+    layer, image = NonlocalFilter((1.5, 1.0), num_landmarks=7, photometric_bandwidth=0.3), torch.rand(1, 1, 8, 9)
+    with pytest.raises(ValueError, match=r"^weights must be None in an exported program"):
+        torch.export.export(layer, (image,), {"weights": torch.ones_like(image)})

@@ -73,10 +73,10 @@ def test_batched_gradients_of_a_network_for_the_guide() -> None:
             torch.testing.assert_close(others[number], theirs)
 
 
-@pytest.mark.parametrize("name", ["guide", "photometric_bandwidth", "spatial_bandwidth", "patch_weights"])
+@pytest.mark.parametrize("name", ["guide", "photometric_bandwidth", "spatial_bandwidth", "patch_weights", "weights"])
 def test_the_refusal_names_what_is_transformed(name: str) -> None:
     fixed = {"guide": GUIDES[:1], "photometric_bandwidth": torch.tensor(0.3), "spatial_bandwidth": torch.tensor(5.0)}
-    fixed |= {"patch_weights": torch.ones(3, 3)}
+    fixed |= {"patch_weights": torch.ones(3, 3), "weights": torch.ones_like(GUIDES[:1])}
     with pytest.raises(TypeError, match=rf"^{name} must not be transformed by torch.func"):
         grad(lambda value: nonlocal_operator(**fixed | {name: value, "num_landmarks": 7}).factor.sum())(fixed[name])
 
