@@ -16,7 +16,7 @@ from nlfilter_torch.photo.cli.showing import Scribbled, tell_selected
 from nlfilter_torch.photo.declared.json_values import Value
 from nlfilter_torch.photo.declared.parameters import MASK
 from nlfilter_torch.photo.declared.steps import working_bytes
-from nlfilter_torch.photo.io.extras import NO_EXTRAS
+from nlfilter_torch.photo.io.decoded import NO_METADATA
 from nlfilter_torch.photo.io.pfm import PFM, write_pfm
 from nlfilter_torch.photo.io.photographs import (
     Depth,
@@ -126,7 +126,7 @@ class MaskJob:
     def _check_rows(self, picture: StoredPicture, allowed: int) -> StoredPicture:
         """Check whether the mask can be written, and return the picture that it is written like."""
         check_depth(self.source, picture.rows.dtype)
-        plain = replace(picture, rows=region_rows(picture.rows, 0), alpha=False, icc=None, exif=None, extras=NO_EXTRAS)
+        plain = replace(picture, rows=region_rows(picture.rows, 0), alpha=False, metadata=NO_METADATA)
         if self.floats:
             check_file(self.target)
             height, width = picture.rows.shape[:2]

@@ -1,98 +1,123 @@
-"""Decoding of PNG, JPEG, WebP and AVIF files by Pillow, or by imagecodecs if they have more than 8 bits."""
+"""WebP and AVIF files, by Pillow; AVIF files of more than 8 bits by imagecodecs."""
 
+import io
 import struct
-import warnings
+from mmap import mmap
 from pathlib import Path
+from typing import BinaryIO
 
 import imagecodecs
 import numpy as np
-from PIL import AvifImagePlugin, Image, ImageFile, PngImagePlugin, UnidentifiedImageError, WebPImagePlugin  # noqa: F401
+from PIL import AvifImagePlugin, Image, ImageFile, WebPImagePlugin
 
-from nlfilter_torch.photo.io import colours, tiff
+from nlfilter_torch.photo.io import colours, xmp
 from nlfilter_torch.photo.io import exif as exif_tags
-from nlfilter_torch.photo.io.decoded import Channels, CheckSize, Decoded
+from nlfilter_torch.photo.io.decoded import Channels, CheckSize, Decoded, Metadata, UnhandledImage
+from nlfilter_torch.photo.io.extras import Extras
+
+ENCODING: dict[str, dict[str, object]] = {
+    "WebP": {"lossless": True, "exact": True},  # exact: also where it is transparent
+    "AVIF": {"quality": 90, "subsampling": "4:4:4"},
+}
+MOST_AVIF, LONGEST_AVIF = 1 << 28, 1 << 15  # pixels, and those of a side, that libavif decodes
+HEAD = 1 << 16  # bytes that hold the description of an AVIF file
+WEBP_CHUNKS = (b"VP8 ", b"VP8L", b"VP8X", b"ALPH", b"ICCP", b"EXIF", b"XMP ", b"ANIM", b"ANMF")
 
 
-def read_by_pillow(path: Path, deep_png: bool, check_size: CheckSize) -> Decoded:
-    """Read a PNG, JPEG, WebP or AVIF file; ``deep_png`` if it is a PNG file of 16 bits."""
-    with tiff.decoding(path), _identified(path) as image:
+def is_webp(head: bytes) -> bool:
+    """Whether a file with these first bytes is WebP."""
+    return head[:4] == b"RIFF" and head[8:12] == b"WEBP"
+
+
+def is_avif(head: bytes) -> bool:
+    """Whether a file with these first bytes is AVIF."""
+    return head[4:8] == b"ftyp" and b"avi" in head
+
+
+def read_by_pillow(path: Path, data: bytes | mmap, check_size: CheckSize) -> Decoded:
+    """Read a WebP or AVIF file."""
+    webp = is_webp(data[:16])
+    if not webp:
+        _check_avif_size(path, data)
+    # Not Image.open, which refuses pictures of more than 179 megapixels whatever the memory.
+    with (WebPImagePlugin.WebPImageFile if webp else AvifImagePlugin.AvifImageFile)(path) as image:
         frames = getattr(image, "n_frames", 1)
-        if frames > 1 and image.format != "MPO":
-            raise tiff.UnhandledImage(f"{path} is an animation of {frames} frames; save one of them as a picture")
+        if frames > 1:
+            raise UnhandledImage(f"{path} is an animation of {frames} frames; save one of them as a picture")
         check_size(image.size)
-        if "icc_profile" not in image.info:
-            _check_colours(path, image)
-        orientation, exif = exif_tags.split(image.getexif)
-        channels = imagecodecs.png_decode(path.read_bytes()) if deep_png else _decoded(path, image)
-        channels = channels.reshape(*channels.shape[:2], -1)
-        return Decoded(channels, orientation, image.info.get("icc_profile"), exif)
+        if not webp and "icc_profile" not in image.info:
+            _check_colours(path, data)
+        stated = list(_webp_extras(data)) if webp else [xmp.GAIN_MAP] * (b"tmap" in data[:HEAD])
+        if webp:
+            upright = exif_tags.read_upright(image.info.get("exif"))
+        else:  # whose info holds the block as Pillow writes it anew
+            block, orientation = image._decoder.get_info()[4:6]
+            upright = exif_tags.read_upright(block, orientation)
+        packet, named = xmp.upright(image.info.get("xmp"))
+        extras = Extras(packet, left_out=(*stated, *named, *upright.left_out))
+        channels = _decoded(image, data)
+        metadata = Metadata(image.info.get("icc_profile"), upright.block, extras)
+        return Decoded(channels.reshape(*channels.shape[:2], -1), upright.orientation, metadata)
 
 
-def _identified(path: Path) -> ImageFile.ImageFile:
-    """Open a file; raises UnhandledImage unless it is an image of a known kind."""
-    try:
-        return _opened(path)
-    except Image.DecompressionBombError as error:
-        raise MemoryError(f"{path} is too large ({error}); make the picture smaller") from error
-    except UnidentifiedImageError as error:
-        sentence = f"{path} is not a PNG, JPEG, TIFF, WebP or AVIF image; convert it to one of these"
-        raise tiff.UnhandledImage(sentence) from error
-
-
-def _decoded(path: Path, image: ImageFile.ImageFile) -> Channels:
+def _decoded(image: ImageFile.ImageFile, data: bytes | mmap) -> Channels:
     """The pixels (H, W) or (H, W, S) of an open file, as 16 bits if an AVIF file has 10 or 12."""
-    if image.format == "AVIF" and (bits := _bits_of_avif(path)) > 8:  # Pillow would reduce them to 8
-        levels = imagecodecs.avif_decode(path.read_bytes())
+    if image.format == "AVIF" and (bits := _bits_of_avif(data)) > 8:  # Pillow would reduce them to 8
+        levels = imagecodecs.avif_decode(data)
         return np.rint(levels * (65535 / (2**bits - 1))).astype(np.uint16)
-    if image.format == "PNG":  # load() ignores wrong checksums
-        with _opened(path) as again:
-            again.verify()
-    return np.asarray(_plain_mode(image, path))
+    return np.asarray(image)
 
 
-def _opened(path: Path) -> ImageFile.ImageFile:
-    with warnings.catch_warnings():
-        # Pillow's limit on picture sizes is independent of the memory; check_memory replaces it.
-        warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-        warnings.simplefilter("ignore", UserWarning)  # warnings about EXIF, see exif.split
-        return Image.open(path, formats=["PNG", "JPEG", "WEBP", "AVIF"])
+def _check_avif_size(path: Path, data: bytes | mmap) -> None:
+    """Raise UnhandledImage if a picture is larger than libavif decodes."""
+    _, marker, size = data[:HEAD].partition(b"ispe")
+    if not marker or len(size) < 12:
+        return
+    width, height = struct.unpack_from(">II", size, 4)
+    if width * height > MOST_AVIF or max(width, height) > LONGEST_AVIF:
+        raise UnhandledImage(
+            f"{path} has {width}x{height} pixels, and libavif, which decodes it, takes at most {MOST_AVIF}, and "
+            f"{LONGEST_AVIF} per side; convert it to TIFF or PNG"
+        )
 
 
-def _head(path: Path) -> bytes:
-    with path.open("rb") as stream:
-        return stream.read(1 << 16)
+def _check_colours(path: Path, data: bytes | mmap) -> None:
+    """Check the colours of an AVIF file without a profile, see :mod:`nlfilter_torch.photo.io.colours`."""
+    _, marker, numbers = data[:HEAD].partition(b"colrnclx")
+    if marker and len(numbers) >= 4:
+        colours.check_numbers(path, *struct.unpack(">HH", numbers[:4]))
 
 
-def _check_colours(path: Path, image: Image.Image) -> None:
-    """Check the colours of a PNG or AVIF file without a profile, see :mod:`nlfilter_torch.photo.io.colours`."""
-    if image.format == "AVIF":
-        _, marker, numbers = _head(path).partition(b"colrnclx")
-        if marker and len(numbers) >= 4:
-            colours.check_numbers(path, *struct.unpack(">HH", numbers[:4]))
-    elif image.format == "PNG":
-        _, marker, numbers = _head(path).partition(b"IDAT")[0].partition(b"cICP")
-        if marker and len(numbers) >= 2:
-            colours.check_numbers(path, *numbers[:2])
-        elif "srgb" not in image.info:
-            colours.check_png(path, image.info.get("gamma"), image.info.get("chromaticity"))
-
-
-def _bits_of_avif(path: Path) -> int:
+def _bits_of_avif(data: bytes | mmap) -> int:
     """Read the bits per channel from the codec configuration, which is among the first boxes."""
-    head = _head(path)
+    head = data[:HEAD]
     place = head.find(b"av1C") + 6  # after the version, the profile and the level
     flags = head[place] if 6 <= place < len(head) else 0
     return (12 if flags & 0x20 else 10) if flags & 0x40 else 8
 
 
-def _plain_mode(image: Image.Image, path: Path) -> Image.Image:
-    """Convert an image to one of the modes L, LA, RGB, RGBA."""
-    transparent = "transparency" in image.info
-    modes = {"LA": "LA", "PA": "RGBA", "RGBA": "RGBA"}
-    modes |= dict.fromkeys(("1", "L"), "LA" if transparent else "L")
-    modes |= dict.fromkeys(("P", "RGB"), "RGBA" if transparent else "RGB")
-    if image.mode not in modes:
-        sentence = f"{path} is stored in {image.mode} colours, which are not supported; convert it to grey or RGB"
-        raise tiff.UnhandledImage(sentence)
-    image.load()
-    return image.convert(modes[image.mode])
+def _webp_extras(data: bytes | mmap) -> list[str]:
+    """Names of the chunks of a WebP file that are not copied."""
+    names, place = [], 12
+    while place + 8 <= len(data):
+        name, length = struct.unpack_from("<4sI", data, place)
+        if name not in WEBP_CHUNKS:
+            names.append(f"the chunk {name.decode('latin-1').strip()}")
+        place += 8 + length + length % 2
+    return names
+
+
+def write_by_pillow(stream: BinaryIO, kind: str, channels: Channels, metadata: Metadata) -> None:
+    """Write channels (H, W) or (H, W, S) of 8 bits as a WebP or AVIF file."""
+    block = metadata.exif or b""
+    # Pillow writes a block with an orientation anew. It gets it under another number, which is then set right.
+    hidden = exif_tags.hidden_orientation(block)
+    options: dict[str, object] = {"icc_profile": metadata.icc, "exif": hidden} | ENCODING[kind]
+    if metadata.extras.xmp is not None:
+        options["xmp"] = metadata.extras.xmp
+    encoded = io.BytesIO()
+    Image.fromarray(channels).save(encoded, format=kind, **options)
+    whole, place = encoded.getbuffer(), encoded.getvalue().find(hidden.removeprefix(exif_tags.PREFIX)) if block else 0
+    if block:
+        whole[place : place + len(block.removeprefix(exif_tags.PREFIX))] = block.removeprefix(exif_tags.PREFIX)
+    stream.write(whole)

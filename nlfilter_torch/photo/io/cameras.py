@@ -3,17 +3,18 @@
 Needs the ``cli`` extra, and the extras ``raw`` and ``heic``.
 """
 
-import io
+import struct
 from contextlib import suppress
-from functools import partial
+from mmap import ACCESS_READ, mmap
 from pathlib import Path
 
 import numpy as np
-from PIL import ExifTags, Image
 
-from nlfilter_torch.photo.io import colours, tiff
+from nlfilter_torch.photo.io import colours, exif_in_tiff, jpeg, xmp
 from nlfilter_torch.photo.io import exif as exif_tags
-from nlfilter_torch.photo.io.decoded import CheckSize, Decoded
+from nlfilter_torch.photo.io.decoded import CheckSize, Decoded, Metadata, UnhandledImage, decoding
+from nlfilter_torch.photo.io.extras import Extras
+from nlfilter_torch.photo.io.tables import EXIF, Tables
 
 #: Suffixes of RAW files, most of which begin like TIFF files.
 RAWS = (
@@ -45,26 +46,32 @@ def read_raw(path: Path, check_size: CheckSize) -> Decoded:
         with rawpy.imread(str(path)) as raw:
             check_size((raw.sizes.iwidth, raw.sizes.iheight))
             channels = raw.postprocess(output_bps=16, use_camera_wb=True, no_auto_bright=True)
-            exif = None
-            with suppress(rawpy.LibRawError):  # no preview, or an unreadable one
-                preview = raw.extract_thumb()
-                if preview.format == rawpy.ThumbFormat.JPEG:
-                    exif = _exif_of(bytes(preview.data))
+            exif, moved = _own_exif(path)
+            with suppress(rawpy.LibRawError, ValueError, EOFError):  # no preview, or an unreadable one
+                preview = raw.extract_thumb() if exif is None or not _has_details(exif) else None
+                if preview is not None and preview.format == rawpy.ThumbFormat.JPEG:
+                    exif = jpeg.open_jpeg(path, bytes(preview.data)).metadata.exif or exif
     except rawpy.LibRawError as error:
-        raise tiff.UnhandledImage(
+        raise UnhandledImage(
             f"{path} cannot be read as a RAW file, or is damaged; copy it again, or convert it to DNG or TIFF"
         ) from error
-    return Decoded(channels, 1, None, exif)
+    # The pixels are upright, and of another size than the preview.
+    exif = exif_tags.read_upright(exif, 1, channels.shape[1::-1]).block
+    return Decoded(channels, 1, Metadata(exif=exif, extras=Extras(left_out=(exif_in_tiff.MOVED,) * moved)))
 
 
-def _exif_of(preview: bytes) -> bytes | None:
-    """Read the EXIF block of a JPEG preview, and reset its orientation, as the RAW pixels are upright."""
-    return exif_tags.split(partial(_preview_fields, preview))[1]
+def _own_exif(path: Path) -> tuple[bytes | None, bool]:
+    """The EXIF block of a RAW file that is a TIFF file, and whether its maker note was moved."""
+    try:
+        with path.open("rb") as stream, mmap(stream.fileno(), 0, access=ACCESS_READ) as data:
+            return exif_in_tiff.block_of(Tables(data))
+    except (ValueError, struct.error):
+        return None, False
 
 
-def _preview_fields(preview: bytes) -> Image.Exif:
-    """Parse the EXIF block of a JPEG file."""
-    return Image.open(io.BytesIO(preview)).getexif()
+def _has_details(exif: bytes) -> bool:
+    tables = exif_tags.parsed(exif)
+    return tables is not None and any(field.code == EXIF for field in tables.fields(tables.first))
 
 
 def read_heic(path: Path, check_size: CheckSize) -> Decoded:
@@ -76,7 +83,7 @@ def read_heic(path: Path, check_size: CheckSize) -> Decoded:
             f"{path} is an HEIC file and needs the package pillow-heif, which is not installed; "
             "install nlfilter-torch[heic]"
         ) from error
-    with tiff.decoding(path):
+    with decoding(path):
         picture = pillow_heif.open_heif(path, convert_hdr_to_8bit=False)
         check_size(picture.size)
         info = picture.info
@@ -86,13 +93,11 @@ def read_heic(path: Path, check_size: CheckSize) -> Decoded:
         channels = np.asarray(picture)
         if channels.dtype == np.uint16:  # the lower bits are empty
             channels = np.rint(channels * (65535 / (65536 - (1 << (16 - info["bit_depth"]))))).astype(np.uint16)
-        exif = exif_tags.split(partial(_upright_fields, info.get("exif") or b""))[1]
-        return Decoded(channels.reshape(*channels.shape[:2], -1), 1, info.get("icc_profile"), exif)
-
-
-def _upright_fields(block: bytes) -> Image.Exif:
-    """Parse an EXIF block, without its orientation since the pixels are upright already."""
-    fields = Image.Exif()
-    fields.load(block)
-    fields.pop(ExifTags.Base.Orientation, None)
-    return fields
+        # The pixels are upright already.
+        upright = exif_tags.read_upright(info.get("exif"), 1)
+        packet, left_out = xmp.upright(info.get("xmp"))
+        left_out += [xmp.PICTURES] * (len(picture) > 1) + [xmp.DEPTH] * bool(info.get("depth_images"))
+        left_out += [xmp.PICTURES] * bool(info.get("aux"))
+        extras = Extras(packet, left_out=(*left_out, *upright.left_out))
+        metadata = Metadata(info.get("icc_profile"), upright.block, extras)
+        return Decoded(channels.reshape(*channels.shape[:2], -1), 1, metadata)

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from nlfilter_torch.core.warning import warn
-from nlfilter_torch.photo.io import tiff
+from nlfilter_torch.photo.io.decoded import UnhandledImage
 
 # Numbers of ITU-T H.273 (CICP).
 PRIMARIES = {1: "sRGB", 4: "BT.470", 5: "BT.601", 6: "BT.601", 7: "SMPTE 240M", 9: "BT.2020", 11: "DCI-P3"}
@@ -28,7 +28,7 @@ def check_numbers(path: Path, primaries: int, transfer: int) -> None:
         UnhandledImage: if they are those of an HDR picture.
     """
     if transfer in HDR:
-        raise tiff.UnhandledImage(
+        raise UnhandledImage(
             f"{path} is an HDR picture ({TRANSFERS[transfer]}), which is not supported; convert it to sRGB, or to a "
             "TIFF file with a colour profile"
         )

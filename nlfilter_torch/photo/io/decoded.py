@@ -1,11 +1,51 @@
-"""What the readers of image files return, and the check that they call before they decode."""
+"""What the readers of image files return, and the errors that they raise."""
 
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
 from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from nlfilter_torch.photo.io.extras import NO_EXTRAS, Extras
+
 Channels = NDArray[np.generic]  # (H, W, S), in the dtype of the file
+
+
+class UnhandledImage(ValueError):
+    """A valid image file of an unsupported kind."""
+
+
+@contextmanager
+def decoding(path: Path) -> Iterator[None]:
+    """Report any error in the block as a damaged file, since decoders have no common base class for errors."""
+    try:
+        yield
+    except (MemoryError, UnhandledImage):
+        raise
+    except Exception as error:
+        reason = error or type(error).__name__
+        raise ValueError(f"{path} is damaged or cut short ({reason}); copy it again from its source") from error
+
+
+@dataclass(frozen=True)
+class Metadata:
+    """What a file says about its picture.
+
+    Attributes:
+        icc: colour profile, or None.
+        exif: EXIF block with orientation 1, or None.
+        extras: the rest.
+    """
+
+    icc: bytes | None = None
+    exif: bytes | None = None
+    extras: Extras = NO_EXTRAS
+
+
+NO_METADATA = Metadata()
 
 
 class Decoded(NamedTuple):
@@ -14,14 +54,12 @@ class Decoded(NamedTuple):
     Attributes:
         channels: (H, W, S), as stored, so perhaps not upright.
         orientation: EXIF orientation, 1 to 8; 1 is upright.
-        icc: colour profile, or None.
-        exif: EXIF block with orientation 1, or None.
+        metadata: what the file says about them once they are upright.
     """
 
     channels: Channels
     orientation: int
-    icc: bytes | None
-    exif: bytes | None
+    metadata: Metadata
 
 
 class CheckSize(Protocol):
@@ -29,3 +67,20 @@ class CheckSize(Protocol):
 
     def __call__(self, size: tuple[int, int], /, *, double: bool = False) -> None:
         """Check the size (width, height); ``double`` if the pixels are 64-bit floats."""
+
+
+def bands(rows: Iterable[Channels], height: int) -> Iterator[Channels]:
+    """Regroup rows (h, W, S) into pieces of the same ``height``, the last one possibly shorter.
+
+    >>> [len(band) for band in bands([np.zeros((3, 1, 1)), np.zeros((4, 1, 1))], 2)]
+    [2, 2, 2, 1]
+    """
+    waiting: list[Channels] = []
+    for piece in rows:
+        waiting.append(piece)
+        while sum(map(len, waiting)) >= height:
+            whole = np.concatenate(waiting)
+            waiting = [whole[height:]]
+            yield whole[:height]
+    if waiting and sum(map(len, waiting)):
+        yield np.concatenate(waiting)

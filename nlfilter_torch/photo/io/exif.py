@@ -1,37 +1,35 @@
-"""EXIF blocks, and rotation of pictures by their EXIF orientation."""
+"""EXIF blocks, which are kept byte for byte, and rotation of pictures by their EXIF orientation.
 
-import warnings
-from collections.abc import Callable, MutableMapping
-from typing import TypeVar
+A block is a TIFF file without pixels: tables of fields, whose values lie anywhere in it. The notes of camera makers
+hold offsets of their own, which nobody documents, so a block is not written anew. Only the orientation, the sizes and
+the thumbnail change, in their places. This also keeps the type and the bytes of every field, and unknown fields.
+Libraries that parse and write blocks were tried: Pillow changes types and moves the notes, libexif (in libvips) adds
+fields and moves the notes, piexif knows fixed lists of fields, and Exiv2 is under the GPL.
+"""
+
+import io
+import struct
+from collections.abc import Iterable
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import ExifTags, Image, TiffImagePlugin
+from PIL import Image
+
+from nlfilter_torch.photo.io.tables import EXIF, INTEGERS, ORIENTATION, POINTERS, SHORT, Field, Range, Tables
 
 Scalar = TypeVar("Scalar", bound=np.generic)
-Fields = dict[int, object]  # values of a table by their tags
 
 PREFIX = b"Exif\0\0"
-FOLDERS: tuple[int, ...] = (ExifTags.IFD.Exif, ExifTags.IFD.GPSInfo)  # fields that point to a nested table
-INTEROP = int(ExifTags.IFD.Interop)  # a field of the first of these that points to another table
-
-
-class Latin1(str):
-    """Text of a field that Pillow writes as the bytes that it was read from.
-
-    Pillow reads text as latin-1, which keeps the bytes of any encoding, but writes it as ASCII with question marks.
-    """
-
-    __slots__ = ()
-
-    def encode(self, encoding: str = "latin-1", errors: str = "replace") -> bytes:
-        """Encode as latin-1, whatever encoding is asked for."""
-        return super().encode("latin-1", "replace")
-
-
-def writable(value: object) -> object:
-    """The value of a field in the form in which Pillow writes it unchanged."""
-    return Latin1(value) if isinstance(value, str) else value
+SIZES = ((256, 257), (282, 283), (40962, 40963), (41486, 41487))  # horizontal and vertical; swapped by a quarter turn
+RESOLUTION = (282, 283, 296)  # horizontal, vertical, and their unit
+SCALES = {2: 1.0, 3: 2.54}  # of inch and centimetre
+IN_PIXELS = (256, 40962)  # of these
+HIDDEN = 0xFFFE  # the number of no tag
+COMPRESSION, PLACE, LENGTH = 259, 513, 514  # of a thumbnail
+JPEG = 6  # a compression
+THUMBNAIL = 160  # longest side
+QUALITIES = (85, 70, 50, 30, 10)  # of thumbnails, until one fits
 
 
 def upright(channels: NDArray[Scalar], orientation: int) -> NDArray[Scalar]:
@@ -46,53 +44,6 @@ def upright(channels: NDArray[Scalar], orientation: int) -> NDArray[Scalar]:
     return channels[:: -1 if orientation in (3, 4, 7, 8) else 1, :: -1 if orientation in (2, 3, 6, 7) else 1]
 
 
-def split(read: Callable[[], Image.Exif]) -> tuple[int, bytes | None]:
-    """Return the orientation, and the other fields as an EXIF block with orientation 1, or None if there are none.
-
-    ``read`` returns the block. Width and height fields are swapped if the orientation swaps them. Invalid fields are
-    dropped, since they do not affect the pixels.
-    """
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # Pillow warns about damaged blocks
-        try:
-            exif = read()
-            fields = dict(exif)
-        except Exception:  # Pillow has no common base class for these errors
-            return 1, None
-        orientation = orientation_of(fields.get(ExifTags.Base.Orientation))
-        if set(fields) <= {ExifTags.Base.Orientation}:
-            return orientation, None
-        exif[ExifTags.Base.Orientation] = 1
-        folders: dict[int, Fields] = {
-            code: folder for code in FOLDERS if code in fields and (folder := _folder(exif, code))
-        }
-        width, height = ExifTags.Base.ExifImageWidth, ExifTags.Base.ExifImageHeight
-        details = folders.get(ExifTags.IFD.Exif, {})
-        if orientation >= 5 and width in details and height in details:
-            details[width], details[height] = details[height], details[width]
-        _keep_bytes(exif, *folders.values())
-        try:
-            return orientation, exif.tobytes()
-        except Exception:  # Pillow does not say which field is invalid
-            return orientation, _sound(fields, folders).tobytes()
-
-
-def _keep_bytes(*tables: MutableMapping[int, object]) -> None:
-    """Make Pillow write the texts of tables as they were read."""
-    for table in tables:
-        for code, value in list(table.items()):
-            table[code] = writable(value)
-
-
-def without_orientation(block: bytes) -> bytes:
-    """Remove the orientation from an EXIF block; empty if nothing else is in it."""
-    exif = Image.Exif()
-    exif.load(block)
-    exif.pop(ExifTags.Base.Orientation, None)
-    _keep_bytes(exif, *(_folder(exif, code) for code in FOLDERS if code in exif))
-    return exif.tobytes() if exif else b""
-
-
 def orientation_of(value: object) -> int:
     """Return the EXIF orientation, 1 to 8; 1 (upright) if ``value`` is invalid.
 
@@ -102,42 +53,179 @@ def orientation_of(value: object) -> int:
     return int(value) if isinstance(value, int) and 1 <= value <= 8 else 1
 
 
-def _folder(exif: Image.Exif, code: int) -> Fields:
+class Block(Tables):
+    """The tables of an EXIF block, whose bytes may be changed in place."""
+
+    data: bytearray
+
+
+def parsed(block: bytes | None) -> Block | None:
+    """The tables of a block; None if it is empty, or damaged from the start."""
     try:
-        return exif.get_ifd(code)
-    except Exception:
-        return {}
+        tables = Block(bytearray((block or b"").removeprefix(PREFIX)))
+    except (ValueError, struct.error):
+        return None
+    return tables if not tables.big and tables.fields(tables.first) else None
 
 
-def tables(exif: Image.Exif) -> dict[int, Fields]:
-    """The nested tables of a block, each with the tables inside it in place of pointers to them."""
-    folders = {code: dict(folder) for code in FOLDERS if (folder := _folder(exif, code))}
-    for folder in folders.values():
-        if folder.pop(INTEROP, None) is not None and (inner := _folder(exif, INTEROP)):
-            folder[INTEROP] = inner
-    return folders
+class Upright(NamedTuple):
+    """An EXIF block of a picture that is turned upright.
+
+    Attributes:
+        orientation: of the picture as it is stored.
+        block: with orientation 1, or None if nothing else is in it.
+        left_out: names of what was damaged.
+    """
+
+    orientation: int
+    block: bytes | None = None
+    left_out: tuple[str, ...] = ()
 
 
-def _sound(fields: Fields, folders: dict[int, Fields]) -> Image.Exif:
-    """Build an EXIF block from the fields that can be written."""
-    block = Image.Exif()
-    for code, value in fields.items():
-        if code not in FOLDERS and is_writable(code, value):
-            block[code] = writable(value)
-    block[ExifTags.Base.Orientation] = 1
-    for code, folder in folders.items():
-        block.get_ifd(code).update(
-            {key: writable(value) for key, value in folder.items() if key != INTEROP and is_writable(key, value)}
+def read_upright(block: bytes | None, orientation: int | None = None, size: tuple[int, int] | None = None) -> Upright:
+    """Set the orientation of a block to 1, and its sizes to those of the upright picture.
+
+    Args:
+        block: as it stands in the file, or None.
+        orientation: of the pixels, where the format does not say it in the block. None is that of the block.
+        size: (width, height) of the upright picture, where it is not that of the stored one turned by the orientation.
+    """
+    tables = parsed(block)
+    if tables is None:
+        return Upright(orientation or 1, None, ("a damaged EXIF block",) if block else ())
+    first = [field for field in tables.fields(tables.first) if field.code == ORIENTATION]
+    if orientation is None:
+        orientation = orientation_of(tables.number(first[0])) if first else 1
+    for field in first:
+        _straighten(tables, field)
+    damaged = _drop_damaged(tables)
+    fields = list(tables.walk())
+    _resize(tables, {field.code: field for field in fields}, orientation >= 5, size)
+    only = all(field.code == ORIENTATION for field in fields) and not _thumbnail(tables)
+    left_out = ("damaged fields of EXIF",) if damaged else ()
+    return Upright(orientation, None if only else PREFIX + bytes(tables.data), left_out)
+
+
+def _drop_damaged(tables: Block) -> bool:
+    """Remove fields without a valid value from the first table and that of EXIF; whether there were any."""
+    starts = [tables.first, *(tables.number(f) or 0 for f in tables.fields(tables.first) if f.code == EXIF)]
+    damaged = False
+    for start in starts[::-1]:
+        fields = [f for f in tables.fields(start) if f.code not in POINTERS or tables.inner(f)]
+        pointer, count = tables.next(start), tables.count(start)
+        if len(fields) == count:
+            continue
+        damaged = True
+        entries = b"".join(bytes(tables.data[f.entry : f.entry + tables.step]) for f in fields)
+        rest = bytes(tables.data[pointer : pointer + 4]) if pointer is not None else b""
+        table = tables.packed(SHORT, len(fields)) + entries + rest
+        tables.data[start : start + 2 + count * tables.step + len(rest)] = table.ljust(
+            2 + count * tables.step + len(rest), b"\0"
         )
-    return block
+    return damaged
 
 
-def is_writable(code: int, value: object) -> bool:
-    """Whether Pillow can write a field with that value."""
-    table = TiffImagePlugin.ImageFileDirectory_v2()
-    try:
-        table[code] = writable(value)
-        table.tobytes()
-    except Exception:
-        return False
-    return True
+def resolution(block: bytes | None) -> tuple[float, float] | None:
+    """The pixels per inch that a block says, or None."""
+    tables = parsed(block)
+    if tables is None:
+        return None
+    fields = {field.code: field for field in tables.fields(tables.first) if field.code in RESOLUTION}
+    values = [tables.ratio(fields[code]) for code in RESOLUTION[:2] if code in fields]
+    scale = SCALES.get(tables.number(fields[RESOLUTION[2]]) or 0) if RESOLUTION[2] in fields else 1.0
+    return (values[0] * scale, values[1] * scale) if scale is not None and len(values) == 2 else None
+
+
+def hidden_orientation(block: bytes) -> bytes:
+    """The block with its orientation under the number of no tag."""
+    tables = parsed(block)
+    if tables is None:
+        return block
+    for field in tables.fields(tables.first):
+        if field.code == ORIENTATION:
+            tables.data[field.entry : field.entry + 2] = struct.pack(tables.order + "H", HIDDEN)
+    return block[: len(block) - len(tables.data)] + bytes(tables.data)
+
+
+def _straighten(tables: Block, field: Field) -> None:
+    """Set an orientation to 1; as a short integer if it was no integer."""
+    kind = field.kind if field.count == 1 and field.kind in INTEGERS else SHORT
+    struct.pack_into(tables.order + "HHI4x", tables.data, field.entry, field.code, kind, 1)
+    struct.pack_into(tables.order + INTEGERS[kind], tables.data, field.entry + 8, 1)
+
+
+def _resize(tables: Block, fields: dict[int, Field], turned: bool, size: tuple[int, int] | None) -> None:
+    """Set the sizes in a block, or swap those that a quarter turn swaps."""
+    for across, down in SIZES:
+        pair = [fields[code] for code in (across, down) if code in fields and fields[code].count == 1]
+        values = [tables.raw(field) for field in pair]
+        if size is not None and across in IN_PIXELS and all(field.kind in INTEGERS for field in pair):
+            values = [tables.packed(field.kind, length) for field, length in zip(pair, size, strict=False)]
+        elif turned and len(pair) == 2 and pair[0].kind == pair[1].kind:
+            values = values[::-1]
+        for field, value in zip(pair, values, strict=len(pair) == 2):
+            tables.data[field.place : field.end] = value
+
+
+def _thumbnail(tables: Tables) -> int:
+    """Offset of the table of the thumbnail, or 0."""
+    pointer = tables.next(tables.first)
+    return tables.unpack("I", pointer) if pointer is not None else 0
+
+
+def has_thumbnail(block: bytes) -> bool:
+    """Whether a block has a table of a thumbnail."""
+    tables = parsed(block)
+    return tables is not None and _thumbnail(tables) != 0
+
+
+def refreshed(block: bytes, picture: NDArray[np.generic] | None) -> bytes:
+    """The block with a thumbnail of a picture (H, W, S) of 8 or 16 bits in the place of the one that it has, if any.
+
+    Without a picture, or where the new thumbnail does not fit in the place, the block has none.
+    """
+    tables = parsed(block)
+    if tables is None or not (start := _thumbnail(tables)):
+        return block
+    fields = {field.code: field for field in tables.fields(start)}
+    place, length = (tables.number(fields[code]) if code in fields else None for code in (PLACE, LENGTH))
+    compression = tables.number(fields[COMPRESSION]) if COMPRESSION in fields else JPEG
+    room = (place or 0, (place or 0) + (length or 0))
+    free = room[1] <= len(tables.data) and not _overlaps(room, tables.ranges())
+    jpeg = None if picture is None or compression != JPEG or not free else _small_jpeg(picture, length or 0)
+    if free:
+        tables.data[slice(*room)] = (jpeg or b"").ljust(length or 0, b"\0")
+    if jpeg is None:
+        return PREFIX + _without_table(tables, start, room if free else (0, 0))
+    tables.data[fields[LENGTH].place : fields[LENGTH].end] = tables.packed(fields[LENGTH].kind, len(jpeg))
+    if ORIENTATION in fields:
+        _straighten(tables, fields[ORIENTATION])
+    return PREFIX + bytes(tables.data)
+
+
+def _overlaps(place: Range, ranges: Iterable[Range]) -> bool:
+    return any(start < place[1] and place[0] < stop for start, stop in ranges)
+
+
+def _without_table(tables: Block, start: int, room: Range) -> bytes:
+    """The bytes of a block without the table of its thumbnail, cut where nothing follows."""
+    pointer = tables.next(tables.first)
+    assert pointer is not None  # it led to the table
+    tables.data[pointer : pointer + 4] = bytes(4)
+    end = max(stop for _, stop in tables.ranges())
+    return bytes(tables.data[: max(end, pointer + 4)] if min(start, room[0] or start) >= end else tables.data)
+
+
+def _small_jpeg(picture: NDArray[np.generic], longest: int) -> bytes | None:
+    """A thumbnail of a picture (H, W, S) in at most so many bytes, or None."""
+    step = max(1, max(picture.shape[:2]) // (4 * THUMBNAIL))
+    levels = np.asarray(picture[::step, ::step, : 3 if picture.shape[2] > 2 else 1])
+    levels = (levels / (np.iinfo(levels.dtype.name).max / 255)).astype(np.uint8)
+    small = Image.fromarray(levels.squeeze(2) if levels.shape[2] == 1 else levels)
+    small.thumbnail((THUMBNAIL, THUMBNAIL))
+    for quality in QUALITIES:
+        stream = io.BytesIO()
+        small.save(stream, "JPEG", quality=quality)
+        if len(stream.getvalue()) <= longest:
+            return stream.getvalue()
+    return None

@@ -1,30 +1,69 @@
-"""Metadata of image files besides profile and EXIF: XMP and print resolution."""
+"""Metadata of image files besides profile and EXIF: XMP, print resolution, tags of TIFF, and what is not copied."""
 
-import io
-import math
-import re
-import struct
-import warnings
-import zlib
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
-import imagecodecs
 import numpy as np
-import tifffile
-from numpy.typing import NDArray
-from PIL import Image, PngImagePlugin
 
 from nlfilter_torch.core.warning import warn
-from nlfilter_torch.photo.io import exif as exif_tags
-from nlfilter_torch.photo.io import tiff
+from nlfilter_torch.photo.io.tables import LENGTHS
 
-PNG_KEY = "XML:com.adobe.xmp"
 JPEG_LIMIT = 65_000  # bytes of XMP that fit in a JPEG segment; longer packets are not written
-INCH, CENTIMETRE = 2, 3  # values of the TIFF tag ResolutionUnit
-# Pixels are turned upright when read, but XMP may repeat the original orientation.
-ORIENTATION = re.compile(rb"(tiff:Orientation\s*(?:=\s*[\"']|>)\s*)[1-8]")
+RESOLUTION = (282, 283, 296)  # horizontal, vertical, and their unit
+SWAPPED = {282: 283, 283: 282}
+# Tags that say how a TIFF file stores its pixels. The output has its own.
+STORAGE = frozenset((*range(254, 260), 262, *range(263, 267), 273, *range(277, 280), 284, 288, 289, 292, 293))
+STORAGE |= {317, 320, 321, *range(322, 329), 332, 333, 334, 336, 338, 339, 347, *range(512, 522), *range(529, 533)}
+STORAGE |= {32995, 32996, 32997, 32998, 34675}
+#: Tags of GeoTIFF and GDAL: where the pixels lie on the ground, notes, and the value without data.
+GROUND = (33550, 33922, 34264, 34735, 34736, 34737)
+GDAL_NOTES, NODATA = 42112, 42113
+OF_A_DEPTH = (NODATA, 280, 281, 290, 291, 301, 340, 341)  # hold levels, or a value for each level
+FRACTIONS = (5, 10)  # types of two numbers
+
+
+@dataclass(frozen=True)
+class Tag:
+    """A tag of a TIFF file as it is stored.
+
+    Attributes:
+        code: its number.
+        kind: number of its type.
+        data: its values.
+        order: "<" or ">", the byte order of the values.
+    """
+
+    code: int
+    kind: int
+    data: bytes
+    order: str
+
+    @property
+    def count(self) -> int:
+        """Number of values."""
+        return len(self.data) // LENGTHS[self.kind]
+
+    def stored(self, order: str) -> tuple[int, int, int, bytes, bool]:
+        """The tag in a byte order, as tifffile takes it."""
+        unit = LENGTHS[self.kind] // (2 if self.kind in FRACTIONS else 1)
+        data = self.data if order == self.order else np.frombuffer(self.data, f"V{unit}").view(f"u{unit}")
+        return self.code, self.kind, 0, data if isinstance(data, bytes) else data.byteswap().tobytes(), True
+
+
+class Part(NamedTuple):
+    """A part of a file that only files of the same type can hold.
+
+    Attributes:
+        kind: that type.
+        name: what it is, in words.
+        data: its bytes.
+    """
+
+    kind: str
+    name: str
+    data: bytes
 
 
 @dataclass(frozen=True)
@@ -34,122 +73,58 @@ class Extras:
     Attributes:
         xmp: an XMP packet, or None.
         dpi: pixels per inch, horizontal and vertical, or None.
+        tags: of a TIFF file, which only TIFF files can hold.
+        size: (H, W) of the picture that the tags describe, or None if there are none.
+        depth: of that picture.
+        parts: of the file, which only files of the same type can hold.
+        left_out: names of what was in the file and is not copied.
     """
 
     xmp: bytes | None = None
     dpi: tuple[float, float] | None = None
+    tags: tuple[Tag, ...] = ()
+    size: tuple[int, int] | None = None
+    depth: str = ""
+    parts: tuple[Part, ...] = ()
+    left_out: tuple[str, ...] = ()
 
-    def options(self, kind: str) -> dict[str, object]:
-        """Options for Pillow to write the metadata to a JPEG, WebP, AVIF or PNG file."""
-        options: dict[str, object] = {}
-        if self.dpi is not None and kind not in ("WebP", "AVIF"):
-            options["dpi"] = self.dpi
-        if self.xmp is None:
-            return options
-        if kind == "JPEG" and len(self.xmp) > JPEG_LIMIT:
-            warn(
-                f"XMP metadata of {len(self.xmp)} bytes is left out, as JPEG holds at most {JPEG_LIMIT}; write a PNG, "
-                "TIFF, WebP or AVIF file to keep it"
-            )
-            return options
-        if kind != "PNG":
-            return options | {"xmp": self.xmp}
-        info = PngImagePlugin.PngInfo()
-        info.add_itxt(PNG_KEY, self.xmp.decode("utf-8", "replace"))
-        return options | {"pnginfo": info}
+    def tags_for(self, size: tuple[int, int], depth: str) -> tuple[Tag, ...]:
+        """The tags that are true of a picture of a size (H, W) and depth."""
+        return tuple(
+            tag
+            for tag in self.tags
+            if (tag.code not in GROUND or size == self.size) and (tag.code not in OF_A_DEPTH or depth == self.depth)
+        )
 
-    def chunks(self) -> list[tuple[bytes, bytes]]:
-        """The metadata as chunks of a PNG file."""
-        chunks = []
-        if self.dpi is not None:
-            chunks.append((b"pHYs", struct.pack(">IIB", *(round(value / 0.0254) for value in self.dpi), 1)))
-        if self.xmp is not None:
-            chunks.append((b"iTXt", PNG_KEY.encode() + bytes(5) + self.xmp))
-        return chunks
-
-    def tags(self) -> tiff.Resolution:
-        """Options for tifffile to write the resolution; XMP is written with the extra tags."""
-        return {} if self.dpi is None else {"resolution": self.dpi, "resolutionunit": INCH}
+    def lacking_tags(self, kept: Iterable[Tag] = ()) -> list[str]:
+        """Names of the tags that are not among those kept."""
+        gone = [tag.code for tag in self.tags if tag not in kept and not (tag.code in RESOLUTION and self.dpi)]
+        return [] if not gone else [f"the TIFF {'tag' if len(gone) == 1 else 'tags'} {', '.join(map(str, gone))}"]
 
 
 NO_EXTRAS = Extras()
 
 
-def read_extras(path: Path) -> Extras:
-    """Read the extras of an image file whose pixels can be read; invalid fields are dropped."""
+def note_left_out(path: Path, names: Sequence[str]) -> None:
+    """Warn that a file was written without something that the input holds."""
+    if names:
+        warn(f"{path} is written without some metadata of the input: {', '.join(dict.fromkeys(names))}")
+
+
+def turned(pair: tuple[float, float], orientation: int) -> tuple[float, float]:
+    """A horizontal and a vertical number after a picture stored with an EXIF orientation was turned upright."""
+    return pair[::-1] if orientation >= 5 else pair
+
+
+def turned_tag(tag: Tag, orientation: int) -> Tag:
+    """A tag of a picture that was turned upright: a quarter turn swaps the two resolutions."""
+    return replace(tag, code=SWAPPED.get(tag.code, tag.code)) if orientation >= 5 else tag
+
+
+def sound(pair: Sequence[object] | None) -> tuple[float, float] | None:
+    """Return a print resolution if it is two valid numbers, else None."""
     try:
-        return _read(path)
-    except Exception:  # decoders have no common base class for errors
-        return NO_EXTRAS
-
-
-def _read(path: Path) -> Extras:
-    with path.open("rb") as stream:
-        is_tiff = tiff.is_tiff(stream.read(4))
-    if is_tiff:
-        with tifffile.TiffFile(path) as file:
-            tags = file.pages.first.tags
-            values = {code: tags[code].value for code in (tiff.XMP, 282, 283, 296) if code in tags}
-        scale = {INCH: 1.0, CENTIMETRE: 2.54}.get(values.get(296, INCH))
-        pair = None if scale is None else tuple(_ratio(values.get(code)) * scale for code in (282, 283))
-        return Extras(_upright(values.get(tiff.XMP)), _sound(pair))
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # Pillow warns about sizes and damaged EXIF
-        with Image.open(path) as image:
-            if image.format == "PNG" and not _xmp(image) and _has_late_text(path):
-                image.load()  # also reads what follows the pixels
-            xmp = _xmp(image)
-            return Extras(_upright(xmp.encode() if isinstance(xmp, str) else xmp), _sound(image.info.get("dpi")))
-
-
-def _xmp(image: Image.Image) -> bytes | str | None:
-    return image.info.get("xmp", image.info.get(PNG_KEY))
-
-
-def _has_late_text(path: Path) -> bool:
-    """Whether a PNG file has text behind its pixels, where some programs write XMP."""
-    with path.open("rb") as stream:
-        stream.seek(8)  # signature
-        pixels = False
-        while len(head := stream.read(8)) == 8:
-            length, name = struct.unpack(">I4s", head)
-            if pixels and name == b"iTXt":
-                return True
-            pixels = pixels or name == b"IDAT"
-            stream.seek(length + 4, 1)  # content and checksum
-    return False
-
-
-def _ratio(value: object) -> float:
-    """Convert a TIFF fraction to a float; NaN if it is invalid."""
-    if isinstance(value, tuple) and len(value) == 2 and value[1]:
-        return float(value[0]) / float(value[1])
-    return math.nan
-
-
-def _sound(pair: Sequence[float] | None) -> tuple[float, float] | None:
-    """Return the resolution if it is two valid numbers, else None."""
-    try:
-        x, y = (float(value) for value in pair or ())
-    except (TypeError, ValueError):  # of damaged files
+        x, y = (float(value) for value in pair or ())  # type: ignore[arg-type]
+    except (TypeError, ValueError, ZeroDivisionError):  # of damaged files
         return None
     return (x, y) if all(1 <= value <= 60_000 for value in (x, y)) else None  # 1 without a unit is not a resolution
-
-
-def _upright(xmp: object) -> bytes | None:
-    """Set the orientation in an XMP packet to upright."""
-    return ORIENTATION.sub(rb"\g<1>1", xmp) if isinstance(xmp, bytes) and xmp.strip() else None
-
-
-def encode_deep_png(channels: NDArray[np.generic], icc: bytes | None, exif: bytes | None, extras: Extras) -> bytes:
-    """Encode a 16-bit PNG file, with profile, EXIF and extras between header and pixels as the format requires."""
-    encoded = imagecodecs.png_encode(channels)
-    start = 8 + 25  # signature and header chunk, of fixed length
-    chunks = io.BytesIO()
-    if icc is not None:
-        PngImagePlugin.putchunk(chunks, b"iCCP", b"ICC Profile\0\0", zlib.compress(icc))
-    if exif is not None:
-        PngImagePlugin.putchunk(chunks, b"eXIf", exif.removeprefix(exif_tags.PREFIX))
-    for name, content in extras.chunks():
-        PngImagePlugin.putchunk(chunks, name, content)
-    return bytes(encoded[:start]) + chunks.getvalue() + bytes(encoded[start:])

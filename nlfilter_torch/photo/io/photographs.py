@@ -3,22 +3,24 @@
 Needs the ``cli`` extra (Pillow, tifffile, imagecodecs, psutil).
 """
 
+import math
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import partial
+from mmap import ACCESS_READ, mmap
 from pathlib import Path
 from typing import BinaryIO, Literal
 
 import numpy as np
 import psutil
 import torch
-from PIL import Image
 from torch import Tensor
 
-from nlfilter_torch.photo.io import cameras, tiff
+from nlfilter_torch.photo.io import by_pillow, cameras, jpeg, png, tiff
 from nlfilter_torch.photo.io import exif as exif_tags
-from nlfilter_torch.photo.io.by_pillow import read_by_pillow
-from nlfilter_torch.photo.io.decoded import Channels
-from nlfilter_torch.photo.io.extras import NO_EXTRAS, Extras, encode_deep_png, read_extras
+from nlfilter_torch.photo.io.decoded import Channels, CheckSize, Decoded, Metadata, UnhandledImage, decoding
+from nlfilter_torch.photo.io.exif_in_tiff import shortened
+from nlfilter_torch.photo.io.extras import NO_EXTRAS, Extras, note_left_out
 from nlfilter_torch.photo.io.writing import check_file, open_beside
 from nlfilter_torch.photo.tiled.pictures import Picture, stored_as
 
@@ -33,13 +35,10 @@ DEPTHS: dict[str, tuple[str, ...]] = {
     "AVIF": ("uint8",),
     "TIFF": ("uint8", "uint16", "float16", "float32", "float64"),
 }
-ENCODING: dict[str, dict[str, object]] = {
-    "JPEG": {"quality": 95, "subsampling": 0},
-    "WebP": {"lossless": True, "exact": True},  # exact: also where it is transparent
-    "AVIF": {"quality": 90, "subsampling": "4:4:4"},
-}
-LONGEST_SIDE = {"WebP": 16383, "JPEG": 65500}  # pixels
-LONGEST_EXIF = 65533  # bytes, in JPEG
+# Pixels. Those of libpng and libavif are what they decode.
+LONGEST_SIDE = {"WebP": 16383, "JPEG": 65500, "PNG": png.LONGEST_SIDE, "AVIF": by_pillow.LONGEST_AVIF}
+MOST_PIXELS = {"AVIF": by_pillow.MOST_AVIF}
+LONGEST_EXIF = jpeg.LONGEST  # bytes, in JPEG
 CONVERTED = 1 << 18  # pixels that are converted at a time between files and floats
 SUFFIXES = {".png": "PNG", ".jpg": "JPEG", ".jpeg": "JPEG", ".webp": "WebP", ".avif": "AVIF"}
 SUFFIXES |= {".tif": "TIFF", ".tiff": "TIFF"}
@@ -65,6 +64,11 @@ class Photograph:
     icc: bytes | None = None
     exif: bytes | None = None
     extras: Extras = NO_EXTRAS
+
+    @property
+    def metadata(self) -> Metadata:
+        """Profile, EXIF and the rest."""
+        return Metadata(self.icc, self.exif, self.extras)
 
     @property
     def size(self) -> tuple[int, int]:
@@ -102,13 +106,13 @@ def read_photograph(path: str | Path, *, bytes_per_pixel: int = 0, memory: int |
         TooLarge: ``bytes_per_pixel`` for all pixels exceeds the memory. It is a MemoryError.
     """
     path = Path(path)
-    channels, icc, exif = read_channels(path, bytes_per_pixel=bytes_per_pixel, memory=memory)
-
+    decoded = read_channels(path, bytes_per_pixel=bytes_per_pixel, memory=memory)
+    channels, metadata = decoded.channels, decoded.metadata
     depth = check_depth(path, channels.dtype)
     planes = _planes(Picture(channels, str(path), channels=channels.shape[2]))
     colours = 3 if planes.shape[1] >= 3 else 1
     alpha = planes[:, colours:] if planes.shape[1] > colours else None
-    return Photograph(planes[:, :colours], depth, alpha, icc, exif, read_extras(path))  # type: ignore[arg-type]
+    return Photograph(planes[:, :colours], depth, alpha, metadata.icc, metadata.exif, metadata.extras)  # type: ignore[arg-type]
 
 
 def _planes(picture: Picture) -> Tensor:
@@ -150,10 +154,8 @@ def first_bytes(path: Path) -> bytes:
     return head
 
 
-def read_channels(
-    path: Path, *, bytes_per_pixel: int, memory: int | None
-) -> tuple[Channels, bytes | None, bytes | None]:
-    """Read upright channels (H, W, S) in the stored dtype, profile and EXIF; see :func:`read_photograph`."""
+def read_channels(path: Path, *, bytes_per_pixel: int, memory: int | None) -> Decoded:
+    """Read upright channels (H, W, S) in the stored dtype, and metadata; see :func:`read_photograph`."""
     head = first_bytes(path)
     check_size = partial(_check_size, path, bytes_per_pixel, memory)
     if cameras.is_raw(path):
@@ -163,9 +165,35 @@ def read_channels(
     elif tiff.is_tiff(head):
         decoded = tiff.read(path, check_size)
     else:
-        deep_png = head.startswith(b"\x89PNG") and head[24:25] == b"\x10"  # the bit depth in the header
-        decoded = read_by_pillow(path, deep_png, check_size)
-    return exif_tags.upright(decoded.channels, decoded.orientation), decoded.icc, decoded.exif
+        with path.open("rb") as stream, mmap(stream.fileno(), 0, access=ACCESS_READ) as data, decoding(path):
+            decoded = _read_mapped(path, data, check_size)
+    return decoded._replace(channels=exif_tags.upright(decoded.channels, decoded.orientation), orientation=1)
+
+
+def _read_mapped(path: Path, data: mmap, check_size: CheckSize) -> Decoded:
+    """Read a PNG, JPEG, WebP or AVIF file that is mapped into memory."""
+    head = data[:32]
+    if is_png(head):
+        picture = png.open_png(path, data)
+        check_size(picture.size)
+        return Decoded(picture.decode(data), picture.orientation, picture.metadata)
+    if is_jpeg(head):
+        photo = jpeg.open_jpeg(path, data)
+        check_size(photo.size)
+        return Decoded(photo.decode(path), photo.orientation, photo.metadata)
+    if by_pillow.is_webp(head) or by_pillow.is_avif(head):
+        return by_pillow.read_by_pillow(path, data, check_size)
+    raise UnhandledImage(f"{path} is not a PNG, JPEG, TIFF, WebP or AVIF image; convert it to one of these")
+
+
+def is_png(head: bytes) -> bool:
+    """Whether a file with these first bytes is PNG."""
+    return head.startswith(png.SIGNATURE)
+
+
+def is_jpeg(head: bytes) -> bool:
+    """Whether a file with these first bytes is JPEG."""
+    return head.startswith(b"\xff\xd8\xff")
 
 
 def _check_size(
@@ -191,31 +219,65 @@ def write_photograph(photograph: Photograph, path: str | Path) -> None:
     rows = max(1, CONVERTED // photograph.size[1])
     parts = zip(*(plane.split(rows, dim=2) for plane in planes), strict=True)
     channels = np.concatenate([stored_as(torch.cat(part, dim=1), photograph.depth) for part in parts])  # (H, W, S)
+    alpha = photograph.alpha is not None
     with open_beside(path) as stream:
-        encode(stream, kind, channels, photograph.alpha is not None, photograph.icc, photograph.exif, photograph.extras)
+        metadata, left_out = with_thumbnail(photograph.metadata, None if kind == "TIFF" else channels)
+        left_out += encode(stream, kind, [channels], channels.shape, channels.dtype, alpha, metadata)
+    note_left_out(path, left_out)
 
 
 def encode(
     stream: BinaryIO,
     kind: str,
-    channels: Channels,
+    rows: Iterable[Channels],
+    shape: tuple[int, int, int],
+    dtype: np.dtype[np.generic],
     alpha: bool,
-    icc: bytes | None,
-    exif: bytes | None,
-    extras: Extras,
-) -> None:
-    """Write channels (H, W, S) in their dtype as an image file of a type in :data:`DEPTHS`."""
-    channels = channels[..., 0] if channels.shape[2] == 1 else channels
+    metadata: Metadata,
+) -> list[str]:
+    """Write rows (h, W, S) of a picture of ``shape`` as an image file of a type in :data:`DEPTHS`.
+
+    Returns the names of metadata that are left out.
+    """
+    extras = metadata.extras
+    left_out = [*extras.left_out, *(part.name for part in extras.parts if part.kind != kind)]
     if kind == "TIFF":
-        tiff.write(stream, channels, channels.shape, channels.dtype, alpha, icc, exif, extras.xmp, **extras.tags())
-    elif channels.dtype == np.uint16:
-        stream.write(encode_deep_png(channels, icc, exif, extras))
+        whole = np.concatenate(list(rows))
+        whole = whole[..., 0] if shape[2] == 1 else whole
+        return left_out + tiff.write(stream, whole, whole.shape, dtype, alpha, metadata)
+    left_out += extras.lacking_tags()
+    if kind == "PNG":
+        png.write_png(stream, rows, shape, dtype, metadata)
+    elif kind == "JPEG":
+        metadata, lacking = fitting_jpeg(metadata)
+        left_out += lacking
+        jpeg.write_jpeg(stream, rows, shape, metadata)
     else:
-        if exif is not None and kind == "AVIF":  # Pillow would remove it, and write the block anew
-            exif = exif_tags.without_orientation(exif)
-        options: dict[str, object] = {"icc_profile": icc, "exif": exif or b""} | ENCODING.get(kind, {})
-        options |= extras.options(kind)
-        Image.fromarray(channels).save(stream, format=kind, **options)
+        if extras.dpi is not None and exif_tags.resolution(metadata.exif) is None:
+            left_out.append("the print resolution")
+        whole = np.concatenate(list(rows))
+        by_pillow.write_by_pillow(stream, kind, whole[..., 0] if shape[2] == 1 else whole, metadata)
+    return left_out
+
+
+def with_thumbnail(metadata: Metadata, channels: Channels | None) -> tuple[Metadata, list[str]]:
+    """Metadata whose thumbnail, if they have any, shows channels (H, W, S), or is left out and named."""
+    if metadata.exif is None or not exif_tags.has_thumbnail(metadata.exif):
+        return metadata, []
+    block = exif_tags.refreshed(metadata.exif, channels)
+    return replace(metadata, exif=block), [] if exif_tags.has_thumbnail(block) else ["the thumbnail"]
+
+
+def fitting_jpeg(metadata: Metadata) -> tuple[Metadata, list[str]]:
+    """Metadata that a JPEG file can hold, and what it cannot."""
+    left_out = []
+    if metadata.exif is not None and len(metadata.exif) > LONGEST_EXIF:
+        metadata = replace(metadata, exif=shortened(metadata.exif, LONGEST_EXIF))
+        left_out.append("the maker note, as JPEG holds at most 65533 bytes of EXIF data")
+    packet = metadata.extras.xmp
+    if packet is not None and len(packet) > jpeg.LONGEST_XMP:
+        left_out.append(f"XMP of {len(packet)} bytes, as JPEG holds at most {jpeg.LONGEST_XMP}")
+    return metadata, left_out
 
 
 def check_output(path: str | Path, photograph: Photograph) -> str:
@@ -223,11 +285,11 @@ def check_output(path: str | Path, photograph: Photograph) -> str:
 
     Call it before long work, so that the error comes early.
     """
-    return check_type(path, photograph.depth, photograph.alpha is not None, photograph.size, photograph.exif)
+    return check_type(path, photograph.depth, photograph.alpha is not None, photograph.size, photograph.metadata)
 
 
 def check_type(
-    path: str | Path, depth: str, alpha: bool, size: tuple[int, int] = (1, 1), exif: bytes | None = None
+    path: str | Path, depth: str, alpha: bool, size: tuple[int, int] = (1, 1), metadata: Metadata | None = None
 ) -> str:
     """Check, as :func:`check_output`, a picture of that depth and size (H, W), with or without alpha."""
     path = Path(path)
@@ -252,12 +314,28 @@ def check_type(
             f"{path} cannot hold this picture: {kind} has at most {LONGEST_SIDE[kind]} pixels per side, got "
             f"{size[1]}x{size[0]}; write a PNG or TIFF file"
         )
-    if kind == "JPEG" and len(exif or b"") > LONGEST_EXIF:
+    if math.prod(size) > MOST_PIXELS.get(kind, math.prod(size)):
         raise ValueError(
-            f"{path} cannot hold this picture: JPEG has at most {LONGEST_EXIF} bytes of EXIF data, got "
-            f"{len(exif or b'')}; write a PNG, TIFF or WebP file"
+            f"{path} cannot hold this picture: {kind} is decoded up to {MOST_PIXELS[kind]} pixels, got "
+            f"{size[1]}x{size[0]}; write a PNG or TIFF file"
         )
+    if kind == "JPEG" and metadata is not None:
+        _check_jpeg_metadata(path, metadata)
     return kind
+
+
+def _check_jpeg_metadata(path: Path, metadata: Metadata) -> None:
+    """Raise ValueError if a JPEG file cannot hold the EXIF block, without the maker note, or the profile."""
+    pieces = {"EXIF data": (metadata.exif, LONGEST_EXIF), "colour profile": (metadata.icc, jpeg.LONGEST_ICC)}
+    for name, (content, longest) in pieces.items():
+        if content is None or len(content) <= longest:
+            continue
+        if name == "EXIF data" and shortened(content, longest) is not None:
+            continue
+        raise ValueError(
+            f"{path} cannot hold this picture: JPEG has at most {longest} bytes of {name}, got {len(content)}; "
+            "write a PNG, TIFF or WebP file"
+        )
 
 
 def check_memory(path: Path, width: int, height: int, bytes_per_pixel: int, memory: int | None = None) -> None:

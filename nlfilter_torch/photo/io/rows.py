@@ -19,9 +19,9 @@ import psutil
 
 from nlfilter_torch.photo.io import exif as exif_tags
 from nlfilter_torch.photo.io import tiff
-from nlfilter_torch.photo.io.decoded import Channels
-from nlfilter_torch.photo.io.extras import NO_EXTRAS, Extras, read_extras
-from nlfilter_torch.photo.io.photographs import check_type, encode, first_bytes, read_channels
+from nlfilter_torch.photo.io.decoded import NO_METADATA, Channels, Metadata, bands, decoding
+from nlfilter_torch.photo.io.extras import note_left_out
+from nlfilter_torch.photo.io.photographs import check_type, encode, first_bytes, read_channels, with_thumbnail
 from nlfilter_torch.photo.io.tiff import TiffRows
 from nlfilter_torch.photo.io.writing import check_file, claimed, link_target, name_beside, open_beside, part_beside
 from nlfilter_torch.photo.tiled.pictures import Rows, RowSource
@@ -44,19 +44,15 @@ class StoredPicture:
         rows: upright rows, (H, W, S) or (H, W).
         alpha: whether the last channel is transparency.
         cached: bytes kept in memory while the picture is read.
-        icc: the colour profile, or None.
-        exif: the EXIF block, or None.
+        metadata: profile, EXIF and the rest.
         attributes: attributes of a zarr array.
-        extras: XMP and print resolution.
     """
 
     rows: RowSource
     alpha: bool
     cached: int
-    icc: bytes | None = None
-    exif: bytes | None = None
+    metadata: Metadata = NO_METADATA
     attributes: Mapping[str, object] | None = None
-    extras: Extras = NO_EXTRAS
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -70,7 +66,8 @@ class StoredPicture:
         if samples > 2:
             return self
         shape = (height, width, 3 + self.alpha)
-        return replace(self, rows=np.broadcast_to(np.zeros((), self.rows.dtype), shape), icc=None)
+        rows = np.broadcast_to(np.zeros((), self.rows.dtype), shape)
+        return replace(self, rows=rows, metadata=replace(self.metadata, icc=None))
 
 
 def is_zarr(path: Path) -> bool:
@@ -96,10 +93,9 @@ def open_picture(path: Path, memory: int) -> Iterator[StoredPicture]:
         elif tiff.is_tiff(first_bytes(path)):
             stored = _open_tiff(path, stack)
         else:
-            channels, icc, exif = read_channels(path, bytes_per_pixel=CODEC_MEMORY_FACTOR, memory=memory)
-            stored = StoredPicture(
-                channels, channels.shape[2] in (2, 4), channels.nbytes, icc, exif, extras=read_extras(path)
-            )
+            decoded = read_channels(path, bytes_per_pixel=CODEC_MEMORY_FACTOR, memory=memory)
+            channels = decoded.channels
+            stored = StoredPicture(channels, channels.shape[2] in (2, 4), channels.nbytes, decoded.metadata)
         if stored.cached > memory:
             raise MemoryError(
                 f"{path} can only be read in pieces of {stored.cached / 1e6:.0f} MB, but only {memory / 1e6:.0f} MB "
@@ -119,7 +115,7 @@ def check_place(path: Path, depth: str, picture: StoredPicture, memory: int) -> 
         elif not _holds_zarr(path):
             raise ValueError(f"{path} is a folder, not a zarr array that can be replaced; choose another name")
         return
-    kind = check_type(path, depth, picture.alpha, picture.shape[:2], picture.exif)
+    kind = check_type(path, depth, picture.alpha, picture.shape[:2], picture.metadata)
     needed = 0 if kind == "TIFF" else math.prod(picture.shape) * np.dtype(depth).itemsize * CODEC_MEMORY_FACTOR
     if needed > memory:
         raise MemoryError(
@@ -136,16 +132,13 @@ def write_picture(path: Path, rows: Rows | Tiling, depth: str, like: StoredPictu
         return
     kind = check_type(path, depth, like.alpha)
     with open_beside(path) as stream:
+        values = (part for _, part in rows)
+        metadata, left_out = with_thumbnail(like.metadata, None)
         if kind == "TIFF":
-            values = (part for _, part in rows)
-            tiff.write_rows(
-                stream, values, shape, dtype, like.alpha, like.icc, like.exif, like.extras.xmp, **like.extras.tags()
-            )
+            left_out += tiff.write_rows(stream, values, shape, dtype, like.alpha, metadata)
         else:
-            whole = np.empty(shape, dtype)
-            for part, values_of_part in rows:
-                whole[part] = values_of_part
-            encode(stream, kind, whole, like.alpha, like.icc, like.exif, like.extras)
+            left_out += encode(stream, kind, values, shape, dtype, like.alpha, metadata)
+    note_left_out(path, left_out)
 
 
 def free_memory() -> int:
@@ -159,11 +152,11 @@ def usual_memory(most: int = sys.maxsize) -> int:
 
 
 def _open_tiff(path: Path, stack: ExitStack) -> StoredPicture:
-    with tiff.decoding(path):
+    with decoding(path):
         rows = stack.enter_context(TiffRows(path))
     tiff.warn_of_pages(path)
     source: RowSource = _turn(rows, stack) if rows.turned else rows
-    return StoredPicture(source, rows.alpha, rows.cached, rows.icc, rows.exif, extras=read_extras(path))
+    return StoredPicture(source, rows.alpha, rows.cached, rows.metadata)
 
 
 def _turn(rows: TiffRows, stack: ExitStack) -> RowSource:
@@ -281,7 +274,7 @@ def _write_zarr(path: Path, rows: Rows | Tiling, dtype: np.dtype[np.generic], li
                 rows.passes.processes.fill(rows, beside)
             else:
                 start = 0
-                for band in tiff.bands((part for _, part in rows), CHUNK):
+                for band in bands((part for _, part in rows), CHUNK):
                     write_band(array, start, band)
                     start += len(band)
             if path.exists():

@@ -3,26 +3,25 @@
 import logging
 import os
 import struct
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
-from functools import partial
+from collections.abc import Iterable, Iterator
+from mmap import ACCESS_READ, mmap
 from pathlib import Path
 from typing import BinaryIO, TypedDict, Unpack
 
 import numpy as np
 import tifffile
-from PIL import ExifTags, Image, TiffImagePlugin
 
 from nlfilter_torch.core.warning import warn
 from nlfilter_torch.photo.io import exif as exif_tags
-from nlfilter_torch.photo.io.decoded import Channels, CheckSize, Decoded
+from nlfilter_torch.photo.io import exif_in_tiff, xmp
+from nlfilter_torch.photo.io.decoded import Channels, CheckSize, Decoded, Metadata, UnhandledImage, bands, decoding
+from nlfilter_torch.photo.io.extras import GROUND, RESOLUTION, STORAGE, Extras, Tag, sound, turned, turned_tag
+from nlfilter_torch.photo.io.tables import LONG, ORIENTATION, RATIONAL, SHORT, Tables
 
-# Tags that describe the photograph. The others describe how the file stores it and are not copied.
-_DESCRIPTIVE = (270, 271, 272, 305, 306, 315, 33432, *exif_tags.FOLDERS)
-_ORIENTATION = int(ExifTags.Base.Orientation)
 # tifffile logs problems with a file. Without a handler Python would print them beside our error message.
 logging.getLogger("tifffile").addHandler(logging.NullHandler())
-XMP = 700  # tag
+XMP, SUB_FILES = 700, 330  # tags
+INCH = 2  # unit of the resolution
 TILE_SIZE = 256  # side of the tiles that are written
 MAX_CLASSIC_BYTES = 4_000_000_000  # bytes of pixels above which a BigTIFF is written
 _ASSOCIATED = tifffile.EXTRASAMPLE.ASSOCALPHA
@@ -30,36 +29,19 @@ MOST_PAGES = 100  # that are counted
 CACHED_BANDS = 2  # cached bands of strips or tiles: rows shared by two tiles of a picture span at most two
 
 
-class Resolution(TypedDict, total=False):
-    """Options of :func:`tifffile.imwrite` for the print resolution."""
+class _Resolution(TypedDict, total=False):
+    """Options of tifffile for the print resolution."""
 
-    resolution: tuple[float, float]
+    resolution: tuple[float | tuple[int, int], float | tuple[int, int]]
     resolutionunit: int
 
 
-class _Options(Resolution, total=False):
-    """Further options of :func:`tifffile.imwrite`."""
+class _Options(TypedDict, total=False):
+    """Further options of tifffile."""
 
     tile: tuple[int, int]
-    bigtiff: bool
     maxworkers: int
     buffersize: int
-
-
-class UnhandledImage(ValueError):
-    """A valid image file of an unsupported kind."""
-
-
-@contextmanager
-def decoding(path: Path) -> Iterator[None]:
-    """Report any error in the block as a damaged file, since decoders have no common base class for errors."""
-    try:
-        yield
-    except (MemoryError, UnhandledImage):
-        raise
-    except Exception as error:
-        reason = error or type(error).__name__
-        raise ValueError(f"{path} is damaged or cut short ({reason}); copy it again from its source") from error
 
 
 def is_tiff(head: bytes) -> bool:
@@ -68,7 +50,7 @@ def is_tiff(head: bytes) -> bool:
 
 
 def read(path: Path, check_size: CheckSize) -> Decoded:
-    """Read the first page; the EXIF block is not read from a BigTIFF."""
+    """Read the first page."""
     with decoding(path), TiffRows(path) as rows:
         check_size((rows.shape[1], rows.shape[0]), double=rows.dtype == np.float64)
         ends = (at + count for at, count in zip(rows.page.dataoffsets, rows.page.databytecounts, strict=True) if count)
@@ -78,7 +60,7 @@ def read(path: Path, check_size: CheckSize) -> Decoded:
         if rows.page.axes == "SYX":
             channels = np.moveaxis(channels, 0, -1)
         warn_of_pages(path)
-        return Decoded(plain(rows.page, channels.reshape(rows.shape)), rows.orientation, rows.icc, rows.exif)
+        return Decoded(plain(rows.page, channels.reshape(rows.shape)), rows.orientation, rows.metadata)
 
 
 def count_pages(path: Path) -> int:
@@ -136,15 +118,40 @@ def plain(page: tifffile.TiffPage, channels: Channels) -> Channels:
     return _unmultiplied(channels) if _ASSOCIATED in page.extrasamples else channels
 
 
-def metadata(file: tifffile.TiffFile, path: Path) -> tuple[int, bytes | None, bytes | None]:
-    """Read orientation, profile and EXIF (not from a BigTIFF) of the first page of a file."""
-    tags = file.pages.first.tags
-    orientation, profile = tags.get(_ORIENTATION), tags.get(34675)
-    return (
-        1 if orientation is None else exif_tags.orientation_of(orientation.value),
-        profile.value if profile is not None and isinstance(profile.value, bytes) else None,
-        None if file.is_bigtiff else _read_exif(path),
+def read_metadata(file: tifffile.TiffFile, stream: BinaryIO, depth: str) -> tuple[int, Metadata]:
+    """Read the orientation of the first page of a file, and the metadata of the upright picture of that depth."""
+    profile = file.pages.first.tags.get(34675)
+    icc = profile.value if profile is not None and isinstance(profile.value, bytes) else None
+    with mmap(stream.fileno(), 0, access=ACCESS_READ) as data:
+        tables = Tables(data)
+        fields = tables.fields(tables.first)
+        block, moved = exif_in_tiff.block_of(tables)
+        orientation, exif, damaged = exif_tags.read_upright(block)
+        stored = [field for field in fields if field.code not in (*exif_in_tiff.DESCRIPTIVE, *STORAGE, XMP, SUB_FILES)]
+        tags = [Tag(field.code, field.kind, tables.raw(field), tables.order) for field in stored]
+        packet = next((tables.raw(field) for field in fields if field.code == XMP), None)
+        ratios = {field.code: tables.ratio(field) for field in fields if field.code in RESOLUTION[:2]}
+        units = [tables.number(field) for field in fields if field.code == RESOLUTION[2]]
+    packet, left_out = xmp.upright(packet)
+    left_out += [exif_in_tiff.MOVED] * moved + ["smaller versions and masks"] * any(f.code == SUB_FILES for f in fields)
+    scale = exif_tags.SCALES.get((units or [INCH])[0] or 0)
+    pair = None if scale is None or len(ratios) < 2 else sound([ratios[code] * scale for code in RESOLUTION[:2]])
+    if units == [1] and set(ratios.values()) == {1.0}:  # says nothing
+        tags = [tag for tag in tags if tag.code not in RESOLUTION]
+    if orientation > 1:
+        left_out += [f"the TIFF tag {tag.code}, as the picture is turned" for tag in tags if tag.code in GROUND]
+        tags = [turned_tag(tag, orientation) for tag in tags if tag.code not in GROUND]
+    height, width = file.pages.first.imagelength, file.pages.first.imagewidth
+    size = (width, height) if orientation >= 5 else (height, width)
+    extras = Extras(
+        packet,
+        None if pair is None else turned(pair, orientation),
+        tuple(tags),
+        size if tags else None,
+        depth if tags else "",
+        left_out=(*left_out, *damaged),
     )
+    return orientation, Metadata(icc, exif, extras)
 
 
 def write_rows(
@@ -153,19 +160,19 @@ def write_rows(
     shape: tuple[int, int, int],
     dtype: np.dtype[np.generic],
     alpha: bool,
-    icc: bytes | None,
-    exif: bytes | None,
-    xmp: bytes | None = None,
-    **resolution: Unpack[Resolution],
-) -> None:
-    """Write rows (h, W, S) of a picture of ``shape`` as they arrive, in tiles; large files become BigTIFF."""
+    metadata: Metadata,
+) -> list[str]:
+    """Write rows (h, W, S) of a picture of ``shape`` as they arrive, in tiles; large files become BigTIFF.
+
+    Returns what is left out, see :func:`write`.
+    """
     height, width, samples = shape
     plain_shape = (height, width) if samples == 1 else shape
     big = height * width * samples * dtype.itemsize > MAX_CLASSIC_BYTES
     # Compressing ahead in threads would queue hundreds of megabytes.
     size = TILE_SIZE * TILE_SIZE * samples * dtype.itemsize
-    options = _Options(maxworkers=1, buffersize=size, tile=(TILE_SIZE, TILE_SIZE), bigtiff=big, **resolution)
-    write(stream, _tiles(rows, width), plain_shape, dtype, alpha, icc, None if big else exif, xmp, **options)
+    options = _Options(maxworkers=1, buffersize=size, tile=(TILE_SIZE, TILE_SIZE))
+    return write(stream, _tiles(rows, width), plain_shape, dtype, alpha, metadata, big, **options)
 
 
 def _tiles(rows: Iterable[Channels], width: int) -> Iterator[Channels]:
@@ -177,105 +184,66 @@ def _tiles(rows: Iterable[Channels], width: int) -> Iterator[Channels]:
             yield padded[..., 0] if padded.shape[2] == 1 else padded
 
 
-def bands(rows: Iterable[Channels], height: int) -> Iterator[Channels]:
-    """Regroup rows (h, W, S) into pieces of the same ``height``, the last one possibly shorter.
-
-    >>> [len(band) for band in bands([np.zeros((3, 1, 1)), np.zeros((4, 1, 1))], 2)]
-    [2, 2, 2, 1]
-    """
-    waiting: list[Channels] = []
-    for piece in rows:
-        waiting.append(piece)
-        while sum(map(len, waiting)) >= height:
-            whole = np.concatenate(waiting)
-            waiting = [whole[height:]]
-            yield whole[:height]
-    if waiting and sum(map(len, waiting)):
-        yield np.concatenate(waiting)
-
-
 def write(
     stream: BinaryIO,
     data: Channels | Iterator[Channels],
     shape: tuple[int, ...],
     dtype: np.dtype[np.generic],
     alpha: bool,
-    icc: bytes | None,
-    exif: bytes | None,
-    xmp: bytes | None = None,
+    metadata: Metadata,
+    big: bool = False,
     **options: Unpack[_Options],
-) -> None:
+) -> list[str]:
     """Write a picture of ``shape`` (H, W) or (H, W, S), or an iterator over its tiles, compressed without loss.
 
-    ``alpha`` says whether the last channel is transparency; ``options`` are those of :func:`tifffile.imwrite`.
+    ``alpha`` says whether the last channel is transparency; ``options`` are those of :func:`tifffile.imwrite`. Returns
+    the names of metadata that are left out.
     """
-    tags = Image.Exif()
-    if exif is not None:
-        tags.load(exif)
-    folders = exif_tags.tables(tags)
+    extras = metadata.extras
+    kept = extras.tags_for((shape[0], shape[1]), dtype.name)
+    head = exif_in_tiff.opening(metadata.exif, kept[0].order if kept else "<", big)
+    tags = [tag.stored(head.order) for tag in (*head.tags, *kept) if tag.code not in RESOLUTION]
+    if extras.xmp is not None:
+        tags.append((XMP, 1, 0, extras.xmp, True))
     # tifffile does not write nested tables, so a placeholder tag with the next lower number reserves space for each.
-    places = [(code - 1, "I", 1, 0, True) for code in folders]
+    places = [(code - 1, LONG, 1, 0, True) for code in head.nested]
     start = stream.tell()
-    tifffile.imwrite(
-        stream,
-        data,
-        shape=shape,
-        dtype=dtype,
-        photometric="rgb" if len(shape) == 3 and shape[2] >= 3 else "minisblack",
-        planarconfig="contig" if len(shape) == 3 else None,
-        extrasamples=["unassalpha"] if alpha else None,
-        compression="zlib",
-        predictor=bool(np.issubdtype(dtype, np.integer)),
-        iccprofile=icc,
-        extratags=[(_ORIENTATION, "H", 1, 1, True), *_texts(tags, xmp), *places],
-        metadata=None,
-        software=False,
-        **options,
-    )
+    with tifffile.TiffWriter(stream, bigtiff=big, byteorder=head.order) as file:  # type: ignore[arg-type]
+        stream.write(head.body)
+        file.write(
+            data,
+            shape=shape,
+            dtype=None if isinstance(data, np.ndarray) else dtype,
+            photometric="rgb" if len(shape) == 3 and shape[2] >= 3 else "minisblack",
+            planarconfig="contig" if len(shape) == 3 else None,
+            extrasamples=["unassalpha"] if alpha else None,
+            compression="zlib",
+            predictor=bool(np.issubdtype(dtype, np.integer)),
+            iccprofile=metadata.icc,
+            extratags=[(ORIENTATION, SHORT, 1, 1, True), *tags, *places],
+            metadata=None,
+            software=False,
+            **_resolution(extras, kept),
+            **options,
+        )
     stream.seek(start)
-    with tifffile.TiffFile(stream) as file:
-        order = file.byteorder
-        positions = {code: file.pages.first.tags[code - 1].offset for code in folders}
-    for code, folder in folders.items():
-        _write_folder(stream, order, positions[code], code, folder)
+    with tifffile.TiffFile(stream) as written:
+        positions = {code: written.pages.first.tags[code - 1].offset for code in head.nested}
+    for code, offset in head.nested.items():
+        exif_in_tiff.point(stream, head.order, big, positions[code], code, offset)
+    return extras.lacking_tags(kept) + [exif_in_tiff.MOVED] * head.moved
 
 
-def _texts(tags: Image.Exif, xmp: bytes | None) -> Iterator[tuple[int, str, int, bytes, bool]]:
-    """The descriptive tags and XMP, as tifffile takes them."""
-    for code in _DESCRIPTIVE:
-        if code in tags and code not in exif_tags.FOLDERS:
-            yield code, "s", 0, str(tags[code]).encode("latin-1", "replace"), True  # latin-1, as decoded by Pillow
-    if xmp is not None:
-        yield XMP, "B", len(xmp), xmp, True
-
-
-def _write_folder(stream: BinaryIO, order: str, position: int, code: int, folder: Mapping[int, object]) -> None:
-    """Append a table of tags and make the tag at ``position`` point at it."""
-    table = TiffImagePlugin.ImageFileDirectory_v2(ifh=(b"II*\0" if order == "<" else b"MM\0*") + bytes(4))
-    for key, value in folder.items():
-        if exif_tags.is_writable(key, value):
-            table[key] = exif_tags.writable(value)
-    end = stream.seek(0, 2)
-    stream.write(bytes(end % 2))  # tables begin on even offsets
-    offset = end + end % 2
-    stream.write(table.tobytes(offset))
-    stream.seek(position)
-    stream.write(struct.pack(f"{order}HHLL", code, 4, 1, offset))  # type 4: 32-bit integer; count 1
-
-
-def _read_exif(path: Path) -> bytes | None:
-    with path.open("rb") as stream:
-        return exif_tags.split(partial(_descriptive_fields, stream))[1]
-
-
-def _descriptive_fields(stream: BinaryIO) -> Image.Exif:
-    """Parse the tags of a TIFF file that describe the photograph, and its orientation."""
-    exif = Image.Exif()
-    exif.load_from_fp(stream)
-    for code in list(exif):
-        if code not in _DESCRIPTIVE and code != _ORIENTATION:
-            del exif[code]
-    return exif
+def _resolution(extras: Extras, tags: Iterable[Tag]) -> _Resolution:
+    """The resolution as stored in a TIFF file, or else in dpi."""
+    kinds = dict(zip(RESOLUTION, (RATIONAL, RATIONAL, SHORT), strict=True))
+    stored = {tag.code: tag for tag in tags if tag.kind == kinds.get(tag.code) and tag.count == 1}
+    values = [struct.unpack(stored[code].order + "II", stored[code].data) for code in RESOLUTION[:2] if code in stored]
+    unit = stored.get(RESOLUTION[2])
+    if len(values) == 2:
+        number = INCH if unit is None else struct.unpack(unit.order + "H", unit.data)[0]
+        return _Resolution(resolution=(values[0], values[1]), resolutionunit=number)
+    return {} if extras.dpi is None else _Resolution(resolution=extras.dpi, resolutionunit=INCH)
 
 
 def _unmultiplied(channels: Channels) -> Channels:
@@ -294,8 +262,7 @@ class TiffRows:
     Attributes:
         shape: (H, W, S).
         dtype: dtype in native byte order.
-        icc: the colour profile, or None.
-        exif: the EXIF block, or None.
+        metadata: profile, EXIF and the rest.
         alpha: whether the last channel is transparency.
     """
 
@@ -307,7 +274,7 @@ class TiffRows:
             self.file = tifffile.TiffFile(self.stream, name=str(path))
             page = self.file.pages.first
             check_page(path, page)
-            self.orientation, self.icc, self.exif = metadata(self.file, path)
+            self.orientation, self.metadata = read_metadata(self.file, self.stream, _native(page).name)
         except BaseException:
             self.stream.close()
             raise

@@ -12,6 +12,7 @@ from PIL import ExifTags, Image
 from nlfilter_torch.photo.cli import editing
 from nlfilter_torch.photo.io import rows, tiff
 from nlfilter_torch.photo.io import rows as streaming_files
+from nlfilter_torch.photo.io.decoded import Metadata
 from nlfilter_torch.photo.io.rows import StoredPicture, open_picture, write_picture
 from tests.commands import refused, small_photo
 from tests.files import PLENTY, PROFILE, cat, rows_of
@@ -53,7 +54,7 @@ def test_writing_rows_keeps_everything(tmp_path: Path, suffix: str, channels: in
     picture = cat(270, 350, 4)[..., [0] if channels == 1 else [0, 3] if channels == 2 else slice(channels)]
     exif = Image.Exif()
     exif[ExifTags.Base.Make] = "Maker"
-    like = StoredPicture(picture, channels in (2, 4), 0, PROFILE, exif.tobytes(), {"stain": "H&E"})
+    like = StoredPicture(picture, channels in (2, 4), 0, Metadata(PROFILE, exif.tobytes()), {"stain": "H&E"})
     parts = ((slice(top, min(top + 41, 270)), picture[top : top + 41]) for top in range(0, 270, 41))
     path = tmp_path / f"out{suffix}"
     write_picture(path, parts, "uint8", like)
@@ -64,9 +65,9 @@ def test_writing_rows_keeps_everything(tmp_path: Path, suffix: str, channels: in
         if suffix == ".zarr":
             assert written.attributes == {"stain": "H&E"}
         else:
-            assert written.icc == PROFILE
-            assert written.exif is not None
-            assert b"Maker" in written.exif
+            assert written.metadata.icc == PROFILE
+            assert written.metadata.exif is not None
+            assert b"Maker" in written.metadata.exif
     assert [entry.name for entry in tmp_path.iterdir()] == [path.name]
 
 
