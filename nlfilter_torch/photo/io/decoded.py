@@ -1,5 +1,6 @@
 """What the readers of image files return, and the errors that they raise."""
 
+import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -28,6 +29,14 @@ def decoding(path: Path) -> Iterator[None]:
     except Exception as error:
         reason = error or type(error).__name__
         raise ValueError(f"{path} is damaged or cut short ({reason}); copy it again from its source") from error
+
+
+@contextmanager
+def quiet() -> Iterator[None]:
+    """Suppress the warnings of Pillow about damaged EXIF blocks, which it does not read for us."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        yield
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ fields and moves the notes, piexif knows fixed lists of fields, and Exiv2 is und
 import io
 import struct
 from collections.abc import Iterable
+from itertools import product
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -28,8 +29,8 @@ IN_PIXELS = (256, 40962)  # of these
 HIDDEN = 0xFFFE  # the number of no tag
 COMPRESSION, PLACE, LENGTH = 259, 513, 514  # of a thumbnail
 JPEG = 6  # a compression
-THUMBNAIL = 160  # longest side
-QUALITIES = (85, 70, 50, 30, 10)  # of thumbnails, until one fits
+THUMBNAIL_SIDES = (160, 80, 40)  # the longest side of thumbnails, until one fits
+QUALITIES = (85, 70, 50, 30)  # of each
 
 
 def upright(channels: NDArray[Scalar], orientation: int) -> NDArray[Scalar]:
@@ -218,12 +219,12 @@ def _without_table(tables: Block, start: int, room: Range) -> bytes:
 
 def _small_jpeg(picture: NDArray[np.generic], longest: int) -> bytes | None:
     """A thumbnail of a picture (H, W, S) in at most so many bytes, or None."""
-    step = max(1, max(picture.shape[:2]) // (4 * THUMBNAIL))
+    step = max(1, max(picture.shape[:2]) // (4 * THUMBNAIL_SIDES[0]))
     levels = np.asarray(picture[::step, ::step, : 3 if picture.shape[2] > 2 else 1])
     levels = (levels / (np.iinfo(levels.dtype.name).max / 255)).astype(np.uint8)
     small = Image.fromarray(levels.squeeze(2) if levels.shape[2] == 1 else levels)
-    small.thumbnail((THUMBNAIL, THUMBNAIL))
-    for quality in QUALITIES:
+    for side, quality in product(THUMBNAIL_SIDES, QUALITIES):
+        small.thumbnail((side, side))
         stream = io.BytesIO()
         small.save(stream, "JPEG", quality=quality)
         if len(stream.getvalue()) <= longest:

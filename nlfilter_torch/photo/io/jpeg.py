@@ -14,7 +14,7 @@ from PIL import JpegImagePlugin
 
 from nlfilter_torch.photo.io import exif as exif_tags
 from nlfilter_torch.photo.io import xmp
-from nlfilter_torch.photo.io.decoded import Channels, Metadata, UnhandledImage, bands
+from nlfilter_torch.photo.io.decoded import Channels, Metadata, UnhandledImage, bands, quiet
 from nlfilter_torch.photo.io.extras import Extras, Part, sound, turned
 
 QUALITY = 95
@@ -103,7 +103,9 @@ class Jpeg:
     def decode(self, path: Path) -> Channels:
         """The channels (H, W, S) as stored."""
         # Not Image.open, which refuses pictures of more than 179 megapixels whatever the memory.
-        with JpegImagePlugin.JpegImageFile(path) as image:
+        with quiet():
+            image = JpegImagePlugin.JpegImageFile(path)
+        with image:
             return np.asarray(image).reshape(self.size[1], self.size[0], self.samples)
 
     def decode_into(self, data: bytes | mmap, out: Channels) -> None:

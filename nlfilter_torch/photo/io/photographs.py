@@ -181,8 +181,10 @@ def _read_mapped(path: Path, data: mmap, check_size: CheckSize) -> Decoded:
         photo = jpeg.open_jpeg(path, data)
         check_size(photo.size)
         return Decoded(photo.decode(path), photo.orientation, photo.metadata)
-    if by_pillow.is_webp(head) or by_pillow.is_avif(head):
-        return by_pillow.read_by_pillow(path, data, check_size)
+    if by_pillow.is_webp(head):
+        return by_pillow.read_webp(path, data, check_size)
+    if by_pillow.is_avif(head):
+        return by_pillow.read_avif(path, data, check_size)
     raise UnhandledImage(f"{path} is not a PNG, JPEG, TIFF, WebP or AVIF image; convert it to one of these")
 
 

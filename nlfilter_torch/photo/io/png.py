@@ -282,7 +282,7 @@ def write_png(
     above: Channels | None = None
     for band in bands(rows, max(1, BAND // length)):
         # libpng chooses the filters, which need the row above.
-        part = band if above is None else np.concatenate([above, band])
+        part = np.ascontiguousarray(band if above is None else np.concatenate([above, band]))
         encoded = bytes(imagecodecs.png_encode(part, level=0))
         filtered = zlib.decompress(b"".join(encoded[c.start : c.stop] for c in chunks(encoded) if c.name == b"IDAT"))
         packed = packer.compress(memoryview(filtered)[0 if above is None else length :])

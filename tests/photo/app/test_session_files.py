@@ -8,7 +8,6 @@ import psutil
 import pytest
 from PIL import Image
 
-import nlfilter_torch.photo.io.photographs
 from nlfilter_torch.__main__ import main
 from nlfilter_torch.operator.features import reduce_channels
 from nlfilter_torch.photo.app.session import Session
@@ -136,11 +135,11 @@ def test_an_interrupted_save_leaves_the_old_file(session: Session, monkeypatch: 
     before = target.read_bytes()
     session.set("abstract", power=0.5)
 
-    def break_off(image: Image.Image, stream: io.BytesIO, **options: object) -> None:
+    def break_off(stream: io.BytesIO, *_: object) -> None:
         stream.write(before[:100])
         raise OSError("no space left on device")
 
-    monkeypatch.setattr(nlfilter_torch.photo.io.photographs.Image.Image, "save", break_off)
+    monkeypatch.setattr("nlfilter_torch.photo.io.png.write_png", break_off)
     with pytest.raises(OSError, match="no space left"):
         session.save("out.png")
     assert target.read_bytes() == before

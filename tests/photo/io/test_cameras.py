@@ -1,5 +1,7 @@
 """RAW and HEIC files are read upright, at 16 bits where they have more than 8, and never written."""
 
+import struct
+import subprocess
 import sys
 from pathlib import Path
 
@@ -12,6 +14,7 @@ from PIL import ExifTags, Image, ImageCms
 from nlfilter_torch.photo.cli import main
 from nlfilter_torch.photo.io.cameras import is_heic
 from nlfilter_torch.photo.io.photographs import TooLarge, read_photograph
+from tests.files import camera_block, fields_of
 
 SCENE = skimage.data.astronaut()[60:124, 130:210]
 PROFILE = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
@@ -121,6 +124,38 @@ def test_colours_that_heic_describes_by_numbers(tmp_path: Path) -> None:
     with_profile.info["icc_profile"] = PROFILE
     heif.from_pillow(with_profile).save(tmp_path / "c.heic")
     assert read_photograph(tmp_path / "c.heic").icc == PROFILE
+
+
+@pytest.mark.parametrize("first", ["nlfilter_torch.photo.io.photographs", "pillow_heif"])
+def test_xmp_of_heic_does_not_depend_on_imports(tmp_path: Path, first: str) -> None:
+    heif = pytest.importorskip("pillow_heif")
+    packet = b'<x:xmpmeta xmp:Rating="4"/>'
+    heif.from_pillow(Image.fromarray(SCENE)).save(tmp_path / "in.heic", xmp=packet, exif=camera_block(thumbnail=False))
+    code = f"import {first}\nfrom nlfilter_torch.photo.io.photographs import read_photograph\n"
+    code += f"p = read_photograph({str(tmp_path / 'in.heic')!r})\nprint(p.extras.xmp, len(p.exif))"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert result.stdout.strip() == f"{packet!r} {len(camera_block(thumbnail=False))}"
+
+
+def test_exif_and_gps_of_dng_are_kept(tmp_path: Path) -> None:
+    pytest.importorskip("rawpy")
+    write_dng(tmp_path / "in.dng", SCENE)
+    whole = (tmp_path / "in.dng").read_bytes()
+    start = struct.unpack("<I", whole[4:8])[0]
+    count = struct.unpack("<H", whole[start : start + 2])[0]
+    entries = [whole[start + 2 + 12 * number : start + 14 + 12 * number] for number in range(count)]
+    version, place = b"0231", len(whole) + len(whole) % 2
+    details = struct.pack("<H", 1) + struct.pack("<HHI", 36864, 7, 4) + version + bytes(4)
+    gps = struct.pack("<H", 1) + struct.pack("<HHI", 1, 2, 2) + b"N\0\0\0" + bytes(4)
+    entries += [struct.pack("<HHII", code, 4, 1, at) for code, at in ((34665, place), (34853, place + len(details)))]
+    entries.sort(key=lambda entry: struct.unpack("<H", entry[:2]))
+    table = struct.pack("<H", len(entries)) + b"".join(entries) + bytes(4)
+    whole = whole.ljust(place, b"\0") + details + gps + table
+    first = struct.pack("<I", place + len(details + gps))
+    (tmp_path / "in.dng").write_bytes(whole[:4] + first + whole[8:])
+    found = fields_of(read_photograph(tmp_path / "in.dng").exif)
+    assert found[36864, 7] == version
+    assert found[1, 2] == b"N\0"
 
 
 def test_avif_is_no_heic() -> None:

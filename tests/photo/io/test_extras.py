@@ -1,5 +1,6 @@
 """XMP and the print resolution are copied from every file type to every other, in memory and in tiles."""
 
+import contextlib
 import io
 from pathlib import Path
 
@@ -34,7 +35,9 @@ def check(path: Path) -> None:
 @pytest.mark.parametrize(("name", "depth"), KINDS)
 def test_files_hold_them(tmp_path: Path, name: str, depth: str) -> None:
     path = tmp_path / name
-    write_photograph(Photograph(cat(4), depth, extras=EXTRAS), path)  # type: ignore[arg-type]
+    lacking = path.suffix in (".webp", ".avif")
+    with pytest.warns(UserWarning, match="without .* the print resolution") if lacking else contextlib.nullcontext():
+        write_photograph(Photograph(cat(4), depth, extras=EXTRAS), path)  # type: ignore[arg-type]
     check(path)
     with Image.open(path) as opened:  # as read by another program
         opened.load()
@@ -85,7 +88,7 @@ def test_fields_without_sense_are_dropped(tmp_path: Path) -> None:
 
 def test_what_a_file_cannot_hold_is_left_out(tmp_path: Path) -> None:
     long = Extras(b"<x>" + b" " * LONGEST_XMP + b"</x>")
-    with pytest.warns(UserWarning, match="is left out, as JPEG holds at most 65000; write a PNG, TIFF, WebP or AVIF"):
+    with pytest.warns(UserWarning, match="XMP of 65007 bytes, as JPEG holds at most 65000"):
         write_photograph(Photograph(cat(4), extras=long), tmp_path / "a.jpg")
     assert read_photograph(tmp_path / "a.jpg").extras == Extras()
     write_photograph(Photograph(cat(4), extras=long), tmp_path / "a.png")

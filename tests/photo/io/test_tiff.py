@@ -1,5 +1,6 @@
 """TIFF files of every kind become plain channels; invalid tags are ignored."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ import torch
 from PIL import Image
 
 from nlfilter_torch.photo.io.exif import upright
-from nlfilter_torch.photo.io.photographs import read_photograph
+from nlfilter_torch.photo.io.photographs import read_photograph, write_photograph
 from nlfilter_torch.photo.io.rows import open_picture
 from nlfilter_torch.photo.io.tiff import TiffRows
 from tests.files import cat, photograph, rows_of, same, stored_values
@@ -131,3 +132,46 @@ def test_a_tiff_in_one_piece_needs_memory_for_it(tmp_path: Path) -> None:
     tifffile.imwrite(tmp_path / "in.tif", cat(), photometric="rgb", rowsperstrip=200, compression="zlib")
     with pytest.raises(MemoryError, match=r"can only be read in pieces of 0 MB, .* save it in smaller tiles"):
         open_picture(tmp_path / "in.tif", 100_000).__enter__()
+
+
+GROUND = [
+    (33550, "d", 3, (0.5, 0.5, 0.0), True),
+    (33922, "d", 6, (0.0, 0.0, 0.0, 440720.0, 100000.0, 0.0), True),
+    (34735, "H", 8, (1, 1, 0, 1, 1024, 0, 1, 1), True),
+    (34736, "d", 2, (6378137.0, 298.25), True),
+    (34737, "s", 0, "WGS 84|", True),
+    (42112, "s", 0, "<GDALMetadata/>", True),
+    (42113, "s", 0, "-9999", True),
+]
+
+
+def raw_tags(path: Path) -> dict[int, object]:
+    with tifffile.TiffFile(path) as file:
+        return {code: file.pages.first.tags[code].value for code, *_ in GROUND if code in file.pages.first.tags}
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_tags_of_geotiff_are_kept(tmp_path: Path, order: str) -> None:
+    grey = cat(channels=1)[..., 0].astype(np.float32)
+    tifffile.imwrite(tmp_path / "in.tif", grey, extratags=GROUND, metadata=None, byteorder=order)
+    opened = read_photograph(tmp_path / "in.tif")
+    write_photograph(opened, tmp_path / "out.tif")
+    assert len(raw_tags(tmp_path / "in.tif")) == 7
+    assert raw_tags(tmp_path / "out.tif") == raw_tags(tmp_path / "in.tif")
+    with pytest.warns(UserWarning, match="without .*: the TIFF tag 42113$"):
+        write_photograph(replace(opened, depth="uint8"), tmp_path / "out.tif")
+    with pytest.warns(UserWarning, match="without .*: the TIFF tags 33550, 33922, 34735, 34736, 34737$"):
+        write_photograph(replace(opened, pixels=opened.pixels[..., :50]), tmp_path / "small.tif")
+    with pytest.warns(UserWarning, match="without .*: the TIFF tags 33550, 33922, .*, 42112, 42113$"):
+        write_photograph(replace(opened, depth="uint8"), tmp_path / "out.png")
+    tifffile.imwrite(tmp_path / "in.tif", grey, extratags=[*GROUND, (274, "H", 1, 3, True)], metadata=None)
+    with pytest.warns(UserWarning, match="the TIFF tag 33550, as the picture is turned"):
+        write_photograph(read_photograph(tmp_path / "in.tif"), tmp_path / "out.tif")
+    assert set(raw_tags(tmp_path / "out.tif")) == {42112, 42113}
+
+
+def test_the_resolution_keeps_its_unit(tmp_path: Path) -> None:
+    tifffile.imwrite(tmp_path / "in.tif", cat(), photometric="rgb", resolution=((11811, 100), (3, 7)), resolutionunit=3)
+    write_photograph(read_photograph(tmp_path / "in.tif"), tmp_path / "out.tif")
+    with tifffile.TiffFile(tmp_path / "out.tif") as file:
+        assert [file.pages.first.tags[code].value for code in (282, 283, 296)] == [(11811, 100), (3, 7), 3]

@@ -7,7 +7,6 @@ import stat
 from pathlib import Path
 
 import pytest
-from PIL import Image
 
 from nlfilter_torch.photo.cli import main
 from nlfilter_torch.photo.io import writing as files
@@ -54,11 +53,11 @@ def test_a_failed_write_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.
     path = tmp_path / "out.png"
     path.write_bytes(b"old")
 
-    def fail(self: Image.Image, stream: io.BufferedRandom, **options: object) -> None:
+    def fail(stream: io.BufferedRandom, *_: object) -> None:
         stream.write(b"half")
         raise OSError("disk full")
 
-    monkeypatch.setattr(Image.Image, "save", fail)
+    monkeypatch.setattr("nlfilter_torch.photo.io.png.write_png", fail)
     with pytest.raises(OSError, match="disk full"):
         write_photograph(photograph(stored_values(3, "uint8")), path)
     assert [file.name for file in tmp_path.iterdir()] == ["out.png"]
