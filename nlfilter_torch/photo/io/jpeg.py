@@ -88,7 +88,7 @@ class Jpeg:
         size: (width, height).
         samples: channels, 1 or 3.
         whole: whether it has an end.
-        progressive: whether decoding needs memory for all pixels.
+        in_passes: whether it is progressive, so that decoding needs memory for all pixels.
         orientation: EXIF orientation.
         metadata: of the upright picture.
     """
@@ -96,9 +96,14 @@ class Jpeg:
     size: tuple[int, int]
     samples: int
     whole: bool
-    progressive: bool
+    in_passes: bool
     orientation: int
     metadata: Metadata
+
+    @property
+    def dtype(self) -> np.dtype[np.generic]:
+        """Of the channels."""
+        return np.dtype(np.uint8)
 
     def decode(self, path: Path) -> Channels:
         """The channels (H, W, S) as stored."""

@@ -78,7 +78,7 @@ class Png:
         size: (width, height).
         samples: channels after palettes and transparent colours are made plain.
         dtype: of these.
-        interlaced: whether it is.
+        in_passes: whether it is interlaced, so that decoding needs memory for all pixels.
         orientation: EXIF orientation.
         metadata: of the upright picture.
         parts: all chunks.
@@ -87,17 +87,21 @@ class Png:
     size: tuple[int, int]
     samples: int
     dtype: np.dtype[np.generic]
-    interlaced: bool
+    in_passes: bool
     orientation: int
     metadata: Metadata
     parts: tuple[Chunk, ...]
 
-    def decode(self, data: bytes | mmap, out: Channels | None = None) -> Channels:
-        """The channels (H, W, S) as stored; into ``out`` if the picture is not interlaced."""
+    def decode_into(self, data: bytes | mmap, out: Channels) -> None:
+        """Decode the channels (H, W, S) of a file without interlacing into an array."""
+        imagecodecs.png_decode(data, out=out[..., 0] if self.samples == 1 else out)
+
+    def decode(self, data: bytes | mmap) -> Channels:
+        """The channels (H, W, S) as stored."""
         shape = (self.size[1], self.size[0], self.samples)
-        if self.interlaced:
+        if self.in_passes:
             return _interlaced(data, self.parts, shape, self.dtype)
-        return np.asarray(imagecodecs.png_decode(data, out=out)).reshape(shape)
+        return np.asarray(imagecodecs.png_decode(data)).reshape(shape)
 
 
 def open_png(path: Path, data: bytes | mmap) -> Png:

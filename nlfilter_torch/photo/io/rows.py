@@ -1,4 +1,7 @@
-"""Picture files read and written a few rows at a time: TIFF, BigTIFF and zarr. Other formats are decoded whole.
+"""Picture files read and written a few rows at a time: TIFF, BigTIFF, zarr, PNG and JPEG.
+
+Large PNG and JPEG files are decoded into a temporary file. WebP and AVIF files, progressive JPEG files and interlaced
+PNG files are decoded whole.
 
 Needs the ``cli`` extra, and the ``zarr`` extra for zarr. A file appears complete or not at all.
 """
@@ -6,10 +9,10 @@ Needs the ``cli`` extra, and the ``zarr`` extra for zarr. A file appears complet
 import math
 import shutil
 import sys
-import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
+from mmap import ACCESS_READ, mmap
 from pathlib import Path
 from types import ModuleType
 from typing import Protocol
@@ -17,11 +20,20 @@ from typing import Protocol
 import numpy as np
 import psutil
 
-from nlfilter_torch.photo.io import exif as exif_tags
-from nlfilter_torch.photo.io import tiff
+from nlfilter_torch.photo.io import jpeg, png, tiff
 from nlfilter_torch.photo.io.decoded import NO_METADATA, Channels, Metadata, bands, decoding
 from nlfilter_torch.photo.io.extras import note_left_out
-from nlfilter_torch.photo.io.photographs import check_type, encode, first_bytes, read_channels, with_thumbnail
+from nlfilter_torch.photo.io.photographs import (
+    TooLarge,
+    check_type,
+    encode,
+    first_bytes,
+    is_jpeg,
+    is_png,
+    read_channels,
+    with_thumbnail,
+)
+from nlfilter_torch.photo.io.scratch import Scratch, upright_copy
 from nlfilter_torch.photo.io.tiff import TiffRows
 from nlfilter_torch.photo.io.writing import check_file, claimed, link_target, name_beside, open_beside, part_beside
 from nlfilter_torch.photo.tiled.pictures import Rows, RowSource
@@ -33,6 +45,8 @@ CHUNK = 256  # side of the chunks of a new zarr array
 FIFTH = psutil.virtual_memory().total // 5
 WHOLE = min(FIFTH, 2_000_000_000)  # a photograph that needs more is edited in tiles
 TILED = 1_000_000_000  # for tiles; with more they are no faster
+UNPACKED = 1_000_000_000  # to decode a photograph in memory rather than in a temporary file
+COPIED = 64  # rows of that file that are turned at a time
 CODEC_MEMORY_FACTOR = 8  # memory to decode or encode other formats, as a multiple of the picture's size in bytes
 
 
@@ -93,9 +107,7 @@ def open_picture(path: Path, memory: int) -> Iterator[StoredPicture]:
         elif tiff.is_tiff(first_bytes(path)):
             stored = _open_tiff(path, stack)
         else:
-            decoded = read_channels(path, bytes_per_pixel=CODEC_MEMORY_FACTOR, memory=memory)
-            channels = decoded.channels
-            stored = StoredPicture(channels, channels.shape[2] in (2, 4), channels.nbytes, decoded.metadata)
+            stored = _open_codec(path, memory, stack)
         if stored.cached > memory:
             raise MemoryError(
                 f"{path} can only be read in pieces of {stored.cached / 1e6:.0f} MB, but only {memory / 1e6:.0f} MB "
@@ -116,7 +128,11 @@ def check_place(path: Path, depth: str, picture: StoredPicture, memory: int) -> 
             raise ValueError(f"{path} is a folder, not a zarr array that can be replaced; choose another name")
         return
     kind = check_type(path, depth, picture.alpha, picture.shape[:2], picture.metadata)
-    needed = 0 if kind == "TIFF" else math.prod(picture.shape) * np.dtype(depth).itemsize * CODEC_MEMORY_FACTOR
+    needed = (
+        0
+        if kind in ("TIFF", "PNG", "JPEG")
+        else math.prod(picture.shape) * np.dtype(depth).itemsize * CODEC_MEMORY_FACTOR
+    )
     if needed > memory:
         raise MemoryError(
             f"{path} needs {needed / 1e6:.0f} MB of memory to be encoded, but only {memory / 1e6:.0f} MB may be used; "
@@ -155,23 +171,39 @@ def _open_tiff(path: Path, stack: ExitStack) -> StoredPicture:
     with decoding(path):
         rows = stack.enter_context(TiffRows(path))
     tiff.warn_of_pages(path)
-    source: RowSource = _turn(rows, stack) if rows.turned else rows
+    source: RowSource = rows
+    if rows.turned:
+        source = upright_copy(rows, rows.orientation, max(rows.segment[0], 64), stack)
     return StoredPicture(source, rows.alpha, rows.cached, rows.metadata)
 
 
-def _turn(rows: TiffRows, stack: ExitStack) -> RowSource:
-    """Rotate a picture that is stored sideways, in a temporary file."""
-    height, width, samples = rows.shape
-    copy = stack.enter_context(tempfile.TemporaryFile())  # noqa: SIM115 - the stack closes it
-    upright = np.memmap(copy, dtype=rows.dtype, mode="w+", shape=(width, height, samples))
-    step = max(rows.segment[0], 64)
-    for start in range(0, height, step):
-        stop = min(start + step, height)
-        block = exif_tags.upright(rows[slice(start, stop)], rows.orientation)
-        # Orientations 6 and 7 begin with the last row.
-        place = slice(height - stop, height - start) if rows.orientation in (6, 7) else slice(start, stop)
-        upright[:, place] = block
-    return upright
+def _open_codec(path: Path, memory: int, stack: ExitStack) -> StoredPicture:
+    """Open a file that is decoded whole; large PNG and JPEG files into a temporary file."""
+    try:
+        decoded = read_channels(path, bytes_per_pixel=CODEC_MEMORY_FACTOR, memory=min(memory, UNPACKED))
+    except TooLarge:
+        if (unpacked := _unpacked(path, stack)) is not None:
+            return unpacked
+        decoded = read_channels(path, bytes_per_pixel=CODEC_MEMORY_FACTOR, memory=memory)
+    channels = decoded.channels
+    return StoredPicture(channels, channels.shape[2] in (2, 4), channels.nbytes, decoded.metadata)
+
+
+def _unpacked(path: Path, stack: ExitStack) -> StoredPicture | None:
+    """Decode a PNG file without interlacing, or a baseline JPEG file, into a temporary file; None for others."""
+    with path.open("rb") as stream, mmap(stream.fileno(), 0, access=ACCESS_READ) as data, decoding(path):
+        head = data[:32]
+        if not is_png(head) and not is_jpeg(head):
+            return None
+        picture = png.open_png(path, data) if is_png(head) else jpeg.open_jpeg(path, data)
+        if picture.in_passes:
+            return None
+        scratch = Scratch((picture.size[1], picture.size[0], picture.samples), picture.dtype, stack)
+        with scratch.array() as out:
+            picture.decode_into(data, out)
+    if picture.orientation > 1:
+        scratch = upright_copy(scratch, picture.orientation, COPIED, stack)
+    return StoredPicture(scratch, picture.samples in (2, 4), 0, picture.metadata)
 
 
 def zarr_package() -> ModuleType:
