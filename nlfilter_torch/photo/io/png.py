@@ -5,10 +5,11 @@ Pillow reduces 16 bits to 8, ignores wrong checksums and refuses long chunks, so
 
 import io
 import struct
+import tempfile
 import zlib
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from mmap import mmap
+from mmap import ACCESS_READ, mmap
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
@@ -36,6 +37,7 @@ ADAM7 = (
 )  # y, x, steps
 # Chunks that describe the pixels of the file. Colours are checked, see colours.py.
 STORAGE = (b"IHDR", b"PLTE", b"tRNS", b"IDAT", b"IEND", b"gAMA", b"cHRM", b"sRGB", b"cICP")
+PIXELS = (b"IHDR", b"PLTE", b"tRNS", b"IDAT", b"IEND")
 TEXTS = (b"tEXt", b"zTXt", b"iTXt")
 READ = (b"iCCP", b"eXIf", b"pHYs", b"acTL", b"fcTL", b"fdAT")
 KEYS = (XMP_KEY, RAW_KEY + b"exif", RAW_KEY + b"xmp")  # of texts that are read
@@ -94,14 +96,28 @@ class Png:
 
     def decode_into(self, data: bytes | mmap, out: Channels) -> None:
         """Decode the channels (H, W, S) of a file without interlacing into an array."""
-        imagecodecs.png_decode(data, out=out[..., 0] if self.samples == 1 else out)
+        with tempfile.TemporaryFile() as stream:
+            self._copy_pixels(data, stream)
+            stream.flush()
+            with mmap(stream.fileno(), 0, access=ACCESS_READ) as pixels:
+                imagecodecs.png_decode(pixels, out=out[..., 0] if self.samples == 1 else out)
 
     def decode(self, data: bytes | mmap) -> Channels:
         """The channels (H, W, S) as stored."""
         shape = (self.size[1], self.size[0], self.samples)
         if self.in_passes:
             return _interlaced(data, self.parts, shape, self.dtype)
-        return np.asarray(imagecodecs.png_decode(data)).reshape(shape)
+        stream = io.BytesIO()
+        self._copy_pixels(data, stream)
+        return np.asarray(imagecodecs.png_decode(stream.getbuffer())).reshape(shape)
+
+    def _copy_pixels(self, data: bytes | mmap, stream: BinaryIO) -> None:
+        """Write the file without its metadata, of which libpng would print warnings."""
+        stream.write(SIGNATURE)
+        with memoryview(data) as view:
+            for chunk in self.parts:
+                if chunk.name in PIXELS:
+                    stream.write(view[chunk.start - 8 : chunk.stop + 4])
 
 
 def open_png(path: Path, data: bytes | mmap) -> Png:
