@@ -27,7 +27,7 @@ def decoding(path: Path) -> Iterator[None]:
     except (MemoryError, UnhandledImage):
         raise
     except Exception as error:
-        reason = error or type(error).__name__
+        reason = str(error) or type(error).__name__
         raise ValueError(f"{path} is damaged or cut short ({reason}); copy it again from its source") from error
 
 
