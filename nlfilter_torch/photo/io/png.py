@@ -43,6 +43,7 @@ READ = (b"iCCP", b"eXIf", b"pHYs", b"acTL", b"fcTL", b"fdAT")
 KEYS = (XMP_KEY, RAW_KEY + b"exif", RAW_KEY + b"xmp")  # of texts that are read
 LONGEST_TEXT = 1 << 28  # bytes of a text or profile
 BAND = 1 << 22  # bytes that are compressed at a time
+ROOM = 1 << 16  # bytes for chunks
 INCH = 0.0254  # metres
 LONGEST_SIDE = 1_000_000  # pixels; a limit of libpng
 
@@ -303,7 +304,8 @@ def write_png(
     for band in bands(rows, max(1, BAND // length)):
         # libpng chooses the filters, which need the row above.
         part = np.ascontiguousarray(band if above is None else np.concatenate([above, band]))
-        encoded = bytes(imagecodecs.png_encode(part, level=0))
+        room = bytearray(part.nbytes + part.nbytes // 64 + 16 * len(part) + ROOM)  # imagecodecs' own is too small
+        encoded = bytes(imagecodecs.png_encode(part, level=0, out=room))
         filtered = zlib.decompress(b"".join(encoded[c.start : c.stop] for c in chunks(encoded) if c.name == b"IDAT"))
         packed = packer.compress(memoryview(filtered)[0 if above is None else length :])
         if packed:

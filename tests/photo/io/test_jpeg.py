@@ -77,3 +77,11 @@ def test_profiles_in_several_segments(tmp_path: Path) -> None:
         open_jpeg(Path(), stream.getvalue()[:3000]).decode_into(
             stream.getvalue()[:3000], np.empty((200, 150, 3), np.uint8)
         )
+
+
+@pytest.mark.parametrize("shape", [(1, 1, 1), (1, 5000, 1), (3000, 1, 3), (70, 9000, 3)])
+def test_noise_of_every_shape_is_written(shape: tuple[int, int, int]) -> None:
+    values = np.random.default_rng(0).integers(0, 256, shape, dtype=np.uint8)
+    stream = io.BytesIO()
+    write_jpeg(stream, [values], shape, Metadata())
+    assert np.asarray(imagecodecs.jpeg8_decode(stream.getvalue())).size == values.size

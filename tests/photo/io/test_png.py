@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 from PIL import Image, PngImagePlugin
 
+from nlfilter_torch.photo.io.decoded import Metadata
 from nlfilter_torch.photo.io.photographs import read_photograph, write_photograph
-from nlfilter_torch.photo.io.png import ADAM7, SAMPLES, SIGNATURE, chunks, write_chunk
+from nlfilter_torch.photo.io.png import ADAM7, SAMPLES, SIGNATURE, chunks, write_chunk, write_png
 from tests.files import cat
 
 KINDS = [
@@ -114,3 +115,13 @@ def test_long_texts_and_profiles_are_read(tmp_path: Path) -> None:
     write_photograph(read_photograph(tmp_path / "in.png"), tmp_path / "out.png")
     assert read_photograph(tmp_path / "out.png").icc == profile
     np.testing.assert_array_equal(imagecodecs.png_decode((tmp_path / "out.png").read_bytes()), cat())
+
+
+@pytest.mark.parametrize("depth", ["uint8", "uint16"])
+@pytest.mark.parametrize("shape", [(1, 1, 1), (1, 3000, 1), (3000, 1, 3), (2, 70_000, 4), (300, 5000, 4)])
+def test_noise_of_every_shape_is_written(tmp_path: Path, shape: tuple[int, int, int], depth: str) -> None:
+    draw = np.random.default_rng(0)
+    stream = io.BytesIO()
+    values = draw.integers(0, np.iinfo(depth).max, shape, dtype=depth, endpoint=True)
+    write_png(stream, (values[top : top + 7] for top in range(0, shape[0], 7)), shape, values.dtype, Metadata())
+    np.testing.assert_array_equal(np.asarray(imagecodecs.png_decode(stream.getvalue())).reshape(shape), values)
