@@ -110,7 +110,7 @@ class Png:
             return _interlaced(data, self.parts, shape, self.dtype)
         stream = io.BytesIO()
         self._copy_pixels(data, stream)
-        return np.asarray(imagecodecs.png_decode(stream.getbuffer())).reshape(shape)
+        return np.asarray(imagecodecs.png_decode(stream.getvalue())).reshape(shape)
 
     def _copy_pixels(self, data: bytes | mmap, stream: BinaryIO) -> None:
         """Write the file without its metadata, of which libpng would print warnings."""
