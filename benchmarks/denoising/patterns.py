@@ -19,7 +19,7 @@ from benchmarks.denoiser_training.patterns import APART, pattern
 from benchmarks.denoising.cases import Case, with_noise
 from benchmarks.denoising.measuring import judge
 from benchmarks.denoising.methods import Method
-from benchmarks.denoising.sets import Clipped, Results, mean, read, rounded
+from benchmarks.denoising.sets import TITLES, Clipped, Results, mean, read, rounded
 from benchmarks.report import table
 from nlfilter_torch.operator.features import reduce_channels
 
@@ -94,7 +94,11 @@ def pattern_table(content: Mapping[str, Any], key: str) -> str:
     lines = []
     for method, row in rows.items():
         means = [mean({name: row[name] for name in names}, "psnr") for names in groups.values()]
-        line = [method, *(f"{value:.2f}" for value in means), f"{mean(row, 'psnr'):.2f}"]
+        line = [
+            TITLES.get((method, key.split(", ")[0]), method),
+            *(f"{value:.2f}" for value in means),
+            f"{mean(row, 'psnr'):.2f}",
+        ]
         lead = mean(rows["ours"], "psnr") - mean(row, "psnr") if "ours" in rows and method != "ours" else None
         lines.append([*line, "" if lead is None else f"{lead:+.2f}"])
     header = [f"patterns, {key}", *(f"{group} ({len(names)})" for group, names in groups.items())]
