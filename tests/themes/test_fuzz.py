@@ -160,6 +160,7 @@ def test_every_public_function_is_called() -> None:
         "FittedFilter",
         "FittedLook",
         "FunctionProduct",
+        "NoiseProfile",
         "NonlocalOperator",
         "Spectrum",
     }
