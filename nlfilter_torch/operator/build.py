@@ -322,7 +322,7 @@ def operator_from_features(
         generator=generator,
         group=group,
     )
-    operator = operator_from_points(features, size, method, weights)
+    operator = _from_points(features, size, method, weights)
     _warn_of_coverage(operator)
     return operator
 
@@ -334,6 +334,13 @@ def operator_from_points(
     features: Tensor, size: tuple[int, ...], method: Construction, weights: Tensor | None = None
 ) -> NonlocalOperator:
     """:func:`operator_from_features` where a user did not choose the points: without the warning about landmarks."""
+    return _from_points(features, size, method, weights)
+
+
+def _from_points(
+    features: Tensor, size: tuple[int, ...], method: Construction, weights: Tensor | None
+) -> NonlocalOperator:
+    """Check and build, outside of transforms; leaving them twice would hide what is transformed."""
     refuse_transforms(features=features, weights=weights, landmarks=method.landmarks)
     check_features(features, "features", empty=True)
     check_construction(method)
