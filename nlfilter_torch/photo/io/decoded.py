@@ -88,7 +88,8 @@ def bands(rows: Iterable[Channels], height: int) -> Iterator[Channels]:
     for piece in rows:
         waiting.append(piece)
         while sum(map(len, waiting)) >= height:
-            whole = np.concatenate(waiting)
+            # A single piece may be the whole picture, which is not copied.
+            whole = waiting[0] if len(waiting) == 1 else np.concatenate(waiting)
             waiting = [whole[height:]]
             yield whole[:height]
     if waiting and sum(map(len, waiting)):
