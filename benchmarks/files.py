@@ -112,7 +112,7 @@ def block_of(case: Case) -> bytes:
     place = len(b"Exif\0\0") + 8 + 2 + 12 + 8
     block[place : place + 2] = case.orientation.to_bytes(2, "little" if case.order == "<" else "big")
     if case.source == ".avif":  # Pillow would write a block with an orientation anew
-        block[place - 8 : place - 6] = (268).to_bytes(2, "little" if case.order == "<" else "big")
+        block[place - 8 : place - 6] = (18246).to_bytes(2, "little" if case.order == "<" else "big")
     return bytes(block)
 
 
