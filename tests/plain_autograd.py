@@ -58,9 +58,10 @@ def plain_filter(
         steps: of the balancing, each of which reduces the error by a factor of three; 14 reach float32.
     """
     weights = patch_window(patch_size).to(guide) if patch_weights is None else patch_weights / patch_weights.sum()
-    features = GuideFeatures(weights, photometric_bandwidth, spatial_bandwidth, "all")(guide)
+    recipe = GuideFeatures(weights, photometric_bandwidth, spatial_bandwidth, "all")
+    features = recipe(guide)
     size = (guide.shape[2], guide.shape[3])
-    landmarks, _ = assign_landmarks(features, size, num_landmarks, "kmeans", None)
+    landmarks, _ = assign_landmarks(features, size, num_landmarks, "kmeans", None, layout=recipe.layout)
     between = affinity(landmarks.double(), landmarks.double())  # (B, M, M), in float64 as it is badly conditioned
     identity = torch.eye(num_landmarks, dtype=torch.float64)
     lower = torch.linalg.cholesky(between + JITTER * identity)

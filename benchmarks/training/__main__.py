@@ -17,6 +17,7 @@ TOPICS: dict[str, str] = {  # name of a module of this package: what it measures
     "sizes": "padded batches, and exported and compiled layers for images of any size",
     "refinement": "coarse segmentations refined, beside kornia, OpenCV and a dense CRF; bad bandwidths",
     "clusters": "landmarks of clusters and manifolds beside scikit-learn's k-means++, and how well they cover points",
+    "equivariance": "layers, masks and edits of pictures that are flipped, transposed or rotated",
     "landmarks": "landmarks that are held: slopes, noise, recovered parameters, training",
 }
 

@@ -99,6 +99,42 @@ def root_weighted(scaling: Tensor, weights: Tensor | None) -> Tensor:
     return scaling if weights is None else scaling * weights.sqrt()
 
 
+def order_by(first: Tensor, second: Tensor) -> Tensor:
+    """Indices (B, n) that sort values (B, n), and where these are equal others (B, n); they turn with an image."""
+    order = second.argsort(1)
+    return order.gather(1, first.gather(1, order).argsort(dim=1, stable=True))
+
+
+def symmetric_places(size: tuple[int, int], count: int, generator: torch.Generator) -> Tensor:
+    """Draw about ``count`` pixels of an image (H, W), together with their mirror images: row-major indices (n,).
+
+    The same pixels are drawn of an image that is flipped, transposed or rotated by 90 degrees, in another order.
+    Some may be drawn twice.
+    """
+    short, long = sorted(size)
+    orientations = 8 if short == long else 4
+    places = torch.randint(short * long, (max(1, count // orientations),), generator=generator).to(generator.device)
+    return mirrored(places // long, places % long, size)
+
+
+def mirrored(short: Tensor, long: Tensor, size: tuple[int, int]) -> Tensor:
+    """Row-major indices (n,) of places (m,) along the short and the long side of an image (H, W), and of their mirrors.
+
+    There are four images of a place, or eight in a square.
+    """
+    height, width = size
+    down, across = (short, long) if height <= width else (long, short)
+    pairs = [(down, across), (across, down)] if height == width else [(down, across)]
+    return torch.cat(
+        [
+            (height - 1 - row if upset else row) * width + (width - 1 - column if turned else column)
+            for row, column in pairs
+            for upset in (False, True)
+            for turned in (False, True)
+        ]
+    )
+
+
 def stratified(pixels: int, count: int, generator: torch.Generator) -> Tensor:
     """Draw ``count`` pixels, one from each of ``count`` equal intervals of pixel indices.
 

@@ -199,7 +199,10 @@ class NonlocalAffinity(Learnable):
             kept = counts.nonzero().squeeze(1)
             features, counts, size = features[:, :, kept], counts[kept].unsqueeze(0), (1, len(kept))
         count = min(self.num_landmarks, features.shape[2])
-        chosen, _ = assign_landmarks(features, size, count, self.landmarks, self.generator, weights=counts)
+        layout = recipe.layout if len(guide) == 1 and counts is None else None  # then as those of its operator
+        chosen, _ = assign_landmarks(
+            features, size, count, self.landmarks, self.generator, weights=counts, layout=layout
+        )
         self.held.keep(chosen, recipe)
 
     def _held(self, hold: Hold | None, landmarks: Landmarks) -> HeldAssignment | HeldFeatures | None:

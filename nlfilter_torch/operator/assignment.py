@@ -53,3 +53,16 @@ class Assignment:
             return self
         clusters, start = (None if tensor is None else tensor.to(device) for tensor in (self.clusters, self.start))
         return Assignment(self.candidates.to(device), clusters, start, self.points)
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Which features of a pixel belong to which place of its patch.
+
+    Attributes:
+        patch: width p of a patch; the features are C patches, row by row.
+        coordinates: whether row and column of the pixel follow.
+    """
+
+    patch: int
+    coordinates: bool

@@ -23,7 +23,7 @@ from nlfilter_torch.core.communicator import ALONE, Communicator, all_gather_sha
 from nlfilter_torch.core.precision import full_precision, trainable, uncompiled, uncompiled_with, working_dtype
 from nlfilter_torch.core.torch_internals import is_hidden, outside_transforms, refuse_transforms
 from nlfilter_torch.core.warning import warn
-from nlfilter_torch.operator.assignment import Assignment
+from nlfilter_torch.operator.assignment import Assignment, Layout
 from nlfilter_torch.operator.counting import assign_among_counted, extended, hidden_points
 from nlfilter_torch.operator.coverage import (
     FEW,
@@ -283,7 +283,8 @@ def operator_from_features(
     """Build the filter of any points from their features: landmarks, Nystrom factor, completion and balancing.
 
     Points may be the pixels of an image, every n-th of them, a weighted sample, the voxels of a volume, a point cloud.
-    :func:`nonlocal_operator` applies the same steps to the weighted patches of a guide.
+    :func:`nonlocal_operator` applies the same steps to the weighted patches of a guide. Its k-means landmarks turn with
+    the image; those of points depend on their order.
 
     Args:
         features: (B, D, N), already divided by bandwidths: the affinity of two points is ``exp(-|x_i - x_j|^2)``. On
@@ -402,7 +403,7 @@ def sampled_operator(
     window = unit_window(patch_size, None).to(guide)
     recipe = GuideFeatures(window, photometric_bandwidth, spatial_bandwidth, "luminance")
     features, size = recipe(guide), (guide.shape[2], guide.shape[3])
-    chosen, _ = assign_landmarks(features, size, num_landmarks, landmarks, generator)
+    chosen, _ = assign_landmarks(features, size, num_landmarks, landmarks, generator, layout=recipe.layout)
     count = len(places)
     weights = guide.new_full((1, count), features.shape[2] / count)
     return _assemble(features[:, :, places], (1, count), method, recipe=recipe, weights=weights, chosen=chosen)
@@ -432,7 +433,8 @@ def _assemble(
         return _empty(features, size, count, method.completion, recipe)
     in_graph, assignment = torch.compiler.is_compiling(), None  # never with a generator, weights or a group
     if chosen is None:
-        chosen, assignment = _landmarks(method, features, whole, count, communicator, weights)
+        layout = None if recipe is None else recipe.layout
+        chosen, assignment = _landmarks(method, features, whole, count, communicator, weights, layout)
     inverse = inverse_cholesky(chosen)
     alone = not in_graph and communicator.size == 1  # ranks send each other nothing that only diagnostics need
     sample = communicator.columns(features.detach(), _places(math.prod(whole), features)) if alone else None
@@ -497,16 +499,14 @@ def _landmarks(
     count: int,
     communicator: Communicator,
     weights: Tensor | None,
+    layout: Layout | None,
 ) -> tuple[Tensor, Assignment | None]:
     """:func:`landmarks_by`, from the points that count alone where weights are 0."""
-    if (
-        weights is None
-        or hidden_points(weights) is None
-        or not isinstance(method.landmarks, str)
-        or communicator.size > 1
-    ):
+    if weights is None or communicator.size > 1 or not isinstance(method.landmarks, str):
+        return landmarks_by(method, features, size, count, communicator, weights, layout)
+    if layout is None and hidden_points(weights) is None:
         return landmarks_by(method, features, size, count, communicator, weights)
-    return assign_among_counted(features, size, count, method.landmarks, method.generator, weights)
+    return assign_among_counted(features, size, count, method.landmarks, method.generator, weights, layout)
 
 
 def _places(points: int, features: Tensor) -> Tensor:

@@ -11,10 +11,18 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from nlfilter_torch.core.kernels.clusters import pick
 from nlfilter_torch.core.kernels.tall_skinny import spread
-from nlfilter_torch.operator.assignment import Assignment
-from nlfilter_torch.operator.landmarks import assign_landmarks
+from nlfilter_torch.operator.assignment import Assignment, Layout
+from nlfilter_torch.operator.landmarks import (
+    assign_landmarks,
+    canonical_candidates,
+    clustered,
+    drawn_candidates,
+    orientations,
+)
 from nlfilter_torch.operator.options import Sampling
+from nlfilter_torch.operator.orientation import source_pixels
 from nlfilter_torch.operator.scaling import KernelMatrix
 
 # Share of the diagonal correction that a point of weight 0 keeps: its own value counts where little else does.
@@ -37,6 +45,7 @@ def assign_among_counted(
     sampling: Sampling,
     generator: torch.Generator | None,
     weights: Tensor,
+    layout: Layout | None = None,
 ) -> tuple[Tensor, Assignment | None]:
     """:func:`~nlfilter_torch.operator.landmarks.assign_landmarks`, of the points that count in each image.
 
@@ -48,15 +57,54 @@ def assign_among_counted(
     for image, row in zip(features.split(1), weights, strict=True):
         if generator is not None and state is not None:
             generator.set_state(state)  # all images of a batch use the same random numbers
+        source = torch.Generator().manual_seed(0) if generator is None else generator
         kept = row.nonzero().squeeze(1)
-        counted = row[kept].unsqueeze(0)
-        even = bool((counted == counted[:, :1]).all())
-        landmarks, assignment = assign_landmarks(
-            image[:, :, kept], _size_of(kept, size), count, sampling, generator,
-            weights=None if even else counted,
-        )  # fmt: skip
-        parts.append((landmarks, replace(assignment, candidates=kept[assignment.candidates], points=math.prod(size))))
+        if layout is not None and sampling == "kmeans" and count < len(kept):
+            landmarks, assignment = _in_canonical_order(image, size, count, source, row, kept, layout)
+        else:
+            counted = _uneven(row[kept].unsqueeze(0))
+            landmarks, assignment = assign_landmarks(
+                image[:, :, kept], _size_of(kept, size), count, sampling, source, weights=counted
+            )
+            assignment = replace(assignment, candidates=kept[assignment.candidates])
+        parts.append((landmarks, replace(assignment, points=math.prod(size))))
     return torch.cat([landmarks for landmarks, _ in parts]), _joined([assignment for _, assignment in parts])
+
+
+def _in_canonical_order(
+    image: Tensor,
+    size: tuple[int, ...],
+    count: int,
+    generator: torch.Generator,
+    weights: Tensor,
+    kept: Tensor,
+    layout: Layout,
+) -> tuple[Tensor, Assignment]:
+    """Landmarks of the points ``kept`` (n,) of an image (1, D, N), which turn with it.
+
+    The points are numbered in the canonical orientation of the smallest rectangle that holds them all.
+    """
+    rows, columns = kept // size[1], kept % size[1]
+    (top, left), box = (int(rows.min()), int(columns.min())), (int(rows.max()), int(columns.max()))
+    box = (box[0] - top + 1, box[1] - left + 1)
+    whole = torch.arange(math.prod(size), device=kept.device).view(size)
+    places = whole[top : top + box[0], left : left + box[1]].flatten()
+    inside, amounts = image[:, :, places], weights[places]
+    if layout.coordinates:  # from the first pixel on, as those of an image without what does not count
+        inside = torch.cat([inside[:, :-2], image[:, -2:, whole[: box[0], : box[1]].flatten()]], dim=1)
+    orientation = orientations(inside, box, layout, counted=(amounts > 0).unsqueeze(0))
+    numbers = source_pixels(orientation.numbers, box, torch.arange(len(places), device=kept.device))[0]
+    order = (amounts[numbers] > 0).nonzero().squeeze(1)
+    counted = _uneven(amounts[numbers[order]].unsqueeze(0))
+    drawn = drawn_candidates((1, len(order)), count, "kmeans", generator, counted).to(order.device)
+    candidates, _, chosen = canonical_candidates(inside, box, order[drawn], orientation, layout)
+    assignment = Assignment(places[candidates], None, None, math.prod(size))
+    return clustered(pick(image, assignment.candidates.unsqueeze(1)), chosen, assignment, count, generator)
+
+
+def _uneven(weights: Tensor) -> Tensor | None:
+    """Weights (1, n), or None if they are all equal."""
+    return None if bool((weights == weights[:, :1]).all()) else weights
 
 
 def _joined(assignments: list[Assignment]) -> Assignment | None:

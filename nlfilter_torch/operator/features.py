@@ -27,6 +27,7 @@ from nlfilter_torch.core.communicator import Communicator, all_gather_shapes
 from nlfilter_torch.core.kernels.columns import large_empty
 from nlfilter_torch.core.precision import Gradients, full_precision, once_differentiable, per_image, working_dtype
 from nlfilter_torch.core.torch_internals import for_each_gradient, is_hidden
+from nlfilter_torch.operator.assignment import Layout
 from nlfilter_torch.operator.hidden import fill_hidden
 from nlfilter_torch.operator.options import GuideChannels, SpatialBandwidth, bandwidths_of
 
@@ -100,6 +101,15 @@ class GuideFeatures:
     photometric_bandwidth: float | Tensor
     spatial_bandwidth: SpatialBandwidth | None
     guide_channels: GuideChannels
+
+    @property
+    def layout(self) -> Layout | None:
+        """Which features belong to which place of a patch; None for volumes."""
+        return (
+            None
+            if self.patch_weights.ndim > 2
+            else Layout(self.patch_weights.shape[0], self.spatial_bandwidth is not None)
+        )
 
     def __call__(
         self,

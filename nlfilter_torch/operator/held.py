@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.core.communicator import ALONE, Communicator
-from nlfilter_torch.operator.assignment import Assignment
+from nlfilter_torch.operator.assignment import Assignment, Layout
 from nlfilter_torch.operator.landmarks import assign_landmarks, choose_in_graph, landmarks_of
 from nlfilter_torch.operator.options import Construction
 
@@ -18,6 +18,7 @@ def landmarks_by(
     count: int,
     communicator: Communicator = ALONE,
     weights: Tensor | None = None,
+    layout: Layout | None = None,
 ) -> tuple[Tensor, Assignment | None]:
     """Landmarks (B, D, M) for features (B, D, N) of an image of ``size``, by the ``landmarks`` of a construction.
 
@@ -29,8 +30,8 @@ def landmarks_by(
     landmarks = method.landmarks
     if isinstance(landmarks, str):
         if torch.compiler.is_compiling():  # never with a generator, weights or a group
-            return choose_in_graph(features, size, count, landmarks)
-        return assign_landmarks(features, size, count, landmarks, method.generator, communicator, weights)
+            return choose_in_graph(features, size, count, landmarks, layout)
+        return assign_landmarks(features, size, count, landmarks, method.generator, communicator, weights, layout)
     batch, points = features.shape[0], math.prod(size)
     if isinstance(landmarks, Assignment):
         _check_assignment(landmarks, batch, points)

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -20,8 +21,16 @@ from nlfilter_torch.core.kernels.clusters import (
     squared_distances,
 )
 from nlfilter_torch.core.torch_internals import register
-from nlfilter_torch.operator.assignment import Assignment
+from nlfilter_torch.operator.assignment import Assignment, Layout
 from nlfilter_torch.operator.options import Sampling
+from nlfilter_torch.operator.orientation import (
+    MOST_CHANNELS,
+    Orientation,
+    canonical_points,
+    orientation_of,
+    source_pixels,
+    whole_sums,
+)
 
 CAPTURED = 1e-4  # a point whose residual on the unit diagonal is below this counts as captured
 # Candidates per landmark. More candidates or iterations move the centroids by less than their sampling error: at
@@ -51,6 +60,7 @@ def assign_landmarks(
     generator: torch.Generator | None,
     communicator: Communicator = ALONE,
     weights: Tensor | None = None,
+    layout: Layout | None = None,
 ) -> tuple[Tensor, Assignment]:
     """Choose or compute ``count`` landmarks; also return of which points they are made.
 
@@ -64,27 +74,104 @@ def assign_landmarks(
         communicator: ranks that the rows of the image are distributed over; N is then the number of pixels of this
             rank, and all ranks use what the first one draws.
         weights: (B, N), number of pixels that each point represents; k-means candidates are drawn in proportion to it.
+        layout: of the features, if they are those of an image: k-means then chooses the same patches of an image that
+            is flipped, transposed or rotated by 90 degrees. Not used with weights.
 
     Returns:
         (B, D, M), differentiable in the features (for k-means with the assignment held fixed), and the assignment. The
-        same pixels are drawn for all images of a batch, so that a batch without weights gives the same results as
-        single calls.
+        same pixels are drawn for all images of a batch, but for their orientations, so that a batch without weights
+        gives the same results as single calls.
     """
     generator = torch.Generator().manual_seed(0) if generator is None else generator
     points = math.prod(size)
     if count == features.shape[-1] and communicator.size == 1:
         return features.clone(), Assignment(torch.arange(points, device=features.device)[None], None, None, points)
-    pixels = (
-        _candidates_by_weight(weights.mean(0), count, generator)
-        if weights is not None and sampling == "kmeans"
-        else candidate_pixels(size, count, sampling, generator)
-    )
+    pixels = drawn_candidates(size, count, sampling, generator, weights)
     pixels = communicator.broadcast(pixels.to(features.device))
-    subset = communicator.columns(features, pixels)
-    if len(pixels) == count:
-        return subset, Assignment(pixels[None], None, None, points)
-    start, assignment = clusters(subset.detach(), count, generator, communicator)
-    return means_of_clusters(subset, start, assignment), Assignment(pixels[None], assignment, start, points)
+    if layout is not None and sampling == "kmeans" and weights is None:
+        orientation = orientations(features, size, layout, communicator)
+        candidates, subset, chosen = canonical_candidates(features, size, pixels, orientation, layout, communicator)
+    else:
+        candidates = pixels[None]
+        subset = communicator.columns(features, pixels)
+        chosen = subset.detach()
+    return clustered(subset, chosen, Assignment(candidates, None, None, points), count, generator, communicator)
+
+
+def clustered(
+    subset: Tensor,
+    canonical: Tensor,
+    candidates: Assignment,
+    count: int,
+    generator: torch.Generator,
+    communicator: Communicator = ALONE,
+) -> tuple[Tensor, Assignment]:
+    """The result of :func:`assign_landmarks` from candidates with features (B, D, S), and those by which they cluster.
+
+    Landmarks are the candidates themselves, if there are as many.
+    """
+    if subset.shape[2] == count:
+        return subset, candidates
+    start, assignment = clusters(canonical, count, generator, communicator)
+    return means_of_clusters(subset, start, assignment), replace(candidates, clusters=assignment, start=start)
+
+
+def canonical_candidates(
+    features: Tensor,
+    size: Sequence[int],
+    pixels: Tensor,
+    orientation: Orientation,
+    layout: Layout,
+    communicator: Communicator = ALONE,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Candidates with the numbers ``pixels`` (S,) in the canonical orientation of each image.
+
+    Args:
+        features: (B, D, N), of the rows here.
+        size: (H, W) of the whole image.
+        pixels: (S,).
+        orientation: of the images.
+        layout: of the features.
+        communicator: ranks that the rows of the image are distributed over.
+
+    Returns:
+        Their indices (B, S) in the images, their features (B, D, S), and those for the canonical orientation.
+    """
+    candidates = source_pixels(orientation.numbers, size, pixels)
+    subset, coordinates = communicator.columns(features, candidates.unsqueeze(1)), None
+    if layout.coordinates:
+        places = source_pixels(orientation.numbers, size, pixels, flipped=False)
+        coordinates = communicator.columns(features[:, -2:].detach(), places.unsqueeze(1))
+    return candidates, subset, canonical_points(subset, orientation, layout, coordinates)
+
+
+def orientations(
+    features: Tensor,
+    size: Sequence[int],
+    layout: Layout,
+    communicator: Communicator = ALONE,
+    counted: Tensor | None = None,
+) -> Orientation:
+    """The canonical orientations of images of ``size`` (H, W) with features (B, D, N), those of the rows here.
+
+    Pixels where ``counted`` (B, N) is False do not count.
+    """
+    area, width = layout.patch * layout.patch, size[1]
+    planes = range(area // 2, features.shape[1] - 2 * layout.coordinates, area)
+    values = [features[:, plane].detach() for plane in planes[:MOST_CHANNELS]]
+    if counted is not None:
+        values = [torch.where(counted, plane, plane.amin(1, keepdim=True)) for plane in values]
+        counted = counted.unflatten(1, (-1, width))
+    least, most = ([getattr(plane, end)(1) for plane in values] for end in ("amin", "amax"))
+    ends = torch.stack([-torch.stack(least).amin(0), torch.stack(most).amax(0)], dim=1)  # (B, 2)
+    ends = communicator.max(ends)
+    span = ends.sum(1, keepdim=True)
+    scale = 1 / torch.where(span > 0, span, 1.0)
+    sums = [
+        whole_sums(((plane + ends[:, :1]) * scale).unflatten(1, (-1, width)), communicator.first_row, size, counted)
+        for plane in values
+    ]
+    return orientation_of(communicator.sum(torch.stack(sums, dim=1)), len(planes))
 
 
 def landmarks_of(features: Tensor, assignment: Assignment, communicator: Communicator = ALONE) -> Tensor:
@@ -115,6 +202,15 @@ def candidate_pixels(size: tuple[int, ...], count: int, sampling: Sampling, gene
     return stratified(pixels, candidate_count(pixels, count, sampling), generator)
 
 
+def drawn_candidates(
+    size: tuple[int, ...], count: int, sampling: Sampling, generator: torch.Generator, weights: Tensor | None
+) -> Tensor:
+    """:func:`candidate_pixels`, those of k-means in proportion to weights (B, N) if there are any."""
+    if weights is None or sampling != "kmeans":
+        return candidate_pixels(size, count, sampling, generator)
+    return _candidates_by_weight(weights.mean(0), count, generator)
+
+
 def _candidates_by_weight(weights: Tensor, count: int, generator: torch.Generator) -> Tensor:
     """Draw k-means candidates by :func:`stratified` sampling of the pixels represented by points of weights (N,)."""
     summed = weights.double().cumsum(0).cpu()
@@ -126,11 +222,14 @@ def _candidates_by_weight(weights: Tensor, count: int, generator: torch.Generato
     )
 
 
-def condense(subset: Tensor, count: int, generator: torch.Generator, communicator: Communicator = ALONE) -> Tensor:
-    """Compute landmarks (B, D, M) from features (B, D, S) of the candidates: centroids if S > M."""
+def condense(subset: Tensor, count: int, generator: torch.Generator, points: Tensor | None = None) -> Tensor:
+    """Compute landmarks (B, D, M) from features (B, D, S) of the candidates: centroids if S > M.
+
+    Clusters are those of ``points`` (B, D, S), the features for the canonical orientation, if they are not None.
+    """
     if subset.shape[2] == count:
         return subset
-    return means_of_clusters(subset, *clusters(subset.detach(), count, generator, communicator))
+    return means_of_clusters(subset, *clusters(subset.detach() if points is None else points, count, generator))
 
 
 def clusters(
@@ -272,34 +371,44 @@ def _sums_by_product(points: Tensor, assignment: Tensor, count: int) -> Tensor:
     return points @ members.scatter_(1, assignment.unsqueeze(1), 1.0).mT
 
 
-def _fake_choice(features: Tensor, size: Sequence[int], count: int, sampling: str) -> tuple[Tensor, ...]:
+def _fake_choice(
+    features: Tensor, size: Sequence[int], count: int, sampling: str, patch: int, coordinates: bool
+) -> tuple[Tensor, ...]:
     batch, candidates = features.shape[0], candidate_count(math.prod(size), count, sampling)
-    shapes = (candidates,), (batch, 1, count), (batch, candidates)
+    shapes = (batch, candidates), (batch, 1, count), (batch, candidates)
     return tuple(features.new_empty(shape, dtype=torch.long) for shape in shapes)
 
 
 @register(
-    "choose(Tensor features, SymInt[] size, int count, str sampling) -> (Tensor, Tensor, Tensor)",
+    "choose(Tensor features, SymInt[] size, int count, str sampling, int patch, bool coordinates)"
+    " -> (Tensor, Tensor, Tensor)",
     None,
     _fake_choice,
 )
-def choose(features: Tensor, size: Sequence[int], count: int, sampling: Sampling) -> tuple[Tensor, Tensor, Tensor]:
-    """Choose candidates (S,), initial centroids among them (B, 1, M) and their assignment to clusters (B, S)."""
-    generator = torch.Generator().manual_seed(0)
-    pixels = candidate_pixels(tuple(size), count, sampling, generator).to(features.device)
-    if len(pixels) == count:  # each is a cluster of its own
-        alone = torch.arange(count, device=features.device).expand(len(features), -1)
-        return pixels, alone.unsqueeze(1).contiguous(), alone.contiguous()
-    start, assignment = clusters(ALONE.columns(features, pixels), count, generator)
-    return pixels, start, assignment
+def choose(
+    features: Tensor, size: Sequence[int], count: int, sampling: Sampling, patch: int, coordinates: bool
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Choose candidates (B, S), initial centroids among them (B, 1, M) and their assignment to clusters (B, S).
+
+    ``patch`` and ``coordinates`` are the :class:`Layout` of the features; a width of 0 means that there is none.
+    """
+    layout = Layout(patch, coordinates) if patch else None
+    assignment = assign_landmarks(features, tuple(size), count, sampling, None, layout=layout)[1]
+    batch = (len(features), -1)
+    candidates = assignment.candidates.expand(*batch).contiguous()
+    if assignment.clusters is None or assignment.start is None:  # each is a cluster of its own
+        alone = torch.arange(count, device=features.device).expand(*batch)
+        return candidates, alone.unsqueeze(1).contiguous(), alone.contiguous()
+    return candidates, assignment.start, assignment.clusters
 
 
 def choose_in_graph(
-    features: Tensor, size: tuple[int, ...], count: int, sampling: Sampling
+    features: Tensor, size: tuple[int, ...], count: int, sampling: Sampling, layout: Layout | None = None
 ) -> tuple[Tensor, Assignment]:
     """:func:`assign_landmarks` in a form that can be compiled; chooses the same landmarks as without a generator."""
     # Nothing here depends on the size of the image, so that a program serves for all sizes.
-    pixels, start, clusters = choose(features.detach(), size, count, sampling)
+    patch, coordinates = (0, False) if layout is None else (layout.patch, layout.coordinates)
+    pixels, start, clusters = choose(features.detach(), size, count, sampling, patch, coordinates)
     means = sampling == "kmeans"
-    assignment = Assignment(pixels[None], clusters if means else None, start if means else None, features.shape[2])
+    assignment = Assignment(pixels, clusters if means else None, start if means else None, features.shape[2])
     return landmarks_of(features, assignment), assignment

@@ -17,6 +17,7 @@ from torch.overrides import TorchFunctionMode
 from nlfilter_torch.core.kernels.clusters import UNCOVERED, best_trial, odds, pick
 from nlfilter_torch.core.kernels.columns import PLAIN_EXPONENT, SMALLEST_EXPONENT
 from nlfilter_torch.core.torch_internals import outside_modes
+from nlfilter_torch.operator.assignment import Layout
 from nlfilter_torch.operator.landmarks import (
     CAPTURED,
     DRAWN_SINGLY,
@@ -24,7 +25,9 @@ from nlfilter_torch.operator.landmarks import (
     LARGEST,
     TIE,
     candidate_pixels,
+    canonical_candidates,
     draw_few,
+    orientations,
     pivot_draws,
 )
 from nlfilter_torch.operator.nystrom import JITTER
@@ -45,7 +48,9 @@ class PortableForms(TorchFunctionMode):
         return FORMS.get(func, func)(*args, **(kwargs or {}))
 
 
-def choose(features: Tensor, size: Sequence[int], count: int, sampling: Sampling) -> tuple[Tensor, Tensor, Tensor]:
+def choose(
+    features: Tensor, size: Sequence[int], count: int, sampling: Sampling, patch: int, coordinates: bool
+) -> tuple[Tensor, Tensor, Tensor]:
     """As :func:`nlfilter_torch.operator.landmarks.choose`, with the random numbers as constants of the program."""
     with outside_modes():
         generator = torch.Generator().manual_seed(0)
@@ -56,17 +61,23 @@ def choose(features: Tensor, size: Sequence[int], count: int, sampling: Sampling
     batch = features.shape[0]
     if len(pixels) == count:
         alone = torch.arange(count, device=features.device).expand(batch, -1)
-        return pixels, alone.unsqueeze(1), alone
+        return pixels.expand(batch, -1), alone.unsqueeze(1), alone
     if count > DRAWN_SINGLY:
         raise ValueError(
             f"num_landmarks must be at most {DRAWN_SINGLY} in a portable program with landmarks='kmeans', got {count}; "
             "use landmarks='uniform'"
         )
-    points = pick(features, pixels.expand(batch, 1, -1))
+    if patch:
+        layout = Layout(patch, coordinates)
+        orientation = orientations(features, size, layout)
+        candidates, _, points = canonical_candidates(features, size, pixels, orientation, layout)
+    else:
+        candidates = pixels.expand(batch, -1)
+        points = pick(features, candidates.unsqueeze(1))
     points = (points - points.mean(dim=2, keepdim=True)).clamp(-LARGEST, LARGEST).float()
     chosen = _pivots(pick(points, first.expand(batch, 1, -1)), draws.tolist())  # (B, M)
     start = first.expand(batch, -1).gather(1, chosen).unsqueeze(1)
-    return pixels, start, _lloyd(points, pick(points, start))
+    return candidates, start, _lloyd(points, pick(points, start))
 
 
 def _pivots(points: Tensor, draws: list[list[float]]) -> Tensor:

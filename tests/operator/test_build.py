@@ -184,7 +184,8 @@ def test_a_guide_is_its_features(spatial: float | None) -> None:
     image = picture("camera", 40, 50, torch.float32)
     options = {"num_landmarks": 30}
     operator = nonlocal_operator(image, photometric_bandwidth=0.1, spatial_bandwidth=spatial, **options)
-    points = operator_from_features(operator.kernel.recipe(image), size=(40, 50), **options)
+    # Points have no orientation, so that their landmarks would be others.
+    points = operator_from_features(operator.kernel.recipe(image), size=(40, 50), landmarks=operator, **options)
     for name in ("factor", "diagonal", "scaling", "remainder", "residual"):
         assert torch.equal(getattr(points, name), getattr(operator, name))
 

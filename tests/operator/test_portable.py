@@ -47,13 +47,14 @@ def test_the_inverse_root_is_that_of_the_same_matrix(points: float) -> None:
     torch.testing.assert_close(root @ root, lower.mT @ lower, rtol=1e-6, atol=1e-6 / JITTER)
 
 
-def test_landmarks_are_those_of_the_operator() -> None:
+@pytest.mark.parametrize(("patch", "coordinates"), [(0, False), (1, False), (1, True)])
+def test_landmarks_are_those_of_the_operator(patch: int, coordinates: bool) -> None:
     features = noise(2, 3, 2000, dtype=torch.float32) / 0.2
-    expected = NLFILTER.choose(features, [40, 50], 20, "kmeans")
-    for ours, theirs in zip(portable.choose(features, [40, 50], 20, "kmeans"), expected, strict=True):
+    arguments = features, [40, 50], 20, "kmeans", patch, coordinates
+    for ours, theirs in zip(portable.choose(*arguments), NLFILTER.choose(*arguments), strict=True):
         assert torch.equal(ours, theirs)
     with pytest.raises(ValueError, match=r"num_landmarks must be at most 256 .*, got 300; use landmarks='uniform'"):
-        portable.choose(features, [40, 50], 300, "kmeans")
+        portable.choose(features, [40, 50], 300, "kmeans", patch, coordinates)
 
 
 def test_a_model_is_wanted() -> None:

@@ -6,6 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from nlfilter_torch.core.blocks import mirrored, order_by
 from nlfilter_torch.core.checks import check_image, check_same_size, check_values
 from nlfilter_torch.core.precision import full_precision, per_image, squarable, working_dtype
 from nlfilter_torch.operator.features import reduce_channels
@@ -116,7 +117,7 @@ def measured_noise(size: tuple[int, int], colours: Tensor, channels: GuideChanne
     slopes = torch.where(truncated, torch.inf, _slopes(windows))
     level, _ = _level(response, slopes, light)
     brightness, variances, counts = [], [], []
-    for group in light.argsort(1).tensor_split(BRIGHTNESS_GROUPS, dim=1):
+    for group in order_by(light, slopes).tensor_split(BRIGHTNESS_GROUPS, dim=1):
         if group.shape[1] == 0:
             continue  # fewer windows than groups
         inside = group[..., None].expand(-1, -1, response.shape[2])
@@ -137,18 +138,24 @@ def window_places(size: tuple[int, int]) -> Tensor:
 
 
 def _window_pixels(size: tuple[int, int]) -> Tensor:
-    """Row-major indices of the pixels of windows at random positions, window by window; the same for every call."""
+    """Row-major indices of the pixels of windows at random positions, window by window; the same for every call.
+
+    Mirror images of a window are windows, too: the noise of a picture that is flipped or transposed is the same.
+    """
     height, width = size
     rows, columns = max(1, height - WINDOW_SIZE + 1), max(1, width - WINDOW_SIZE + 1)
-    generator = torch.Generator().manual_seed(0)
+    inside = torch.arange(WINDOW_SIZE)
     if rows * columns <= NUM_WINDOWS:
         corners = torch.arange(rows * columns)
-    else:
-        corners = torch.randint(rows * columns, (NUM_WINDOWS,), generator=generator)
-    inside = torch.arange(WINDOW_SIZE)
-    down = _mirrored(corners // columns, inside, height)
-    across = _mirrored(corners % columns, inside, width)
-    return (down[:, :, None] * width + across[:, None, :]).flatten()
+        down, across = _mirrored(corners // columns, inside, height), _mirrored(corners % columns, inside, width)
+        return (down[:, :, None] * width + across[:, None, :]).flatten()
+    short, long = sorted((rows, columns))
+    count = NUM_WINDOWS // (8 if rows == columns else 4)
+    corners = torch.randint(short * long, (count,), generator=torch.Generator().manual_seed(0))
+    sides = sorted(size)
+    down, across = _mirrored(corners // long, inside, sides[0]), _mirrored(corners % long, inside, sides[1])
+    down, across = torch.broadcast_tensors(down[:, :, None], across[:, None, :])
+    return mirrored(down, across, size).flatten()
 
 
 def _windows(size: tuple[int, int], colours: Tensor, channels: GuideChannels) -> Tensor:
@@ -181,7 +188,7 @@ def _slopes(windows: Tensor) -> Tensor:
 def _level(response: Tensor, slopes: Tensor, light: Tensor) -> tuple[Tensor, Tensor]:
     """Noise level (B,) from responses (B, n, r) in windows with the smallest slopes (B, n), and their brightness."""
     count = max(1, min(slopes.shape[1], max(20, int(FLAT_SHARE * slopes.shape[1]))))
-    least = slopes.argsort(1)[:, :count]
+    least = order_by(slopes, light)[:, :count]
     responses = response.gather(1, least[..., None].expand(-1, -1, response.shape[2]))
     return responses.flatten(1).median(1).values / MEDIAN, light.gather(1, least).mean(1)
 

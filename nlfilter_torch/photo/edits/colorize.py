@@ -393,8 +393,7 @@ def bandwidth_ratio(source: Source[M]) -> Tensor:
     Where sky, buildings and ground lie above each other, brightness changes more from top to bottom, and so do colours.
     """
     step = max(1, min(source.size) // BLOCKS)
-    height, width = (length // step for length in source.size)
-    blocks = source.reduced(luminance, step)[..., :height, :width]  # without those that the border cuts off
+    blocks = source.reduced(luminance, step)
     changes = [blocks.diff(dim=dim).abs().flatten(1) for dim in (2, 3)]
     down, across = (change.sum(1) / max(1, change.shape[1]) + SAME_BRIGHTNESS for change in changes)
     return (down / across).pow(ANISOTROPY).clamp(1 / MOST_ANISOTROPY, MOST_ANISOTROPY)

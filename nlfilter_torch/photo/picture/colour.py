@@ -110,10 +110,14 @@ def _label(chroma: Tensor, painted: Tensor) -> Tensor:
     """Colour index (N,) of each painted pixel of chroma (3, N), -1 for the others."""
     paint = chroma[:, painted]  # (3, n)
     numbers = torch.full_like(paint[0], -1, dtype=torch.long)
+    # The commonest colour comes first, whatever its place: the groups turn with the picture.
+    cells, cell = (paint / (SAME_COLOUR / 2)).round().unique(dim=1, return_inverse=True)
     leaders: list[Tensor] = []
     while len(leaders) < MAX_COLOURS and bool((numbers < 0).any()):
-        leader = paint[:, (numbers < 0).nonzero()[0]]  # (3, 1)
-        numbers[(numbers < 0) & ((paint - leader).norm(dim=0) < SAME_COLOUR)] = len(leaders)
+        left = numbers < 0
+        common = cell[left].bincount(minlength=cells.shape[1]).argmax()
+        leader = paint[:, left & (cell == common)].double().mean(1, keepdim=True).to(paint)  # (3, 1)
+        numbers[left & ((paint - leader).norm(dim=0) < SAME_COLOUR)] = len(leaders)
         leaders.append(leader)
     left = numbers < 0
     if bool(left.any()):

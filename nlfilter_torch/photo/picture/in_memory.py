@@ -40,7 +40,7 @@ class InMemory:
     first = 0
 
     def __init__(self, image: Tensor, cache: Cache | None = None) -> None:
-        self.image, self.cache, self.dtype = image, cache, image.dtype
+        self.image, self.cache, self.dtype = image.contiguous(), cache, image.dtype
         self.batch, self.channels, *size = image.shape
         self.size, self.width = (size[0], size[1]), size[1]
 
@@ -188,7 +188,7 @@ class InMemoryOperator:
         count = self.operator.factor.shape[2]
         if not self.sampled or count <= SAMPLE:
             return self.operator.spectrum()
-        operator, places = self.operator, sampled_places(count).to(self.operator.factor.device)
+        operator, places = self.operator, sampled_places(self.source.size).to(self.operator.factor.device)
         columns = Columns(operator.factor[:, :, places], operator.scaling[:, places], operator.remainder[:, places])
         return sampled_pairs([columns], count, operator.factor.dtype)
 

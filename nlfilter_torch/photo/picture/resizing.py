@@ -86,27 +86,63 @@ def cubic(distance: Tensor) -> Tensor:
     return torch.where(t <= 1, near, torch.where(t < 2, far, torch.zeros_like(t)))
 
 
+def block_counts(size: tuple[int, int], step: float) -> tuple[int, int]:
+    """Numbers of rows and columns of blocks of about ``step`` x ``step`` pixels of a picture (H, W)."""
+    height, width = (max(1, math.ceil(length / step - 0.01)) for length in size)  # no very thin last block
+    return height, width
+
+
 def block_means(planes: Tensor, step: float) -> Tensor:
-    """Means over blocks of ``step`` x ``step`` pixels; blocks at the lower and right borders may be smaller.
+    """Means over blocks of about ``step`` x ``step`` pixels, a whole number of which fill the picture evenly.
 
-    With a fractional step, a pixel on the border of two blocks counts in both, weighted by the part in each.
+    A pixel on the border of two blocks counts in both, weighted by the part in each. Means are computed in float64: in
+    float32 those of a mirrored picture would differ by rounding, and with them its landmarks.
     """
-    if step == round(step):
-        step = round(step)
-        return planes if step == 1 else F.avg_pool2d(planes, step, ceil_mode=True, count_include_pad=False)
-    rows, columns = (_shares(length, step).to(planes) for length in planes.shape[-2:])
-    return rows @ planes @ columns.mT
+    size = (planes.shape[-2], planes.shape[-1])
+    counts = block_counts(size, step)
+    if counts == size:
+        return planes
+    if step == round(step) and all(count * step == length for count, length in zip(counts, size, strict=True)):
+        strips = planes.split(round(step) * BLOCK, dim=2)
+        return torch.cat([F.avg_pool2d(strip.double(), round(step)).to(planes) for strip in strips], dim=2)
+    return block_parts(planes, 0, size, step)[1].to(planes)
 
 
-def _shares(length: int, step: float) -> Tensor:
-    """Weights (n, length) of the pixels along an axis in n blocks of a fractional step."""
-    count = math.ceil(length / step - 0.01)  # avoids a very thin last block
-    ends = torch.arange(count + 1, dtype=torch.float64) * step
-    ends[-1] = length
-    first = torch.arange(length, dtype=torch.float64)
-    inside = torch.minimum(ends[1:, None], first + 1) - torch.maximum(ends[:-1, None], first)
-    inside = inside.clamp(min=0.0)
-    return inside / inside.sum(1, keepdim=True)
+def block_parts(rows: Tensor, start: int, size: tuple[int, int], step: float) -> tuple[int, Tensor]:
+    """The part of :func:`block_means`, (B, C, n, m) in float64, that rows (B, C, h, W) of a picture (H, W) contribute.
+
+    ``start`` is the first of the rows; the number of the first row of blocks comes with the result. Parts of all rows
+    are to be added up.
+    """
+    counts, stop = block_counts(size, step), start + rows.shape[2]
+    first, last = start * counts[0] // size[0], (stop * counts[0] - 1) // size[0]
+    down = _parts(rows.double(), 2, (first, last + 1), size[0], counts[0], start)
+    return first, _parts(down, 3, (0, counts[1]), size[1], counts[1], 0)
+
+
+def _parts(planes: Tensor, axis: int, wanted: tuple[int, int], length: int, count: int, start: int) -> Tensor:
+    """Weighted sums of planes over the blocks ``wanted`` of an axis that ``count`` blocks divide evenly.
+
+    Args:
+        planes: part of a picture, from its row or column ``start`` on.
+        axis: that is divided.
+        wanted: numbers of the first block and of that after the last.
+        length: of the axis in the whole picture.
+        count: of the blocks of the whole picture.
+        start: where the planes begin.
+    """
+    blocks, here = torch.arange(*wanted), planes.shape[axis]
+    total = torch.zeros((), dtype=planes.dtype, device=planes.device)
+    for step in range(length // count + 2):
+        pixels = blocks * length // count + step
+        inside = torch.minimum((blocks + 1) * length, (pixels + 1) * count) - torch.maximum(
+            blocks * length, pixels * count
+        )  # in units of a pixel over the number of blocks
+        inside = torch.where((pixels >= start) & (pixels < start + here), inside, 0).clamp(min=0)
+        places = (pixels - start).clamp(0, here - 1).to(planes.device)
+        share = (inside.double() / length).to(planes)
+        total = total + planes.index_select(axis, places) * (share.unsqueeze(1) if axis == 2 else share)
+    return total
 
 
 def enlarged(blocks: Tensor, steps: tuple[float, float], corner: tuple[int, int], size: tuple[int, int]) -> Tensor:

@@ -87,21 +87,45 @@ def scribbled_blocks(
             first = part.stop
 
 
-def sums_in_blocks(values: Tensor, places: Tensor, width: int, step: float, shape: tuple[int, int]) -> Tensor:
-    """Sums (B, C, h, w) over square blocks of values (B, C, n) at pixels with row-major indices (n,).
+Size = tuple[int, int]
+
+
+def blocks_at(places: Tensor, size: Size, shape: Size) -> Tensor:
+    """Row-major indices (n,) of the blocks that pixels of a picture belong to, by their middles.
 
     Args:
-        values: to add.
-        places: indices in a picture of that width.
-        width: of the picture, in pixels.
-        step: side of a block, in pixels.
-        shape: numbers of rows and columns of blocks.
+        places: row-major indices (n,) of the pixels.
+        size: (H, W) of the picture.
+        shape: numbers of rows and columns of blocks, which are equal.
     """
-    blocks = blocks_at(places, width, step, shape)
-    return values.new_zeros(*values.shape[:2], shape[0] * shape[1]).index_add(2, blocks, values).unflatten(2, shape)
+    row, column = (
+        ((2 * part + 1) * count) // (2 * length)
+        for part, count, length in zip((places // size[1], places % size[1]), shape, size, strict=True)
+    )
+    return row * shape[1] + column
 
 
-def blocks_at(places: Tensor, width: int, step: float, shape: tuple[int, int]) -> Tensor:
-    """Row-major indices (n,) of the blocks of pixels; the arguments are those of :func:`sums_in_blocks`."""
-    rows, columns = (part.double() / step for part in (places // width, places % width))
-    return rows.long() * shape[1] + columns.long()
+def parts_in_blocks(places: Tensor, size: Size, shape: Size) -> list[tuple[Tensor, Tensor]]:
+    """Blocks (n,) that pixels lie in, and the parts (n,) in float64 of the pixels that do.
+
+    There are four if pixels may lie on borders of blocks, else one. The arguments are those of :func:`blocks_at`.
+    """
+    axes = []
+    for part, count, length in zip((places // size[1], places % size[1]), shape, size, strict=True):
+        first, last = part * count // length, ((part + 1) * count - 1) // length
+        beyond = ((part + 1) * count - last * length).double() / count  # of a pixel, in the last of its blocks
+        beyond = torch.where(first == last, 0.0, beyond)
+        axes.append([(first, 1 - beyond)] + ([] if length % count == 0 else [(last, beyond)]))
+    rows, columns = axes
+    return [(row * shape[1] + column, down * across) for row, down in rows for column, across in columns]
+
+
+def sums_in_blocks(values: Tensor, places: Tensor, size: Size, shape: Size) -> Tensor:
+    """Sums (B, C, h, w) over blocks of values (B, C, n) at pixels; the other arguments are those of :func:`blocks_at`.
+
+    The value of a pixel on the border of blocks counts in each by the part of the pixel that lies in it.
+    """
+    sums = values.new_zeros(*values.shape[:2], shape[0] * shape[1])
+    for block, part in parts_in_blocks(places, size, shape):
+        sums = sums.index_add(2, block, values * part.to(values))
+    return sums.unflatten(2, shape)

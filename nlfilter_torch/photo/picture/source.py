@@ -13,6 +13,7 @@ from typing import Protocol, TypeVar
 import torch
 from torch import Tensor
 
+from nlfilter_torch.core.blocks import symmetric_places
 from nlfilter_torch.core.kernels.grams import compute_grams
 from nlfilter_torch.core.rational import RationalForm
 from nlfilter_torch.operator.columns import Columns
@@ -71,7 +72,7 @@ class Guide:
         guide = image if self.transform is None else self.transform(image)
         if self.blur_margin == 0:
             return guide
-        return blur(guide, self.blur)
+        return blur(guide.double(), self.blur).to(guide.dtype)  # in float64, mirrored pictures differ less
 
 
 class Operator(Protocol):
@@ -203,9 +204,13 @@ def seeded(seed: int = 0) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
 
 
-def sampled_places(count: int) -> Tensor:
-    """Indices, ascending, of :data:`SAMPLE` of ``count`` pixels; the same sample in memory and in tiles."""
-    return torch.randperm(count, generator=seeded())[:SAMPLE].sort().values
+def sampled_places(size: tuple[int, int]) -> Tensor:
+    """Indices, ascending, of :data:`SAMPLE` pixels of a picture (H, W); the same sample in memory and in tiles.
+
+    It holds the mirror images of its pixels, so that it turns with the picture.
+    """
+    pixels = size[0] * size[1]
+    return torch.arange(pixels) if pixels <= SAMPLE else symmetric_places(size, SAMPLE, seeded()).sort().values
 
 
 def sampled_pairs(blocks: Iterable[Columns], count: int, dtype: torch.dtype) -> RitzPairs:

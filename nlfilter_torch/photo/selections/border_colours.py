@@ -7,6 +7,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from nlfilter_torch.photo.picture.colour import dot
+from nlfilter_torch.photo.picture.resizing import block_means
 from nlfilter_torch.photo.selections.closed_form import linear_mask
 from nlfilter_torch.photo.selections.pyramid import pyramid_levels
 
@@ -54,11 +55,10 @@ class Sides:
 
 def colours_beside(image: Tensor, mask: Tensor) -> Sides:
     """Compare an image (B, C, H, W) with the colours on both sides of the borders of a mask (B, 1, H, W)."""
-    (height, width), step = image.shape[-2:], 1 << pyramid_levels(min(image.shape[-2:]))
+    step = 1 << pyramid_levels(min(image.shape[-2:]))
     weights = torch.cat([mask, 1 - mask], dim=1).square().square() + MIN_SIDE_WEIGHT  # (B, 2, H, W)
     planes = torch.cat([weights, image * weights[:, :1], image * weights[:, 1:]], dim=1)
-    planes = F.pad(planes, (0, -width % step, 0, -height % step), "replicate")
-    coarse = F.avg_pool2d(planes, step)
+    coarse = block_means(planes, step)
     size = 2 * SIDE_RADIUS + 1
     # Separable box sums; pixels outside the picture do not count.
     sums = F.avg_pool2d(coarse, (size, 1), 1, (SIDE_RADIUS, 0))
@@ -67,9 +67,9 @@ def colours_beside(image: Tensor, mask: Tensor) -> Sides:
     least = sums[:, :2].amin(1, keepdim=True)
     beside = torch.cat([outside, inside - outside, least / (least + HALF_TRUST_SHARE)], dim=1)
     if step > 1:
-        beside = F.interpolate(beside, scale_factor=step, mode="bilinear", align_corners=False)
+        beside = F.interpolate(beside, image.shape[-2:], mode="bilinear", align_corners=False)
     channels = image.shape[1]
-    outside, across, known = beside[..., :height, :width].split([channels, channels, 1], dim=1)
+    outside, across, known = beside.split([channels, channels, 1], dim=1)
     contrast = dot(across, across) / channels
     slopes = across / (channels * (contrast + MIN_SIDE_WEIGHT * HALF_TRUST_CONTRAST))
     mixture = torch.cat([slopes, -dot(outside, slopes)], dim=1)

@@ -119,7 +119,7 @@ def solve_linear(models: list[LinearMasks], start: Tensor, rough: Tensor, front:
     assert coarser is not None  # for mypy
     functions = torch.stack([models[0].fit(mask.clamp(0.0, 1.0).double()) for mask in coarser.split(1, 1)], dim=1)
     slopes, constant = functions.tensor_split([-1], dim=2)
-    return (torch.cat([slopes, constant - END_MARGIN], dim=2) / (1 - 2 * END_MARGIN)).to(coarser)
+    return (torch.cat([slopes, constant - END_MARGIN], dim=2) / (1 - 2 * END_MARGIN)).to(start)
 
 
 def damped(model: LinearMasks, mask: Tensor, target: Tensor, trust: Tensor) -> Tensor:
@@ -136,8 +136,9 @@ def damped(model: LinearMasks, mask: Tensor, target: Tensor, trust: Tensor) -> T
         trust: c, the confidence.
     """
     middle, half = (1 + SLOWEST) / 2, (1 - SLOWEST) / 2
-    residual = ((model.smoothed(mask.double()) + target) / (1 + trust) - mask).to(mask)
-    model, damping = model.to(mask), 1 / (1 + trust)
+    mask = mask.double()
+    residual = ((model.smoothed(mask) + target) / (1 + trust) - mask).to(target)
+    model, damping = model.to(target), 1 / (1 + trust)
     ratio, step = half / middle, residual / middle
     mask = mask + step
     for _ in range(LINEAR_STEPS - 1):

@@ -21,7 +21,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from nlfilter_torch.core.kernels.stencil import solve_stencil
-from nlfilter_torch.photo.picture.scribbled_pixels import blocks_at, sums_in_blocks
+from nlfilter_torch.photo.picture.scribbled_pixels import parts_in_blocks, sums_in_blocks
 from nlfilter_torch.photo.selections.stroke_groups import StrokeGroups
 
 SAME = 0.007  # difference in luminance at which an absolute weight falls to a quarter
@@ -83,8 +83,7 @@ class LocalValues:
             the degree to which the scribbles determine a block; the ratio of both is a weighted mean of the scribbles'
             values.
         guide: luminance of the blocks, (B, 1, h, w).
-        step: side of a block in pixels.
-        width: W of the picture.
+        size: (H, W) of the picture.
         left_out: at each scribbled pixel, the solutions of its block if the values and ones of its own group of strokes
             are replaced by 0, (B, P+1, n) in float64; None if no strokes were compared. The ratio of both is the
             prediction from the other strokes.
@@ -93,8 +92,7 @@ class LocalValues:
     links: Links
     values: Tensor
     guide: Tensor
-    step: int
-    width: int
+    size: tuple[int, int]
     left_out: Tensor | None = None
 
     @staticmethod
@@ -113,13 +111,13 @@ class LocalValues:
         ``guide`` holds the means over blocks of ``links.step(size)`` pixels of a picture of that size (H, W). With
         ``groups``, the ``predicted`` values (B, P, n) are also extended from the other groups of strokes.
         """
-        step, width = links.step(size), size[1]
-        rows, columns = guide.shape[2:]
+        rows, columns = shape = (guide.shape[2], guide.shape[3])
+        area = size[0] * size[1] / (rows * columns)
         sets = [torch.cat([values * weights, weights], dim=1)]
         if groups is not None and predicted is not None:
             sets += groups.without_each(torch.cat([predicted * weights, weights], dim=1))
-        sums = sums_in_blocks(torch.cat(sets, dim=1), places, width, step, (rows, columns)).double()
-        sums, count = sums * (SCRIBBLE_WEIGHT / step**2), values.shape[1]
+        sums = sums_in_blocks(torch.cat(sets, dim=1), places, size, shape).double()
+        sums, count = sums * (SCRIBBLE_WEIGHT / area), values.shape[1]
         # In flat areas the system is a u = 3 u'', as there are three neighbours on each side.
         anchor = sums[:, count : count + 1] + 3 / (links.decay_distance**2 * rows * columns)
         around, inside = (F.unfold(planes, 3, padding=1) for planes in (guide, torch.ones_like(guide[:1])))
@@ -130,9 +128,10 @@ class LocalValues:
         solution, *others = solve_stencil(stencil, sums).split([known.shape[1] for known in sets], dim=1)
         left_out = None
         if groups is not None and others:
-            at = blocks_at(places, width, step, (rows, columns))
-            left_out = groups.of_own([other.flatten(2)[:, :, at] for other in others])
-        return LocalValues(links, solution.to(guide), guide, step, width, left_out)
+            parts = parts_in_blocks(places, size, shape)
+            at = [sum(other.flatten(2)[:, :, block] * part for block, part in parts) for other in others]
+            left_out = groups.of_own([torch.as_tensor(values) for values in at])
+        return LocalValues(links, solution.to(guide), guide, size, left_out)
 
     def __call__(self, own: Tensor, first: int) -> Tensor:
         """Return mean values of scribbles, and their influence in [0, 1], for a rectangle: (B, C+1, h, w).
@@ -140,20 +139,19 @@ class LocalValues:
         The influence is the square root of the interpolated solution for ones. ``own`` is the luminance of the pixels,
         (B, 1, h, w), and ``first`` the row-major index of the first of them.
         """
-        values = self._at(own, *divmod(first, self.width))
+        values = self._at(own, *divmod(first, self.size[1]))
         influence = values[:, -1:].clamp(min=MIN_INFLUENCE)
         return torch.cat([values[:, :-1] / influence, influence.sqrt()], dim=1)
 
     def _at(self, own: Tensor, top: int, left: int) -> Tensor:
         """Interpolate the solutions (B, C+1, h, w) in a rectangle."""
         height, width = own.shape[2:]
-        if self.step == 1:
+        if self.size == self.guide.shape[2:]:
             return self.values[:, :, top : top + height, left : left + width]
-        rows = self._two_nearest(top, height, self.guide.shape[2], own)
-        columns = self._two_nearest(left, width, self.guide.shape[3], own)
+        rows, columns = self._two_nearest(0, top, height, own), self._two_nearest(1, left, width, own)
         total, weight = self.values.new_zeros(()), self.values.new_zeros(())
-        first = max(0, top // self.step - 1)  # of the rows of blocks that are used
-        blocks = torch.cat([self.guide, self.values], dim=1)[:, :, first : (top + height) // self.step + 2]
+        first, last = int(rows[0][0][0]), int(rows[1][0][-1])  # of the rows of blocks that are used
+        blocks = torch.cat([self.guide, self.values], dim=1)[:, :, first : last + 1]
         for column, column_share in columns:
             near = blocks[..., column]  # rows of which are then copied whole
             for row, row_share in rows:
@@ -163,9 +161,11 @@ class LocalValues:
                 total, weight = torch.addcmul(total, share, values), weight + share
         return total / weight
 
-    def _two_nearest(self, first: int, count: int, blocks: int, like: Tensor) -> list[tuple[Tensor, Tensor]]:
+    def _two_nearest(self, axis: int, first: int, count: int, like: Tensor) -> list[tuple[Tensor, Tensor]]:
         """Indices (count,) of the blocks before and after pixels along an axis, with linear weights (count,)."""
-        position = (torch.arange(first, first + count, dtype=like.dtype, device=like.device) + 0.5) / self.step - 0.5
+        blocks, length = self.guide.shape[2 + axis], self.size[axis]
+        places = torch.arange(first, first + count, dtype=torch.float64, device=like.device)
+        position = (places + 0.5) * blocks / length - 0.5
         before = position.floor()
         share = (position - before).to(like)
         number = before.long()

@@ -28,7 +28,7 @@ from nlfilter_torch.photo.picture.edit import PhotoEdit
 from nlfilter_torch.photo.picture.in_memory import edit_image
 from nlfilter_torch.photo.picture.pixels import Pixels, corner
 from nlfilter_torch.photo.picture.resizing import enlarged
-from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles
+from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles, parts_in_blocks
 from nlfilter_torch.photo.picture.source import Fitted, Reduced, Source
 from nlfilter_torch.photo.picture.viewing import viewed_size
 from nlfilter_torch.photo.selections.closed_form import LinearMasks, linear_mask, linear_models, solve_linear
@@ -289,9 +289,8 @@ def _reduced(source: Source[M], floats: int) -> tuple[Reduced, tuple[float, floa
     size = viewed_size(source.size, VIEWED)
     viewed = source if size == source.size else source.resized(size)
     side = math.ceil(math.sqrt(size[0] * size[1] / SOLVED))
-    # In a long narrow picture, the rounding of the smaller size makes the steps differ.
-    steps = (side * source.size[0] / size[0], side * source.size[1] / size[1])
-    return viewed.blocks(side, floats), steps
+    small = viewed.blocks(side, floats)
+    return small, (source.size[0] / small.size[0], source.size[1] / small.size[1])
 
 
 def _fit_borders(small: Reduced, image: Tensor, rough: Tensor, front: Tensor, back: Tensor) -> Tensor:
@@ -322,23 +321,22 @@ def blocks_of(scribbles: Scribbles, small: Source[M], size: tuple[int, int], ste
     """
     if steps == (1, 1):
         return scribbles
-    rows, columns = (
-        ((torch.arange(length, dtype=torch.float64) + 0.5) / step).long().clamp(max=count - 1).to(scribbles.places)
-        for length, count, step in zip(size, small.size, steps, strict=True)
-    )
-    pixels = torch.outer(rows.bincount(minlength=small.size[0]), columns.bincount(minlength=small.size[1])).flatten()
-    row, column = rows[scribbles.places // size[1]], columns[scribbles.places % size[1]]
-    places, block = (row * small.size[1] + column).unique(return_inverse=True)
-    weights = scribbles.weights.new_zeros(*scribbles.weights.shape[:2], len(places))
-    weights = weights.index_add(2, block, scribbles.weights) / pixels[places]
+    parts = parts_in_blocks(scribbles.places, size, small.size)
+    places, blocks = torch.cat([block for block, _ in parts]).unique(return_inverse=True)
+    shares = torch.cat([share for _, share in parts])
+    add = partial(_added, blocks, shares.to(scribbles.weights), len(places))
+    weights = add(scribbles.weights) / (steps[0] * steps[1])
     colours = scribbles.colours
     if colours is not None:
         total = scribbles.weights.sum(1, keepdim=True)
-        sums = [
-            part.new_zeros(*part.shape[:2], len(places)).index_add(2, block, part) for part in (colours * total, total)
-        ]
-        colours = sums[0] / sums[1].clamp(min=EPSILON)
+        colours = add(colours * total) / add(total).clamp(min=EPSILON)
     return Scribbles(places, weights.clamp(max=1.0), small.colours(places), colours)
+
+
+def _added(blocks: Tensor, shares: Tensor, count: int, values: Tensor) -> Tensor:
+    """Sums (B, C, count) of the shares of values (B, C, n) in blocks; both are repeated for each part of a pixel."""
+    repeated = values.repeat(1, 1, len(blocks) // values.shape[2]) * shares
+    return values.new_zeros(*values.shape[:2], count).index_add(2, blocks, repeated)
 
 
 def _against(inside: list[Scribbles], number: int, background: list[Scribbles]) -> Scribbles:

@@ -5,6 +5,8 @@ import math
 import torch.nn.functional as F
 from torch import Tensor
 
+from nlfilter_torch.photo.picture.resizing import block_means
+
 COARSEST = 48  # minimum short side of the coarsest level, in pixels
 LEVELS = 4  # maximum number of reduced levels
 
@@ -15,14 +17,13 @@ def pyramid_levels(short: int) -> int:
 
 
 def halved(planes: Tensor, levels: int) -> list[Tensor]:
-    """A pyramid of planes (B, C, H, W), each level half the size; an odd last row or column is kept as it is."""
+    """A pyramid of planes (B, C, H, W), each level half the size, rounded up."""
     pyramid = [planes]
     for _ in range(levels):
-        pyramid.append(F.avg_pool2d(pyramid[-1], 2, ceil_mode=True, count_include_pad=False))
+        pyramid.append(block_means(pyramid[-1], 2))
     return pyramid
 
 
 def doubled(planes: Tensor, like: Tensor) -> Tensor:
     """Planes of one level, enlarged to the next finer level, which has the size of ``like``."""
-    twice = F.interpolate(planes, scale_factor=2, mode="bilinear", align_corners=False)
-    return twice[..., : like.shape[-2], : like.shape[-1]]
+    return F.interpolate(planes, like.shape[-2:], mode="bilinear", align_corners=False)

@@ -28,6 +28,7 @@ from nlfilter_torch.photo.selections.scribbled_colours import (
     inner_places,
     likeness,
     linked_evenly,
+    outwards,
 )
 from nlfilter_torch.photo.selections.texture import TEXTURE_MARGIN, with_texture
 
@@ -111,7 +112,8 @@ class RoughMasks:
 
     def mask(self, number: int, scribbles: Scribbles) -> Tensor:
         """The rough mask (B, 1, H, W) of a region with that number, from scribbles on it and on its background."""
-        unlike = 1 - likeness(scribbles.image, scribbles.weights[:, :1], self.frame.colours, self.photometric_bandwidth)
+        colours, weights = outwards(scribbles, self.picture.size)
+        unlike = 1 - likeness(colours, weights[:, :1], self.frame.colours, self.photometric_bandwidth)
         linked = linked_evenly(self.evenness, scribbles.planes(self.picture))
         frame_links, grid_links = self.frame.values(linked), self.grid.values(linked)
         regression = self.regression(scribbles, unlike, frame_links, grid_links)
@@ -120,8 +122,8 @@ class RoughMasks:
         compared = [unlike, likely_frame, self.grid.colours, grid_links, self.photometric_bandwidth]
         by_colour = self.picture.kept(
             ("likelihood", number),
-            [scribbles.image, scribbles.weights, *compared],
-            partial(colour_likelihood, self.picture.image, scribbles, self.frame.colours, *compared),
+            [colours, weights, *compared],
+            partial(colour_likelihood, self.picture.image, colours, weights, self.frame.colours, *compared),
         )
         return likely + (by_colour - likely) * COLOUR_SHARE * (around(likely) / ENOUGH_AROUND).clamp(max=1.0)
 
@@ -166,4 +168,5 @@ def around(likely: Tensor) -> Tensor:
     size = (likely.shape[-2], likely.shape[-1])
     step = max(1, min(size) // AROUND_GRID)
     coarse = block_means(likely, step)
-    return enlarged(blur(coarse, AROUND_SIGMA * min(size) / step), (step, step), (0, 0), size)
+    steps = (size[0] / coarse.shape[-2], size[1] / coarse.shape[-1])
+    return enlarged(blur(coarse, AROUND_SIGMA * min(size) / step), steps, (0, 0), size)

@@ -10,7 +10,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from nlfilter_torch.core.blocks import pixel_blocks
+from nlfilter_torch.core.blocks import order_by, pixel_blocks
 from nlfilter_torch.core.precision import per_image
 from nlfilter_torch.operator.features import blur
 from nlfilter_torch.photo.picture.colour import hundredths_of_lab
@@ -38,18 +38,29 @@ def frame_places(size: tuple[int, int]) -> Tensor:
     height, width = size
     spacing = max(1, (height + width) // FRAME_POINTS)
     top, left = min(1, height - 1), min(1, width - 1)
-    rows, columns = torch.arange(top, height, spacing), torch.arange(left, width, spacing)
+    rows, columns = (_spaced(first, length, spacing) for first, length in ((top, height), (left, width)))
     lines = [(top + 0 * columns, columns), (height - 1 - top + 0 * columns, columns)]
     lines += [(rows, left + 0 * rows), (rows, width - 1 - left + 0 * rows)]
     return torch.cat([down * width + along for down, along in lines]).unique()
 
 
+def _spaced(first: int, length: int, spacing: int) -> Tensor:
+    """Places (n,) along an axis, from ``first`` to that from its end, symmetric about the middle."""
+    distance = max(0, length - 1 - 2 * first)
+    steps = max(1, round(distance / spacing))
+    half = first + torch.arange(steps // 2 + 1) * distance // steps
+    return torch.cat([half, length - 1 - half]).unique()
+
+
 def inner_places(size: tuple[int, int]) -> Tensor:
-    """Indices (n,), ascending, of pixels on a regular grid."""
-    height, width = size
+    """Indices (n,), ascending, of pixels on a regular grid, symmetric about the middle."""
     step = max(1, min(size) // INNER_ROWS, math.ceil(max(size) / MOST_INNER))
-    rows, columns = (torch.arange(min(step, length) // 2, length, step) for length in (height, width))
-    return (rows.unsqueeze(1) * width + columns).flatten()
+    axes = []
+    for length in size:
+        count = len(range(min(step, length) // 2, length, step))
+        half = (2 * torch.arange((count + 1) // 2) + 1) * length // (2 * count)
+        axes.append(torch.cat([half, length - 1 - half]).unique())
+    return (axes[0].unsqueeze(1) * size[1] + axes[1]).flatten()
 
 
 @torch.no_grad()
@@ -65,11 +76,20 @@ def linked_evenly(even: Tensor, scribbles: Tensor) -> Tensor:
     """
     height, width = even.shape[-2:]
     steps = [max(min(LINK_STEP, length), math.ceil(length / MOST_LINKED)) for length in (height, width)]
-    passable = -F.max_pool2d(-even, steps, ceil_mode=True)
-    start = passable * F.max_pool2d((scribbles > 0).to(even), steps, ceil_mode=True)
+    counts = (math.ceil(height / steps[0]), math.ceil(width / steps[1]))
+    passable = -F.adaptive_max_pool2d(-even, counts)
+    start = passable * F.adaptive_max_pool2d((scribbles > 0).to(even), counts)
     front, back = _widest_paths(passable.expand_as(start), start).split(1, dim=1)
     linked = ((front - back - UNLINKED) / (LINKED - UNLINKED)).clamp(0.0, 1.0)
-    return linked.repeat_interleave(steps[0], 2).repeat_interleave(steps[1], 3)[..., :height, :width]
+    return _repeated(_repeated(linked, 2, height), 3, width)
+
+
+def _repeated(blocks: Tensor, axis: int, length: int) -> Tensor:
+    """Blocks along an axis, repeated for each of so many pixels; one on a border has the mean of both."""
+    count = blocks.shape[axis]
+    middles = (2 * torch.arange(length, device=blocks.device) + 1) * count
+    before, after = (blocks.index_select(axis, ends // (2 * length)) for ends in (middles - 1, middles))
+    return (before + after) / 2
 
 
 def _widest_paths(passable: Tensor, start: Tensor) -> Tensor:
@@ -111,7 +131,8 @@ def evenness(image: Tensor) -> Tensor:
 
 def colour_likelihood(
     image: Tensor,
-    scribbles: Scribbles,
+    scribbled: Tensor,
+    weights: Tensor,
     frame: Tensor,
     unlike: Tensor,
     likely: Tensor,
@@ -126,7 +147,8 @@ def colour_likelihood(
 
     Args:
         image: the reduced picture.
-        scribbles: on the region and on its background.
+        scribbled: colours (B, C, n) of scribbled pixels, see :func:`outwards`.
+        weights: of those on the region and on its background, (B, 2, n).
         frame: colours (B, C, n) of the pixels along the borders of the picture.
         unlike: dissimilarity of these pixels to the scribbles on the region, (B, 1, n).
         likely: likelihood of these pixels by the regression, (B, 1, n), times their :func:`evenness`. Where an even
@@ -138,20 +160,36 @@ def colour_likelihood(
     """
     places = hundredths_of_lab(image).flatten(2)
     scale = BANDWIDTH_SHARE * per_image(bandwidth, image, 3)
-    samples = (every_nth(scribbles.image, weights, NUM_COLOURS) for weights in scribbles.weights.split(1, dim=1))
+    samples = (every_nth(scribbled, side, NUM_COLOURS) for side in weights.split(1, dim=1))
     inside, outside = (density(places, colours_in_lab(sample), shares, scale) for sample, shares in samples)
     shares = unlike * torch.cat([likely.square(), (1 - likely).square()], dim=1)
     shares = shares / unlike.sum(2, keepdim=True).clamp(min=EPSILON)
     within, around = density(places, colours_in_lab(frame), shares, scale).split(1, dim=1)
     shares = linked / linked.sum(2, keepdim=True).clamp(min=1.0)
     inside = inside + within + density(places, colours_in_lab(inner), shares, scale)
-    opposed = (scribbles.weights[:, 1].detach() > 0).any(1).view(-1, 1, 1)
+    opposed = (weights[:, 1].detach() > 0).any(1).view(-1, 1, 1)
     outside = torch.where(opposed, (outside + around) / 2, around)
     return ((inside + MIN_DENSITY) / (inside + outside + 2 * MIN_DENSITY)).unflatten(2, image.shape[-2:])
 
 
+def outwards(scribbles: Scribbles, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
+    """Colours (B, C, n) and weights (B, K, n) of scribbled pixels of a picture (H, W), from its middle outwards.
+
+    Pixels at the same distance are ordered by brightness, so that the order turns with the picture.
+    """
+    height, width = size
+    rows, columns = scribbles.places // width, scribbles.places % width
+    distances = (2 * rows + 1 - height).square() + (2 * columns + 1 - width).square()
+    light = scribbles.image.detach().mean(1)
+    order = order_by(distances.expand_as(light), light).unsqueeze(1)
+    image, weights = scribbles.image, scribbles.weights
+    return image.gather(2, order.expand_as(image)), weights.gather(2, order.expand_as(weights))
+
+
 def every_nth(colours: Tensor, weights: Tensor, number: int) -> tuple[Tensor, Tensor]:
     """Choose every n-th pixel of positive weight, about ``number`` in each image, independently of the other images.
+
+    The order of the pixels matters: see :func:`outwards`.
 
     Args:
         colours: (B, C, n).

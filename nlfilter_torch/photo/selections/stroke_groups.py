@@ -8,10 +8,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles, blocks_at, sums_in_blocks
+from nlfilter_torch.core.blocks import order_by
+from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles, blocks_at
 
 GROUPS = 5
 CELLS = 64  # number of cells along the short side; painted areas in the same or in adjacent cells are connected
+
+
+def _cells(length: int, side: float) -> int:
+    """Number of cells along an axis, such that no border of two cells runs through the middle of a pixel."""
+    count = math.ceil(length / side)
+    return count if length % count == 0 or count % 2 == 1 else count + 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,13 +39,29 @@ class StrokeGroups:
         """Number the strokes of a picture (H, W). Areas closer together than 1/64 of the short side are connected."""
         from skimage.measure import label
 
-        places, side = scribbles.places, max(1.0, min(size) / CELLS)
-        cells = (math.ceil(size[0] / side), math.ceil(size[1] / side))
-        weights = scribbles.weights.detach().amax(1, keepdim=True)
-        painted = sums_in_blocks(weights, places, size[1], side, cells).squeeze(1) > 0
+        side = max(1.0, min(size) / CELLS)
+        cells = (_cells(size[0], side), _cells(size[1], side))
+        at = blocks_at(scribbles.places, size, cells)
+        weights = scribbles.weights.detach().amax(1)
+        painted = weights.new_zeros(len(weights), cells[0] * cells[1]).index_add(1, at, weights).unflatten(1, cells) > 0
         numbers = torch.from_numpy(np.stack([label(image, connectivity=2) for image in painted.cpu().numpy()]))
-        strokes = numbers.to(places).flatten(1)[:, blocks_at(places, size[1], side, cells)]
-        return StrokeGroups((strokes - 1).clamp(min=0), int(numbers.max()))
+        strokes = (numbers.to(at).flatten(1)[:, at] - 1).clamp(min=0)
+        groups = StrokeGroups(strokes, int(numbers.max()))
+        return groups if groups.count <= GROUPS else groups._outwards(scribbles, size)
+
+    def _outwards(self, scribbles: Scribbles, size: tuple[int, int]) -> "StrokeGroups":
+        """The strokes, numbered from the middle of the picture outwards, so that the numbers turn with it.
+
+        Strokes at the same distance are ordered by brightness.
+        """
+        places = scribbles.places
+        distances = (2 * (places // size[1]) + 1 - size[0]).square() + (2 * (places % size[1]) + 1 - size[1]).square()
+        painted = (scribbles.weights.detach() > 0).any(1)
+        distances = torch.where(painted, distances, distances.max() + 1)
+        nearest = distances.new_full((len(self.strokes), self.count), torch.iinfo(torch.long).max)
+        nearest = nearest.scatter_reduce(1, self.strokes, distances, "amin")
+        light = self.sums(scribbles.image.detach().mean(1, keepdim=True) * painted.unsqueeze(1)).squeeze(1)
+        return StrokeGroups(order_by(nearest, light).argsort(1).gather(1, self.strokes), self.count)
 
     @property
     def groups(self) -> Tensor:

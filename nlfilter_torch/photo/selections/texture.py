@@ -21,8 +21,10 @@ def with_texture(planes: Tensor, brightness: Tensor, weight: float) -> Tensor:
     Returns:
         (B, 2 C + 3, H, W): the planes, their means, and ``weight`` times the strength of grain and of both gradients.
     """
+    # In float32, blurred planes of a mirrored picture would differ by rounding, and with them its landmarks.
+    planes, brightness, dtype = planes.double(), brightness.double(), planes.dtype
     padded = pad_border(brightness, 1)
     rows, columns = padded[..., 1:-1, 2:] - padded[..., 1:-1, :-2], padded[..., 2:, 1:-1] - padded[..., :-2, 1:-1]
     grain = torch.cat([brightness - blur(brightness, GRAIN_SIGMA), rows / 2, columns / 2], dim=1)
     strength = (blur(grain.square(), TEXTURE_SIGMA) + 1e-8).sqrt()  # the derivative of the root is finite
-    return torch.cat([planes, blur(planes, SURROUND_SIGMA), weight * strength], dim=1)
+    return torch.cat([planes, blur(planes, SURROUND_SIGMA), weight * strength], dim=1).to(dtype)

@@ -19,6 +19,7 @@ from nlfilter_torch.core.blocks import stratified
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.operator.build import operator_from_points
 from nlfilter_torch.operator.features import GuideFeatures, estimate_bandwidth, reduce_channels, unit_window
+from nlfilter_torch.operator.landmarks import assign_landmarks
 from nlfilter_torch.operator.options import Construction
 from nlfilter_torch.operator.scaling import PixelScaling
 from nlfilter_torch.operator.spectrum import RitzPairs
@@ -210,6 +211,10 @@ def learn_filter(pictures: Sequence[Picture], guide: Guide) -> LearntFilter:
     points, colours = torch.cat(features, dim=2), torch.cat(images, dim=2)
     weights = torch.full((1, points.shape[2]), pictures[0].pixels / points.shape[2], dtype=points.dtype)
     options["num_landmarks"] = min(options.get("num_landmarks", 100), points.shape[2])
+    if len(pictures) == 1 and count == pictures[0].pixels and options["landmarks"] == "kmeans":  # as for any picture
+        options["landmarks"], _ = assign_landmarks(
+            points, pictures[0].size, options["num_landmarks"], "kmeans", generator, layout=recipe.layout
+        )
     method = Construction(generator=generator, **options)
     built = operator_from_points(points, (points.shape[2],), method, weights[0])
     pixels = (built.factor, built.diagonal, colours, weights)

@@ -386,7 +386,7 @@ class TiledOperator:
         """The spectrum."""
         count = self.guide.pixels
         if self.guide.guide.sampled and count > SAMPLE:
-            features = self.features_at(sampled_places(count))
+            features = self.features_at(sampled_places(self.guide.size))
             return sampled_pairs(map(self.columns, features.split(sampling.CHUNK, dim=2)), count, self.guide.dtype)
         sums = next(iter(self._sums.values()), None) or self.sums(first_plane, 1)
         return RitzPairs.of_sums(sums.grams[:, :2] + self._grams, sums.dtype)

@@ -17,6 +17,7 @@ from torch import Tensor
 from nlfilter_torch.core.blocks import stratified
 from nlfilter_torch.core.checks import check_choice
 from nlfilter_torch.core.workers import in_order, single_threaded
+from nlfilter_torch.operator.assignment import Layout
 from nlfilter_torch.operator.columns import Columns
 from nlfilter_torch.operator.features import (
     GuideFeatures,
@@ -31,6 +32,14 @@ from nlfilter_torch.operator.nystrom import inverse_cholesky
 from nlfilter_torch.operator.operator import Kernel
 from nlfilter_torch.operator.option_checks import check_bandwidths, check_construction, landmark_count
 from nlfilter_torch.operator.options import Completion, Construction, GuideChannels, Sampling, SpatialBandwidth
+from nlfilter_torch.operator.orientation import (
+    ORIENTATIONS,
+    Orientation,
+    canonical_points,
+    orientation_of,
+    orientation_sums,
+    source_pixels,
+)
 from nlfilter_torch.operator.sinkhorn import sinkhorn_balance
 from nlfilter_torch.photo.picture.source import Guide
 from nlfilter_torch.photo.tiled.pictures import Picture, Tile
@@ -202,7 +211,7 @@ class Pilot:
 
 @dataclass(frozen=True)
 class PatchReader:
-    """Reads the patches and colours of chosen pixels of a tile, and measures its gradient.
+    """Reads the patches and colours of chosen pixels of a tile, and measures its gradient and orientation.
 
     Attributes:
         picture: guide of the picture.
@@ -221,15 +230,20 @@ class PatchReader:
         """Number of rows of the guide around a tile that are read."""
         return max(self.patch_size // 2, 1)
 
-    def __call__(self, part: tuple[Tile, Tensor]) -> tuple[Tensor, Tensor, float]:
-        """Patches (1, C p^2, n), colours (1, C, n), and the sum of the squared gradients of all pixels of the tile."""
+    def __call__(self, part: tuple[Tile, Tensor]) -> tuple[Tensor, Tensor, float, Tensor]:
+        """Patches (1, C p^2, n) and colours (1, C, n) of the pixels, and two sums over all pixels of the tile.
+
+        These are the sum of the gradients, and those of :func:`orientation_sums`, (1, C, 6, 6).
+        """
         tile, chosen = part
         seen = self.picture.seen(tile, self.margin)
         guide = reduce_channels(seen.pixels, self.guide_channels)
         gradient = 0.0
         if self.measures_gradient:
             gradient = float(gradients(guide, seen.halo).double().mean((0, 1)).sum())
-        return patches_at(guide, seen, chosen, self.patch_size), tile.inner.flatten(2)[:, :, chosen], gradient
+        rows = guide[:, :, seen.halo[0] : guide.shape[2] - seen.halo[1]]
+        sums = orientation_sums(rows, tile.start, self.picture.size)
+        return patches_at(guide, seen, chosen, self.patch_size), tile.inner.flatten(2)[:, :, chosen], gradient, sums
 
 
 def take_pilot(
@@ -258,13 +272,16 @@ def take_pilot(
     num_landmarks = landmark_count(method, picture.pixels)
 
     generator = torch.Generator().manual_seed(0) if generator is None else generator
-    candidates = candidate_pixels(picture.size, num_landmarks, landmarks, generator).cpu()
-    rest = torch.Generator().manual_seed(int(candidates.sum()) % 2**32)  # ``generator`` is for the landmarks alone
+    drawn = candidate_pixels(picture.size, num_landmarks, landmarks, generator).cpu()
+    rest = torch.Generator().manual_seed(int(drawn.sum()) % 2**32)  # ``generator`` is for the landmarks alone
     even = stratified(picture.pixels, min(PILOT, picture.pixels), rest)
-    wanted = torch.cat([candidates, even])
+    # The orientation of the picture, which decides which pixels are candidates, is known after the pass.
+    turned = landmarks == "kmeans" and len(drawn) > num_landmarks
+    candidates = source_pixels(torch.arange(ORIENTATIONS if turned else 1), picture.size, drawn)
+    wanted = torch.cat([candidates.flatten(), even])
     reader = PatchReader(picture, patch_size, guide_channels, isinstance(photometric_bandwidth, str))
     parts = visit(picture.picture, reader.margin + picture.margin, wanted.sort().values, report, "Looking")
-    patches, values, slopes = zip(*in_order(reader, parts, workers), strict=True)
+    patches, values, slopes, sums = zip(*in_order(reader, parts, workers), strict=True)
     if isinstance(photometric_bandwidth, str):
         photometric_bandwidth = float(
             bandwidth_of_gradient(torch.tensor(sum(slopes) / picture.pixels, dtype=torch.float64))
@@ -272,13 +289,27 @@ def take_pilot(
     order = torch.empty_like(wanted)
     order[wanted.argsort()] = torch.arange(len(wanted))  # position of each wanted pixel in reading order
     recipe = GuideFeatures(window, photometric_bandwidth, spatial_bandwidth, guide_channels)
-    features = scaled_patches(torch.cat(patches, dim=2)[:, :, order], wanted, picture, recipe)
-    image = torch.cat(values, dim=2)[:, :, order[len(candidates) :]]
+    total = torch.stack(sums).sum(0)
+    orientation = orientation_of(total, patches[0].shape[1] // patch_size**2)
+    if not turned:
+        orientation = Orientation(torch.zeros(1, dtype=torch.long))
+    first = int(orientation.numbers) * len(drawn)
+    used = torch.cat([torch.arange(first, first + len(drawn)), torch.arange(candidates.numel(), len(wanted))])
+    features = scaled_patches(torch.cat(patches, dim=2)[:, :, order[used]], wanted[used], picture, recipe)
+    image = torch.cat(values, dim=2)[:, :, order[candidates.numel() :]]
     weights = torch.full((1, len(even)), picture.pixels / len(even), dtype=picture.dtype)
     with single_threaded(workers):  # so few pixels that a second thread would wait most of the time
-        points = condense(features[:, :, : len(candidates)], num_landmarks, generator)
+        subset, coordinates = features[:, :, : len(drawn)], None
+        if spatial_bandwidth is not None:
+            coordinates = coordinates_of(
+                source_pixels(orientation.numbers, picture.size, drawn, flipped=False)[0], picture, recipe
+            )
+        canonical = canonical_points(
+            subset, orientation, Layout(patch_size, spatial_bandwidth is not None), coordinates
+        )
+        points = condense(subset, num_landmarks, generator, canonical)
         kernel = Kernel(points, inverse_cholesky(points), completion, features=recipe)
-        columns = kernel.factor(features[:, :, len(candidates) :])
+        columns = kernel.factor(features[:, :, len(drawn) :])
         balancing = sinkhorn_balance(
             *columns, tolerance=PILOT_TOLERANCE, completed=completion == "diagonal", weights=weights
         )
@@ -320,8 +351,13 @@ def scaled_patches(patches: Tensor, pixels: Tensor, picture: Picture, recipe: Gu
     features = patches * scale.reshape(1, 1, -1, 1).expand(1, channels, -1, 1).reshape(1, -1, 1)
     if recipe.spatial_bandwidth is None:
         return features
-    places = torch.stack([pixels // picture.size[1], pixels % picture.size[1]]).to(features)
-    return torch.cat([features, recipe.coordinates(places)], dim=1)
+    return torch.cat([features, coordinates_of(pixels, picture, recipe).to(features)], dim=1)
+
+
+def coordinates_of(pixels: Tensor, picture: Picture, recipe: GuideFeatures) -> Tensor:
+    """Features (1, 2, n) of the rows and columns of pixels with the indices (n,)."""
+    places = torch.stack([pixels // picture.size[1], pixels % picture.size[1]])
+    return recipe.coordinates(places.to(recipe.patch_weights))
 
 
 EVEN_SHARE = 0.1  # share of a sample that is spread evenly over the picture

@@ -18,7 +18,7 @@ from nlfilter_torch.operator.eigenvalue_bound import is_bounded
 from nlfilter_torch.photo.picture.ends import ends_of
 from nlfilter_torch.photo.picture.in_memory import InMemory
 from nlfilter_torch.photo.picture.pixels import part_of
-from nlfilter_torch.photo.picture.resizing import block_means, resized, resized_parts
+from nlfilter_torch.photo.picture.resizing import block_counts, block_parts, resized, resized_parts
 from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles
 from nlfilter_torch.photo.picture.source import Fitted, Guide, Kept, Planes, Source
 from nlfilter_torch.photo.tiled.operator import TiledOperator, TilePixels
@@ -310,12 +310,17 @@ class Tiled:
     @torch.no_grad()
     def reduced(self, planes: Planes, step: int) -> Tensor:
         """Means over blocks of ``step`` pixels in both directions."""
-        rows = max(1, self.picture.statistics_rows // step) * step
-        return torch.cat(list(self._map_tiles(partial(self._block_means, planes, step), rows, "Reducing")), dim=2)
+        rows, counts = max(1, self.picture.statistics_rows // step) * step, block_counts(self.size, step)
+        total: Tensor | None = None
+        for first, part in self._map_tiles(partial(self._block_parts, planes, step), rows, "Reducing"):
+            total = part.new_zeros(*part.shape[:2], *counts) if total is None else total
+            total[:, :, first : first + part.shape[2]] += part
+        assert total is not None  # for mypy
+        return total.to(self.dtype)
 
-    def _block_means(self, planes: Planes, step: int, tile: Tile) -> Tensor:
-        """Means over blocks of a tile."""
-        return block_means(self._planes_of(planes, tile), step)
+    def _block_parts(self, planes: Planes, step: int, tile: Tile) -> tuple[int, Tensor]:
+        """What a tile contributes to the means over blocks."""
+        return block_parts(self._planes_of(planes, tile), tile.start, self.size, step)
 
     def _map_tiles(self, function: Callable[[Tile], Result], rows: int, stage: str) -> Iterator[Result]:
         """Apply a function to each tile, and yield the results in order.

@@ -50,7 +50,7 @@ def arguments(dtype: torch.dtype) -> dict[str, tuple[Any, ...]]:
         "pivots": (features, torch.linspace(0.1, 0.9, TRIALS * LANDMARKS, dtype=dtype).view(-1, TRIALS), 1e-4),
         "lloyd": (features, landmarks, 3, 1e-6),
         "invert": (factor @ factor.mT + torch.eye(LANDMARKS, dtype=dtype),),
-        "choose": (features, [1, PIXELS], LANDMARKS, "kmeans"),
+        "choose": (features, [1, PIXELS], LANDMARKS, "kmeans", 2, False),
         "without": (factor, norms > norms.median()),
         "convolve": (images16, weight, random(5, seed=7).to(dtype), 2, random(BATCH, 5, 7, 9, seed=8).to(dtype)),
         "solve": (coefficients, random(BATCH, 2, 6, 7, seed=10).to(dtype)),

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from nlfilter_torch.photo.picture.in_memory import InMemory
 from nlfilter_torch.photo.picture.pixels import Strip
+from nlfilter_torch.photo.picture.resizing import block_counts, block_means
 from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles, blocks_at, scribbled_blocks, sums_in_blocks
 from tests.problems import box, noise
 
@@ -86,13 +87,10 @@ def test_blocks_of_columns_come_with_their_weights_and_values() -> None:
 
 @pytest.mark.parametrize("step", [1.0, 4.0, 2.5])
 def test_sums_over_blocks_are_those_of_the_pixels_in_them(step: float) -> None:
-    shape = (int(11 / step) + 1, int(14 / step) + 1)
+    shape = block_counts(SIZE, step)
     scribbles = scribbles_of(MASKS)
-    sums = sums_in_blocks(scribbles.weights, scribbles.places, SIZE[1], step, shape)
-    wanted = torch.zeros(2, 1, *shape, dtype=torch.float64)
-    for row in range(SIZE[0]):
-        for column in range(SIZE[1]):
-            wanted[..., int(row / step), int(column / step)] += MASKS[..., row, column]
-    torch.testing.assert_close(sums, wanted)
+    sums = sums_in_blocks(scribbles.weights, scribbles.places, SIZE, shape)
+    area = SIZE[0] * SIZE[1] / (shape[0] * shape[1])
+    torch.testing.assert_close(sums, area * block_means(MASKS, step).to(sums))
     places = torch.tensor([0, 14, 11 * 15 + 14])
-    assert blocks_at(places, SIZE[1], step, shape).tolist() == [0, shape[1] - 1, shape[0] * shape[1] - 1]
+    assert blocks_at(places, SIZE, shape).tolist() == [0, shape[1] - 1, shape[0] * shape[1] - 1]

@@ -13,6 +13,7 @@ from nlfilter_torch.photo.selections.scribbled_colours import (
     evenness,
     every_nth,
     linked_evenly,
+    outwards,
 )
 from tests.problems import noise
 
@@ -44,7 +45,9 @@ def test_colours_of_a_region_where_it_reaches_the_border_belong_to_it() -> None:
     def likelihoods(likely: float, inside: float = 0.0) -> torch.Tensor:
         by_regression = torch.tensor([[[1.0, likely, 0.0]]]).double()
         grid, linked = image.squeeze(2)[..., 1:2], torch.tensor([[[inside]]]).double()
-        return colour_likelihood(image, scribbles, frame, unlike, by_regression, grid, linked, 0.08).flatten()
+        return colour_likelihood(
+            image, *outwards(scribbles, (1, 3)), frame, unlike, by_regression, grid, linked, 0.08
+        ).flatten()
 
     assert likelihoods(0.9)[:2].min() > 0.95
     assert likelihoods(0.1)[1] < 0.05

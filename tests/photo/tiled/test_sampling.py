@@ -40,7 +40,7 @@ def test_sample_holds_about_as_many_pixels_as_asked_for_and_stands_for_all(compl
     assert abs(float(sample.weights.sum()) / picture.pixels - 1) < 0.1
     estimate = guess.totals(sample)[1]
     assert (estimate.moment - moment).norm() < 0.02 * torch.as_tensor(moment).norm()
-    assert (estimate.grams - grams).norm() < 0.02 * torch.as_tensor(grams).norm()
+    assert (estimate.grams - grams).norm() < 0.025 * torch.as_tensor(grams).norm()
 
 
 def test_draws_follow_the_rates_and_leave_no_gap() -> None:
