@@ -105,7 +105,9 @@ def test_colorize(
     for method in ("regression", "kmeans"):
         wanted = colorize(grey, GREEN * mask, mask, method=method, strength=0.7, num_landmarks=40, generator=seeded())
         arguments = ("--strokes", strokes, "--method", method, "--strength", 0.7)
-        assert (run("colorize", tmp_path / "grey.png", *arguments) - wanted).abs().max() < 1e-3
+        assert (
+            run("colorize", tmp_path / "grey.png", *arguments) - wanted
+        ).abs().max() < 1.5e-3  # the file has 16 bits
         assert "note" not in capsys.readouterr().err
         assert (run("colorize", photo, *arguments) - wanted).abs().max() < 1 / 255
         assert f"note: {photo} is in colour: colorize replaces its colours everywhere" in capsys.readouterr().err
