@@ -226,7 +226,8 @@ class Colorize(PhotoEdit):
         ratio = viewed.measured(bandwidth_ratio)
         distance = COLORIZE["spatial_bandwidth"].distance(self.spatial_bandwidth, small)
         mean = per_image(cast(float | Tensor, distance), ratio, 1)  # not None, whose place a share of the size takes
-        operators = Operators(self, viewed, (mean / ratio.sqrt(), mean * ratio.sqrt()))
+        bandwidths = (mean / ratio.sqrt()).to(viewed.dtype), (mean * ratio.sqrt()).to(viewed.dtype)
+        operators = Operators(self, viewed, bandwidths)
         wanted = squarable(split_luminance(scribbles.shown.unsqueeze(2))[1]).squeeze(2)  # (B, 3, n)
         if self.method == "kmeans":
             return _coloured(source, viewed, self._segments(operators, scribbles, wanted))
@@ -391,9 +392,10 @@ def bandwidth_ratio(source: Source[M]) -> Tensor:
     """Ratio (B,) of the horizontal to the vertical bandwidth, from changes of brightness at a large scale.
 
     Where sky, buildings and ground lie above each other, brightness changes more from top to bottom, and so do colours.
+    In float64: in float32, the bandwidths of a mirrored picture would differ by rounding, and with them its landmarks.
     """
     step = max(1, min(source.size) // BLOCKS)
-    blocks = source.reduced(luminance, step)
+    blocks = source.reduced(luminance, step).double()
     changes = [blocks.diff(dim=dim).abs().flatten(1) for dim in (2, 3)]
     down, across = (change.sum(1) / max(1, change.shape[1]) + SAME_BRIGHTNESS for change in changes)
     return (down / across).pow(ANISOTROPY).clamp(1 / MOST_ANISOTROPY, MOST_ANISOTROPY)

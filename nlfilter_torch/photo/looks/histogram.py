@@ -20,6 +20,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from nlfilter_torch.operator.features import reduce_channels
+from nlfilter_torch.photo.picture.resizing import block_counts, block_means
 
 DARKEST = 1 / 255  # colours are divided by their largest channel, or by this if it is smaller
 KINDS = 3  # of automatic levels
@@ -88,12 +89,9 @@ def ramps(image: Tensor, stretch: Stretch) -> Tensor:
 
 
 def mean_ramps(image: Tensor, stretch: Stretch, step: int) -> Tensor:
-    """Means of :func:`ramps` over blocks of ``step`` x ``step`` pixels, with one shade in memory at a time."""
+    """:func:`block_means` of :func:`ramps`, with one shade in memory at a time."""
     light = _stretched(brightness(image), stretch) * (SHADES - 1)
-    means = [
-        F.avg_pool2d(light.clamp(k, k + 1), step, ceil_mode=True, count_include_pad=False) - k
-        for k in range(SHADES - 1)
-    ]
+    means = [block_means(light.clamp(k, k + 1), step) - k for k in range(SHADES - 1)]
     return torch.stack(means, dim=2).flatten(1, 2)
 
 
@@ -120,11 +118,11 @@ class LocalCurves:
     def of(size: tuple[int, int], stretch: Stretch, reduced: Callable[[int], Tensor]) -> "LocalCurves":
         """The curves of a picture of size (H, W), one for each of :data:`LIMITS`.
 
-        ``reduced`` returns means of its :func:`ramps` over blocks of so many pixels, (B, 2 (K - 1), h, w).
+        ``reduced`` returns :func:`block_means` of its :func:`ramps` for blocks of so many pixels, (B, 2 (K - 1), h, w).
         """
         step = max(1, min(size) // (TILES * FINE))
         means = reduced(step).unflatten(1, (2, SHADES - 1))
-        rows, columns = (_shares(length, step).to(means) for length in size)
+        rows, columns = (_shares(count).to(means) for count in block_counts(size, step))
         # A hat function rises with one ramp and falls with the next.
         passed = F.pad(rows @ means @ columns.mT, (0, 0, 0, 0, 1, 0), value=1.0)
         histogram = passed - F.pad(passed[:, :, 1:], (0, 0, 0, 0, 0, 1))
@@ -181,10 +179,8 @@ class LocalCurves:
         return total
 
 
-def _shares(length: int, step: int) -> Tensor:
-    """Weights (TILES, n) of blocks of ``step`` pixels in the means over tiles, along a side of a picture."""
-    starts = torch.arange(0, length, step, dtype=torch.float64)
-    ends = (starts + step).clamp(max=length)
-    edges = torch.arange(TILES + 1, dtype=torch.float64).view(-1, 1) * (length / TILES)
-    shared = torch.minimum(ends, edges[1:]) - torch.maximum(starts, edges[:-1])
-    return shared.clamp(min=0) * (TILES / length)
+def _shares(count: int) -> Tensor:
+    """Weights (TILES, n) of n blocks that divide a side of a picture evenly, in the means over tiles."""
+    starts, edges = torch.arange(count) * TILES, torch.arange(TILES + 1).view(-1, 1) * count  # of 1 / (TILES n)
+    shared = torch.minimum(starts + TILES, edges[1:]) - torch.maximum(starts, edges[:-1])
+    return shared.clamp(min=0).double() / count
