@@ -33,6 +33,7 @@ from nlfilter_torch import (
 LIMIT, LEVELS = 0.05, 255
 TRANSFORMATIONS = range(1, 8)  # number 1 flips the rows, 2 the columns, 4 exchanges the axes afterwards
 PICTURES = ("chelsea", "coffee", "rocket")
+EDITED = "astronaut"
 SIZES = ((127, 171), (301, 397))  # of the pictures that are edited; larger ones are reduced within some edits
 Edit = Callable[..., Tensor]
 
@@ -76,9 +77,10 @@ def mask_of(image: Tensor, region: Tensor) -> Tensor:
     return diffusion_mask(nonlocal_operator(image, photometric_bandwidth=0.1).spectrum(), region)
 
 
-def classes_of(image: Tensor, regions: Tensor) -> Tensor:
+def classes_of(image: Tensor, regions: Tensor, temperature: float = 0.0) -> Tensor:
     """Masks of segments."""
-    return SegmentMask()(nonlocal_operator(image, photometric_bandwidth=0.1).spectrum(), regions)
+    layer = SegmentMask(temperature=temperature)
+    return layer(nonlocal_operator(image, photometric_bandwidth=0.1).spectrum(), regions)
 
 
 def edits(image: Tensor) -> dict[str, tuple[Edit, list[Tensor]]]:
@@ -92,6 +94,10 @@ def edits(image: Tensor) -> dict[str, tuple[Edit, list[Tensor]]]:
     return {
         "diffusion_mask": (mask_of, [image, front]),
         "SegmentMask": (classes_of, [image, torch.cat([front, back], dim=1)]),
+        "SegmentMask with a temperature": (
+            partial(classes_of, temperature=0.3),
+            [image, torch.cat([front, back], dim=1)],
+        ),
         "refine": (lambda picture, mask: refine(0.3 + 0.4 * mask, picture), [image, front]),
         "region_mask": (region_mask, [image, front]),
         "region_mask with a background": (region_mask, [image, front, back]),
@@ -134,7 +140,7 @@ def measure(*, quick: bool) -> Iterator[Figure]:
     numbers = range(5, 6) if quick else TRANSFORMATIONS
     yield from of_layers(numbers)
     for size in SIZES[:1] if quick else SIZES:
-        image = photograph("chelsea", *size)
+        image = photograph(EDITED, *size)
         for name, (edit, planes) in edits(image).items():
             levels = differences(edit, planes, numbers if size == SIZES[0] else range(5, 7))
             yield Figure(f"{name} at {size[0]}x{size[1]}: most", levels.max().item(), LIMIT, "levels")
