@@ -52,10 +52,6 @@ class LinearMasks:
         inverse = torch.linalg.inv(covariance + NOISE * torch.eye(count).to(covariance))
         return LinearMasks(image, share, mean, inverse.permute(0, 3, 4, 1, 2).contiguous())
 
-    def to(self, like: Tensor) -> "LinearMasks":
-        """The model in the dtype of a tensor."""
-        return LinearMasks(self.image.to(like), self.share.to(like), self.mean.to(like), self.inverse.to(like))
-
     def fit(self, mask: Tensor) -> Tensor:
         """Fit the linear functions (B, C+1, H, W) of a mask (B, 1, H, W), averaged over all windows around a pixel.
 
@@ -126,8 +122,8 @@ def damped(model: LinearMasks, mask: Tensor, target: Tensor, trust: Tensor) -> T
     """Chebyshev steps from a mask (B, 1, H, W) towards ``(1 + c) a = S a + c t``, S being :meth:`LinearMasks.smoothed`.
 
     The eigenvalues of the preconditioned system lie in [0, 1]; error components with an eigenvalue below
-    :data:`SLOWEST` are left to coarser levels. Only the first residual is computed in float64: the others follow from
-    it by steps that get smaller, and so do their rounding errors.
+    :data:`SLOWEST` are left to coarser levels. All is computed in float64: in float32, rounding errors in flat windows
+    would change masks by up to half a grey level.
 
     Args:
         model: the linear model of the picture.
@@ -136,9 +132,9 @@ def damped(model: LinearMasks, mask: Tensor, target: Tensor, trust: Tensor) -> T
         trust: c, the confidence.
     """
     middle, half = (1 + SLOWEST) / 2, (1 - SLOWEST) / 2
-    mask = mask.double()
-    residual = ((model.smoothed(mask) + target) / (1 + trust) - mask).to(target)
-    model, damping = model.to(target), 1 / (1 + trust)
+    mask, target, trust = mask.double(), target.double(), trust.double()
+    residual = (model.smoothed(mask) + target) / (1 + trust) - mask
+    damping = 1 / (1 + trust)
     ratio, step = half / middle, residual / middle
     mask = mask + step
     for _ in range(LINEAR_STEPS - 1):
