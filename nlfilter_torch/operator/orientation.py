@@ -154,8 +154,13 @@ def _weights(places: Tensor, length: int) -> Tensor:
 
 
 def _hash_first(places: Tensor) -> Tensor:
-    return (places * 40503 + places * places * 9973 + 12345) // 16 % HASHED
+    return _scattered((places * 40503 + 12345) % 65521)
 
 
 def _hash_second(places: Tensor) -> Tensor:
-    return (places * 60493 + places * places * 7919 + 54321) // 16 % HASHED
+    return _scattered((places * 60493 + 54321) % 65521)
+
+
+def _scattered(numbers: Tensor) -> Tensor:
+    """Pseudo-random numbers; a polynomial of a place would be tied wherever the centre of gravity is."""
+    return numbers * numbers % 32749 % HASHED

@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from torch import Tensor
 
@@ -47,6 +47,7 @@ def test_pixels_of_an_orientation_are_where_it_puts_them() -> None:
         assert torch.equal(indices, oriented(numbers.view(6, 9), number).flatten())
 
 
+@example(height=1, width=6, levels=3, seed=288)  # centres of gravity in the middle
 @given(height=st.integers(1, 9), width=st.integers(1, 9), levels=st.integers(1, 3), seed=st.integers(0, 1000))
 def test_all_orientations_of_an_image_have_the_same_canonical_one(
     height: int, width: int, levels: int, seed: int
