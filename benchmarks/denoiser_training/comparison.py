@@ -13,6 +13,7 @@ from torch import Tensor
 
 from benchmarks.denoiser_training.cameras import Camera
 from benchmarks.photographs import pictures
+from nlfilter_torch.core.blocks import reflected
 from nlfilter_torch.nn.denoiser.colours import split_colours
 
 SCALES = (1, 2, 4, 8, 16)  # sides of blocks in pixels
@@ -111,8 +112,7 @@ def cut(picture: Tensor, camera: Camera, side: int, generator: torch.Generator) 
 def _mirrored(length: int, count: int, generator: torch.Generator) -> Tensor:
     """A number of successive places from a random one on, which go back and forth where there are not so many."""
     places = torch.arange(count) + int(torch.randint(max(length - count, 0) + 1, (), generator=generator))
-    places = places % max(2 * length - 2, 1)
-    return torch.minimum(places, 2 * length - 2 - places).clamp(min=0)
+    return reflected(places, length)
 
 
 @torch.no_grad()

@@ -99,6 +99,12 @@ def root_weighted(scaling: Tensor, weights: Tensor | None) -> Tensor:
     return scaling if weights is None else scaling * weights.sqrt()
 
 
+def reflected(places: Tensor, length: int) -> Tensor:
+    """Indices of pixels at any places along an axis, which is continued by reflection beyond both ends."""
+    places = places % max(1, 2 * length - 2)
+    return torch.minimum(places, 2 * length - 2 - places)
+
+
 def order_by(first: Tensor, second: Tensor) -> Tensor:
     """Indices (B, n) that sort values (B, n), and where these are equal others (B, n); they turn with an image."""
     order = second.argsort(1)

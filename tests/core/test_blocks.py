@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from nlfilter_torch import captured_energy, nonlocal_operator
-from nlfilter_torch.core.blocks import mirrored, order_by, symmetric_places
+from nlfilter_torch.core.blocks import mirrored, order_by, reflected, symmetric_places
 from tests.problems import build, noise
 
 
@@ -40,6 +40,11 @@ def test_values_are_ordered_by_others_where_they_are_equal() -> None:
         torch.tensor([[5.0, 3.0, 4.0, 6.0], [3.0, 2.0, 1.0, 0.0]]),
     )
     assert order_by(first, second).tolist() == [[1, 3, 2, 0], [3, 2, 1, 0]]
+
+
+def test_places_beyond_an_axis_are_reflected() -> None:
+    assert reflected(torch.arange(-3, 6), 3).tolist() == [1, 2, 1, 0, 1, 2, 1, 0, 1]
+    assert reflected(torch.arange(-2, 3), 1).tolist() == [0] * 5
 
 
 def test_a_place_is_mirrored_in_both_sides_and_in_a_square_in_its_diagonals() -> None:

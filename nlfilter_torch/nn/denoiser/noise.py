@@ -6,7 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from nlfilter_torch.core.blocks import mirrored, order_by
+from nlfilter_torch.core.blocks import mirrored, order_by, reflected
 from nlfilter_torch.core.checks import check_image, check_same_size, check_values
 from nlfilter_torch.core.precision import full_precision, per_image, squarable, working_dtype
 from nlfilter_torch.operator.features import reduce_channels
@@ -147,13 +147,15 @@ def _window_pixels(size: tuple[int, int]) -> Tensor:
     inside = torch.arange(WINDOW_SIZE)
     if rows * columns <= NUM_WINDOWS:
         corners = torch.arange(rows * columns)
-        down, across = _mirrored(corners // columns, inside, height), _mirrored(corners % columns, inside, width)
+        down = reflected((corners // columns)[:, None] + inside, height)
+        across = reflected((corners % columns)[:, None] + inside, width)
         return (down[:, :, None] * width + across[:, None, :]).flatten()
     short, long = sorted((rows, columns))
     count = NUM_WINDOWS // (8 if rows == columns else 4)
     corners = torch.randint(short * long, (count,), generator=torch.Generator().manual_seed(0))
     sides = sorted(size)
-    down, across = _mirrored(corners // long, inside, sides[0]), _mirrored(corners % long, inside, sides[1])
+    down = reflected((corners // long)[:, None] + inside, sides[0])
+    across = reflected((corners % long)[:, None] + inside, sides[1])
     down, across = torch.broadcast_tensors(down[:, :, None], across[:, None, :])
     return mirrored(down, across, size).flatten()
 
@@ -163,12 +165,6 @@ def _windows(size: tuple[int, int], colours: Tensor, channels: GuideChannels) ->
     order = _window_pixels(size).sort().indices
     reduced = reduce_channels(colours.unsqueeze(3), channels).squeeze(3)
     return reduced[:, :, order.argsort().to(colours.device)].unflatten(2, (-1, WINDOW_SIZE, WINDOW_SIZE)).flatten(1, 2)
-
-
-def _mirrored(corners: Tensor, inside: Tensor, length: int) -> Tensor:
-    """Indices of rows or columns (n, WINDOW_SIZE), with reflection in pictures smaller than a window."""
-    places = (corners[:, None] + inside) % max(1, 2 * length - 2)
-    return torch.minimum(places, 2 * length - 2 - places)
 
 
 def _response(windows: Tensor) -> Tensor:

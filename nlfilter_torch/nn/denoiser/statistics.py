@@ -6,6 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from nlfilter_torch.core.blocks import reflected
 from nlfilter_torch.nn.denoiser.colours import split_colours
 from nlfilter_torch.nn.denoiser.profile import KNOTS, NoiseProfile
 
@@ -82,8 +83,7 @@ def _axis(length: int, count: int) -> Tensor:
     order = torch.arange(count)
     first = order * last // max(1, count - 1)
     starts = torch.where(2 * order < count, first, last - first.flip(0))
-    places = (starts[:, None] + torch.arange(SIDE)) % max(1, 2 * length - 2)
-    return torch.minimum(places, 2 * length - 2 - places).abs()
+    return reflected(starts[:, None] + torch.arange(SIDE), length)
 
 
 def _levels(planes: Tensor, scale: int) -> Tensor:

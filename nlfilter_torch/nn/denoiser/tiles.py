@@ -7,6 +7,7 @@ from itertools import groupby, product
 import torch
 from torch import Tensor
 
+from nlfilter_torch.core.blocks import reflected
 from nlfilter_torch.core.inner import EVERYWHERE, Inner
 from nlfilter_torch.core.workers import in_order
 
@@ -96,13 +97,6 @@ def _profile(length: int) -> Tensor:
 def _extended(planes: Tensor, padding: tuple[int, int, int, int]) -> Tensor:
     """Pad planes by reflection, repeatedly if they are narrower than the padding."""
     left, right, above, below = padding
-    rows = _mirrored(planes.shape[-2], above, below).to(planes.device)
-    columns = _mirrored(planes.shape[-1], left, right).to(planes.device)
+    rows = reflected(torch.arange(-above, planes.shape[-2] + below), planes.shape[-2]).to(planes.device)
+    columns = reflected(torch.arange(-left, planes.shape[-1] + right), planes.shape[-1]).to(planes.device)
     return planes[..., rows, :][..., columns]
-
-
-def _mirrored(length: int, before: int, after: int) -> Tensor:
-    """Indices of ``length`` pixels, extended on both sides by reflection."""
-    period = max(1, 2 * length - 2)
-    places = torch.arange(-before, length + after) % period
-    return torch.minimum(places, period - places)
