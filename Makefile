@@ -94,6 +94,7 @@ QUICK := \
 	'streaming_strokes --quick' \
 	'streaming_cpu --quick' \
 	'streaming_busy --quick' \
+	'busy --quick sharpen' \
 	'app --side 96 --megapixels 0.05' \
 	'denoising --quick --megapixel' \
 	'denoising --quick --patterns --methods noisy ours' \

@@ -6,7 +6,7 @@ Invalid input of any kind is reported in one sentence on standard error, with ex
 import sys
 from collections.abc import Callable, Iterable
 
-from nlfilter_torch.photo.cli import interrupts
+from nlfilter_torch.photo.cli import interrupts, waiting
 
 Commands = Callable[[], Iterable[Callable[..., None]]]
 
@@ -16,6 +16,7 @@ def main(arguments: list[str] | None = None, others: Commands = tuple) -> int:
 
     ``others`` imports and returns commands besides those of this package.
     """
+    waiting.sleep_while_waiting()
     try:
         with interrupts.handled():
             from nlfilter_torch.photo.cli.application import run

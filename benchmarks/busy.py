@@ -1,0 +1,214 @@
+"""Two threads against one beside busy processes: ``python -m benchmarks.busy [JOB ...]``.
+
+Every edit, the operator, the denoiser and steps of training take turns with one thread and with two, alone and beside
+one and two processes that keep a core busy each. Threads wait for each other as in the program
+(``nlfilter_torch.photo.cli.waiting``). With two threads nothing must take more than 1.3 times as long as with one, and
+alone not more than 1.1 times as long as where threads wait as torch has it, by spinning. Ratios are medians over
+``--repeats``. ``--spinning`` shows what spinning costs beside busy processes. ``--quick`` runs it on a small picture.
+"""
+
+import argparse
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from statistics import median
+from typing import TYPE_CHECKING, Self
+
+from benchmarks.streaming_busy import neighbours
+from benchmarks.training.figures import Figure, table
+from nlfilter_torch.photo.cli.waiting import VARIABLES, sleep_while_waiting
+
+if TYPE_CHECKING:
+    import torch
+
+NEIGHBOURS = (0, 1, 2)
+BESIDE, IDLE = 1.3, 1.1  # limits of the ratios of times
+
+JOBS = (
+    *(
+        "detail",
+        "detail of a region",
+        "sharpen",
+        "tone",
+        "denoise",
+        "recolor",
+        "colorize",
+        "defocus",
+        "mask",
+        "abstract",
+    ),
+    *("look", "operator", "operator and filter", "training step", "denoiser", "training step of the denoiser"),
+)
+
+Job = Callable[[], object]
+
+
+def picture(side: int) -> "torch.Tensor":
+    """The astronaut, (1, 3, side, side)."""
+    import skimage.data
+    import torch
+    import torch.nn.functional as F
+
+    pixels = torch.from_numpy(skimage.data.astronaut()).permute(2, 0, 1)[None].float() / 255
+    return F.interpolate(pixels, (side, side), mode="area")
+
+
+def edits(image: "torch.Tensor") -> dict[str, Job]:
+    """Every edit of an image (1, 3, H, W), by its name."""
+    import torch
+
+    from nlfilter_torch import photo, region_mask
+
+    side = image.shape[-1]
+    region, other = torch.zeros_like(image[:, :1]), torch.zeros_like(image[:, :1])
+    region[..., side * 6 // 10 : side * 7 // 10, side // 8 : side // 6] = 1  # on the suit
+    other[..., : side // 10, : side // 10] = 1
+    colours = torch.tensor([0.1, 0.3, 0.9]).view(1, 3, 1, 1) * region
+    noisy = image + 0.06 * torch.randn(image.shape, generator=torch.Generator().manual_seed(1))
+    grey = image.mean(dim=1, keepdim=True).expand_as(image)
+    look = photo.fit_look([(image[..., ::4, ::4], image[..., ::4, ::4] ** 0.8)])
+    alpha = torch.tensor([3.0, 3.0, 4.0, 1.05])
+    return {
+        "detail": lambda: photo.enhance(image, alpha),
+        "detail of a region": lambda: photo.enhance(image, alpha, region),
+        "sharpen": lambda: photo.sharpen(image),
+        "tone": lambda: photo.adjust_tone(image, contrast=1.3),
+        "denoise": lambda: photo.denoise(noisy),
+        "recolor": lambda: photo.recolor(image, colours, region),
+        "colorize": lambda: photo.colorize(grey, colours, region),
+        "defocus": lambda: photo.defocus(image, region),
+        "mask": lambda: region_mask(image, region, other),
+        "abstract": lambda: photo.abstract(image),
+        "look": lambda: photo.apply_look(image, look),
+    }
+
+
+def steps(image: "torch.Tensor") -> dict[str, Job]:
+    """The operator, and steps of training."""
+    import torch
+    from torch import nn
+
+    from nlfilter_torch import NonlocalDenoiser, NonlocalFilter, nonlocal_operator, polynomial_filter
+
+    small = image[..., : image.shape[-2] // 2, : image.shape[-1] // 2].contiguous()
+    features, layer = (
+        nn.Conv2d(3, 8, 5, padding=2),
+        NonlocalFilter(learn=("alpha", "photometric_bandwidth"), photometric_bandwidth=0.3),
+    )
+    denoiser = NonlocalDenoiser.trained()
+
+    def train() -> None:
+        (layer(small, guide=features(small)) - small).square().mean().backward()
+
+    def train_denoiser() -> None:
+        (denoiser(small, 0.1) - small).square().mean().backward()
+
+    weights = torch.tensor([0.2, 0.5, 1.0, 1.0])
+    return {
+        "operator": lambda: nonlocal_operator(image),
+        "operator and filter": lambda: polynomial_filter(nonlocal_operator(image), image, weights),
+        "training step": train,
+        "denoiser": lambda: denoiser(image, 0.1).detach(),
+        "training step of the denoiser": train_denoiser,
+    }
+
+
+def serve(name: str, side: int) -> None:
+    """Run a job with as many threads as each line of the standard input says, and print the seconds that it took."""
+    import torch
+
+    image = picture(side)
+    job = {**edits(image), **steps(image)}[name]
+    for line in sys.stdin:
+        torch.set_num_threads(int(line))
+        began = time.perf_counter()
+        job()
+        print(time.perf_counter() - began, flush=True)
+
+
+class Runner:
+    """A process that runs a job again and again; its threads sleep while they wait, or spin."""
+
+    def __init__(self, name: str, side: int, *, spinning: bool) -> None:
+        environment = {key: value for key, value in os.environ.items() if key not in VARIABLES}
+        if not spinning:
+            environment |= {key: os.environ[key] for key in VARIABLES if key in os.environ}
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "benchmarks.busy", name, "--serve", "--side", str(side)],
+            env=environment,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+
+    def __enter__(self) -> Self:
+        """Run the job once with each number of threads: what is compiled or read when it is first needed."""
+        for threads in (1, 2):
+            self.seconds(threads)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """End the process."""
+        self._process.kill()
+        self._process.communicate()
+
+    def seconds(self, threads: int) -> float:
+        """The time that the job takes with so many threads."""
+        assert self._process.stdin is not None  # for mypy
+        assert self._process.stdout is not None
+        self._process.stdin.write(f"{threads}\n")
+        self._process.stdin.flush()
+        return float(self._process.stdout.readline())
+
+
+def measure(name: str, options: argparse.Namespace) -> Iterator[Figure]:
+    """Figures of a job."""
+    ratios: dict[int, list[float]] = {count: [] for count in NEIGHBOURS}
+    losses, alone = list[float](), list[float]()
+    with ExitStack() as stack:
+        runner = stack.enter_context(Runner(name, options.side, spinning=options.spinning))
+        other = stack.enter_context(Runner(name, options.side, spinning=True))
+        for _ in range(options.repeats):
+            for count in NEIGHBOURS:
+                with neighbours(count):
+                    single, double = runner.seconds(1), runner.seconds(2)
+                ratios[count].append(double / single)
+                if count == 0:
+                    alone.append(single)
+                    losses.append(double / other.seconds(2))
+    yield Figure(f"{name}: alone with one thread", median(alone), unit="s")
+    for count in NEIGHBOURS:
+        where = "alone" if count == 0 else f"beside {count}"
+        yield Figure(f"{name}: two threads by one, {where}", median(ratios[count]), BESIDE)
+    yield Figure(f"{name}: sleeping by spinning, two threads alone", median(losses), IDLE)
+
+
+def main() -> int:
+    """Measure and print a table; return 1 if a figure falls short of its limit."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.busy", description=__doc__)
+    parser.add_argument("jobs", nargs="*", metavar="JOB", help="default: all")
+    parser.add_argument("--side", type=int, default=384, help="of the picture in pixels")
+    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--spinning", action="store_true", help="threads wait as torch has it")
+    parser.add_argument("--quick", action="store_true", help="a small picture, once, to see that everything runs")
+    parser.add_argument("--serve", action="store_true", help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.serve:
+        serve(options.jobs[0], options.side)
+        return 0
+    if options.quick:
+        options.side, options.repeats = 48, 1
+    sleep_while_waiting()
+    print(f"{os.cpu_count()} cores, load {os.getloadavg()[0]:.1f} before", flush=True)
+    figures: list[Figure] = []
+    for name in options.jobs or JOBS:
+        figures += (new := list(measure(name, options)))
+        print(table(new), flush=True)
+    return int(not options.quick and any(not each.holds for each in figures))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
