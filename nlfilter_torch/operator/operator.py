@@ -12,6 +12,7 @@ from nlfilter_torch.core.checks import (
     check_count,
     check_features,
     check_fits,
+    check_instance,
     check_order,
 )
 from nlfilter_torch.core.communicator import ALONE, Communicator
@@ -451,18 +452,33 @@ class NonlocalOperator(Batch):
 
     @full_precision
     @torch.no_grad()
-    def diagnostics(self) -> Diagnostics:
-        """Measure the quality of the operator, at several times the cost of the spectrum."""
-        spectrum, certificate = self.spectrum(), self.certify()
-        vectors = spectrum.eigenvectors.flatten(2)  # (B, R, N)
-        rank = vectors.shape[1]
-        errors = []
-        for part, eigenvalues in zip(vectors.split(16, dim=1), spectrum.eigenvalues.split(16, dim=1), strict=True):
+    def diagnostics(self, eigenvectors: int | None = None, spectrum: Spectrum | None = None) -> Diagnostics:
+        """Measure the quality of the operator, at several times the cost of the spectrum.
+
+        Args:
+            eigenvectors: how many of them are formed and measured, evenly spread over the spectrum; fewer take less
+                time. None is all.
+            spectrum: :meth:`spectrum` of this operator, if it has been computed.
+
+        Raises:
+            TypeError, ValueError: if ``eigenvectors`` is not a positive integer, or ``spectrum`` is none.
+        """
+        spectrum, certificate = self.spectrum() if spectrum is None else spectrum, self.certify()
+        check_instance(spectrum, Spectrum, "spectrum", "take operator.spectrum()")
+        rank = spectrum.eigenvalues.shape[1]
+        if eigenvectors is None:
+            numbers, vectors = list(range(rank)), spectrum.eigenvectors.flatten(2)  # (B, K, N)
+        else:
+            check_count(eigenvectors, "eigenvectors")
+            numbers = torch.linspace(0, rank - 1, min(eigenvectors, rank)).round().long().tolist()
+            vectors = spectrum.some_eigenvectors(numbers).flatten(2)
+        values, errors = spectrum.eigenvalues[:, numbers], list[Tensor]()
+        for part, eigenvalues in zip(vectors.split(16, dim=1), values.split(16, dim=1), strict=True):
             error = (self.matmul(part) - eigenvalues.unsqueeze(2) * part).square()
             errors.append(weighted(error, self.weights).sum(2))
         residual = self.communicator.sum(torch.cat(errors, dim=1)).sqrt()
         inner = self.communicator.sum(weighted(vectors, self.weights) @ vectors.mT)
-        occupied = torch.diag_embed(spectrum.support[:, :rank].to(vectors))
+        occupied = torch.diag_embed(spectrum.support[:, numbers].to(vectors))
         matrix = KernelMatrix(self.factor, self.diagonal, self.weights, self.communicator)
         kernel_sums = matrix.affinities(matrix.moment(torch.ones_like(self.scaling))) + self.diagonal
         if self.weights is not None:

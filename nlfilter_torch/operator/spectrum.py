@@ -185,6 +185,26 @@ class Spectrum(Batch, RitzPairs):
         vectors = (vectors * self.support.unsqueeze(1))[:, :, : self.eigenvalues.shape[1]]
         return (self.root @ self._constant_first(vectors)).mT.to(self.factor)
 
+    @torch.no_grad()
+    @full_precision
+    def some_eigenvectors(self, numbers: Sequence[int]) -> Tensor:
+        """Form the K eigenvectors with these numbers, counted from 0, (B, K, ...), without a gradient.
+
+        Raises:
+            ValueError: if there is no eigenvector of a number.
+
+        Example:
+            >>> from nlfilter_torch import nonlocal_operator
+            >>> spectrum = nonlocal_operator(torch.rand(1, 1, 24, 32), num_landmarks=20).spectrum()
+            >>> torch.allclose(spectrum.some_eigenvectors([0, 7]), spectrum.eigenvectors[:, [0, 7]], atol=1e-6)
+            True
+        """
+        rank = self.eigenvalues.shape[1]
+        if not all(0 <= number < rank for number in numbers):
+            raise ValueError(f"numbers must be from 0 to {rank - 1}, got {list(numbers)}; leave out the others")
+        basis = self._rows(self.ritz.vectors)[:, list(numbers)] @ self.factor
+        return (basis * self.scaling.unsqueeze(1)).unflatten(2, self.size)
+
     @full_precision
     def eigenvectors_at(self, columns: Columns) -> Tensor:
         """Extend the eigenvectors to points that the operator was not made from, (B, R, n).

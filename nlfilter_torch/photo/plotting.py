@@ -74,11 +74,10 @@ def show_eigenvectors(
 
     If none remains, as for a flat picture, the first, constant eigenvector is drawn.
     """
-    vectors = spectrum.eigenvectors[0].numpy(force=True)
-    shown = [number for number in numbers if number <= len(vectors)] or [1]
+    shown = [number for number in numbers if number <= spectrum.eigenvalues.shape[1]] or [1]
+    vectors = spectrum.some_eigenvectors([number - 1 for number in shown])[0].numpy(force=True)
     figure, axes = _panels(vectors.shape[1:], len(shown), columns=math.ceil(math.sqrt(len(shown))), side=side)
-    for axis, number in zip(axes, shown, strict=True):
-        vector = vectors[number - 1]
+    for axis, number, vector in zip(axes, shown, vectors, strict=True):
         title = f"Eigenvector {number}, eigenvalue {float(spectrum.eigenvalues[0, number - 1]):.4f}"
         _draw(axis, title, vector, limit=_limit(vector), colours="RdBu_r")
     return figure

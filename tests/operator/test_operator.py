@@ -246,6 +246,16 @@ def test_diagnostics_are_measured() -> None:
     assert figures.eigenvector_residual == [pytest.approx(residual, abs=1e-8)]
     gram = v @ v.mT - torch.eye(v.shape[1], dtype=torch.float64)
     assert figures.orthogonality == [pytest.approx(gram.abs().max().item(), abs=1e-8)]
+    numbers = [0, 16, 33, len(v[0]) - 1]  # evenly spread
+    few = operator.diagnostics(4, spectrum)
+    residual = (v @ w - spectrum.eigenvalues.unsqueeze(2) * v)[:, numbers].norm(dim=2).max().item()
+    assert few.eigenvector_residual == [pytest.approx(residual, abs=1e-8)]
+    assert few.rank == figures.rank
+    assert operator.diagnostics(1000).eigenvector_residual == pytest.approx(figures.eigenvector_residual)
+    with pytest.raises(ValueError, match="eigenvectors must be at least 1"):
+        operator.diagnostics(0)
+    with pytest.raises(TypeError, match="spectrum must be"):
+        operator.diagnostics(4, spectrum.eigenvalues)  # type: ignore[arg-type]
 
 
 def test_diagnostics_tell_where_the_plain_method_breaks() -> None:

@@ -25,6 +25,8 @@ from nlfilter_torch.photo.declared.presets import PRESETS
 if TYPE_CHECKING:
     from nlfilter_torch.photo.cli.folders import Tally
 
+NAMED = 5  # subfolders that are left out and named
+
 Folder = Annotated[Path, typer.Argument(metavar="IN_DIR", help="The folder that holds the photographs.")]
 Target = Annotated[
     Path,
@@ -85,7 +87,7 @@ def batch(
     step_of(EDITS["detail"], values)
 
     from nlfilter_torch.photo.cli.editing import allowed_memory, check_workers
-    from nlfilter_torch.photo.cli.folders import Tally, edit_folder, left_out, pictures, prepare
+    from nlfilter_torch.photo.cli.folders import Tally, edit_folder, left_out, pictures, prepare, subfolders
     from nlfilter_torch.photo.cli.progress import steps
     from nlfilter_torch.photo.io.rows import WHOLE, free_memory
 
@@ -101,6 +103,11 @@ def batch(
     prepare(paths, target, settings)
     if others := left_out(folder):
         _tell(f"left out {others}; convert them to PNG, JPEG, TIFF, WebP or AVIF if they are photographs")
+    if names := subfolders(folder, target):
+        more = f" and {len(names) - NAMED} others" if len(names) > NAMED else ""
+        _tell(
+            f"left out the subfolders {', '.join(names[:NAMED])}{more}; run the command on each that holds photographs"
+        )
     tally, interrupted = Tally(), False
     count = min(workers or _cores(), len(paths))
     room = memory  # of a worker; None is as much as the command of an edit uses

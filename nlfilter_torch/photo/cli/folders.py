@@ -75,6 +75,12 @@ def left_out(folder: Path) -> str:
     return ", ".join(f"{count} {suffix}" for suffix, count in sorted(suffixes.items()))
 
 
+def subfolders(folder: Path, target: Path) -> list[str]:
+    """Names of the folders in a folder, without hidden ones and the folder ``target``."""
+    inner = sorted(path for path in folder.iterdir() if path.is_dir() and not path.name.startswith("."))
+    return [path.name for path in inner if path.resolve() != target.resolve()]
+
+
 def prepare(paths: Sequence[Path], target: Path, settings: Mapping[str, object]) -> None:
     """Create the output folder, or check that an earlier run with the same settings began it.
 

@@ -296,7 +296,8 @@ def _slider_regions(
 ) -> tuple[Regions, Tensor]:
     """Read K regions and their sliders (K, k+1) from ``--mask`` and ``--region``, or one of them.
 
-    The mask, and rectangles without their own sliders, have the sliders ``alpha`` (k+1,).
+    The mask, and rectangles without their own sliders, have the sliders ``alpha`` (k+1,). All that has the same sliders
+    is one region, as in the editor and in other commands, so that the time does not grow with the number of rectangles.
     """
     rectangles, sliders = [], [] if path is None else [alpha]
     for text in texts or []:
@@ -307,8 +308,9 @@ def _slider_regions(
                 f"--region must have as many sliders as --alpha, {len(alpha)}, got {len(own)} in {text!r}; "
                 "add or drop some"
             )
-        rectangles.append((rectangle, slice(len(sliders), len(sliders) + 1), [1.0]))
-        sliders.append(own)
+        number = next((k for k, others in enumerate(sliders) if torch.equal(others, own)), len(sliders))
+        rectangles.append((rectangle, slice(number, number + 1), [1.0]))
+        sliders += [own] if number == len(sliders) else []
     return Regions((*size, len(sliders)), _picture(size, path, read), rectangles).checked(), torch.stack(sliders)
 
 

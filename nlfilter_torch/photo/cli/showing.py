@@ -4,8 +4,9 @@ Also other notes on what an edit does to a photograph.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from operator import itemgetter
 from pathlib import Path
 
 import torch
@@ -53,11 +54,14 @@ class Scribbled:
             raise ValueError("--show needs scribbles; give --region X,Y,W,H, or omit --show")
 
     def tell_colours(self) -> None:
-        """Print the colour under each rectangle, and a note on standard error if it covers very different colours."""
+        """Print the colour under each rectangle, and a note on standard error if some cover very different colours."""
         for option, overlay in overlays(self.edit, self.drawn):
+            shares = dict[str, float]()
             for rectangle, _, _ in overlay.rectangles:
                 pixels = self.rows.read(rectangle.rows)[..., rectangle.columns].float().clamp(0, 1).flatten(2)
-                tell_colour(f"{option} {rectangle}", option, pixels)
+                place = f"{option} {rectangle}"
+                shares[place] = tell_colour(place, pixels)
+            note_mixed(shares, option)
 
     def show(self, target: Path, edit_at: Callable[[tuple[int, int], float], PhotoEdit]) -> None:
         """Write the photograph, reduced, with scribbles and mask over it.
@@ -86,18 +90,27 @@ class Scribbled:
         write_photograph(Photograph(shown), target)
 
 
-def tell_colour(place: str, option: str, pixels: Tensor) -> None:
-    """Print the colour of the pixels (1, C, n) under a rectangle."""
+def tell_colour(place: str, pixels: Tensor) -> float:
+    """Print the colour of the pixels (1, C, n) under a rectangle; return the share that differs strongly from it."""
     middle = pixels.median(2).values
     red, green, blue = (middle[0].expand(3) * 255).round().int().tolist()
     typer.echo(f"{place}: {pixels.shape[2]} pixels, median colour #{red:02x}{green:02x}{blue:02x}")
-    share = unlike(pixels, middle)
-    if share > NOTE_SHARE:
-        note(
-            f"{place} covers very different colours: {100 * share:.0f} % of its pixels differ strongly from "
-            f"the median; mark each part separately, with a smaller {option} on each, and check them with "
-            "--show FILE"
-        )
+    return unlike(pixels, middle)
+
+
+def note_mixed(shares: Mapping[str, float], option: str) -> None:
+    """Print one note on all rectangles of an option that cover very different colours, by the shares of these."""
+    mixed = {place: share for place, share in shares.items() if share > NOTE_SHARE}
+    if not mixed:
+        return
+    place, share = max(mixed.items(), key=itemgetter(1))
+    others = f", and {len(mixed) - 1} more of {len(shares)}," if len(mixed) > 1 else ""
+    cover, whose = ("cover", "the first one's") if others else ("covers", "its")
+    note(
+        f"{place}{others} {cover} very different colours: {100 * share:.0f} % of {whose} pixels differ "
+        f"strongly from the median; mark each part separately, with a smaller {option} on each, and check "
+        "them with --show FILE"
+    )
 
 
 def drawn_over(image: Tensor, mask: Tensor, colours: Tensor | None, painted: Tensor, kept: Tensor | None) -> Tensor:

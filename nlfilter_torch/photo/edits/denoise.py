@@ -189,7 +189,9 @@ class Denoise(FilteredEdit):
             hint = NO_ESTIMATE if estimated and not bool(noise.levels.any()) else ""
             return f"{text}, less than {LEVELS * NEGLIGIBLE_NOISE:.1f}; no pixel changed{hint}"
         weak = "" if change >= VISIBLE_LEVELS else ", which is barely visible"
-        remedy = "; --strength 2 removes more" if weak and estimated and 0 < float(self.strength) < 2 else ""
+        remedy = ""
+        if weak and estimated and 0 < float(self.strength) < 2:  # a clean photograph has nothing more to lose
+            remedy = "; --strength 2 removes more" if level >= VISIBLE_LEVELS else ", as is the noise"
         return f"{text}; {super().summary(change)}{weak}{remedy}"
 
 

@@ -13,7 +13,7 @@ import pytest
 from PIL import Image
 
 from nlfilter_torch.photo.cli import main
-from nlfilter_torch.photo.cli.folders import RECORD, Tally, pictures, prepare
+from nlfilter_torch.photo.cli.folders import RECORD, Tally, pictures, prepare, subfolders
 from nlfilter_torch.photo.declared.presets import PRESETS, Recipe
 from nlfilter_torch.photo.declared.steps import Step
 from tests.folders import fill, finished, refused
@@ -91,7 +91,15 @@ def test_files_of_other_types_are_mentioned(
     assert capsys.readouterr().err == (
         "nlfilter-torch: left out 2 .heic, 1 without a suffix; convert them to PNG, JPEG, TIFF, WebP or AVIF if they "
         "are photographs\n"
+        "nlfilter-torch: left out the subfolders folder.dng; run the command on each that holds photographs\n"
     )
+
+
+def test_subfolders_are_named_but_for_that_of_the_results(tmp_path: Path) -> None:
+    for name in ("b", "a", ".hidden", "out"):
+        (tmp_path / name).mkdir()
+    (tmp_path / "c.png").touch()
+    assert subfolders(tmp_path, tmp_path / "out") == ["a", "b"]
 
 
 def test_interrupted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

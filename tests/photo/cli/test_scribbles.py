@@ -257,3 +257,13 @@ def test_colours_and_their_mask() -> None:
     assert torch.equal(tensors.colours, torch.cat([red, torch.zeros_like(red), blue], dim=1))
     (mask,) = tensors.masks.values()
     assert torch.equal(mask, red + blue)
+
+
+def test_rectangles_of_the_same_sliders_are_one_region() -> None:
+    texts = ["2,3,4,5", "20,3,4,5:1,2,3", "2,13,4,5:3,2,1", "40,3,4,5:1,2,3"]
+    drawn = at_once(EDITS["detail"], of_edit(EDITS["detail"], (3.0, 2.0, 1.0), SIZE, ScribbleOptions(texts), unread))
+    assert drawn.sliders is not None
+    assert drawn.sliders.tolist() == [[3, 2, 1], [1, 2, 3]]
+    regions = drawn.masks["regions"]
+    assert torch.equal(regions[0, 0], (box(3, 2, 5, 4, SIZE) + box(13, 2, 5, 4, SIZE))[0, 0])
+    assert torch.equal(regions[0, 1], (box(3, 20, 5, 4, SIZE) + box(3, 40, 5, 4, SIZE))[0, 0])

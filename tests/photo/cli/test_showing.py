@@ -68,6 +68,16 @@ def test_a_scribble_over_unlike_things(photo: Path, tmp_path: Path, capsys: pyte
     assert "mark each part separately, with a smaller --region on each, and check them with --show FILE" in said
 
 
+def test_many_scribbles_over_unlike_things_have_one_note(
+    photo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    regions = [f"--region={x},28,18,8:blue" for x in (40, 24, 41)]
+    assert main(["recolor", str(photo), str(tmp_path / "out.png"), *regions]) == 0
+    said = capsys.readouterr().err
+    assert said.count("note: --region 4") == said.count("very different colours") == 1
+    assert "and 1 more of 3, cover very different colours: " in said
+
+
 @pytest.mark.parametrize(
     ("verb", "scribbles"),
     [
