@@ -42,6 +42,7 @@ def edit_luminance(image: Tensor, edit: Callable[[Tensor], Tensor]) -> Tensor:
 
 MAX_COLOURS = 16
 SAME_COLOUR = 0.05  # chroma difference in units of RGB below which strokes have the same colour
+MOST_COMPARED = 2048  # colours of strokes that are compared with each other; more are painted in photographs only
 
 
 def split_luminance(image: Tensor) -> tuple[Tensor, Tensor]:
@@ -107,23 +108,33 @@ def region_means(image: Tensor, regions: Tensor) -> Tensor:
 
 
 def _label(chroma: Tensor, painted: Tensor) -> Tensor:
-    """Colour index (N,) of each painted pixel of chroma (3, N), -1 for the others."""
-    paint = chroma[:, painted]  # (3, n)
-    numbers = torch.full_like(paint[0], -1, dtype=torch.long)
-    # The commonest colour comes first, whatever its place: the groups turn with the picture.
+    """Colour index (N,) of each painted pixel of chroma (3, N), -1 for the others.
+
+    The groups depend on the painted colours alone, not on their places, so that they turn with the picture: each
+    leader is the colour around which most pixels are left, and every pixel belongs to the nearest leader.
+    """
+    paint = chroma[:, painted].double()  # (3, n)
     cells, cell = (paint / (SAME_COLOUR / 2)).round().unique(dim=1, return_inverse=True)
-    leaders: list[Tensor] = []
-    while len(leaders) < MAX_COLOURS and bool((numbers < 0).any()):
-        left = numbers < 0
-        common = cell[left].bincount(minlength=cells.shape[1]).argmax()
-        leader = paint[:, left & (cell == common)].double().mean(1, keepdim=True).to(paint)  # (3, 1)
-        numbers[left & ((paint - leader).norm(dim=0) < SAME_COLOUR)] = len(leaders)
-        leaders.append(leader)
-    left = numbers < 0
-    if bool(left.any()):
-        distance = (paint[:, left].unsqueeze(2) - torch.cat(leaders, 1).unsqueeze(1)).norm(dim=0)
-        numbers[left] = distance.argmin(1)
-    return torch.full_like(painted, -1, dtype=torch.long).masked_scatter(painted, numbers)
+    counts = cell.bincount(minlength=cells.shape[1])
+    means = torch.zeros_like(cells).index_add(1, cell, paint) / counts
+    common = counts.argsort(descending=True, stable=True)[:MOST_COMPARED]
+    leaders = means[:, common[_densest(means[:, common], counts[common])]]
+    nearest = (means.unsqueeze(2) - leaders.unsqueeze(1)).norm(dim=0).argmin(1)
+    return torch.full_like(painted, -1, dtype=torch.long).masked_scatter(painted, nearest[cell])
+
+
+def _densest(colours: Tensor, counts: Tensor) -> list[int]:
+    """Indices of up to 16 colours (3, c) with the most pixels, by counts (c,), of about the same colour.
+
+    Pixels of about the same colour as an earlier one count no more.
+    """
+    colour, similar = ((colours.unsqueeze(2) - colours.unsqueeze(1)).norm(dim=0) < SAME_COLOUR).nonzero(as_tuple=True)
+    left, leaders = counts, list[int]()
+    while len(leaders) < MAX_COLOURS and bool((left > 0).any()):
+        sums = torch.zeros_like(left).index_add(0, colour, left[similar])
+        leaders.append(int(torch.where(left > 0, sums, -1).argmax()))
+        left = left.index_fill(0, similar[colour == leaders[-1]], 0)
+    return leaders
 
 
 def colour_guide(image: Tensor) -> Tensor:

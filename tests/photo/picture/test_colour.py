@@ -111,3 +111,26 @@ def test_means_of_regions_are_exact_on_large_images() -> None:
     image = 0.9 + 0.1 * noise(1, 3, 1400, 1400, dtype=torch.float32)
     wanted = (image.double() * mask.double()).sum((2, 3)) / mask.double().sum()
     torch.testing.assert_close(region_means(image, mask)[:, 0].double(), wanted, rtol=0, atol=1e-7)
+
+
+def test_groups_of_colours_depend_on_the_colours_alone() -> None:
+    """The order of the pixels, which changes when a picture is turned, does not matter."""
+    chroma = split_luminance(colour("coffee", 24, 30))[1]
+    painted = torch.ones(1, 1, 24, 30)
+    regions, means, valid = group_colours(chroma, painted)
+    assert valid.all()
+    assert 3 < regions.shape[1] <= 16
+    order = torch.randperm(24 * 30, generator=torch.Generator().manual_seed(0))
+    mixed = chroma.flatten(2)[..., order].unflatten(2, (24, 30))
+    other, other_means, _ = group_colours(mixed, painted)
+    torch.testing.assert_close(other_means, means)
+    assert torch.equal(other.flatten(2), regions.flatten(2)[..., order])
+
+
+def test_groups_have_the_colours_of_most_pixels_and_take_in_the_nearest() -> None:
+    """Between two colours, each with a few pixels that differ a little, lies a third, nearer to the rarer of them."""
+    line = [0.0] * 30 + [0.02] * 5 + [0.2] * 12 + [0.22] * 3 + [0.13]
+    chroma = torch.tensor(line).view(1, 1, 1, -1) * torch.tensor([1.0, 0.0, -1.0]).view(1, 3, 1, 1)
+    regions, means, _ = group_colours(chroma, torch.ones(1, 1, 1, len(line)))
+    assert regions[0, :, 0].sum(1).tolist() == [35.0, 15.0, 1.0]
+    torch.testing.assert_close(means[0, :, 0], torch.tensor([0.1 / 35, (12 * 0.2 + 3 * 0.22) / 15, 0.13]))
