@@ -52,11 +52,12 @@ def cells(edit: Edit, parameter: Parameter) -> tuple[str, ...]:
         shown = ""
     else:
         shown = ", ".join(f"{slider:g}" for slider in value) if isinstance(value, tuple) else f"{value}"
-    spans = {"choice": ", ".join(parameter.choices), "sliders": f"{parameter.low:g} to {parameter.high:g}, each"}
+    each = f"{parameter.low:g} to {parameter.high:g}, each"
+    spans = {"choice": ", ".join(parameter.choices), "sliders": each, "lattice": each}
     span = spans.get(parameter.kind, f"{parameter.low:g} to {parameter.high:g}")
     unit = UNITS[parameter.unit][0] or {"gain": "times"}.get(parameter.unit, "")
     words = " or ".join(parameter.words)
-    name = f"`{parameter.keyword}`" if parameter.is_option else "`alpha` of a region"
+    name = f"`{parameter.keyword}`" if parameter.is_argument else "`alpha` of a region"
     return f"`{parameter.name}`", shown, f"{span}{', or ' + words if words else ''}", unit, name, parameter.help
 
 

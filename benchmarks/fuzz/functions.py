@@ -335,7 +335,8 @@ FUNCTIONS = {
         | {"alpha": lambda scene: 4 * scene.noise(scene.order + 1), "bands": lambda scene: 2 * scene.noise(7)}
         | {"matrix": lambda scene: scene.noise(9), "amount": _number(0, 2)}
         | {"texture": lambda scene: 2 * scene.noise(6), "saturation": lambda scene: 2 * scene.noise(5)}
-        | {"stretch": lambda scene: scene.noise(3), "local": lambda scene: scene.noise(8)},
+        | {"stretch": lambda scene: scene.noise(3), "local": lambda scene: scene.noise(8)}
+        | {"lattice": lambda scene: scene.noise(3, 3, 3, 3)},
     ),
     "fit_look": Function(
         _fitted_look,

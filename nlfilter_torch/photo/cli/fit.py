@@ -60,6 +60,7 @@ CALLED = {
     "saturation": "saturation",
     "stretch": "automatic levels",
     "local": "local contrast",
+    "lattice": "a lattice of colours",
 }
 
 

@@ -21,10 +21,11 @@ DISTANCES = (0.01, 1e6)  # spatial bandwidths, in pixels
 MAX_SLIDERS = 100
 MAX_PATCH = 99  # pixels
 MAX_LANDMARKS = 10_000
+MAX_NODES = 65  # along each axis of a lattice of colours
 
 #: Arguments of a function by their names, of the types that the declaration of an edit tells.
 Arguments = dict[str, Any]
-Kind = Literal["number", "count", "odd", "choice", "sliders"]
+Kind = Literal["number", "count", "odd", "choice", "sliders", "lattice"]
 Unit = Literal["", "levels", "lab", "px", "%", "gain"]
 Domain = Literal["positive", "not negative", "share", "up to 10", "below 1", "finite", "count", "choice"]
 
@@ -93,6 +94,7 @@ class Parameter:
         metavar: placeholder of a value in the help, if it is not that of the unit.
         slider: the editor's slider.
         is_option: whether the command has an option for it.
+        is_argument: whether the function takes it under its name.
         length: length of a list; 0 is any.
         panel: title of its section in the help of the command; without one it is among the edit's main options.
         per_image: whether the function also takes a tensor with one value for each image.
@@ -117,6 +119,7 @@ class Parameter:
     metavar: str | None = None
     slider: Slider | None = None
     is_option: bool = True
+    is_argument: bool = True
     length: int = 0
     panel: str | None = None
     per_image: bool = False
@@ -154,6 +157,7 @@ class Parameter:
             "odd": f"an odd number {span}",
             "choice": f"{', '.join(named[:-1])} or {''.join(named[-1:])}",
             "sliders": f"a list of {self.length or f'2 to {MAX_SLIDERS}'} numbers {span}",
+            "lattice": f"a list of 3 n^3 numbers, n from 2 to {MAX_NODES}",
         }[self.kind]
         alternatives = [f'"{word}"' for word in self.words] + ["null"] * self.optional
         return ", or ".join([text, *alternatives])
@@ -168,6 +172,12 @@ class Parameter:
             return (
                 isinstance(value, list | tuple)
                 and (self.length or 2) <= len(value) <= (self.length or MAX_SLIDERS)
+                and all(is_within(v, *GAINS) for v in value)
+            )
+        if self.kind == "lattice":
+            return (
+                isinstance(value, list | tuple)
+                and nodes_of(len(value)) is not None
                 and all(is_within(v, *GAINS) for v in value)
             )
         if self.kind == "number":
@@ -245,6 +255,16 @@ class Parameter:
                 checks.check_number(value, name, "pass a float or None" if self.unit == "%" else "pass a float")
             if self.domain is not None:
                 checks.check_values(value, name, self.domain, batch, self.zero_meaning)
+
+
+def nodes_of(count: int) -> int | None:
+    """Nodes n along each axis of a lattice of 3 n^3 numbers, from 2 to :data:`MAX_NODES`, or None.
+
+    >>> nodes_of(3 * 9**3), nodes_of(100)
+    (9, None)
+    """
+    nodes = round((count / 3) ** (1 / 3))
+    return nodes if 2 <= nodes <= MAX_NODES and 3 * nodes**3 == count else None
 
 
 ScribbleKind = Literal["colours", "mask", "sliders"]

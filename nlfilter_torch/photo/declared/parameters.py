@@ -59,6 +59,7 @@ DETAIL = Edit(
             "The sliders inside the region selected by the strokes, as many as in alpha. Default: 1 for each.",
             optional=True,
             is_option=False,  # given by --region
+            is_argument=False,
         ),
         gain(
             "residual",

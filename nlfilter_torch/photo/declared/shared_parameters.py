@@ -39,6 +39,7 @@ class Further(Presentation, total=False):
     min_pixels: float
     metavar: str
     is_option: bool
+    is_argument: bool
     length: int
     per_image: bool
 
@@ -272,6 +273,17 @@ LOOK = Edit(
             idle=(0.0,) * 8,
             metavar="A,B,...,H",
             length=8,
+        ),
+        Parameter(
+            "lattice",
+            "lattice",
+            None,
+            "Changes of red, then of green, then of blue at the nodes of a grid of colours: n equal steps of red from "
+            "0 to 1, each with n of green, each with n of blue. In between they are interpolated. Default: none.",
+            *GAINS,
+            optional=True,
+            idle=None,
+            is_option=False,  # too long; files hold it
         ),
         gain(
             "amount",

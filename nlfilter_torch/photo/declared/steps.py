@@ -112,7 +112,7 @@ class Step:
 
     def arguments(self, size: tuple[int, int], stride: float = 1) -> Arguments:
         """Return the arguments of the edit's function for an image of that size; see :meth:`Parameter.argument_of`."""
-        return {p.keyword: p.argument_of(self[p.name], size, stride) for p in self.declared if p.is_option}
+        return {p.keyword: p.argument_of(self[p.name], size, stride) for p in self.declared if p.is_argument}
 
     def filter_options(self, size: tuple[int, int]) -> Arguments:
         """Return the options of :func:`nonlocal_operator` for an image of size (H, W), the viewing size."""

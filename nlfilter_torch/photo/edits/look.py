@@ -15,6 +15,7 @@ from nlfilter_torch.photo.declared.declaration import Edit
 from nlfilter_torch.photo.declared.shared_parameters import LOOK
 from nlfilter_torch.photo.edits.synthesis import Polynomial
 from nlfilter_torch.photo.looks.histogram import LocalCurves, Stretch, ramps, tones
+from nlfilter_torch.photo.looks.lattice import lattice_of
 from nlfilter_torch.photo.looks.look_filter import BAND_MARGIN, acts, band_change, check_part, pointwise, texture_change
 from nlfilter_torch.photo.picture.drawn import Drawn, M
 from nlfilter_torch.photo.picture.edit import FilteredEdit, Rows
@@ -40,6 +41,7 @@ def apply_look(
     saturation: Numbers = LOOK.defaults["saturation"],
     stretch: Numbers = LOOK.defaults["stretch"],
     local: Numbers = LOOK.defaults["local"],
+    lattice: Numbers | None = LOOK.defaults["lattice"],
     amount: float | Tensor = LOOK.defaults["amount"],
     viewing_size: float = LOOK.defaults["viewing_size"],
     photometric_bandwidth: float | Tensor | str = LOOK.defaults["photometric_bandwidth"],
@@ -71,6 +73,9 @@ def apply_look(
         local: strengths (8,) or (B, 8) of adaptive histogram equalisation with contrast limited to 1.5, 2, 3 and 5
             times: four of the change of luminance, then four of the change of the largest channel, by which the pixel
             is scaled; 0 is none. Histograms are those of 8 x 8 tiles of the picture.
+        lattice: changes of colours at the nodes of a grid, (3, n, n, n) or (B, 3, n, n, n), or the 3 n^3 numbers in
+            this order: of red, green and blue, at n equal steps of red, of green and of blue from 0 to 1; interpolated
+            in tetrahedra. Colours outside [0, 1] change as the nearest inside. None is none.
         amount: a number or a tensor of shape () or (B,); 1 is the look, 0 the image.
         viewing_size: in megapixels; the details of a larger image are those of its reduction to this size; 0 is the
             size of the image.
@@ -107,6 +112,7 @@ def apply_look(
         saturation=saturation,
         stretch=stretch,
         local=local,
+        lattice=lattice,
         amount=amount,
         viewing_size=viewing_size,
         photometric_bandwidth=photometric_bandwidth,
@@ -136,6 +142,7 @@ class LookEdit(FilteredEdit):
     saturation: Numbers
     stretch: Numbers
     local: Numbers
+    lattice: Numbers | None
     amount: float | Tensor
     viewing_size: float
 
@@ -159,7 +166,9 @@ class LookEdit(FilteredEdit):
         fitted = fit_change(source, change, whole_image, self.viewing_size, "none")
         strength = torch.as_tensor(self.amount).to(source.dtype).reshape(-1, 1, 1, 1)
         light = _change_of_light(source, parts["stretch"], parts["local"])
-        result = UnderLook(fitted, light, parts["curves"], parts["matrix"], parts["saturation"], strength)
+        colours = {name: parts[name] for name in ("curves", "matrix", "saturation")}
+        lattice = parts["lattice"] if "lattice" in parts and acts(parts["lattice"], 0.0) else None
+        result = UnderLook(fitted, light, **colours, lattice=lattice, strength=strength)
         if fitted.finish is None:
             return Fitted(result.pixels)
         return Fitted(result.planes, result.finish, fitted.margin)
@@ -183,7 +192,8 @@ class LookEdit(FilteredEdit):
             raise ValueError(f"matrix must be 9 numbers, row by row, got {colours.shape[-1]}; add or drop some")
         order = ("alpha", "bands", "texture", "curves", "matrix", "saturation", "stretch", "local")
         parts["matrix"] = colours.unflatten(-1, (3, 3))
-        return {name: parts[name] for name in order}
+        parts = {name: parts[name] for name in order}
+        return parts if self.lattice is None else parts | {"lattice": _lattice(self.lattice, dtype)}
 
     def _change(self, parts: dict[str, Tensor], viewed: Source[M]) -> Fitted:
         """The change of detail of a picture at the viewing size."""
@@ -239,6 +249,7 @@ class UnderLook:
         curves: tone curves.
         matrix: of colours.
         saturation: factors of the saturation.
+        lattice: changes on a grid of colours; None if there are none.
         strength: amount of the look, (B or 1, 1, 1, 1).
     """
 
@@ -247,6 +258,7 @@ class UnderLook:
     curves: Tensor
     matrix: Tensor
     saturation: Tensor
+    lattice: Tensor | None
     strength: Tensor
 
     def pixels(self, pixels: Pixels) -> Tensor:
@@ -263,7 +275,7 @@ class UnderLook:
         moved, light = (planes, None) if self.light is None else planes.tensor_split([-image.shape[1]], dim=1)
         moved = moved if self.fitted.finish is None else self.fitted.finish(image, moved, inner)
         coloured = image.expand(-1, 3, -1, -1)
-        colours = pointwise(coloured, self.curves, self.matrix, self.saturation) - coloured
+        colours = pointwise(coloured, self.curves, self.matrix, self.saturation, self.lattice) - coloured
         colours = reduce_channels(colours, "luminance") if image.shape[1] == 1 else colours
         shown = image + self.strength * (moved - image + colours)
         return shown if light is None else shown + self.strength * light
@@ -313,6 +325,12 @@ class ChangeOfLight:
             levels = self.stretch.change(pixels.image, self.levels)
             change = levels if change is None else change + levels
         return no_change(pixels) if change is None else change
+
+
+def _lattice(value: Numbers, dtype: torch.dtype) -> Tensor:
+    """A lattice as a tensor (3, n, n, n), or with a dimension of the images before; 3 n^3 numbers take this shape."""
+    numbers = _numbers(value, "lattice", dtype)
+    return numbers if numbers.ndim > 2 else lattice_of(numbers)
 
 
 def _numbers(value: Numbers, name: str, dtype: torch.dtype) -> Tensor:

@@ -1,7 +1,7 @@
 """Looks from pairs of photographs before and after an edit."""
 
 from collections.abc import Collection, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import reduce
 
 import torch
@@ -16,6 +16,7 @@ from nlfilter_torch.photo.declared.shared_parameters import KNOTS, SATURATIONS, 
 from nlfilter_torch.photo.declared.steps import Step, json_of
 from nlfilter_torch.photo.edits.applying import apply_step
 from nlfilter_torch.photo.look_fitting.alignment import inside_frame
+from nlfilter_torch.photo.look_fitting.kept_pixels import KeptPixels, squares
 from nlfilter_torch.photo.look_fitting.look_choice import (
     CHOICES,
     RIDGES,
@@ -27,12 +28,12 @@ from nlfilter_torch.photo.look_fitting.look_choice import (
 )
 from nlfilter_torch.photo.look_fitting.look_pixels import EditedPhotograph, PixelSample
 from nlfilter_torch.photo.look_fitting.look_sums import Layout, Parts, Sums
+from nlfilter_torch.photo.looks.lattice import lattice_of
 from nlfilter_torch.photo.looks.look_filter import NAMES
 
 Pair = tuple[Tensor, ...]  # before and after an edit, and masks of regions, if any
 SLIDERS: Parts = ("alpha",)  # of looks that are steps of detail
 FOLDS = 5  # of cross-validation, among which the pairs are divided
-SQUARES = 3  # a single pair is divided into so many parts along each side, which are the folds
 STIFF, STIFF_ALONE = 3e-3, 1e-2  # smallest ridge of tone curves and saturation, for several pairs and for one
 SLIDERS_ONLY = 0.98  # share of the change from which on an edit counts as one by sliders alone
 LIKELY = 0.95  # share that the layers of a sample of the pixels explain of such an edit
@@ -48,7 +49,7 @@ class FittedLook:
     Attributes:
         step: the look as a step of an edit, of ``look``, or of ``detail`` if sliders alone explain the edits.
         parts: what it consists of: ``alpha``, ``bands``, ``texture``, ``tone`` (one curve) or ``curves``, ``matrix``,
-            ``saturation``, ``stretch`` and ``local``.
+            ``saturation``, ``stretch``, ``local`` and ``lattice``.
         fitted: share of the change of the pairs that it explains, 1 at best, clipped values aside.
         left_out: share of the change of pairs, or of parts of a single picture, explained by looks fitted without them.
         explained: the same two for every choice of parts that was tried.
@@ -73,6 +74,8 @@ class FittedLook:
         matrix = torch.tensor(self.step["matrix"]).view(3, 3)
         named = {name: torch.tensor(self.step[name]) for name in ("alpha", "bands", "texture")}
         others = {name: torch.tensor(self.step[name]) for name in ("saturation", "stretch", "local")}
+        if self.step["lattice"] is not None:
+            others["lattice"] = lattice_of(torch.tensor(self.step["lattice"]))
         return {**named, "curves": curves, "matrix": matrix, **others}
 
     def to_json(self) -> str:
@@ -95,15 +98,17 @@ def fit_look(
     The fit is a least-squares problem in closed form, from small sums over 65,536 pixels of each pair, or over all
     pixels of a smaller one. One pair is in memory at a time. The parts of the look and the strength of a ridge are
     chosen by cross-validation over the pairs. A single pair is divided into ninths, which say little about other
-    pictures; the look is then kept closer to the identity, the less of the edit it explains.
+    pictures; the look is then kept closer to the identity, the less of the edit it explains. A lattice is fitted to
+    what the best look leaves, and added if it explains clearly more of what is left out; colours that no pair has do
+    not depend on it.
 
     Args:
         pairs: photographs before and after the edit, two tensors (B, C, H, W) in [0, 1] of the same shape, C = 1 or 3;
             or three, with masks (B, K, H, W) in [0, 1] of K regions that have looks of their own, which may be missing
             in some pairs. Read once. A frame of one colour around an edited photograph is left out.
         parts: what the look may consist of, any of ``alpha`` (sliders), ``bands`` (gains of blurs), ``texture`` (these
-            without edges), ``curves``, ``matrix``, ``saturation``, ``stretch`` (automatic levels) and ``local`` (local
-            contrast).
+            without edges), ``curves``, ``matrix``, ``saturation``, ``stretch`` (automatic levels), ``local`` (local
+            contrast) and ``lattice`` (what the others leave, as a function of colour), which needs others beside it.
         order: k; k + 1 sliders.
         step: ``look`` with the parameters of the filter; None has the defaults.
         generator: source of randomness for the landmarks; None draws the same for every call.
@@ -129,7 +134,9 @@ def fit_look(
     regions: list[_Region] = []
     for number, (before, after, masks) in enumerate(_images(pairs)):
         count = 1 if masks is None else len(masks)
-        regions = regions or [_Region(layout, []) for _ in range(count)]
+        regions = regions or [
+            _Region(layout, [], kept=KeptPixels() if "lattice" in names else None) for _ in range(count)
+        ]
         if count != len(regions):
             raise ValueError(
                 f"masks must be as many for every pair, got {count} after {len(regions)}; pass one for each region"
@@ -163,26 +170,31 @@ class _Region:
         squares: sums of the squares of the first photograph that shows the region.
         sliders: sums of the Gram matrix of the layers, and of its product with the sliders of each pair; None if there
             is a pair that sliders alone do not explain.
+        kept: pixels of all pairs, for the lattice; None if there is none to fit.
     """
 
     layout: Layout
     folds: list[Sums]
     squares: list[Sums] | None = None
     sliders: tuple[Tensor, Tensor] | None = (torch.zeros(1), torch.zeros(1))
+    kept: KeptPixels | None = None
 
-    def add(self, number: int, pixels: PixelSample, squares: list[Sums], rounding: float) -> None:
+    def add(self, number: int, pixels: PixelSample, squares: list[Sums], rounding: float, width: int) -> None:
         """Add the pixels of a pair with that number, and the sums over their squares.
 
-        ``rounding`` is half the step between the values of the edited photograph, or 0.
+        ``rounding`` is half the step between the values of the edited photograph, or 0, and ``width`` is its width.
         """
         if not squares:
             return  # the region is not in this photograph
         whole = reduce(Sums.__add__, squares)
         self.squares = self.squares or squares
-        if len(self.folds) < FOLDS:
+        fold = len(self.folds) if len(self.folds) < FOLDS else number % FOLDS
+        if fold == len(self.folds):
             self.folds.append(whole)
         else:
-            self.folds[number % FOLDS] = self.folds[number % FOLDS] + whole
+            self.folds[fold] = self.folds[fold] + whole
+        if self.kept is not None:
+            self.kept.add(pixels, fold, width)
         self._add_sliders(pixels, whole, rounding)
 
     def _add_sliders(self, pixels: PixelSample, sums: Sums, rounding: float) -> None:
@@ -210,9 +222,18 @@ class _Region:
             candidates = choose(self.folds, self.layout, choices, STIFF)
             best = simplest(candidates)
         explained = {parts: (look.fitted, look.left_out) for parts, look in candidates.items()}
+        groups = self.folds if len(self.folds) > 1 else self.squares
+        if self.kept is not None and groups:
+            basis = simplest(candidates)
+            more = self.kept.lattice(basis, groups, self.layout)
+            if more is not None:
+                parts = (*basis.parts, "lattice")
+                explained[parts] = more.fitted, more.left_out
+                changed = self._step(replace(basis, parts=parts, coefficients=more.coefficients), step, more.lattice)
+                return FittedLook(changed, parts, more.fitted, more.left_out, explained)
         return FittedLook(self._step(best, step), best.parts, best.fitted, best.left_out, explained)
 
-    def _step(self, look: Candidate, step: Step) -> Step:
+    def _step(self, look: Candidate, step: Step, lattice: Tensor | None = None) -> Step:
         """The look as a step of an edit: of detail if it consists of sliders alone."""
         changes = {name: look.coefficients[:, self.layout.place(name)] for name in self.layout.lengths}
         alpha = 1 + changes["alpha"][0]
@@ -235,6 +256,7 @@ class _Region:
             saturation=_rounded(1 + changes["saturation"][0]),
             stretch=_rounded(changes["stretch"][0]),
             local=_rounded(changes["local"][0]),
+            lattice=None if lattice is None else _rounded(lattice.flatten()),
         )
 
 
@@ -326,7 +348,7 @@ def check_belong(before: Tensor, after: Tensor, first: str, second: str) -> None
 def _add(regions: list[_Region], number: int, photograph: EditedPhotograph) -> None:
     """Add the pixels of a photograph with that number to each of its regions."""
     for region, pixels, sums in zip(regions, *_pixels_and_sums(photograph, regions[0].layout), strict=True):
-        region.add(number, pixels, sums, photograph.rounding)
+        region.add(number, pixels, sums, photograph.rounding, photograph.size[1])
 
 
 def _pixels_and_sums(photograph: EditedPhotograph, layout: Layout) -> tuple[list[PixelSample], list[list[Sums]]]:
@@ -346,19 +368,8 @@ def _pixels_and_sums(photograph: EditedPhotograph, layout: Layout) -> tuple[list
 
 def _sums_of_squares(pixels: PixelSample, layout: Layout, width: int) -> list[Sums]:
     """Sums over the squares of a picture of that width, one after the other to save memory."""
-    square = _squares(pixels.places, width)
+    square = squares(pixels.places, width)
     return pixels.sums(layout, [(square == i).nonzero().squeeze(1) for i in square.unique()])
-
-
-def _squares(places: Tensor, width: int) -> Tensor:
-    """Number of the part of the picture that each pixel (P,) is in: its bounding box is divided into equal parts."""
-    if len(places) == 0:
-        return places
-    rows, columns = (
-        (numbers - numbers.min()) * SQUARES // (numbers.max() - numbers.min() + 1)
-        for numbers in (places // width, places % width)
-    )
-    return rows * SQUARES + columns
 
 
 def _are_sliders(sums: Sums, layout: Layout, share: float) -> bool:

@@ -71,6 +71,8 @@ class Candidate:
         left_out: share of the change of each fold explained by the look fitted to the others.
         risk: mean share of the change of a fold left unexplained by the look fitted to the others; small changes count
             less.
+        ridge: the one that was chosen.
+        stiff: its smallest value for tone curves and saturation.
     """
 
     parts: Parts
@@ -78,6 +80,12 @@ class Candidate:
     fitted: float
     left_out: float
     risk: float
+    ridge: float = 0.0
+    stiff: float = 0.0
+
+    def fitted_to(self, sums: Sums, layout: Layout) -> Tensor:
+        """Coefficients (3, F) of the look with the same parts and ridge, fitted to other sums."""
+        return fit_parts(sums, self.parts, layout, self.ridge, self.stiff)
 
 
 def choose(
@@ -122,7 +130,9 @@ def _candidate(folds: Sequence[Sums], layout: Layout, parts: Parts, stiff: float
     best = int(risks.argmin())
     coefficients = fit_parts(total, parts, layout, ridges[best], stiff)
     left_out = -float(changes[best].sum()) / max(float(total.power.sum()), 1e-30)
-    return Candidate(parts, coefficients, total.explained(coefficients), left_out, float(risks[best]))
+    return Candidate(
+        parts, coefficients, total.explained(coefficients), left_out, float(risks[best]), ridges[best], stiff
+    )
 
 
 def fit_parts(sums: Sums, parts: Parts, layout: Layout, ridge: float, stiff: float = 0.0) -> Tensor:

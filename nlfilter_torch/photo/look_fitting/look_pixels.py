@@ -33,7 +33,8 @@ class PixelSample:
         before: (3, P).
         after: (3, P).
         weighed: columns of the parts of a look that depend on the surroundings of a pixel, as for :func:`columns_of`.
-        weights: (3, P).
+        weights: (3, P); 0 for values that are clipped after the edit.
+        shown: weights (P,) of the pixels regardless of clipping.
     """
 
     places: Tensor
@@ -41,6 +42,13 @@ class PixelSample:
     after: Tensor
     weighed: dict[str, Tensor]
     weights: Tensor
+    shown: Tensor
+
+    def every(self, step: int) -> "PixelSample":
+        """Each ``step``-th of the pixels, with ``step`` times their weights."""
+        weighed = {name: columns[..., ::step] for name, columns in self.weighed.items()}
+        places, before, after = (planes[..., ::step] for planes in (self.places, self.before, self.after))
+        return PixelSample(places, before, after, weighed, self.weights[:, ::step] * step, self.shown[::step] * step)
 
     def sums(self, layout: Layout, subsets: list[Tensor]) -> list[Sums]:
         """Sums over subsets of the pixels, given by their indices (P',)."""
@@ -76,7 +84,8 @@ class EditedPhotograph:
     ) -> None:
         dtype = working_dtype(before)
         before, after = before.to(dtype), after.to(dtype)
-        free = ((after > 0) & (after < 1)).to(dtype) * inside_frame(before, after).to(dtype)
+        inside = inside_frame(before, after).to(dtype)
+        free = ((after > 0) & (after < 1)).to(dtype) * inside
         size = (before.shape[-2], before.shape[-1])
         self.size = viewed_size(size, step["viewing_size"])
         self.stretch = range_of(before[None])  # not of its reduction, which has fewer extremes
@@ -85,11 +94,12 @@ class EditedPhotograph:
         self.rounding = HALF_LEVEL if bool(((levels - levels.round()).abs() < OFF_LEVEL).all()) else 0.0
         if self.size != size:
             before, after, free = (resize(planes[None], self.size)[0] for planes in (before, after, free))
+            inside = resize(inside[None, None], self.size)[0, 0]
             masks = None if masks is None else resize(masks[None].to(before), self.size)[0]
-            free, self.rounding = (free > 0.99).to(dtype), 0.0
+            free, inside, self.rounding = (free > 0.99).to(dtype), (inside > 0.99).to(dtype), 0.0
         self.image, self.order = before[None], order
         self.before, self.after = before.flatten(1), after.flatten(1)
-        self.free, self.masks = free.flatten(1), masks
+        self.free, self.inside, self.masks = free.flatten(1), inside.flatten(), masks
         self.options = step.filter_options(self.size)
         self.generator = generator or seeded()
 
@@ -122,7 +132,7 @@ class EditedPhotograph:
 
     def regions(self) -> list[PixelSample]:
         """Pixels of each region that are not clipped; a region that the photograph does not show has none."""
-        return [self._pixels(weights, self.layers) for weights in self._weights()]
+        return [self._pixels(shown, self.layers) for shown in self._shown()]
 
     def regions_of_sample(self) -> list[PixelSample] | None:
         """A sample of :meth:`regions`, with layers of a filter that is balanced over this sample.
@@ -138,22 +148,28 @@ class EditedPhotograph:
         operator = sampled_operator(self.luminance, places, **self.options, generator=generator)
         luminance = self.luminance.flatten(2)[:, :, None, places]
         layers = detail_layers(operator, luminance, order=self.order)[0, :, 0].flatten(1)
-        inside = self.free[:, places].amax(0) > 0
-        return [self._at(places[inside], layers[:, inside], self.free)]
+        inside = self.inside[places] > 0
+        return [self._at(places[inside], layers[:, inside], self.inside)]
 
-    def _weights(self) -> list[Tensor]:
-        """Weights of the pixels, (3, N) for each region."""
+    def _shown(self) -> list[Tensor]:
+        """Weights of the pixels, clipped or not, (N,) for each region."""
         if self.masks is None:
-            return [self.free]
-        inside = ((self.masks.to(self.free).flatten(1) - INSIDE) / (1 - INSIDE)).clamp(0, 1)
-        return [self.free * mask for mask in inside]
+            return [self.inside]
+        masks = ((self.masks.to(self.free).flatten(1) - INSIDE) / (1 - INSIDE)).clamp(0, 1)
+        return [self.inside * mask for mask in masks]
 
-    def _pixels(self, weights: Tensor, layers: Tensor) -> PixelSample:
-        places = sample(weights.amax(0))
-        return self._at(places, layers[:, places], weights)
+    def _pixels(self, shown: Tensor, layers: Tensor) -> PixelSample:
+        free = shown * self.free.amax(0)
+        places = sample(free)
+        if len(places) > 0:
+            clipped = sample(shown * (free == 0))
+            clipped = clipped[:: 1 + len(clipped) // len(places)]
+            places = torch.cat([places, clipped]).sort().values
+        return self._at(places, layers[:, places], shown)
 
-    def _at(self, places: Tensor, layers: Tensor, weights: Tensor) -> PixelSample:
-        share = float((weights.amax(0) > 0).sum()) / max(len(places), 1)
+    def _at(self, places: Tensor, layers: Tensor, shown: Tensor) -> PixelSample:
+        weights = shown * self.free
+        share = float((weights.amax(0) > 0).sum()) / max(int((weights[:, places].amax(0) > 0).sum()), 1)
         rows, columns = places // self.size[1], places % self.size[1]
         before, after = self.before[:, places], self.after[:, places]
         weighed = {
@@ -163,4 +179,4 @@ class EditedPhotograph:
             "local": self.local.at(before[None], rows, columns)[0].transpose(0, 1),
             "alpha": layers,
         }
-        return PixelSample(places, before, after, weighed, weights[:, places] * share)
+        return PixelSample(places, before, after, weighed, weights[:, places] * share, shown[places] * share)

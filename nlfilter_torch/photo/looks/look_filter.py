@@ -1,5 +1,7 @@
 """A look: sliders of the filter, of blurs and of texture, tone curves, colours, levels and local contrast, added up.
 
+For what curves, matrix and factors of saturation cannot say of colours there is a lattice, changes on a grid of them.
+
 Each part gives a change of the image, and the result is the image plus all changes, so that it is linear in every
 parameter but the image: looks are fitted to edits by least squares.
 """
@@ -23,13 +25,14 @@ from nlfilter_torch.photo.looks.histogram import (
     mean_ramps,
     tones,
 )
+from nlfilter_torch.photo.looks.lattice import lattice_change
 from nlfilter_torch.photo.picture.ends import ends_of
 
 BLURS = 6  # each twice as wide as the one before
 BAND_MARGIN = 2 * (2**BLURS - 1)  # pixels around a pixel that the widest depends on
 FLAT = 0.15  # standard deviation of luminance around a pixel at which half of a band counts as texture
-LookPart = Literal["alpha", "bands", "texture", "curves", "matrix", "saturation", "stretch", "local"]
-#: Parts of a look, with their shapes for one image; a letter is any length from 2 on.
+LookPart = Literal["alpha", "bands", "texture", "curves", "matrix", "saturation", "stretch", "local", "lattice"]
+#: Parts of a look, with their shapes for one image; a letter is any length from 2 on, the same wherever it stands.
 SHAPES: dict[str, tuple[int | str, ...]] = {
     "alpha": ("k+1",),
     "bands": (BLURS + 1,),
@@ -39,10 +42,11 @@ SHAPES: dict[str, tuple[int | str, ...]] = {
     "saturation": ("K",),
     "stretch": (KINDS,),
     "local": (STRENGTHS,),
+    "lattice": (3, "n", "n", "n"),
 }
 NAMES: tuple[LookPart, ...] = get_args(LookPart)
 #: Values at which these parts change nothing; they are not computed then.
-IDLE = {"alpha": 1.0, "bands": 1.0, "texture": 1.0, "stretch": 0.0, "local": 0.0}
+IDLE = {"alpha": 1.0, "bands": 1.0, "texture": 1.0, "stretch": 0.0, "local": 0.0, "lattice": 0.0}
 
 
 @full_precision
@@ -57,7 +61,7 @@ def filter_look(
     acting = {name: value for name, value in parts.items() if name not in IDLE or acts(value, IDLE[name])}
     for name, value in acting.items():
         check_part(value, name, image.shape[0])
-    result = pointwise(image, parts["curves"], parts["matrix"], parts["saturation"])
+    result = pointwise(image, parts["curves"], parts["matrix"], parts["saturation"], acting.get("lattice"))
     if "bands" in acting:
         mean = reduce_channels(image, "luminance").mean((2, 3), keepdim=True)
         result = result + band_change(image, parts["bands"], mean)
@@ -84,9 +88,11 @@ def check_part(value: Tensor, name: str, batch: int) -> None:
     fits = len(own) == len(wanted) and all(
         length >= 2 if isinstance(size, str) else length == size for length, size in zip(own, wanted, strict=True)
     )
+    named_lengths = {(size, length) for size, length in zip(wanted, own, strict=False) if isinstance(size, str)}
+    fits = fits and len(named_lengths) == len({size for size, _ in named_lengths})
     if not fits or shape[: -len(wanted)] not in ((), (1,), (batch,)):
         batched = f", or that for each of {batch} images" if batch > 1 else ""
-        named = f"({wanted[0]},)" if len(wanted) == 1 else f"({wanted[0]}, {wanted[1]})"
+        named = f"({wanted[0]},)" if len(wanted) == 1 else f"({', '.join(map(str, wanted))})"
         raise ValueError(f"{name} must have the shape {named}{batched}, got {shape}; reshape it, or add values")
 
 
@@ -106,12 +112,15 @@ def local_curves(image: Tensor, stretch: Stretch) -> LocalCurves:
 
 
 @full_precision
-def pointwise(image: Tensor, curves: Tensor, matrix: Tensor, saturation: Tensor) -> Tensor:
-    """An image (B, 3, H, W) under tone curves, matrix and saturation, whose changes are added up."""
+def pointwise(
+    image: Tensor, curves: Tensor, matrix: Tensor, saturation: Tensor, lattice: Tensor | None = None
+) -> Tensor:
+    """An image (B, 3, H, W) under tone curves, matrix, saturation and lattice, whose changes are added up."""
     change = matrix - torch.eye(3).to(matrix)
     result = tone_curve(image, curves) + (change.to(image) @ image.flatten(2)).view_as(image)
     factors = (saturation.to(image) - 1).reshape(-1, saturation.shape[-1], 1, 1)
-    return result + below_largest(image) * (factors * saturation_hats(image, saturation.shape[-1])).sum(1, True)
+    result = result + below_largest(image) * (factors * saturation_hats(image, saturation.shape[-1])).sum(1, True)
+    return result if lattice is None else result + lattice_change(image, lattice)
 
 
 def below_largest(image: Tensor) -> Tensor:

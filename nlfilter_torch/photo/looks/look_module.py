@@ -27,6 +27,7 @@ from nlfilter_torch.operator.options import (
 )
 from nlfilter_torch.photo.declared.shading import LANDMARKS, LEVELS, NEAR
 from nlfilter_torch.photo.looks.histogram import KINDS, STRENGTHS
+from nlfilter_torch.photo.looks.lattice import NODES
 from nlfilter_torch.photo.looks.look_filter import BLURS, NAMES, LookPart, acts, check_part, filter_look
 
 
@@ -37,8 +38,8 @@ class Look(nn.Module):
 
     Args:
         parts: initial values by name: ``alpha`` (k+1,), ``bands`` (7,), ``texture`` (6,), ``curves`` (3, K),
-            ``matrix`` (3, 3), ``saturation`` (K,), ``stretch`` (3,) and ``local`` (8,), as from
-            :meth:`FittedLook.tensors`. Omitted parts start from the identity.
+            ``matrix`` (3, 3), ``saturation`` (K,), ``stretch`` (3,), ``local`` (8,) and ``lattice`` (3, n, n, n), as
+            from :meth:`FittedLook.tensors`. Omitted parts start from the identity.
         learn: names of the parts to learn; the others are buffers.
         knots: K, for curves that start from the identity.
         patch_size: option of :func:`nonlocal_operator`, for the filter of ``alpha``, like the following ones.
@@ -72,6 +73,7 @@ class Look(nn.Module):
     saturation: Tensor
     stretch: Tensor
     local: Tensor
+    lattice: Tensor
 
     def __init__(
         self,
@@ -105,6 +107,7 @@ class Look(nn.Module):
             "saturation": torch.ones(5),
             "stretch": torch.zeros(KINDS),
             "local": torch.zeros(STRENGTHS),
+            "lattice": torch.zeros(3, NODES, NODES, NODES),
         } | initial
         for name, value in start.items():
             check_part(value, name, 1)
@@ -142,6 +145,7 @@ class Look(nn.Module):
         saturation: Tensor | None = None,
         stretch: Tensor | None = None,
         local: Tensor | None = None,
+        lattice: Tensor | None = None,
     ) -> Tensor:
         """Apply the look to an image: (B, 3, H, W), with values possibly outside [0, 1].
 
@@ -159,9 +163,10 @@ class Look(nn.Module):
             saturation: (K,) or (B, K).
             stretch: (3,) or (B, 3).
             local: (8,) or (B, 8).
+            lattice: (3, n, n, n) or (B, 3, n, n, n).
         """
         check_image(image, "image", channels=3)
-        passed = (alpha, bands, texture, curves, matrix, saturation, stretch, local)
+        passed = (alpha, bands, texture, curves, matrix, saturation, stretch, local, lattice)
         parts: dict[str, Tensor] = {
             name: getattr(self, name) if part is None else part for name, part in zip(NAMES, passed, strict=True)
         }

@@ -1,0 +1,163 @@
+"""Pixels of all pairs that the lattice of a look is fitted to."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import reduce
+
+import torch
+from torch import Tensor
+
+from nlfilter_torch.photo.look_fitting.lattice_fit import ColourChange, fit_lattice
+from nlfilter_torch.photo.look_fitting.look_choice import SHRINK, SLACK, UNEXPLAINED, WORTH, Candidate
+from nlfilter_torch.photo.look_fitting.look_pixels import PixelSample
+from nlfilter_torch.photo.look_fitting.look_sums import MOST, Layout, Sums, columns_of
+from nlfilter_torch.photo.looks.lattice import colours_of_nodes, resampled
+from nlfilter_torch.photo.looks.look_filter import tone_curve
+
+SQUARES = 3  # a single pair is divided into so many parts along each side, which are the folds
+KEPT = 2 * MOST  # pixels of all pairs
+COLOURS = ("curves", "matrix", "saturation")  # parts that are functions of the colour
+CLEAR = 0.001  # of the change, that a lattice has to explain more than the look without it
+NEAR = 3  # steps between nodes that colours may be away from greys to change with them
+BATCH = 1 << 14  # pixels whose columns are in memory at once
+
+
+def squares(places: Tensor, width: int) -> Tensor:
+    """Number of the part of the picture that each pixel (P,) is in: its bounding box is divided into equal parts."""
+    if len(places) == 0:
+        return places
+    rows, columns = (
+        (numbers - numbers.min()) * SQUARES // (numbers.max() - numbers.min() + 1)
+        for numbers in (places // width, places % width)
+    )
+    return rows * SQUARES + columns
+
+
+@dataclass(frozen=True)
+class LookWithLattice:
+    """A look with a lattice, and the shares of the change that it explains.
+
+    Attributes:
+        coefficients: (3, F) of the columns.
+        lattice: changes (3, n, n, n).
+        fitted: share of the pixels that it was fitted to.
+        left_out: share of those that were left out.
+    """
+
+    coefficients: Tensor
+    lattice: Tensor
+    fitted: float
+    left_out: float
+
+
+@dataclass
+class KeptPixels:
+    """Pixels of all pairs, thinned so that they are never more than :data:`KEPT`.
+
+    Attributes:
+        samples: pixels of a pair, the fold of the pair, and for each pixel the number of its square, (P,).
+        step: how many pixels one stands for.
+    """
+
+    samples: list[tuple[PixelSample, int, Tensor]] = field(default_factory=list)
+    step: int = 1
+
+    def add(self, pixels: PixelSample, fold: int, width: int) -> None:
+        """Add the pixels of a pair in a fold, of a picture of that width."""
+        square = squares(pixels.places, width)
+        self.samples.append((pixels.every(self.step), fold, square[:: self.step]))
+        while sum(len(square) for _, _, square in self.samples) > KEPT:
+            self.step *= 2
+            self.samples = [(pixels.every(2), fold, square[::2]) for pixels, fold, square in self.samples]
+
+    def lattice(self, basis: Candidate, folds: Sequence[Sums], layout: Layout) -> LookWithLattice | None:
+        """The look with a lattice for what it leaves; None if that explains hardly more than the look alone.
+
+        A look from a single pair is weakened as :func:`choose_from_one` does.
+
+        Args:
+            basis: the look.
+            folds: the sums that it was chosen from, of pairs or, for a single one, of its squares.
+            layout: of the columns.
+        """
+        alone = len({fold for _, fold, _ in self.samples}) == 1
+        numbers = [square if alone else torch.full_like(square, fold) for _, fold, square in self.samples]
+        number = torch.cat(numbers).unique(return_inverse=True)[1]
+        group = (number + number // SQUARES) % SQUARES if alone else number
+        count = int(group.max()) + 1
+        if count < 2:
+            return None
+        groups = [(i + i // SQUARES) % SQUARES if alone else i for i in range(len(folds))]
+        others = [
+            [sums for sums, own in zip(folds, groups, strict=True) if own != left] for left in (*range(count), -1)
+        ]
+        looks = [basis.fitted_to(reduce(Sums.__add__, sums), layout) for sums in others]
+        before, after = (
+            torch.cat([getattr(pixels, name) for pixels, _, _ in self.samples], dim=1).double()
+            for name in ("before", "after")
+        )
+        weights = torch.cat([pixels.shown for pixels, _, _ in self.samples]).double()
+        colours = ColourChange(before, after, self._predicted(looks, layout), weights / weights.sum(), group)
+        fitted = fit_lattice(colours)
+        left, without = 1 - fitted.left_out, 1 - fitted.without
+        worth = WORTH if alone and left > UNEXPLAINED else SLACK
+        if worth * left + CLEAR >= without:
+            return None
+        lattice = rising(fitted.changes, looks[-1], layout, fitted.density)
+        strength = 1 - SHRINK * min(max(left, 0.0), 1.0) if alone else 1.0
+        return LookWithLattice(strength * looks[-1], strength * lattice, fitted.fitted, fitted.left_out)
+
+    def _predicted(self, looks: Sequence[Tensor], layout: Layout) -> list[Tensor]:
+        """The pixels under looks with coefficients (3, F), (3, P) each."""
+        coefficients = torch.stack(list(looks))
+        parts = []
+        for pixels, _, _ in self.samples:
+            for start in range(0, len(pixels.places), BATCH):
+                inside = slice(start, start + BATCH)
+                weighed = {name: columns[..., inside] for name, columns in pixels.weighed.items()}
+                columns = columns_of(pixels.before[:, inside], weighed, layout)
+                change = torch.einsum("lcf,cfp->lcp", coefficients, columns)
+                parts.append(pixels.before[:, inside] + change)
+        return list(torch.cat(parts, dim=2))
+
+
+def rising(lattice: Tensor, coefficients: Tensor, layout: Layout, density: Tensor) -> Tensor:
+    """A lattice (3, n, n, n) with which no grey gets darker from one to the next, unless it does without the lattice.
+
+    The least changes of the greys, weighed by their density (n^3,), are passed on to colours near them.
+    """
+    if lattice.shape[1] < layout.knots:  # greys between the nodes count as well
+        shares = resampled(density.view(1, *lattice.shape[1:]).expand(3, -1, -1, -1), layout.knots)[0].flatten()
+        finer = resampled(lattice, layout.knots)
+        risen = rising(finer, coefficients, layout, shares)
+        return lattice if risen is finer else risen
+    nodes = lattice.shape[1]
+    steps = torch.linspace(0, 1, nodes, dtype=torch.float64).expand(3, -1)
+    others = {name: torch.zeros(3, length, nodes) for name, length in layout.lengths.items() if name not in COLOURS}
+    plain = steps + torch.einsum("cf,cfp->cp", coefficients, columns_of(steps, others, layout))
+    diagonal = torch.arange(nodes) * (nodes * nodes + nodes + 1)
+    greys = plain + lattice.flatten(1)[:, diagonal]
+    weights = density[diagonal] + 1e-6 * density.sum()
+    moved = torch.stack([
+        nondecreasing(values, weights) if bool((before.diff() > -1e-6).all()) else values
+        for values, before in zip(greys, plain, strict=True)
+    ])  # fmt: skip
+    if bool((moved == greys).all()):
+        return lattice
+    colours = colours_of_nodes(nodes)
+    near = (1 - (colours.amax(0) - colours.amin(0)) * (nodes - 1) / NEAR).clamp(min=0)
+    curves = (torch.linspace(0, 1, nodes, dtype=torch.float64) + moved - greys).expand(3, -1)
+    change = tone_curve(colours.mean(0).expand(1, 3, -1, -1, -1).flatten(3), curves).view(3, nodes, nodes, nodes)
+    return lattice + near * (change - colours.mean(0))
+
+
+def nondecreasing(values: Tensor, weights: Tensor) -> Tensor:
+    """The nondecreasing values (N,) of least weighted squared distance from some values, by pooling neighbours."""
+    pools: list[tuple[float, float, int]] = []  # mean, weight and number of values
+    for value, weight in zip(values.tolist(), weights.tolist(), strict=True):
+        pools.append((value, weight, 1))
+        while len(pools) > 1 and pools[-2][0] > pools[-1][0]:
+            (low, light, few), (high, heavy, many) = pools.pop(), pools.pop()
+            mean = (low * light + high * heavy) / (light + heavy)
+            pools.append((mean, light + heavy, few + many))
+    return torch.tensor([mean for mean, _, count in pools for _ in range(count)], dtype=values.dtype)

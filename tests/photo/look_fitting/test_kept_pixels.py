@@ -1,0 +1,100 @@
+"""Pixels kept for the lattice, and lattices of looks."""
+
+import pytest
+import torch
+from torch import Tensor
+
+from nlfilter_torch import fit_look
+from nlfilter_torch.photo.declared.presets import Recipe
+from nlfilter_torch.photo.declared.steps import Step
+from nlfilter_torch.photo.edits.applying import apply_step
+from nlfilter_torch.photo.look_fitting.kept_pixels import KEPT, KeptPixels, nondecreasing
+from nlfilter_torch.photo.look_fitting.look_pixels import EditedPhotograph
+from tests.looks import CAT, CUP, FEW, SUIT, explained, in_bytes, single_look
+
+
+def by_hue(image: Tensor) -> Tensor:
+    """An edit that no curve or matrix says: warm colours become lighter, cold ones darker and paler."""
+    warmth = (image[:, :1] - image[:, 2:]) * (1 - image)
+    return in_bytes(image**0.8 + 0.6 * warmth * image[:, 1:2] - 0.3 * warmth.clamp(max=0))
+
+
+def test_edits_by_hue_need_a_lattice_and_carry_over() -> None:
+    pairs = [(image, by_hue(image)) for image in (CAT, CUP, SUIT)]
+    names = ("curves", "matrix", "saturation")
+    plain = single_look(fit_look(pairs[:2], parts=names, step=FEW))
+    look = single_look(fit_look(pairs[:2], parts=(*names, "lattice"), step=FEW))
+    assert look.parts[-1] == "lattice"
+    for pair in pairs:
+        without, share = (1 - explained(*pair, each_look.apply(pair[0])) for each_look in (plain, look))
+        assert share < 0.6 * without
+    assert look.explained[look.parts] == (look.fitted, look.left_out)
+    assert look.tensors["lattice"].shape[0] == 3
+    again = Recipe.from_json(look.to_json(), "it").steps[0]
+    assert again == look.step
+
+
+def test_half_a_picture_carries_over_to_the_other() -> None:
+    edited = by_hue(CUP)
+    look = single_look(fit_look([(CUP[..., :50], edited[..., :50])], step=FEW))
+    assert explained(CUP[..., 50:], edited[..., 50:], look.apply(CUP[..., 50:])) > 0.97
+
+
+def test_smooth_skies_stay_smooth_and_greys_rise() -> None:
+    look = single_look(fit_look([(CUP, by_hue(CUP))], step=FEW))
+    ramp = torch.linspace(0.02, 0.98, 400)
+    sky = torch.stack([0.3 + 0.3 * ramp, 0.5 + 0.3 * ramp, 0.7 + 0.3 * ramp]).view(1, 3, 1, -1)
+    rises = look.apply(sky)[0, :, 0].diff() / sky[0, :, 0].diff()
+    assert float(rises.min()) > 0.1  # no plateau that would show as a band
+    assert float(rises.diff().abs().max()) < 1
+    greys = look.apply(ramp.expand(1, 3, 1, -1))[0, :, 0]
+    assert float(greys.diff().min()) >= -1e-6
+
+
+def test_greys_never_get_darker_even_if_those_of_the_edit_do() -> None:
+    strange = in_bytes(CUP**0.8 + 0.3 * torch.sin(12 * CUP.mean(1, keepdim=True)))
+    look = single_look(fit_look([(CUP, strange)], parts=("curves", "lattice"), step=FEW))
+    greys = look.apply(torch.linspace(0, 1, 300).expand(1, 3, 1, -1))[0, :, 0]
+    assert look.parts[-1] == "lattice"
+    assert float(greys.diff().min()) >= -1e-5
+
+
+def test_the_nearest_values_that_do_not_fall() -> None:
+    values = torch.tensor([0.0, 2.0, 1.0, 3.0, 2.5, 2.0, 5.0], dtype=torch.float64)
+    weights = torch.tensor([1.0, 1.0, 3.0, 1.0, 1.0, 1.0, 1.0], dtype=torch.float64)
+    wanted = torch.tensor([0.0, 1.25, 1.25, 2.5, 2.5, 2.5, 5.0], dtype=torch.float64)
+    torch.testing.assert_close(nondecreasing(values, weights), wanted)
+
+
+def test_never_more_pixels_than_enough_are_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    kept = KeptPixels()
+    assert KEPT >= 1 << 16
+    monkeypatch.setattr("nlfilter_torch.photo.look_fitting.kept_pixels.KEPT", 15_000)
+    for number, image in enumerate((CAT, CUP, SUIT, CAT, CUP)):
+        photograph = EditedPhotograph(image[0], image[0] ** 0.7, None, FEW, 3, None)
+        (pixels,) = photograph.regions()
+        kept.add(pixels, number, photograph.size[1])
+        total = sum(float(sample.shown.sum()) for sample, _, _ in kept.samples)
+        assert total == pytest.approx(8000 * (number + 1), rel=0.01)
+        assert sum(len(square) for _, _, square in kept.samples) <= 15_000
+    assert kept.step == 4
+
+
+@pytest.mark.parametrize("colour", [(0.5, 0.5, 0.5), (0.2, 0.6, 0.4)])
+def test_pairs_of_one_colour_or_two(colour: tuple[float, float, float]) -> None:
+    before = torch.tensor(colour).view(1, 3, 1, 1).expand(1, 3, 20, 20).clone()
+    after = before * 0.8
+    look = single_look(fit_look([(before, after)], step=Step("look", landmarks=20)))
+    assert bool(look.apply(before).isfinite().all())
+    before[..., :10] = 0.9
+    after = before * 0.8
+    look = single_look(fit_look([(before, after)], step=Step("look", landmarks=20)))
+    assert explained(before, after, look.apply(before)) > 0.9
+
+
+def test_a_photograph_of_which_most_is_clipped_is_white_again() -> None:
+    after = in_bytes(by_hue(CUP) * 1.6)
+    look = single_look(fit_look([(CUP, after)], step=FEW))
+    white = (after == 1).all(1, keepdim=True).expand_as(after)
+    assert float(white.float().mean()) > 0.02
+    assert float((apply_step(look.step, CUP).clamp(0, 1) - after)[white].abs().mean()) < 0.01
