@@ -18,6 +18,7 @@ from nlfilter_torch.photo.cli.demo import demo
 from nlfilter_torch.photo.cli.edits import command
 from nlfilter_torch.photo.cli.fit import fit
 from nlfilter_torch.photo.cli.frames import frames
+from nlfilter_torch.photo.cli.hints import explained
 from nlfilter_torch.photo.cli.inspect import inspect
 from nlfilter_torch.photo.cli.interrupts import INTERRUPTED, tell
 from nlfilter_torch.photo.cli.mask import mask
@@ -104,7 +105,7 @@ def run(arguments: list[str] | None, others: Iterable[Callable[..., None]]) -> i
             message = error.format_message()
             if message.startswith("No such option: --preset"):
                 message = "No such option: --preset; use nlfilter-torch detail or apply, which have it"
-            return _refuse(message)
+            return _refuse(explained(message, arguments, _options_of(error)))
         except OSError as error:
             return _refuse(_sentence(error))
         except (ValueError, MemoryError) as error:  # a bad file or value, found by the library
@@ -112,6 +113,12 @@ def run(arguments: list[str] | None, others: Iterable[Callable[..., None]]) -> i
     if status == INTERRUPTED:
         return tell()
     return status if isinstance(status, int) else 0
+
+
+def _options_of(error: typer.TyperException) -> list[str]:
+    """The options of the command that an error is about."""
+    context = getattr(error, "ctx", None)
+    return [] if context is None else [name for parameter in context.command.params for name in parameter.opts]
 
 
 def _sentence(error: OSError) -> str:

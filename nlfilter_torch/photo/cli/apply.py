@@ -25,6 +25,8 @@ def apply(
     preset: Edits,
     mask: options.Masks = None,
     depth: options.OutputDepth = None,
+    quality: options.Quality = None,
+    force: options.Force = False,
     memory: options.Memory = None,
     full: options.Full = False,
     workers: options.Workers = None,
@@ -53,4 +55,6 @@ def apply(
     for recipe, name in zip(recipes, preset, strict=True):
         showing.note_idle(recipe, name)
     job = RecipeJob(recipes, masks, source, target, full)
-    editing.edit_file(job, source, target, depth, memory=memory, workers=workers, cluster=cluster)
+    editing.edit_file(
+        job, source, target, depth, memory=memory, workers=workers, cluster=cluster, quality=quality, force=force
+    )

@@ -12,10 +12,12 @@ from nlfilter_torch.photo.cli import options
 from nlfilter_torch.photo.cli.apply import apply
 from nlfilter_torch.photo.cli.edits import (
     DETAIL_OPTIONS,
+    check_usual,
     edit_photograph,
     other_recipe,
     preset_option,
     step_of,
+    typed_options,
     with_options,
 )
 from nlfilter_torch.photo.cli.interrupts import INTERRUPTED
@@ -73,6 +75,7 @@ def batch(
     workers: Workers = None,
     cluster: Cluster = None,
     memory: options.Memory = None,
+    force: options.Insist = False,
     **values: Any,
 ) -> None:
     """Edit all photographs of a folder: their details, as `nlfilter-torch detail` does, or by any file of edits.
@@ -84,7 +87,9 @@ def batch(
 
     On several machines that share the folders: `nlfilter-torch batch shots edited --cluster tcp://host:8786`
     """
-    step_of(EDITS["detail"], values)
+    step = step_of(EDITS["detail"], values)
+    if not force:
+        check_usual(step, typed_options(context, values))
 
     from nlfilter_torch.photo.cli.editing import allowed_memory, check_workers
     from nlfilter_torch.photo.cli.folders import Tally, edit_folder, left_out, pictures, prepare, subfolders

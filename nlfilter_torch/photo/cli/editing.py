@@ -97,6 +97,27 @@ def check_apart(option: str, path: str | Path | None, **files: str | Path | Iter
                 raise ValueError(f"{option} must be another file than the {what}, got {path}; choose another name")
 
 
+def check_not_input(source: str, target: str, *, force: bool) -> None:
+    """Raise ValueError if the output would replace the photograph, unless the user insists by ``--force``."""
+    if force:
+        return
+    paths = Path(source), Path(target)
+    linked = all(path.exists() for path in paths) and paths[0].samefile(paths[1])
+    if linked or paths[0].resolve() == paths[1].resolve():
+        raise ValueError(
+            f"OUT must be another file than the photograph, got {target}, which the edit would replace; choose another "
+            "name, or insist by --force"
+        )
+
+
+def check_quality(target: str, quality: int | None) -> None:
+    """Raise ValueError if a quality is set for a file that is no JPEG."""
+    if quality is not None and Path(target).suffix.lower() not in (".jpg", ".jpeg"):
+        raise ValueError(
+            f"--quality must be used with a JPEG file, got {quality} for {target}; name a .jpg file, or leave it out"
+        )
+
+
 def check_written(
     source: str,
     target: str,
@@ -222,8 +243,10 @@ def edit_file(
     memory: float | None,
     workers: int | None = None,
     cluster: str | None = None,
+    quality: int | None = None,
+    force: bool = False,
 ) -> None:
-    """Edit the photograph in a file, and write it to another file or the same one, with its metadata.
+    """Edit the photograph in a file, and write it to another file, with its metadata.
 
     Args:
         edit: the edit.
@@ -233,7 +256,11 @@ def edit_file(
         memory: gigabytes that may be used; None is a fifth of the machine's, but at most 2, or 1 in tiles.
         workers: number of processes that filter zarr arrays, instead of threads.
         cluster: address of the cluster whose processes do this.
+        quality: of a JPEG file; None is the default.
+        force: whether the file to write may be the one that is read.
     """
+    check_not_input(source, target, force=force)
+    check_quality(target, quality)
     check_processes(source, target, workers, cluster)
     allowed, kind = allowed_memory(memory), None if depth is None else options.DEPTHS[depth]
     with steps(3) as begin:
@@ -245,7 +272,7 @@ def edit_file(
             begin("Editing")
             output = output.with_pixels(edit.edited(photograph))
             begin("Writing")
-            write_photograph(output, target)
+            write_photograph(output, target, quality=quality)
             return
     with ExitStack() as stack:
         picture = stack.enter_context(open_picture(Path(source), allowed))
@@ -257,4 +284,4 @@ def edit_file(
         report = stack.enter_context(stages())
         job = Job(picture, stored, allowed - picture.cached, allowed_memory(memory, TILED), report, stack, processes)
         with edit.tiling(job) as tiling:
-            write_picture(Path(target), tiling, stored, written)
+            write_picture(Path(target), tiling, stored, written, quality)

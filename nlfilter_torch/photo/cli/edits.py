@@ -142,8 +142,17 @@ def _declared(parameter: Parameter, panel: str | None = None) -> inspect.Paramet
     return _argument(parameter.name, option(parameter, panel), option_value(parameter, parameter.default))
 
 
-def signature(edit: Edit, *, target: object = options.Target, depth: object = options.OutputDepth) -> inspect.Signature:
-    """The signature of an edit's command; ``target`` and ``depth`` annotate its output and the depth of that."""
+def signature(
+    edit: Edit,
+    *,
+    target: object = options.Target,
+    depth: object = options.OutputDepth,
+    further: Iterable[inspect.Parameter] = (),
+) -> inspect.Signature:
+    """The signature of an edit's command.
+
+    ``target`` and ``depth`` annotate its output and the depth of that; ``further`` options follow these.
+    """
     return inspect.Signature(
         [
             _argument("source", options.Source, inspect.Parameter.empty),
@@ -151,6 +160,7 @@ def signature(edit: Edit, *, target: object = options.Target, depth: object = op
             *(_argument(name, annotation, None) for name, annotation in scribble_options(edit).items()),
             *(_declared(p) for p in edit if p.is_option),
             _argument("depth", depth, None),
+            *further,
             _argument("seed", options.Seed, 0),
             _argument("memory", options.Memory, None),
             _argument("full", options.Full, False),
@@ -190,7 +200,8 @@ def command(edit: Edit) -> Command:
         edit_photograph(edit, source, target, typed=typed_options(context, values), **values)
 
     run.__name__, run.__doc__, run.__annotations__ = edit.name, edit.help, {}
-    options_of_edit = signature(edit)
+    further = _argument("quality", options.Quality, None), _argument("force", options.Force, False)
+    options_of_edit = signature(edit, further=further)
     context = _argument("context", typer.Context, inspect.Parameter.empty)
     return with_signature(run, options_of_edit.replace(parameters=[*options_of_edit.parameters.values(), context]))
 
@@ -219,6 +230,8 @@ def edit_photograph(
     *,
     typed: Collection[str] = (),
     depth: options.FileDepth | None = None,
+    quality: int | None = None,
+    force: bool = False,
     seed: int = 0,
     memory: float | None = None,
     full: bool = False,
@@ -246,6 +259,9 @@ def edit_photograph(
             )
         step = look
 
+    if not force:
+        check_usual(step, typed, [text.partition(":")[2] for text in region or []])
+
     from nlfilter_torch.photo.cli import editing
     from nlfilter_torch.photo.cli.edit_job import EditJob
     from nlfilter_torch.photo.cli.scribbles import ScribbleOptions
@@ -256,7 +272,39 @@ def edit_photograph(
     note_useless(step, typed, marked=drawn.marks_objects)
     editing.check_written(source, target, show=show, map=map, mask=mask, strokes=strokes, preset=preset)
     job = EditJob(step, source, target, drawn, show, map, depth, seed, memory, full)
-    editing.edit_file(job, source, target, depth, memory=memory, workers=workers, cluster=cluster)
+    editing.edit_file(
+        job, source, target, depth, memory=memory, workers=workers, cluster=cluster, quality=quality, force=force
+    )
+
+
+def check_usual(step: Step, typed: Collection[str], notes: Iterable[str] = ()) -> None:
+    """Raise ValueError if an option that the user typed has a value that destroys pictures.
+
+    Args:
+        step: the step of the options.
+        typed: names of the options that the user typed.
+        notes: what follows rectangles of ``--region``; for edits of regions these are sliders.
+    """
+    for parameter in step.declared:
+        if parameter.usual is None or parameter.name not in typed:
+            continue
+        _check_usual(f"--{parameter.name.replace('_', '-')}", step[parameter.name], parameter.usual)
+    if step.declared.regional is not None:
+        usual = step.declared["alpha"].usual
+        for note in notes:
+            if note and usual is not None:
+                _check_usual("--region", options.parse_sliders(note, "--region"), usual)
+
+
+def _check_usual(option: str, value: Value, usual: tuple[float, float]) -> None:
+    numbers = value if isinstance(value, tuple) else (value,)
+    if all(isinstance(number, int | float) and usual[0] <= number <= usual[1] for number in numbers):
+        return
+    shown = ",".join(f"{number:g}" if isinstance(number, int | float) else str(number) for number in numbers)
+    raise ValueError(
+        f"{option} must be from {usual[0]:g} to {usual[1]:g}, as other factors destroy the picture (1 changes nothing, "
+        f"1.3 adds 30 %), got {shown}; choose another, or insist by --force"
+    )
 
 
 def note_useless(step: Step, typed: Collection[str], *, marked: bool) -> None:

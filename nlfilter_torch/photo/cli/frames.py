@@ -10,6 +10,7 @@ import typer
 from nlfilter_torch.photo.cli import options
 from nlfilter_torch.photo.cli.edits import (
     DETAIL_OPTIONS,
+    check_usual,
     other_recipe,
     preset_option,
     step_of,
@@ -79,6 +80,7 @@ def frames(
     seed: options.Seed = 0,
     preset: Preset = None,
     memory: options.Memory = None,
+    force: options.Insist = False,
     **values: Value,
 ) -> None:
     """Edit all frames of a film alike, without flicker.
@@ -95,6 +97,8 @@ def frames(
     Another edit: `nlfilter-torch frames film.mp4 edited.mp4 --edit denoise --noise-level 8`
     """
     recipe = chosen_recipe(context, edit, preset, values)
+    if not force:
+        check_usual(recipe.steps[0], typed_options(context, values))
 
     from nlfilter_torch.photo.cli.editing import allowed_memory
     from nlfilter_torch.photo.cli.showing import note_idle
@@ -141,6 +145,8 @@ def edit_film(source: Path, target: Path, references: int, fit: "Callable[[list[
     from nlfilter_torch.photo.cli.progress import steps
     from nlfilter_torch.photo.io.films import check_film_output, open_film, write_film
 
+    if target.exists() and target.samefile(source):
+        raise ValueError(f"OUT must be another file than the film, got {target}; choose another name")
     check_film_output(target)
     with open_film(source) as film, steps(film.count + 1) as begin:
         begin("Fitting to sample frames")

@@ -130,6 +130,32 @@ Full = Annotated[
 ]
 
 
+Force = Annotated[
+    bool,
+    typer.Option(
+        "--force",
+        help="Write over the photograph itself if OUT is IN, and accept values beyond the usual ranges.",
+        rich_help_panel=FILES_PANEL,
+    ),
+]
+Insist = Annotated[
+    bool,
+    typer.Option(
+        "--force",
+        help="Accept values beyond the usual ranges.",
+        rich_help_panel=FILES_PANEL,
+    ),
+]
+Quality = Annotated[
+    int | None,
+    typer.Option(
+        min=1,
+        max=100,
+        metavar="1-100",
+        help="Quality of a JPEG file. Default: 95.",
+        rich_help_panel=FILES_PANEL,
+    ),
+]
 Workers = Annotated[
     int | None,
     typer.Option(

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
 # Values outside these ranges give no useful result, and numbers overflow.
 GAINS = (-1e6, 1e6)  # sliders
+USUAL_GAINS = (0.0, 10.0)  # beyond these, the command wants the user to insist
 BANDWIDTHS = (0.01, 1e6)  # photometric bandwidths, in grey levels from 0 to 255
 DISTANCES = (0.01, 1e6)  # spatial bandwidths, in pixels
 MAX_SLIDERS = 100
@@ -98,6 +99,7 @@ class Parameter:
         length: length of a list; 0 is any.
         panel: title of its section in the help of the command; without one it is among the edit's main options.
         per_image: whether the function also takes a tensor with one value for each image.
+        usual: range of the command, which accepts values of :attr:`low` to :attr:`high` beyond it if the user insists.
     """
 
     name: str
@@ -123,6 +125,7 @@ class Parameter:
     length: int = 0
     panel: str | None = None
     per_image: bool = False
+    usual: tuple[float, float] | None = None
 
     @property
     def keyword(self) -> str:

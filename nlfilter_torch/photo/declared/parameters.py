@@ -5,7 +5,16 @@
 
 from dataclasses import replace
 
-from nlfilter_torch.photo.declared.declaration import FILTER_PANEL, GAINS, Condition, Edit, Parameter, Scribble, Slider
+from nlfilter_torch.photo.declared.declaration import (
+    FILTER_PANEL,
+    GAINS,
+    USUAL_GAINS,
+    Condition,
+    Edit,
+    Parameter,
+    Scribble,
+    Slider,
+)
 from nlfilter_torch.photo.declared.shared_parameters import (
     LIMITS,
     LOOK,
@@ -51,6 +60,7 @@ DETAIL = Edit(
             "One slider for each layer, from the finest detail to the smooth shading, separated by commas. 1 leaves a "
             "layer unchanged, 3 makes it three times as strong, 0 removes it.",
             idle=1.0,
+            usual=USUAL_GAINS,
             metavar="A,B,...,Z",
         ),
         sliders(
@@ -69,6 +79,7 @@ DETAIL = Edit(
             optional=True,
             idle=None,
             panel=FILTER_PANEL,
+            usual=USUAL_GAINS,
         ),
         choice(
             "channels",
@@ -116,6 +127,7 @@ SHARPEN = Edit(
             domain="finite",
             idle=1.0,
             slider=Slider("Amount", 0, 10, 0.5),
+            usual=USUAL_GAINS,
             per_image=True,
         ),
         number(
@@ -148,6 +160,7 @@ TONE = Edit(
             "Contrast of the smooth shading: 1 leaves it unchanged, 1.4 is strong, 0.7 flattens it.",
             idle=1.0,
             slider=Slider("Contrast", 0.5, 1.5, 0.05),
+            usual=(0.2, 3.0),
         ),
         gain(
             "clarity",
@@ -155,6 +168,7 @@ TONE = Edit(
             "Contrast of the largest details: 1 leaves it unchanged, 4 is strong.",
             idle=1.0,
             slider=Slider("Clarity", 0, 5, 0.1),
+            usual=USUAL_GAINS,
         ),
         LIMITS,
         VIEWING_SIZE,

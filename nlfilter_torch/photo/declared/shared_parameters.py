@@ -9,6 +9,7 @@ from nlfilter_torch.photo.declared.declaration import (
     GAINS,
     MAX_LANDMARKS,
     MAX_PATCH,
+    USUAL_GAINS,
     Domain,
     Edit,
     Parameter,
@@ -26,6 +27,7 @@ class Presentation(TypedDict, total=False):
     idle: Value
     slider: Slider
     panel: str
+    usual: tuple[float, float]
 
 
 class Further(Presentation, total=False):
@@ -213,6 +215,7 @@ LOOK = Edit(
             (1.0, 1.0, 1.0, 1.0),
             "One slider for each layer of detail, like those of `nlfilter-torch detail`. 1 leaves a layer as it is.",
             idle=1.0,
+            usual=USUAL_GAINS,
             metavar="A,B,...,Z",
         ),
         sliders(

@@ -205,7 +205,13 @@ def _behind(content: bytes) -> Iterator[str]:
         yield "the bytes behind the picture"
 
 
-def write_jpeg(stream: BinaryIO, rows: Iterable[Channels], shape: tuple[int, int, int], metadata: Metadata) -> None:
+def write_jpeg(
+    stream: BinaryIO,
+    rows: Iterable[Channels],
+    shape: tuple[int, int, int],
+    metadata: Metadata,
+    quality: int = QUALITY,
+) -> None:
     """Write rows (h, W, S) of 8 bits of a picture of ``shape`` as they arrive, without chroma subsampling.
 
     Strips are coded alone and joined by restart markers, after which a decoder begins anew.
@@ -213,7 +219,7 @@ def write_jpeg(stream: BinaryIO, rows: Iterable[Channels], shape: tuple[int, int
     height, width, _ = shape
     for number, strip in enumerate(bands(rows, STRIP)):
         picture = strip[..., 0] if strip.shape[2] == 1 else strip
-        encoded = bytes(imagecodecs.jpeg8_encode(np.ascontiguousarray(picture), level=QUALITY, subsampling="444"))
+        encoded = bytes(imagecodecs.jpeg8_encode(np.ascontiguousarray(picture), level=quality, subsampling="444"))
         parts = list(segments(encoded[: encoded.index(b"\xff\xda") + LONGEST_SCAN] + b"\xff\xd9"))
         scan = next(part for part in parts if part.marker == SOS)
         if number:

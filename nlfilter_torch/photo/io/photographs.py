@@ -16,6 +16,7 @@ import psutil
 import torch
 from torch import Tensor
 
+from nlfilter_torch.core.checks import check_count
 from nlfilter_torch.photo.io import by_pillow, cameras, jpeg, png, tiff
 from nlfilter_torch.photo.io import exif as exif_tags
 from nlfilter_torch.photo.io.decoded import Channels, CheckSize, Decoded, Metadata, UnhandledImage, decoding
@@ -205,16 +206,23 @@ def _check_size(
     check_memory(path, *size, bytes_per_pixel * (1 + double), memory)
 
 
-def write_photograph(photograph: Photograph, path: str | Path) -> None:
+def write_photograph(photograph: Photograph, path: str | Path, *, quality: int | None = None) -> None:
     """Write an image file at the photograph's depth; the extension of the name selects the type.
 
     Integer channels are clipped to their range and rounded. JPEG is written at quality 95 without chroma subsampling,
     AVIF at 90, WebP and TIFF without loss. The file appears complete or not at all.
 
+    Args:
+        photograph: what to write.
+        path: name of the file.
+        quality: of a JPEG file, 1 to 100; None is 95. Other types of file ignore it.
+
     Raises:
-        ValueError: See :func:`~nlfilter_torch.photo.io.check_output`.
+        ValueError: if the quality is out of range; see also :func:`~nlfilter_torch.photo.io.check_output`.
         OSError: The file cannot be written.
     """
+    if quality is not None:
+        check_count(quality, "quality", most=100)
     path = Path(path)
     kind = check_output(path, photograph)
     planes = [photograph.pixels] if photograph.alpha is None else [photograph.pixels, photograph.alpha]
@@ -224,7 +232,7 @@ def write_photograph(photograph: Photograph, path: str | Path) -> None:
     alpha = photograph.alpha is not None
     with open_beside(path) as stream:
         metadata, left_out = with_thumbnail(photograph.metadata, None if kind == "TIFF" else channels)
-        left_out += encode(stream, kind, [channels], channels.shape, channels.dtype, alpha, metadata)
+        left_out += encode(stream, kind, [channels], channels.shape, channels.dtype, alpha, metadata, quality)
     note_left_out(path, left_out)
 
 
@@ -236,9 +244,11 @@ def encode(
     dtype: np.dtype[np.generic],
     alpha: bool,
     metadata: Metadata,
+    quality: int | None = None,
 ) -> list[str]:
     """Write rows (h, W, S) of a picture of ``shape`` as an image file of a type in :data:`DEPTHS`.
 
+    ``quality`` is that of JPEG files; None is the default.
     Returns the names of metadata that are left out.
     """
     extras = metadata.extras
@@ -253,7 +263,7 @@ def encode(
     elif kind == "JPEG":
         metadata, lacking = fitting_jpeg(metadata)
         left_out += lacking
-        jpeg.write_jpeg(stream, rows, shape, metadata)
+        jpeg.write_jpeg(stream, rows, shape, metadata, quality or jpeg.QUALITY)
     else:
         if extras.dpi is not None and exif_tags.resolution(metadata.exif) is None:
             left_out.append("the print resolution")

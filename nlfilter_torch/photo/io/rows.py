@@ -140,8 +140,11 @@ def check_place(path: Path, depth: str, picture: StoredPicture, memory: int) -> 
         )
 
 
-def write_picture(path: Path, rows: Rows | Tiling, depth: str, like: StoredPicture) -> None:
-    """Write rows as they are computed, with the shape, profile and metadata of another picture."""
+def write_picture(path: Path, rows: Rows | Tiling, depth: str, like: StoredPicture, quality: int | None = None) -> None:
+    """Write rows as they are computed, with the shape, profile and metadata of another picture.
+
+    ``quality`` is that of JPEG files; None is the default.
+    """
     shape, dtype = like.shape, np.dtype(depth)
     if path.suffix.lower() == ZARR:
         _write_zarr(path, rows, dtype, like)
@@ -153,7 +156,7 @@ def write_picture(path: Path, rows: Rows | Tiling, depth: str, like: StoredPictu
         if kind == "TIFF":
             left_out += tiff.write_rows(stream, values, shape, dtype, like.alpha, metadata)
         else:
-            left_out += encode(stream, kind, values, shape, dtype, like.alpha, metadata)
+            left_out += encode(stream, kind, values, shape, dtype, like.alpha, metadata, quality)
     note_left_out(path, left_out)
 
 

@@ -33,7 +33,7 @@ def test_version(capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_wrong_calls(capsys: pytest.CaptureFixture[str]) -> None:
     assert refusal(capsys, "detail") == "Missing argument 'IN'."
-    assert refusal(capsys, "embellish").startswith("No such command 'embellish'.")
+    assert refusal(capsys, "embellish") == "No such command 'embellish'; nlfilter-torch --help lists all of them"
 
 
 def test_a_warning_is_a_note(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,5 +1,6 @@
 """Files that commands read, edit and write: pixels, metadata, depth, and errors of one sentence."""
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,7 @@ from nlfilter_torch.photo.cli import main
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.io.photographs import Depth, Photograph, read_photograph, write_photograph
-from tests.commands import refusal, refused
+from tests.commands import refusal, refused, small_photo
 
 PROFILE = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
 PLAIN = ("--limits", "none", "--threshold", 0, "--spatial-bandwidth", "none")  # the filter as it is
@@ -105,7 +106,7 @@ def test_depth_can_be_chosen(photo: Path, tmp_path: Path) -> None:
 
 def test_a_file_can_replace_itself(photo: Path) -> None:
     before = photo.read_bytes()
-    assert detail(photo, photo) == 0
+    assert detail(photo, photo, "--force") == 0
     assert photo.read_bytes() != before
     assert list(photo.parent.iterdir()) == [photo]
 
@@ -256,3 +257,53 @@ def test_channels_of_unsupported_types_in_tiles(tmp_path: Path, capsys: pytest.C
         told = capsys.readouterr().err
         assert f"{signed} stores its channels as int16, which is not supported; convert it" in told
         assert not (tmp_path / "out.png").exists()
+
+
+def test_the_photograph_is_replaced_by_force_only(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    photo = small_photo(tmp_path)
+    before = photo.read_bytes()
+    (tmp_path / "link.png").symlink_to(photo)
+    os.link(photo, tmp_path / "same.png")
+    for command, *options in (["sharpen"], ["apply", "--preset", "crisp"]):
+        for out in (photo, tmp_path / "link.png", tmp_path / "same.png"):
+            assert refusal(capsys, command, photo, out, *options) == (
+                f"OUT must be another file than the photograph, got {out}, which the edit would replace; choose "
+                "another name, or insist by --force"
+            )
+    assert photo.read_bytes() == before
+    assert main(["tone", str(photo), str(photo), "--force"]) == 0
+    assert photo.read_bytes() != before
+
+
+def test_values_that_destroy_a_picture_need_force(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    photo, out = small_photo(tmp_path), tmp_path / "out.png"
+    assert refusal(capsys, "tone", photo, out, "--contrast", "+30") == (
+        "--contrast must be from 0.2 to 3, as other factors destroy the picture (1 changes nothing, 1.3 adds 30 %), "
+        "got 30; choose another, or insist by --force"
+    )
+    for arguments in (
+        ["detail", photo, out, "--alpha", "3,3,40,1"],
+        ["detail", photo, out, "--alpha", "3,3,-1,1"],
+        ["detail", photo, out, "--region", "1,1,4,4:1,1,11,1"],
+        ["sharpen", photo, out, "--amount", "50"],
+        ["batch", tmp_path, tmp_path / "out", "--alpha", "3,3,40,1"],
+        ["frames", tmp_path, tmp_path / "out", "--edit", "tone", "--contrast", "30"],
+    ):
+        assert "as other factors destroy the picture" in refusal(capsys, *arguments)
+    assert not out.exists()
+    assert main(["tone", str(photo), str(out), "--contrast", "30", "--force"]) == 0
+    assert main(["detail", str(photo), str(out), "--alpha", "3,3,40,1", "--force"]) == 0
+
+
+@pytest.mark.parametrize("memory", [[], ["--memory", "0.001"]])
+def test_quality_of_jpeg(memory: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    photo, sizes = small_photo(tmp_path), list[int]()
+    for quality in ("20", "95", "100"):
+        assert main(["sharpen", str(photo), str(tmp_path / "out.jpg"), "--quality", quality, *memory]) == 0
+        sizes.append((tmp_path / "out.jpg").stat().st_size)
+    assert main(["sharpen", str(photo), str(tmp_path / "usual.jpg"), *memory]) == 0
+    assert sizes[0] < sizes[1] < sizes[2]
+    assert (tmp_path / "usual.jpg").stat().st_size == sizes[1]
+    assert refusal(capsys, "sharpen", photo, tmp_path / "out.png", "--quality", "80").startswith(
+        "--quality must be used with a JPEG file, got 80 for "
+    )
