@@ -125,6 +125,12 @@ RESPONSES: dict[str, Any] = {
 EDITS: dict[str, Callable[[Tensor], object]] = {
     "recolor": lambda x: recolor(x, IMAGE, PAINTED, num_landmarks=20),
     "colorize": lambda x: colorize(x[:, :1], IMAGE, PAINTED, num_landmarks=20),
+    "nonlocal_operator": lambda x: nonlocal_operator(x, num_landmarks=20),
+    "small bandwidth": lambda x: nonlocal_operator(x, num_landmarks=20, photometric_bandwidth=0.1),
+    "NonlocalFilter": lambda x: NonlocalFilter(num_landmarks=20)(x),
+}
+#: These see images in the range that they use.
+OF_ANY_SCALE: dict[str, Callable[[Tensor], object]] = {
     "defocus": lambda x: defocus(x, PAINTED, num_landmarks=20),
     "abstract": lambda x: abstract(x, num_landmarks=20),
     "denoise": lambda x: denoise(x, num_landmarks=20),
@@ -132,9 +138,6 @@ EDITS: dict[str, Callable[[Tensor], object]] = {
     "adjust_tone": lambda x: adjust_tone(x, num_landmarks=20),
     "enhance": lambda x: enhance(x, ONES, PAINTED, num_landmarks=20),
     "filter_frames": lambda x: filter_frames([], ONES, references=[x[:1]], num_landmarks=20),
-    "nonlocal_operator": lambda x: nonlocal_operator(x, num_landmarks=20),
-    "small bandwidth": lambda x: nonlocal_operator(x, num_landmarks=20, photometric_bandwidth=0.1),
-    "NonlocalFilter": lambda x: NonlocalFilter(num_landmarks=20)(x),
 }
 
 
@@ -183,6 +186,12 @@ def test_one_warning_for_an_image_in_0_to_255(edit: str) -> None:
     assert len(about) == 1
     assert re.fullmatch(r"(image|grey|guide|references) must be .+, got values up to 25\d.*; .+", str(about[0].message))
     assert about[0].filename == __file__
+
+
+@pytest.mark.parametrize("edit", list(OF_ANY_SCALE))
+@pytest.mark.filterwarnings("error")
+def test_no_warning_for_edits_of_any_scale(edit: str) -> None:
+    OF_ANY_SCALE[edit](255 * IMAGE)
 
 
 def test_no_warning_for_feature_maps_and_high_dynamic_range() -> None:

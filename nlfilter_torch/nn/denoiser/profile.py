@@ -68,6 +68,17 @@ class NoiseProfile:
         """Return noise that is stronger by a factor, a number or a tensor of shape () or (B,)."""
         return replace(self, levels=self.levels * per_image(factor, self.levels, 4))
 
+    def in_range(self, black: Tensor, span: Tensor) -> "NoiseProfile":
+        """Return the noise of the pictures less ``black`` (B,) and divided by ``span`` (B,)."""
+        knots = torch.linspace(0, 1, KNOTS).to(self.levels)
+        positions = ((black[:, None] + span[:, None] * knots).clamp(0, 1) * (KNOTS - 1)).to(self.levels)
+        below = positions.floor().clamp(max=KNOTS - 2)
+        squares = self.levels.square().expand(len(positions), -1, -1, -1)
+        places = below.long()[:, None, None].expand(-1, *squares.shape[1:3], -1)
+        share = (positions - below)[:, None, None]
+        levels = torch.lerp(squares.gather(3, places), squares.gather(3, places + 1), share).sqrt()
+        return NoiseProfile(levels / per_image(span, levels, 4), ((self.light - black) / span).to(self.light))
+
     @full_precision
     def at(self, image: Tensor, scales: Sequence[int] = SCALES) -> Tensor:
         """Levels at the pixels of an image (B, C, H, W), by the mean brightness of 5x5 pixels.

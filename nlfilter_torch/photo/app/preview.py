@@ -30,10 +30,11 @@ from nlfilter_torch.photo.declared.shared_parameters import VIEWING_SIZE
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.edits.applying import PreparedStep, edit_of, filter_key, scribbles_of
 from nlfilter_torch.photo.picture.changes import activity, change_of_mean, limit_by_activity, split_sliders
-from nlfilter_torch.photo.picture.in_memory import InMemory
+from nlfilter_torch.photo.picture.in_memory import InMemory, fit_edit
 from nlfilter_torch.photo.picture.painting import TensorPainter
 from nlfilter_torch.photo.picture.pixels import Fitted, Pixels, Planes, part_of
 from nlfilter_torch.photo.picture.resizing import resize
+from nlfilter_torch.photo.picture.seen import range_of
 from nlfilter_torch.photo.picture.source import seeded
 from nlfilter_torch.photo.picture.viewing import MEGAPIXEL, viewed_size, within_limits
 
@@ -157,6 +158,7 @@ class Preview:
         self.photograph = photograph
         self.pixels = resize(photograph.float(), self.size) if self.size != whole else photograph.float()
         self._layers: Layers | None = None
+        self._working = range_of(InMemory(photograph.float()))
         self._source = InMemory(self.pixels, {})  # with the filter of the masks
         self._compared_by: Key = ()  # the settings of that filter
         self._mask: tuple[Key, Tensor] | None = None
@@ -224,7 +226,7 @@ class Preview:
             selection = edit.selection()
             if selection is None:
                 return None
-            fitted = selection.fit(self._source, edit.marks(drawn))
+            fitted = fit_edit(selection, self._source, edit.marks(drawn), working=self._working)
             self._mask = (key, self._source.all(fitted))
         return self._mask[1]
 
@@ -251,6 +253,8 @@ class Preview:
 
     def _is_of_layers(self, step: Step) -> bool:
         """Whether a step only weighs layers of luminance, which are cached; such edits take regions, too."""
+        if self._working is not None:  # the layers are those of the picture as it is
+            return False
         if step.declared.regional is None or step["residual"] is not None or step["channels"] != "luminance":
             return False
         return self._viewed(step) >= self.size
@@ -278,7 +282,8 @@ class Preview:
             self._filter = None  # released first, since two filters would take twice the memory
         # A reduced photograph goes a little beyond its range, here as in saving.
         image = image.clamp(0, 1) if before else image
-        edit = between_knots(step.declared, PreparedStep(image, stride=self.stride), image)
+        working = None if before else self._working  # of the photograph, as in saving
+        edit = between_knots(step.declared, PreparedStep(image, stride=self.stride, working=working), image)
         if keep:
             self._filter = (key, edit)
         return edit

@@ -21,7 +21,7 @@ from nlfilter_torch.photo.io.photographs import Photograph
 from nlfilter_torch.photo.io.rows import StoredPicture, open_picture
 from nlfilter_torch.photo.picture.drawn import Drawn, M
 from nlfilter_torch.photo.picture.edit import PhotoEdit, Rows
-from nlfilter_torch.photo.picture.in_memory import InMemory, edit_image
+from nlfilter_torch.photo.picture.in_memory import InMemory, edit_image, fit_edit
 from nlfilter_torch.photo.picture.source import Source, seeded
 from nlfilter_torch.photo.tiled.pictures import Picture, RowSource, stored_as
 from nlfilter_torch.photo.tiled.source import Tiled
@@ -93,7 +93,7 @@ class EditJob:
         self._tell(rows, drawn)
         edit = self._measured(tiled, rows)
         with single_threaded(tiled.passes.workers(1)):
-            fitted = edit.fit(tiled, as_rows(drawn))
+            fitted = fit_edit(edit, tiled, as_rows(drawn))
         with tiled.tiling(fitted) as tiling:
             meter = ChangeMeter()
             yield meter.watched(tiling) if edit.reports_change else tiling

@@ -31,6 +31,7 @@ from nlfilter_torch.photo.io.writing import check_file
 from nlfilter_torch.photo.picture.drawn import Drawn, M
 from nlfilter_torch.photo.picture.edit import Rows
 from nlfilter_torch.photo.picture.in_memory import InMemory
+from nlfilter_torch.photo.picture.seen import Seen, of_picture, range_of
 from nlfilter_torch.photo.picture.source import Fitted, Source, seeded
 from nlfilter_torch.photo.selections.mask import RegionMask
 from nlfilter_torch.photo.tiled.pictures import Picture
@@ -164,6 +165,8 @@ class MaskJob:
 
     def _fitted(self, source: Source[M], drawn: Drawn[M]) -> Fitted:
         """Fit the mask, and print how much is selected."""
-        regions = self._edit_at(source.size).select(source, drawn.masks["scribbles"], drawn.masks.get("background"))
+        working, edit = range_of(source), self._edit_at(source.size)
+        seen = source if working is None else Seen(source, working)
+        regions = edit.select(seen, drawn.masks["scribbles"], drawn.masks.get("background"))
         tell_selected(regions.reduced_masks(), self.scribbles.backgrounds["--background"])
-        return Fitted(regions.masks)
+        return Fitted(regions.masks) if working is None else of_picture(Fitted(regions.masks), working)

@@ -113,6 +113,7 @@ class Abstract(FilteredEdit):
     """The edit of :func:`abstract`."""
 
     declared: ClassVar[Edit] = ABSTRACT
+    relative: ClassVar[bool] = True
     power: float | Tensor
     edges: float
     edge_width: float | None

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from nlfilter_torch.core.checks import check_photograph
+from nlfilter_torch.core.checks import check_image, check_photograph
 from nlfilter_torch.core.precision import full_precision, working_dtype
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.declared.shared_parameters import FILTER
@@ -21,10 +21,11 @@ from nlfilter_torch.photo.edits.sharpen import Sharpen
 from nlfilter_torch.photo.edits.tone import Tone
 from nlfilter_torch.photo.picture.drawn import Drawn, M, Painter
 from nlfilter_torch.photo.picture.edit import PhotoEdit
-from nlfilter_torch.photo.picture.in_memory import InMemory
+from nlfilter_torch.photo.picture.in_memory import InMemory, fit_edit
 from nlfilter_torch.photo.picture.painting import TensorPainter
 from nlfilter_torch.photo.picture.source import Fitted, Source, seeded
 from nlfilter_torch.photo.picture.viewing import viewed_size
+from nlfilter_torch.photo.picture.working_range import WorkingRange
 
 #: The edits, and each by its name. A new edit takes a line here.
 EDITS: tuple[type[PhotoEdit], ...] = (Denoise, Detail, Tone, Sharpen, Colorize, Recolor, Defocus, Abstract, LookEdit)
@@ -86,6 +87,7 @@ def fit_step(
     *,
     stride: float = 1,
     generator: torch.Generator | None = None,
+    working: WorkingRange | None = None,
 ) -> Fitted:
     """Fit a step to a picture, with the given scribbles in place of the step's own; see :func:`scribbles_of`.
 
@@ -95,16 +97,17 @@ def fit_step(
         drawn: the scribbles.
         stride: sampling step of the source relative to the photograph, in pixels along each axis.
         generator: source of randomness; None is that of the command line.
+        working: the range in which the step sees the picture, see :func:`fit_edit`.
     """
     edit = edit_of(step, source.size, stride=stride, generator=generator)
     edit.check_channels(source.channels)
-    return edit.fit(source, drawn)
+    return fit_edit(edit, source, drawn, working=working)
 
 
 @full_precision
 def apply_step(step: Step, image: Tensor, *, generator: torch.Generator | None = None) -> Tensor:
     """Apply a step to an image (B, C, H, W) in [0, 1]; without a generator, with the seed of the command line."""
-    check_photograph(image, "image")
+    (check_image if EDIT_OF[step.edit].relative else check_photograph)(image, "image")
     source = InMemory(image.to(working_dtype(image)))
     drawn = scribbles_of(step, source.size, TensorPainter())
     return source.all(fit_step(step, source, drawn, generator=generator)).to(image.dtype)
@@ -114,17 +117,18 @@ class PreparedStep:
     """Applies steps with equal :func:`filter_key` to an image (1, C, H, W) in [0, 1].
 
     The filter is computed once, for the first of them, and strokes are rasterised once. ``stride`` is the sampling step
-    of the image relative to the photograph.
+    of the image relative to the photograph, and ``working`` the range in which steps see it, see :func:`fit_edit`.
     """
 
-    def __init__(self, image: Tensor, *, stride: float = 1) -> None:
+    def __init__(self, image: Tensor, *, stride: float = 1, working: WorkingRange | None = None) -> None:
         self._source, self._dtype, self._stride = InMemory(image.to(working_dtype(image)), {}), image.dtype, stride
-        self._painter = TensorPainter()
+        self._painter, self._working = TensorPainter(), working
 
     def __call__(self, step: Step) -> Tensor:
         """Apply a step."""
         drawn = scribbles_of(step, self._source.size, self._painter)
-        return self._source.all(fit_step(step, self._source, drawn, stride=self._stride)).to(self._dtype)
+        fitted = fit_step(step, self._source, drawn, stride=self._stride, working=self._working)
+        return self._source.all(fitted).to(self._dtype)
 
 
 def viewed_stride(step: Step, size: tuple[int, int], stride: float) -> float:

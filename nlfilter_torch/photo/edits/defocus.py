@@ -105,6 +105,7 @@ class Defocus(ObjectEdit):
     """The edit of :func:`defocus`."""
 
     declared: ClassVar[Edit] = DEFOCUS
+    relative: ClassVar[bool] = True
     radius: float | None
     aperture: Aperture
     reach: float | Tensor = REACH

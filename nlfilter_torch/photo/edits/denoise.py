@@ -29,7 +29,9 @@ from nlfilter_torch.photo.picture.drawn import Drawn, M
 from nlfilter_torch.photo.picture.edit import FilteredEdit
 from nlfilter_torch.photo.picture.in_memory import edit_image
 from nlfilter_torch.photo.picture.pixels import whole_image
+from nlfilter_torch.photo.picture.seen import Seen, range_of
 from nlfilter_torch.photo.picture.source import Fitted, Guide, Operator, Pixels, Planes, Source
+from nlfilter_torch.photo.picture.working_range import WorkingRange
 
 Method = Literal["network", "rule"]
 
@@ -117,11 +119,18 @@ class Denoise(FilteredEdit):
     """The edit of :func:`denoise`; ``noise_level`` may also be the estimated noise."""
 
     declared: ClassVar[Edit] = DENOISE
+    relative: ClassVar[bool] = True
     reports_change: ClassVar[bool] = True
     noise_level: float | Tensor | Noise | NoiseProfile | None
     strength: float | Tensor
     method: Method
     guide_channels: GuideChannels = "all"
+    working: WorkingRange | None = None
+
+    def in_range(self, working: WorkingRange) -> Self:
+        """Return the edit with the noise level as the network sees it; an estimated one is already."""
+        level = self.noise_level if self.working is not None else _in_range(self.noise_level, working)
+        return replace(self, noise_level=level, working=working)
 
     def fit(self, source: Source[M], drawn: Drawn[M]) -> Fitted:
         """Fit the network, or the sliders of the rule."""
@@ -162,15 +171,20 @@ class Denoise(FilteredEdit):
         return Fitted(RuleDenoising(layers, energy, noise, level))
 
     def measured(self, source: Source[M]) -> Self:
-        """Return the edit with the noise of the picture, if its level is not set."""
-        return replace(self, noise_level=self._estimated(source)) if self.noise_level is None else self
+        """Return the edit with the noise of the picture, if its level is not set, as it is in the working range."""
+        working = range_of(source)
+        edit = self if working is None else self.in_range(working)
+        if self.noise_level is not None:
+            return edit
+        return replace(edit, noise_level=edit._estimated(source if working is None else Seen(source, working)))
 
     def _estimated(self, source: Source[M]) -> Noise | NoiseProfile:
         return profile_of(source) if self.method == "network" else noise_of(source)
 
     def map_of(self, image: Tensor) -> Tensor:
         """Levels (B, 3, H, W) of the noise at scales 4, 2 and 1 as red, green and blue, 1 at :data:`WHITE_LEVELS`."""
-        luminance, colour = self._noise.at(image, (4, 2, 1)).square().unflatten(1, (3, 2)).unbind(2)
+        seen = image if self.working is None else self.working.seen(image)
+        luminance, colour = self._noise.at(seen, (4, 2, 1)).square().unflatten(1, (3, 2)).unbind(2)
         return ((luminance + 2 / 3 * colour).sqrt() * (LEVELS / WHITE_LEVELS)).clamp(0, 1)
 
     @property
@@ -184,15 +198,35 @@ class Denoise(FilteredEdit):
         """The noise, measured or set, and how much the pixels changed."""
         noise, level = self._noise, LEVELS * float(self._noise.level)
         estimated = isinstance(self.noise_level, (Noise, NoiseProfile))
-        text = f"denoise: {'estimated' if estimated else 'given'} noise of {level:.2f} grey levels{_described(noise)}"
+        size, changed = f"{level:.2f} grey levels", super().summary(change)
+        least = f"{LEVELS * NEGLIGIBLE_NOISE:.1f}"
+        if self.working is not None:  # in which levels are those of a picture that uses the whole range
+            change = change / float(self.working.span)
+            size, changed = (self.working.described(share / LEVELS) for share in (level, change))
+            changed, least = f"pixels changed by {changed} (RMS)", f"{100 * NEGLIGIBLE_NOISE:.2g} %"
+        text = f"denoise: {'estimated' if estimated else 'given'} noise of {size}{_described(noise)}"
         if level < LEVELS * NEGLIGIBLE_NOISE:
             hint = NO_ESTIMATE if estimated and not bool(noise.levels.any()) else ""
-            return f"{text}, less than {LEVELS * NEGLIGIBLE_NOISE:.1f}; no pixel changed{hint}"
+            return f"{text}, less than {least}; no pixel changed{hint}"
         weak = "" if change >= VISIBLE_LEVELS else ", which is barely visible"
         remedy = ""
         if weak and estimated and 0 < float(self.strength) < 2:  # a clean photograph has nothing more to lose
             remedy = "; --strength 2 removes more" if level >= VISIBLE_LEVELS else ", as is the noise"
-        return f"{text}; {super().summary(change)}{weak}{remedy}"
+        return f"{text}; {changed}{weak}{remedy}"
+
+
+def _in_range(level: object, working: WorkingRange) -> float | Tensor | Noise | NoiseProfile | None:
+    """A noise level, in units of pictures, as they are seen in their working range."""
+    black, span = working.black.flatten(), working.span.flatten()
+    if isinstance(level, NoiseProfile):
+        return level.in_range(black, span)
+    if isinstance(level, Noise):
+        floor, gain = (level.floor + level.gain * black) / span.square(), level.gain / span
+        return Noise(floor, gain, (level.light - black) / span)
+    if isinstance(level, Tensor):
+        return level / per_image(span, level, max(1, level.ndim))
+    DENOISE.check(noise_level=level)
+    return None if level is None else torch.as_tensor(level, dtype=span.dtype) / span
 
 
 def _described(noise: NoiseProfile) -> str:

@@ -149,6 +149,7 @@ class Detail(FilteredEdit):
     limits: Limits
     viewing_size: float
     declared: ClassVar[Edit] = DETAIL
+    relative: ClassVar[bool] = True
 
     @classmethod
     def of(cls, arguments: Arguments) -> Self:

@@ -7,7 +7,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from nlfilter_torch.core.checks import check_alpha, check_image, check_photograph, check_same_size, check_values
+from nlfilter_torch.core.checks import check_alpha, check_image, check_same_size, check_values
 from nlfilter_torch.core.inner import Inner
 from nlfilter_torch.core.precision import working_dtype
 from nlfilter_torch.filtering.fitted import FittedFilter, fit_filter
@@ -20,8 +20,10 @@ from nlfilter_torch.photo.picture.changes import activity, limit_by_activity, sp
 from nlfilter_torch.photo.picture.in_memory import InMemory
 from nlfilter_torch.photo.picture.limits import Balance, Limits
 from nlfilter_torch.photo.picture.pixels import whole_image
+from nlfilter_torch.photo.picture.seen import range_of
 from nlfilter_torch.photo.picture.source import Fitted, Pixels, Planes, Source, luminance
 from nlfilter_torch.photo.picture.viewing import balance, fit_change, viewed_size
+from nlfilter_torch.photo.picture.working_range import WorkingRange
 
 
 def filter_frames(
@@ -88,6 +90,8 @@ def filter_frames(
     # References are stacked vertically to one image, at the cost of a few patches across the seams.
     viewed = viewed_size((references[0].shape[-2], references[0].shape[-1]), viewing_size)
     stacked = torch.cat([InMemory(f.to(working_dtype(f))).resized(viewed).image for f in references], dim=2)
+    working = range_of(InMemory(stacked))
+    stacked = stacked if working is None else working.seen(stacked)
     grey = reduce_channels(stacked, "luminance")
     options = OperatorOptions(
         photometric_bandwidth=photometric_bandwidth,
@@ -102,7 +106,7 @@ def filter_frames(
     fitted = fit_filter(operator, stacked if channels == "all" else grey, order=alpha.shape[-1] - 1)
     planes = whole_image if channels == "all" else luminance
     change = FrameChange(fitted, planes, alpha, residual, threshold)
-    edit = FrameEdit(change, InMemory(stacked), limits, viewing_size)
+    edit = FrameEdit(change, InMemory(stacked), limits, viewing_size, working)
     return map(edit, frames)
 
 
@@ -118,7 +122,7 @@ def _check_references(references: Sequence[Tensor], spatial_bandwidth: SpatialBa
             "pass one frame, or no spatial_bandwidth"
         )
     for frame in references:
-        check_photograph(frame, "references", batch=1)
+        check_image(frame, "references", batch=1)
         check_same_size(frame, (references[0].shape[-2], references[0].shape[-1]), "references", "first one")
 
 
@@ -150,11 +154,20 @@ class FrameChange:
 class FrameEdit:
     """The edit of single frames.
 
-    All frames share the balance of the references: if each had its own, the brightness of the film would flicker.
+    All frames share the balance of the references, and the range in which they are seen, if it is not their own: if
+    each had its own, the brightness of the film would flicker.
     """
 
-    def __init__(self, change: FrameChange, references: InMemory, limits: Limits, viewing_size: float) -> None:
+    def __init__(
+        self,
+        change: FrameChange,
+        references: InMemory,
+        limits: Limits,
+        viewing_size: float,
+        working: WorkingRange | None = None,
+    ) -> None:
         self.change, self.references, self.limits, self.viewing_size = change, references, limits, viewing_size
+        self.working = working
         self._differentiable = change.alpha.requires_grad  # a gradient needs a graph for each frame
         self._constant = None if self._differentiable else self._balance()
 
@@ -165,8 +178,10 @@ class FrameEdit:
     def __call__(self, frame: Tensor) -> Tensor:
         """Edit a frame (B, C, H, W)."""
         check_image(frame, "frames")
-        source = InMemory(frame.to(working_dtype(frame)))
+        image = frame.to(working_dtype(frame))
+        source = InMemory(image if self.working is None else self.working.seen(image))
         brighter = self._balance() if self._differentiable else self._constant
         planes = self.change.planes
         fitted = fit_change(source, self.change, planes, self.viewing_size, self.limits, brighter=brighter)
-        return source.all(fitted).to(frame.dtype)
+        result = source.all(fitted)
+        return (result if self.working is None else self.working.edited(image, result)).to(frame.dtype)

@@ -102,6 +102,7 @@ class Sharpen(FilteredEdit):
     """The edit of :func:`sharpen`."""
 
     declared: ClassVar[Edit] = SHARPEN
+    relative: ClassVar[bool] = True
     amount: float | Tensor
     guide_blur: float
     limits: Limits

@@ -98,6 +98,7 @@ class Tone(FilteredEdit):
     """The edit of :func:`adjust_tone`."""
 
     declared: ClassVar[Edit] = TONE
+    relative: ClassVar[bool] = True
     contrast: float | Tensor
     clarity: float | Tensor
     order: int = 3

@@ -14,6 +14,7 @@ from nlfilter_torch.photo.declared.declaration import Arguments, Edit
 from nlfilter_torch.photo.picture.drawn import Drawn, M
 from nlfilter_torch.photo.picture.pixels import Fitted
 from nlfilter_torch.photo.picture.source import Source
+from nlfilter_torch.photo.picture.working_range import WorkingRange
 
 
 @dataclass(frozen=True)
@@ -40,10 +41,14 @@ class PhotoEdit(ABC):
     Attributes:
         declared: its name, parameters and scribbles.
         reports_change: whether the command reports how much it changed the pixels, see :meth:`summary`.
+        relative: whether the edit sees a picture relative to the range that it uses, see :class:`WorkingRange`.
+        gives_picture: whether the result is an edited picture; otherwise it is a mask.
     """
 
     declared: ClassVar[Edit]
     reports_change: ClassVar[bool] = False
+    relative: ClassVar[bool] = False
+    gives_picture: ClassVar[bool] = True
 
     @classmethod
     def of(cls, arguments: Arguments) -> Self:
@@ -57,6 +62,10 @@ class PhotoEdit(ABC):
         Raises:
             TypeError, ValueError: if a setting or the scribbles do not suit the picture.
         """
+
+    def in_range(self, working: WorkingRange) -> Self:
+        """Return the edit with settings in units of the picture converted to those in which it sees the picture."""
+        return self
 
     def check_channels(self, channels: int) -> None:
         """Raise ValueError if the edit cannot be applied to a photograph with that number of channels."""

@@ -20,13 +20,15 @@ from nlfilter_torch.operator.columns import Columns
 from nlfilter_torch.operator.operator import NonlocalOperator
 from nlfilter_torch.operator.pixel_matrix import PixelMatrix
 from nlfilter_torch.operator.spectrum import RitzPairs, Spectrum
-from nlfilter_torch.photo.picture.drawn import Drawn
+from nlfilter_torch.photo.picture.drawn import Drawn, M
 from nlfilter_torch.photo.picture.edit import PhotoEdit
 from nlfilter_torch.photo.picture.ends import ends_of
 from nlfilter_torch.photo.picture.pixels import Fitted, Planes, part_of, strips_of
 from nlfilter_torch.photo.picture.resizing import block_means, resize
 from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles
+from nlfilter_torch.photo.picture.seen import Seen, in_own_units, of_picture, range_of
 from nlfilter_torch.photo.picture.source import SAMPLE, Blocks, Guide, Kept, Source, sampled_pairs, sampled_places
+from nlfilter_torch.photo.picture.working_range import WorkingRange
 
 Cache = dict[Hashable, tuple[Sequence[Tensor], object]]  # results by their names, with the tensors they depend on
 
@@ -43,6 +45,9 @@ class InMemory:
         self.image, self.cache, self.dtype = image.contiguous(), cache, image.dtype
         self.batch, self.channels, *size = image.shape
         self.size, self.width = (size[0], size[1]), size[1]
+
+    def accept_any_scale(self) -> None:
+        """Such warnings are given before."""
 
     def operator(self, guide: Guide) -> "InMemoryOperator":
         """Build, or take from the cache, :func:`nonlocal_operator` of the guide.
@@ -108,6 +113,10 @@ class InMemory:
             return self
         cache: Cache | None = None if self.cache is None else {}
         return self.kept(("blocks", step), [], lambda: InMemory(block_means(self.image, step), cache))
+
+    def like(self, image: Tensor) -> "InMemory":
+        """Another image (B, C, H, W), with a cache if this one has one."""
+        return InMemory(image, None if self.cache is None else {})
 
     def resized_weights(self, weights: Tensor, size: tuple[int, int], name: str) -> Tensor:
         """Resize weights."""
@@ -254,6 +263,25 @@ def without_tensors(option: Hashable) -> Hashable:
     return Tensor if isinstance(option, Tensor) else option
 
 
+def fit_edit(edit: PhotoEdit, source: Source[M], drawn: Drawn[M], *, working: WorkingRange | None = None) -> Fitted:
+    """Fit an edit to a picture.
+
+    Args:
+        edit: the edit.
+        source: the picture.
+        drawn: scribbles, in the form that the source takes.
+        working: the range in which the edit sees the picture, if it does not depend on its pixels alone; None is the
+            range that they use.
+    """
+    if not edit.relative:
+        return edit.fit(source, drawn)
+    working = range_of(source) if working is None else working
+    if working is None:
+        return edit.fit(source, drawn)
+    fitted = of_picture(edit.in_range(working).fit(Seen(source, working), drawn), working)
+    return in_own_units(fitted, working) if edit.gives_picture else fitted
+
+
 @full_precision
 def edit_image(
     edit: PhotoEdit,
@@ -267,6 +295,6 @@ def edit_image(
 
     ``name`` is that of the image in errors, and ``channels`` the number that it must have, if any.
     """
-    check_photograph(image, name, channels=channels)
+    (check_image if edit.relative else check_photograph)(image, name, channels=channels)
     source = InMemory(image.to(working_dtype(image)))
-    return source.all(edit.fit(source, Drawn() if drawn is None else drawn)).to(image.dtype)
+    return source.all(fit_edit(edit, source, Drawn() if drawn is None else drawn)).to(image.dtype)

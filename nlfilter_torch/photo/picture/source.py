@@ -120,6 +120,9 @@ class Source(Protocol[M]):
     def dtype(self) -> torch.dtype:
         """Precision of the computation, float32 or float64."""
 
+    def accept_any_scale(self) -> None:
+        """Do not warn of values far outside [0, 1], since the edit takes them."""
+
     def operator(self, guide: Guide) -> Operator:
         """Build the filter of the picture."""
 
@@ -197,6 +200,9 @@ class Source(Protocol[M]):
 
 class Reduced(Source[Tensor], Pixels, Protocol):
     """A picture in memory: a source, and the set of all its pixels."""
+
+    def like(self, image: Tensor) -> "Reduced":
+        """Another picture, of the same kind, that keeps results if this one does."""
 
 
 def seeded(seed: int = 0) -> torch.Generator:

@@ -122,6 +122,8 @@ class RegionMask(PhotoEdit):
     """
 
     declared: ClassVar[Edit] = MASK
+    relative: ClassVar[bool] = True
+    gives_picture: ClassVar[bool] = False
     reach: float | Tensor
     photometric_bandwidth: float | Tensor
     spatial_bandwidth: float | Tensor | None

@@ -107,6 +107,11 @@ class Frame(Tiled):
         super().__init__(picture, passes)
         self.references, self.num_requested = references, 0
 
+    def accept_any_scale(self) -> None:
+        """Do not warn of values far outside [0, 1] from now on, in this frame or the references."""
+        for picture in (self.picture, *self.references.pictures):
+            picture.accept_any_scale()
+
     def cached_result(self, compute: Callable[[], Cached]) -> Cached:
         """Return the next cached result for the references, or compute and cache it."""
         if self.num_requested == len(self.references.results):

@@ -103,6 +103,7 @@ def pixels_of_part(tiled: Tiled, part: Rectangle) -> TilePixels:
     margin = tiled.margin
     around = part.grown(margin, tiled.size)
     picture = Picture(select_columns(tiled.picture.source, around.columns), tiled.picture.name)
+    picture.checks_scale = tiled.picture.checks_scale
     tile = picture.tile(part.rows.start, part.rows.stop, margin)
     columns = part.inside(around)[1]
     features = PartFeatures(picture, tile, around.columns.start, columns)

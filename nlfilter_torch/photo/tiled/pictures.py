@@ -121,6 +121,7 @@ class Picture:
         size: (H, W).
         colours: 1 or 3; a further channel is transparency, which is ignored.
         dtype: of the computation.
+        checks_scale: whether a warning is due if values are far outside [0, 1].
     """
 
     def __init__(self, source: RowSource, name: str = "source", *, channels: int | None = None) -> None:
@@ -140,8 +141,12 @@ class Picture:
         self.size = (int(shape[0]), int(shape[1]))
         self.samples = int(shape[2]) if len(shape) == 3 else 1
         self.colours = channels or (3 if self.samples >= 3 else 1)
-        self.kind, self._scale_is_checked = kind, channels is None and kind not in WHITE
+        self.kind, self.checks_scale = kind, channels is None and kind not in WHITE
         self.dtype = torch.float64 if kind == "float64" else torch.float32
+
+    def accept_any_scale(self) -> None:
+        """Do not warn of values far outside [0, 1] from now on."""
+        self.checks_scale = False
 
     @property
     def pixels(self) -> int:
@@ -176,8 +181,8 @@ class Picture:
         elif not np.isfinite(stored).all():
             raise ValueError(f"{self.name} holds NaN or infinite pixels; replace them first")
         image = torch.from_numpy(np.ascontiguousarray(values.transpose(2, 0, 1)))[None]
-        if self._scale_is_checked:
-            self._scale_is_checked = not warn_of_scale(image, self.name)  # warns once
+        if self.checks_scale:
+            self.checks_scale = not warn_of_scale(image, self.name)  # warns once
         return image
 
     def tiles(self, margin: int, rows: int) -> Iterator[Tile]:

@@ -67,6 +67,7 @@ class GuidePicture(Picture):
 
     def __init__(self, picture: Picture, guide: Guide) -> None:
         super().__init__(picture.source, picture.name)
+        self.checks_scale = picture.checks_scale
         self.picture, self.guide = picture, guide
         self.stored: Tensor | None = None
 

@@ -122,6 +122,10 @@ class Tiled:
         self.cached_floats = 0  # floats of cached columns
         self.guide_floats = 0  # floats of stored guides
 
+    def accept_any_scale(self) -> None:
+        """Do not warn of values far outside [0, 1] from now on."""
+        self.picture.accept_any_scale()
+
     @torch.no_grad()
     @full_precision
     def operator(self, guide: Guide) -> "TiledOperator":

@@ -196,10 +196,12 @@ def test_the_scale_of_floats_is_noted(
 ) -> None:
     source = tmp_path / "in.tif"
     write_photograph(Photograph(255 * pixels, "float32"), source)
-    assert main(["tone", str(source), str(tmp_path / "out.tif"), "--contrast", "1.2"]) == 0
+    assert main(["recolor", str(source), str(tmp_path / "out.tif"), "--region", "1,2,5,4:red"]) == 0
     noted = capsys.readouterr().err
     assert noted.count("must be in or near [0, 1]") == 1
     assert "divide by the value of white" in noted
+    assert main(["tone", str(source), str(tmp_path / "out.tif"), "--contrast", "1.2"]) == 0
+    assert "must be in or near [0, 1]" not in capsys.readouterr().err  # it is seen in the range that it uses
 
 
 @pytest.mark.parametrize(
