@@ -6,7 +6,8 @@ Only public functions validate; internal functions trust their arguments.
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any
+from numbers import Integral, Real
+from typing import Any, TypeGuard
 
 import torch
 from torch import Tensor
@@ -175,7 +176,7 @@ def spelled(size: Sequence[int]) -> str:
 
 def check_patch_size(patch_size: int) -> None:
     """Raise unless ``patch_size`` is an odd positive integer of at most :data:`LARGEST_PATCH`."""
-    if isinstance(patch_size, bool) or not isinstance(patch_size, int):
+    if not is_integer(patch_size):
         raise TypeError(f"patch_size must be an int, got {type(patch_size).__name__}; pass 1, 3, 5, ...")
     if patch_size < 1 or patch_size % 2 == 0:
         remedy = f"try {min(abs(patch_size) // 2 * 2 + 1, LARGEST_PATCH)}"
@@ -196,12 +197,26 @@ def described(value: object) -> str:
     """Describe a value of any type in one line, for error messages."""
     if isinstance(value, int) and value.bit_length() > 64:
         return f"an integer of {value.bit_length()} bits"
+    if is_number(value) and not isinstance(value, int | float):
+        return repr(value.item())  # of numpy
     return repr(value) if value is None or isinstance(value, str | int | float) else type(value).__name__
+
+
+def is_number(value: object) -> TypeGuard[float]:
+    """Whether this is a number of Python or numpy, of any precision, but not a bool."""
+    if isinstance(value, int | float):
+        return not isinstance(value, bool)
+    return isinstance(value, Real) and type(value).__module__ == "numpy"
+
+
+def is_integer(value: object) -> TypeGuard[int]:
+    """Whether this is an integer of Python or numpy."""
+    return is_number(value) and isinstance(value, Integral)
 
 
 def check_number(value: object, name: str, remedy: str = "pass a float") -> None:
     """Raise unless ``value`` is a number (tensors are not accepted)."""
-    if isinstance(value, bool) or not isinstance(value, int | float):
+    if not is_number(value):
         raise TypeError(f"{name} must be a number, got {type(value).__name__}; {remedy}")
 
 
@@ -211,14 +226,16 @@ def check_positive(value: float | Tensor, name: str, batch: int | None = None) -
 
 
 def check_values(value: object, name: str, domain: str, batch: int | None = None, remedy: str = "") -> None:
-    """Raise unless ``value`` is a number, or a tensor of shape () or (batch,), in a domain named in :data:`DOMAINS`.
+    """Raise unless ``value`` is a number or a tensor, () or (batch,), in a domain named in :data:`DOMAINS`.
+
+    A tensor (batch, 1, 1, 1) is taken for (batch,).
 
     The values of a tensor are not checked if :func:`~nlfilter_torch.core.torch_internals.is_hidden`.
     """
     wanted, inside, usual = DOMAINS[domain]
     remedy = remedy or usual
     if not isinstance(value, Tensor):
-        if isinstance(value, bool) or not isinstance(value, int | float):
+        if not is_number(value):
             raise TypeError(f"{name} must be a number or a tensor, got {type(value).__name__}; pass a number")
         # Python integers may exceed the range of floats and the 64 bits of torch.
         finite = abs(value) < 1 << 63 if isinstance(value, int) else math.isfinite(value)
@@ -228,7 +245,7 @@ def check_values(value: object, name: str, domain: str, batch: int | None = None
     check_tensor(value, name)
     if value.dtype == torch.bool or value.dtype.is_complex:
         raise TypeError(f"{name} must be a number or a tensor of real numbers, got {value.dtype}; convert it")
-    if value.numel() != 1 and (batch is None or tuple(value.shape) != (batch,)):
+    if value.numel() != 1 and (batch is None or tuple(value.shape) not in ((batch,), (batch, 1, 1, 1))):
         shapes = "()" if batch is None else f"() or ({batch},)"
         raise ValueError(f"{name} must be a number or have shape {shapes}, got {tuple(value.shape)}; reshape it")
     if is_hidden(value):
@@ -241,7 +258,7 @@ def check_values(value: object, name: str, domain: str, batch: int | None = None
 
 def check_pair(value: object, name: str) -> None:
     """Raise unless ``value`` is a pair of non-negative integers."""
-    if not isinstance(value, tuple | list) or not all(isinstance(v, int) and not isinstance(v, bool) for v in value):
+    if not isinstance(value, tuple | list) or not all(map(is_integer, value)):
         raise TypeError(f"{name} must be a pair of ints, got {described(value)}; pass (0, 0) for none")
     if len(value) != 2 or not all(0 <= v < 1 << 63 for v in value):
         numbers = ", ".join(map(described, value))
@@ -279,7 +296,7 @@ def check_scale(bandwidth: float | Tensor, name: str, largest: Tensor, what: str
 
 def check_count(value: object, name: str, *, least: int = 1, most: int | None = None) -> None:
     """Raise unless ``value`` is an integer from ``least`` (default 1) to ``most``."""
-    if isinstance(value, bool) or not isinstance(value, int):
+    if not is_integer(value):
         raise TypeError(f"{name} must be an int, got {type(value).__name__}; pass a positive integer")
     if value < least:
         raise ValueError(f"{name} must be at least {least}, got {described(value)}; pass a positive integer")
@@ -394,7 +411,7 @@ def check_features(features: Tensor, name: str, size: int | None = None, *, empt
 
 def check_size(size: object, points: int) -> tuple[int, ...]:
     """Return ``size``, with (N,) as (1, N); raise unless it holds positive integers whose product is ``points``."""
-    if not isinstance(size, tuple | list) or len(size) == 0 or any(type(length) is not int for length in size):
+    if not isinstance(size, tuple | list) or len(size) == 0 or not all(map(is_integer, size)):
         raise TypeError(
             "size must be integers, such as (H, W), (D, H, W) or (N,), got "
             f"{size if isinstance(size, tuple) else described(size)}; pass ({points},), for example"

@@ -5,6 +5,7 @@ import warnings
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -32,6 +33,7 @@ from nlfilter_torch import (
     spectral_filter,
 )
 from nlfilter_torch.core.checks import check_finite
+from nlfilter_torch.photo import Step
 from tests.problems import noise
 
 IMAGE = noise(2, 3, 8, 9, dtype=torch.float32)
@@ -154,6 +156,32 @@ def test_numbers_and_tensors_of_them_are_taken(function: str, value: float | Ten
     result = NUMBERS[function][1](value)
     assert isinstance(result, Tensor)
     assert result.isfinite().all()
+
+
+@pytest.mark.parametrize("function", list(NUMBERS))
+def test_numbers_of_numpy_and_tensors_with_the_dimensions_of_images_are_taken(function: str) -> None:
+    call = NUMBERS[function][1]
+    half, both = call(0.5), call(torch.tensor([0.5, 0.6]))
+    for value in (np.float16(0.5), np.float32(0.5), np.float64(0.5), torch.full((1, 1, 1, 1), 0.5)):
+        torch.testing.assert_close(call(value), half)
+    torch.testing.assert_close(call(torch.tensor([0.5, 0.6]).view(2, 1, 1, 1)), both)
+    if function != "reach":
+        torch.testing.assert_close(call(np.int64(1)), call(1))
+
+
+def test_integers_of_numpy_are_taken() -> None:
+    options = {"num_landmarks": np.int64(20), "patch_size": np.int32(3), "photometric_bandwidth": np.float32(0.25)}
+    usual = {"num_landmarks": 20, "patch_size": 3, "photometric_bandwidth": 0.25}
+    assert torch.equal(enhance(IMAGE, ONES, **options), enhance(IMAGE, ONES, **usual))
+    assert torch.equal(nonlocal_operator(GREY, **options).factor, nonlocal_operator(GREY, **usual).factor)
+    level = torch.tensor([0.1, 0.2])
+    assert torch.equal(denoise(IMAGE, noise_level=level), denoise(IMAGE, noise_level=level.view(2, 1, 1, 1)))
+    for wrong in (np.bool_(True), np.float32(2.5), np.array(20)):
+        with pytest.raises(TypeError, match=r"num_landmarks must be an int, got .+; pass a positive integer"):
+            nonlocal_operator(GREY, num_landmarks=wrong)
+    with pytest.raises(ValueError, match="num_landmarks must be at least 1, got 0; "):
+        nonlocal_operator(GREY, num_landmarks=np.int64(0))
+    assert Step("detail", alpha=(np.float32(2), np.int64(1))).to_json() == Step("detail", alpha=(2.0, 1)).to_json()
 
 
 @pytest.mark.parametrize("response", list(RESPONSES))

@@ -1,6 +1,7 @@
 """The noise of a photograph: maps of its level, and its estimation from the flattest windows."""
 
 from dataclasses import dataclass
+from typing import TypeGuard
 
 import torch
 import torch.nn.functional as F
@@ -56,9 +57,14 @@ class Noise:
         return (floor + gain * light).sqrt()
 
 
+def is_noise_map(noise: object, size: tuple[int, int]) -> TypeGuard[Tensor]:
+    """Whether this is a map for an image (H, W), and not a level for each image, (B, 1, 1, 1)."""
+    return isinstance(noise, Tensor) and noise.ndim == 4 and (noise.numel() != len(noise) or size == (1, 1))
+
+
 def noise_map(noise: float | Tensor, image: Tensor, name: str = "noise") -> Tensor:
     """Expand noise levels, a number, (B,) or a map (B, 1 or C, H, W), to a map; errors call them ``name``."""
-    if isinstance(noise, Tensor) and noise.ndim == 4:
+    if is_noise_map(noise, (image.shape[-2], image.shape[-1])):
         check_image(noise, name, batch=image.shape[0])
         check_same_size(noise, (image.shape[-2], image.shape[-1]), name, "image")
         if noise.shape[1] not in (1, image.shape[1]):

@@ -2,7 +2,7 @@
 
 import json
 import reprlib
-from typing import TypeGuard
+from typing import Protocol, TypeGuard, runtime_checkable
 
 #: The value of a parameter of an edit; JSON has lists in place of tuples.
 Value = float | str | tuple[float, ...] | None
@@ -50,3 +50,23 @@ def shown(value: object) -> str:
 def is_within(value: object, low: float, high: float) -> TypeGuard[float]:
     """Whether a JSON value is a number in a closed, finite range; NaN is not."""
     return isinstance(value, int | float) and not isinstance(value, bool) and low <= value <= high
+
+
+@runtime_checkable
+class SupportsItem(Protocol):
+    """A number of numpy."""
+
+    def item(self) -> float:
+        """The number of Python that equals it."""
+
+
+def plain(value: Value) -> Value:
+    """The value with numbers of Python in place of those of numpy, which JSON does not take.
+
+    >>> from numpy import float32, int64
+    >>> plain(float32(0.5)), plain((int64(2), 1.0)), plain("auto")
+    (0.5, (2, 1.0), 'auto')
+    """
+    if isinstance(value, tuple):
+        return tuple(entry.item() if isinstance(entry, SupportsItem) else entry for entry in value)
+    return value.item() if isinstance(value, SupportsItem) else value

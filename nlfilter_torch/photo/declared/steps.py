@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from nlfilter_torch.photo.declared.declaration import Arguments, Edit
-from nlfilter_torch.photo.declared.json_values import Value, shown
+from nlfilter_torch.photo.declared.json_values import Value, plain, shown
 from nlfilter_torch.photo.declared.parameters import EDITS
 from nlfilter_torch.photo.declared.shared_parameters import FILTER
 
@@ -47,6 +47,7 @@ class Step:
             raise TypeError(
                 f"{edit} has no parameter {min(unknown)}; its parameters are {', '.join(p.name for p in declared)}"
             )
+        values = {name: plain(value) for name, value in values.items()}
         changed = [(p.name, values[p.name]) for p in declared if p.name in values and values[p.name] != p.default]
         for name, value in (("edit", edit), ("strokes", strokes), ("values", tuple(changed))):
             object.__setattr__(self, name, value)

@@ -17,7 +17,7 @@ from nlfilter_torch.core.torch_internals import cached_constants
 from nlfilter_torch.filtering.filters import weigh_layers
 from nlfilter_torch.nn.denoiser.estimate import white_profile
 from nlfilter_torch.nn.denoiser.network import NonlocalDenoiser, deviation_of, level_planes
-from nlfilter_torch.nn.denoiser.noise import Noise
+from nlfilter_torch.nn.denoiser.noise import Noise, is_noise_map
 from nlfilter_torch.nn.denoiser.profile import NoiseProfile
 from nlfilter_torch.nn.denoiser.tiles import STEP
 from nlfilter_torch.operator.options import Completion, GuideChannels, Sampling
@@ -136,7 +136,7 @@ class Denoise(FilteredEdit):
         """Fit the network, or the sliders of the rule."""
         DENOISE.check(source.batch, strength=self.strength, method=self.method)
         check_count(self.num_landmarks, "num_landmarks")
-        is_map = isinstance(self.noise_level, Tensor) and self.noise_level.ndim == 4
+        is_map = is_noise_map(self.noise_level, source.size)
         if not isinstance(self.noise_level, (Noise, NoiseProfile)) and not is_map:
             DENOISE.check(source.batch, noise_level=self.noise_level)
         noise = self._estimated(source) if self.noise_level is None else self.noise_level

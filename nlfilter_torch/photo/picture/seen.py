@@ -96,7 +96,6 @@ def _extended(low: Tensor, high: Tensor, step: Tensor) -> tuple[Tensor, Tensor]:
     """The range with room on both sides, but not beyond black and white, which clipped pixels have."""
     resolution = 2 * LEAST_STEPS * torch.finfo(low.dtype).eps * torch.maximum(low.abs(), high.abs())
     least = torch.maximum(LEAST_STEPS * step, resolution)
-    missing = (least - (high - low)).clamp(min=0) / 2
     around = AROUND * (high - low) + (least - (high - low)).clamp(min=0) / 2
     below, above = low - around, high + around
     below = torch.where(low >= 0, below.clamp(min=0), below)
