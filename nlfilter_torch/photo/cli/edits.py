@@ -311,7 +311,7 @@ def note_useless(step: Step, typed: Collection[str], *, marked: bool) -> None:
     """Print notes if a step changes nothing, or options that the user typed have no effect."""
     edit = step.declared
     if not (edit.requires_strokes or marked or step.changes()):
-        options.note(f"{edit.name} changes nothing with these options: the photograph is written as it is")
+        options.note(f"{edit.name} changes nothing with these options: the photograph is written without an edit")
     condition = edit.filter_condition
     if condition is not None and step[condition.name] != condition.value:
         for parameter in edit:

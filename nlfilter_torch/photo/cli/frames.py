@@ -108,10 +108,12 @@ def frames(
     from nlfilter_torch.photo.tiled.tiles import Passes
 
     film_steps(recipe.steps)
-    note_idle(recipe, preset or f"--edit {edit}")
+    film = is_film(source) and not source.is_dir()
+    what = "the film is encoded again" if film else "the photographs are written"
+    note_idle(recipe, preset or f"--edit {edit}", what)
     passes = Passes("float32", memory=allowed_memory(memory, TILED))
 
-    work = edit_film if is_film(source) and not source.is_dir() else edit_folder
+    work = edit_film if film else edit_folder
     count = work(source, target, references, partial(FilmEdit, recipe.steps, passes=passes, seed=seed))
     typer.echo(f"{count} frames in {target}")
 

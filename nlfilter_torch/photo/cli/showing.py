@@ -143,10 +143,10 @@ def tell_selected(mask: Tensor, background: list[str] | None) -> None:
         note("nearly all of the picture's borders are selected; mark what is not part of the object with --background")
 
 
-def note_idle(recipe: Recipe, name: str) -> None:
-    """Print a note if an edit changes nothing."""
+def note_idle(recipe: Recipe, name: str, what: str = "the photograph is written") -> None:
+    """Print a note if an edit changes nothing; ``what`` says what is done all the same."""
     if not recipe.acting:
-        note(f"{name} holds no step that changes anything: the photograph is written as it is")
+        note(f"{name} holds no step that changes anything: {what} without an edit")
 
 
 def unlike(pixels: Tensor, middle: Tensor) -> float:

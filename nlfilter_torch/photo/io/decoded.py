@@ -1,9 +1,11 @@
 """What the readers of image files return, and the errors that they raise."""
 
+import sys
 import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from mmap import mmap
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
@@ -11,6 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlfilter_torch.photo.io.extras import NO_EXTRAS, Extras
+
+if sys.platform == "linux":
+    from mmap import MADV_DONTNEED
 
 Channels = NDArray[np.generic]  # (H, W, S), in the dtype of the file
 
@@ -76,6 +81,12 @@ class CheckSize(Protocol):
 
     def __call__(self, size: tuple[int, int], /, *, double: bool = False) -> None:
         """Check the size (width, height); ``double`` if the pixels are 64-bit floats."""
+
+
+def release(data: bytes | mmap) -> None:
+    """Give back the memory for what was read of a file that is mapped to be read; it is read again when needed."""
+    if sys.platform == "linux" and isinstance(data, mmap):
+        data.madvise(MADV_DONTNEED)
 
 
 def bands(rows: Iterable[Channels], height: int) -> Iterator[Channels]:

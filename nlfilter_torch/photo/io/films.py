@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from nlfilter_torch.core.warning import warn
 from nlfilter_torch.photo.io.photographs import first_bytes
 from nlfilter_torch.photo.io.writing import check_file, claimed, link_target, part_beside
 
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     from av.packet import Packet
     from av.sidedata.sidedata import SideData
     from av.stream import Stream
+    from av.video.format import VideoFormat
     from av.video.frame import VideoFrame
     from av.video.stream import VideoStream
 
@@ -35,6 +37,7 @@ ENCODERS: dict[str, tuple[str, dict[str, str]]] = {
     "hevc": ("libx265", {"crf": "18", "preset": "medium", "x265-params": "log-level=error"}),
     "prores": ("prores_ks", {}),
 }
+OF_RGB = {"libx264": "libx264rgb"}  # encoders of the same codec for RGB
 BT601, BT709 = 5, 1  # colour matrices, numbered as in swscale
 MATRICES = {1: 1, 4: 4, 5: 5, 6: 5, 7: 7, 9: 9}  # from numbers of H.273 to those of swscale
 LIMITED, FULL = 1, 2  # colour ranges
@@ -227,7 +230,7 @@ def write_film(film: Film, path: Path, edit: Callable[[Floats], Floats], begin: 
             options = {"movflags": "+faststart" + ("+use_metadata_tags" if kind == "mov" else "")}
             try:
                 with av.open(str(beside), "w", format=kind, options=options) as output:
-                    count = _Transcoder(film, output, path, _encoder(film, output)).run(edit, begin)
+                    count = _Transcoder(film, output, path, _encoder(film, output, path)).run(edit, begin)
             except av.error.FFmpegError as error:
                 if isinstance(error, OSError) and error.filename:
                     raise
@@ -311,18 +314,67 @@ class _Transcoder:
             self.output.mux(packet)
 
 
-def _encoder(film: Film, output: "OutputContainer") -> "VideoStream":
+def stored_format(wanted: "VideoFormat", name: str) -> tuple[str, "VideoFormat"]:
+    """The format nearest to that of a film which an encoder offers, or its relative for RGB, and the encoder's name.
+
+    Chroma of the same resolution counts more than RGB, and that more than the depth.
+    """
+    av = _av()
+    names = [name, *([OF_RGB[name]] if name in OF_RGB and wanted.is_rgb else [])]
+    offered = [(encoder, form) for encoder in names for form in av.codec.Codec(encoder, "w").video_formats or ()]
+    plain = [(encoder, form) for encoder, form in offered if len(form.components) in (1, 3)]
+    return min(plain, key=lambda pair: _distance(wanted, pair[1]))
+
+
+def _distance(wanted: "VideoFormat", stored: "VideoFormat") -> tuple[object, ...]:
+    """What a format lacks of another one, most important first, and then what it has more."""
+    (across, down), (stored_across, stored_down) = block_of(wanted), block_of(stored)
+    bits, stored_bits = wanted.components[0].bits, stored.components[0].bits
+    return (
+        len(stored.components) < len(wanted.components),
+        stored_across > across or stored_down > down,
+        stored.is_rgb != wanted.is_rgb,
+        stored_bits < bits,
+        stored.name != wanted.name,
+        across + down - stored_across - stored_down,
+        len(stored.components),
+        stored_bits,
+        stored.name.startswith("yuvj"),
+        stored.padded_bits_per_pixel - stored.bits_per_pixel,
+    )
+
+
+def block_of(form: "VideoFormat") -> tuple[int, int]:
+    """Width and height in pixels of the block that shares a chroma sample."""
+    return 64 // form.chroma_width(64), 64 // form.chroma_height(64)
+
+
+def changes_between(wanted: "VideoFormat", stored: "VideoFormat") -> Iterator[str]:
+    """What differs between the format of a film and that of the edited one, in words."""
+    if block_of(wanted) != block_of(stored):
+        blocks = ("x".join(map(str, block_of(form))) for form in (stored, wanted))
+        yield " in place of ".join(blocks) + " pixels share a colour"
+    if wanted.is_rgb and not stored.is_rgb:
+        yield "YCbCr in place of RGB"
+    bits = stored.components[0].bits, wanted.components[0].bits
+    if bits[0] < bits[1]:
+        yield f"{bits[0]} bits in place of {bits[1]}"
+
+
+def _encoder(film: Film, output: "OutputContainer", path: Path) -> "VideoStream":
     """Add a stream for the edited frames, with the properties of the film."""
     av = _av()
     source = film.stream.codec_context
     name, options = ENCODERS.get(source.codec.canonical_name, ENCODERS["h264"])
+    wanted = av.VideoFormat((source.pix_fmt or "yuv420p").replace("yuvj", "yuv"))
+    name, stored = stored_format(wanted, name)
+    if changes := ", ".join(changes_between(wanted, stored)):
+        warn(f"{path} stores frames as {stored.name}, since {name} has no {wanted.name}: {changes}")
     rate = film.stream.average_rate or 25
     target = cast("VideoStream", output.add_stream(name, rate=rate, options=options))
-    offered = {form.name for form in av.codec.Codec(name, "w").video_formats or ()}
-    wanted = (source.pix_fmt or "").replace("yuvj", "yuv")
-    target.pix_fmt = wanted if wanted in offered else "yuv420p"
+    target.pix_fmt = stored.name
     target.width, target.height = source.width, source.height
-    across, down = subsampling(target.pix_fmt)
+    across, down = block_of(stored)
     if target.width % across or target.height % down:
         raise ValueError(
             f"{film.path} must have an even width and height to be stored as {target.pix_fmt}, got "
@@ -339,17 +391,6 @@ def _encoder(film: Film, output: "OutputContainer") -> "VideoStream":
         context.codec_tag = "hvc1"  # required by some players
     target.metadata.update(film.stream.metadata)
     return target
-
-
-def subsampling(pix_fmt: str) -> tuple[int, int]:
-    """Return the width and height in pixels of the block that shares a chroma sample.
-
-    >>> subsampling("yuv420p10le"), subsampling("yuv422p"), subsampling("gbrp")
-    ((2, 2), (2, 1), (1, 1))
-    """
-    if "420" in pix_fmt or pix_fmt.startswith("nv12"):
-        return 2, 2
-    return (2, 1) if "422" in pix_fmt else (1, 1)
 
 
 def display_matrix(frame: "VideoFrame") -> list[int] | None:

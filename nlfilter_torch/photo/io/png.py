@@ -18,7 +18,7 @@ import numpy as np
 
 from nlfilter_torch.photo.io import colours, xmp
 from nlfilter_torch.photo.io import exif as exif_tags
-from nlfilter_torch.photo.io.decoded import Channels, Metadata, UnhandledImage, bands
+from nlfilter_torch.photo.io.decoded import Channels, Metadata, UnhandledImage, bands, release
 from nlfilter_torch.photo.io.extras import Extras, Part, sound, turned
 
 SIGNATURE = b"\x89PNG\r\n\x1a\n"
@@ -100,6 +100,7 @@ class Png:
         with tempfile.TemporaryFile() as stream:
             self._copy_pixels(data, stream)
             stream.flush()
+            release(data)
             with mmap(stream.fileno(), 0, access=ACCESS_READ) as pixels:
                 imagecodecs.png_decode(pixels, out=out[..., 0] if self.samples == 1 else out)
 

@@ -5,13 +5,13 @@ import shutil
 import tempfile
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from threading import Lock
 from typing import Protocol
 
 import numpy as np
 
 from nlfilter_torch.photo.io.decoded import Channels
 from nlfilter_torch.photo.io.exif import upright
+from nlfilter_torch.photo.tiled.pictures import FileRows
 
 
 class StoredRows(Protocol):
@@ -44,7 +44,7 @@ class Scratch:
             )
         self.stream = stack.enter_context(tempfile.TemporaryFile())  # noqa: SIM115 - the stack closes it
         self.stream.truncate(needed)
-        self.lock = Lock()
+        self.rows = FileRows(self.stream, shape, dtype)
 
     @contextmanager
     def array(self) -> Iterator[Channels]:
@@ -52,11 +52,7 @@ class Scratch:
         yield np.memmap(self.stream, dtype=self.dtype, mode="r+", shape=self.shape)
 
     def __getitem__(self, rows: slice) -> Channels:
-        length = math.prod(self.shape[1:]) * self.dtype.itemsize
-        with self.lock:
-            self.stream.seek(rows.start * length)
-            data = self.stream.read((rows.stop - rows.start) * length)
-        return np.frombuffer(data, self.dtype).reshape(-1, *self.shape[1:])
+        return self.rows[rows]
 
 
 def upright_copy(rows: StoredRows, orientation: int, step: int, stack: ExitStack) -> Scratch:

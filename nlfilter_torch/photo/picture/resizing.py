@@ -1,6 +1,7 @@
 """Resizing of pictures: interpolation a few rows at a time, means over blocks, and enlarging of blocks."""
 
 import math
+from collections import deque
 from collections.abc import Callable, Iterator
 from functools import partial
 
@@ -12,6 +13,7 @@ from nlfilter_torch.core.torch_internals import cached_constants
 
 Read = Callable[[int, int], Tensor]  # returns the rows (B, C, n, W) of a picture from start to stop
 BLOCK = 64  # rows resized at once
+PIECE = 1 << 21  # pixels, at most, that are reduced along rows at once
 
 
 def resized(
@@ -44,17 +46,28 @@ def resized_parts(
     across = None if columns is None else interpolation(columns, size[1], wanted[1])
     for start in range(rows.start, rows.stop, BLOCK):
         used, weights = interpolation(range(start, min(start + BLOCK, rows.stop)), size[0], wanted[0])
-        yield partial(_part, read(used.start, used.stop), weights, across, wanted[1])
+        step = max(1, PIECE // size[1])
+        pieces = deque(read(first, min(first + step, used.stop)) for first in range(used.start, used.stop, step))
+        yield partial(_part, pieces, weights, across, wanted[1])
 
 
-def _part(rows: Callable[[], Tensor], weights: Tensor, across: tuple[slice, Tensor] | None, width: int) -> Tensor:
-    """Interpolate rows from the rows of the picture that they depend on, and weights."""
-    planes = rows()
-    if across is None:
-        planes = F.interpolate(planes, (planes.shape[2], width), mode="bicubic", antialias=True)
-    else:
-        planes = planes[..., across[0]] @ across[1].to(planes).mT
+def _part(
+    pieces: deque[Callable[[], Tensor]], weights: Tensor, across: tuple[slice, Tensor] | None, width: int
+) -> Tensor:
+    """Interpolate rows from the rows of the picture that they depend on, in a few pieces, and weights.
+
+    A piece that was used, which may keep its pixels, is dropped.
+    """
+    parts = [_along_rows(pieces.popleft()(), across, width) for _ in range(len(pieces))]
+    planes = torch.cat(parts, dim=2)
     return torch.einsum("rn,bcnw->bcrw", weights.to(planes), planes)
+
+
+def _along_rows(planes: Tensor, across: tuple[slice, Tensor] | None, width: int) -> Tensor:
+    """Interpolate each row."""
+    if across is None:
+        return F.interpolate(planes, (planes.shape[2], width), mode="bicubic", antialias=True)
+    return planes[..., across[0]] @ across[1].to(planes).mT
 
 
 @cached_constants  # strips of one picture have the same columns

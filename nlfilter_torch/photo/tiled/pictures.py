@@ -1,9 +1,11 @@
 """Pictures read a few rows at a time: memory maps, zarr arrays, tifffile files, anything that can be sliced."""
 
+import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property, partial
-from typing import Protocol
+from threading import Lock
+from typing import BinaryIO, Protocol
 
 import numpy as np
 import torch
@@ -61,6 +63,34 @@ class LazyRows:
         """Whether a value is not 0; reads a few rows at a time."""
         height = self.shape[0]
         return any(self[start : min(start + CHUNK_ROWS, height)].any() for start in range(0, height, CHUNK_ROWS))
+
+
+@dataclass(frozen=True)
+class FileRows:
+    """Rows in an open file, which are read when they are needed.
+
+    They are not mapped into memory: the system counts what was read of a mapped file as memory of the process.
+
+    Attributes:
+        stream: the file, which holds nothing else.
+        shape: (H, W) or (H, W, S).
+        dtype: of the rows.
+        lock: held while the place in the file matters.
+    """
+
+    stream: BinaryIO
+    shape: tuple[int, ...]
+    dtype: np.dtype[np.generic]
+    lock: Lock = field(default_factory=Lock)
+
+    def __getitem__(self, rows: slice) -> Stored:
+        """The rows from ``rows.start`` to ``rows.stop``."""
+        start, stop, _ = rows.indices(self.shape[0])
+        length = math.prod(self.shape[1:]) * self.dtype.itemsize
+        with self.lock:
+            self.stream.seek(start * length)
+            data = self.stream.read((stop - start) * length)
+        return np.frombuffer(data, self.dtype).reshape(-1, *self.shape[1:])
 
 
 class RowTarget(Protocol):

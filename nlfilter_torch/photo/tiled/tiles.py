@@ -18,6 +18,7 @@ from nlfilter_torch.photo.tiled import sampling
 from nlfilter_torch.photo.tiled.pictures import (
     FLOAT32,
     KINDS,
+    FileRows,
     Picture,
     Rows,
     RowSource,
@@ -217,7 +218,7 @@ def intermediate(rows: Rows, size: tuple[int, int], folder: Path | None) -> Iter
                 reason = f"{error.strerror}, for a temporary file of {needed}"
                 raise OSError(error.errno, reason, str(folder or gettempdir())) from error
         file.flush()
-        yield np.memmap(file, kind, "r", shape=shape)
+        yield FileRows(file, shape, kind)
 
 
 def factor_bytes(pixels: int, num_landmarks: int) -> int:

@@ -47,7 +47,7 @@ def test_apply(pixels: torch.Tensor, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("step", "sentence"),
     [
-        (Step.idle("tone"), "edit.json holds no step that changes anything: the photograph is written as it is"),
+        (Step.idle("tone"), "edit.json holds no step that changes anything: the photograph is written without an edit"),
         (COLORIZE, "in.png is in colour: colorize replaces its colours everywhere by those of the scribbles"),
     ],
     ids=["idle", "colorize"],

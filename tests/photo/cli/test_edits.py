@@ -47,7 +47,9 @@ def test_an_edit_that_changes_nothing_says_so(
 ) -> None:
     verb, *options = map(str, arguments)
     assert main([verb, str(photo), str(tmp_path / "out.png"), *options]) == 0
-    note = f"nlfilter-torch: note: {verb} changes nothing with these options: the photograph is written as it is\n"
+    note = (
+        f"nlfilter-torch: note: {verb} changes nothing with these options: the photograph is written without an edit\n"
+    )
     assert note in capsys.readouterr().err
     assert main(["detail", str(photo), str(tmp_path / "out.png"), "--alpha", "1,1", "--region", "2,2,5,5:2,1"]) == 0
     assert "changes nothing" not in capsys.readouterr().err

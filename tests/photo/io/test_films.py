@@ -8,7 +8,7 @@ import av
 import numpy as np
 import pytest
 
-from nlfilter_torch.photo.io.films import open_film, write_film
+from nlfilter_torch.photo.io.films import changes_between, open_film, stored_format, write_film
 from tests.films import crop, facts, write
 
 
@@ -54,6 +54,54 @@ def test_a_film_keeps_all_but_its_pixels(name: str, options: dict[str, Any], tmp
             assert (
                 np.abs(pixels - crop(60 + 2 * i, 130 + 2 * i, *pixels.shape[:2])).mean() < 6 / 255
             )  # chroma is halved
+
+
+@pytest.mark.parametrize(("codec", "pix_fmt"), [("libx264rgb", "rgb24"), ("png", "rgb24"), ("rawvideo", "bgr24")])
+@pytest.mark.filterwarnings("error")
+def test_films_of_rgb_stay_rgb(codec: str, pix_fmt: str, tmp_path: Path) -> None:
+    """Alternating red and blue columns would become violet if colours were halved."""
+    columns = np.zeros((32, 48, 3), np.uint8)
+    columns[:, ::2, 0] = columns[:, 1::2, 2] = 200
+    source, target = tmp_path / "film.mov", tmp_path / "out.mov"
+    with av.open(str(source), "w") as file:
+        stream = file.add_stream(codec, rate=10, options={"crf": "0"} if codec == "libx264rgb" else {})
+        stream.width, stream.height, stream.pix_fmt = 48, 32, pix_fmt
+        for _ in range(3):
+            file.mux(stream.encode(av.VideoFrame.from_ndarray(columns, format="rgb24").reformat(format=pix_fmt)))
+        file.mux(stream.encode(None))
+    assert copy(source, target) == 3
+    with open_film(target) as film:
+        assert film.stream.codec_context.format.is_rgb
+        assert np.abs(film.sample(1)[0] - columns / 255).max() < 6 / 255
+
+
+def test_what_an_encoder_lacks_is_named(tmp_path: Path) -> None:
+    nearest = {
+        ("yuv420p", "libx264"): "yuv420p",
+        ("yuv411p", "libx264"): "yuv422p",
+        ("yuv440p", "libx264"): "yuv444p",
+        ("yuyv422", "libx264"): "yuv422p",
+        ("p010le", "libx265"): "yuv420p10le",
+        ("gray", "libx264"): "gray",
+        ("gbrp", "libx265"): "gbrp",
+        ("rgb48le", "libx264"): "bgr24",
+        ("yuv422p12le", "prores_ks"): "yuv422p10le",
+        ("gbrp", "prores_ks"): "yuv444p10le",
+    }
+    for (wanted, encoder), stored in nearest.items():
+        assert stored_format(av.VideoFormat(wanted), encoder)[1].name == stored
+    differences = changes_between(av.VideoFormat("gbrp12le"), av.VideoFormat("yuv420p"))
+    assert list(differences) == [
+        "2x2 in place of 1x1 pixels share a colour",
+        "YCbCr in place of RGB",
+        "8 bits in place of 12",
+    ]
+    film = write(
+        tmp_path / "film.mov", codec="prores_ks", pix_fmt="yuv444p10le", sound=None, options={"profile": "4444"}
+    )
+    message = "stores frames as yuv444p10le, since prores_ks has no yuv444p12le: 10 bits in place of 12"
+    with pytest.warns(UserWarning, match=message):
+        copy(film, tmp_path / "out.mov")
 
 
 def test_colours_are_those_that_the_tags_say(tmp_path: Path) -> None:
