@@ -1,5 +1,6 @@
 """Edits of single photographs by commands: the results of the functions, the same in tiles, and refusals."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -281,3 +282,22 @@ def test_the_same_pixels_in_memory_and_from_a_file(photo: Path, pixels: torch.Te
     edit = EditJob(Step("tone", contrast=1.3), str(photo), "", ScribbleOptions(), None, None, None, 0, None, False)
     wanted = adjust_tone(pixels, contrast=1.3, generator=seeded())
     assert (edit.edited(read_photograph(photo)) - wanted).abs().max() < 1e-5
+
+
+def test_the_noise_of_a_faint_picture_is_told_as_a_share_of_its_range(
+    pixels: torch.Tensor, tmp_path: Path, tiled: bool, capsys: pytest.CaptureFixture[str]
+) -> None:
+    noisy = pixels + 0.1 * torch.randn(pixels.shape, generator=torch.Generator().manual_seed(0))
+    for name, scale, unit in (
+        ("in.png", 0.01, r"0\.\d+ grey levels"),
+        ("in.tif", 60000.0, r"\d+ \(in values of the file\)"),
+    ):
+        source, target = tmp_path / name, tmp_path / f"out-{name}"
+        write_photograph(Photograph(scale * noisy, "uint16" if scale < 1 else "float32"), source)
+        assert main(["denoise", str(source), str(target), "--noise-level", "0.2"]) == 0
+        told = capsys.readouterr().out
+        share = r"[\d.e-]+ % of the range in use"
+        assert re.search(rf"given noise of .+, {share}.*; ", told)
+        assert main(["denoise", str(source), str(target)]) == 0
+        told = capsys.readouterr().out
+        assert re.search(rf"estimated noise of {unit}, {share}|no pixel changed", told), told
