@@ -19,6 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from benchmarks.denoising.cases import psnr
 from benchmarks.levin import propagate
 from benchmarks.photographs import photograph, pictures
 from nlfilter_torch import colorize
@@ -107,11 +108,6 @@ METHODS: dict[str, Method] = {
     "k-means": lambda grey, strokes, mask: colorize(grey, strokes, mask, method="kmeans"),
     "Levin": levin,
 }
-
-
-def psnr(result: Tensor, wanted: Tensor) -> float:
-    """PSNR in dB, for images in [0, 1]."""
-    return float(-10 * (result - wanted).square().mean().log10())
 
 
 def crops(names: tuple[str, ...], shape: tuple[int, int]) -> dict[str, Tensor]:

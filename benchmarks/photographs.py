@@ -50,6 +50,21 @@ def pictures(folder: Path | None, side: int, names: Sequence[str]) -> dict[str, 
     return {name: reduced_to(picture.expand(-1, 3, -1, -1), side) for name, picture in images.items()}
 
 
+def kodak(folder: Path, number: int) -> torch.Tensor:
+    """One of Kodak's 24 photographs (1, 3, H, W), from a folder of files with their usual names (kodim07.png)."""
+    return read_photograph(folder / f"kodim{number:02d}.png").pixels.float()
+
+
+def middle(picture: torch.Tensor, height: int, width: int) -> torch.Tensor:
+    """The middle of a photograph (1, C, H, W), as large as fits the shape, reduced to (height, width) by area."""
+    rows, columns = picture.shape[-2:]
+    scale = min(rows / height, columns / width)
+    cut = (round(height * scale), round(width * scale))
+    top, left = (rows - cut[0]) // 2, (columns - cut[1]) // 2
+    part = picture[..., top : top + cut[0], left : left + cut[1]].float()
+    return F.interpolate(part, (height, width), mode="area").contiguous()
+
+
 def reduced_to(picture: torch.Tensor, side: int) -> torch.Tensor:
     """Reduce a photograph to a short side; smaller ones are not changed."""
     scale = side / min(picture.shape[-2:])

@@ -101,3 +101,14 @@ def noisy(image: torch.Tensor, noise: float | torch.Tensor, seed: int = 0) -> to
 def decibels(image: torch.Tensor, clean: torch.Tensor) -> float:
     """Peak signal-to-noise ratio."""
     return float(-10 * (image - clean).square().mean().log10())
+
+
+def oriented(image: torch.Tensor, number: int) -> torch.Tensor:
+    """An image (..., H, W) in an orientation of eight: 1 flips rows, 2 columns, 4 exchanges the axes afterwards."""
+    flipped = image.flip([axis for axis, bit in ((-2, 1), (-1, 2)) if number & bit])
+    return flipped.mT if number & 4 else flipped
+
+
+def inverse(image: torch.Tensor, number: int) -> torch.Tensor:
+    """The image of which this is the orientation."""
+    return oriented(image.mT if number & 4 else image, number & 3)

@@ -5,7 +5,8 @@ from kornia.color import rgb_to_lab
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from benchmarks.colorize import levin, psnr
+from benchmarks.colorize import levin
+from benchmarks.denoising.cases import psnr
 from benchmarks.figures.scenes import SIDE, SIZE, Box, Numbers, luminance, painted_over, rounded, scene, spots, strokes
 from nlfilter_torch import colorize, diffusion_mask, nonlocal_operator, recolor
 from nlfilter_torch.photo.picture.colour import merge_luminance, split_luminance

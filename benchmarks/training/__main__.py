@@ -20,20 +20,26 @@ TOPICS: dict[str, str] = {  # name of a module of this package: what it measures
     "equivariance": "layers, masks and edits of pictures that are flipped, transposed or rotated",
     "landmarks": "landmarks that are held: slopes, noise, recovered parameters, training",
 }
+ON_KODAK = ("functions", "landmarks")  # topics with a choice of photographs
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Measure the topics, print a table of each, and return 1 if a figure falls short of its limit."""
+    """Measure the topics, print a table of each, and return 1 if a figure falls short of its limit or is not finite."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.training", description=__doc__)
     topics = "; ".join(f"{name}: {text}" for name, text in TOPICS.items())
     parser.add_argument("topics", nargs="*", default=list(TOPICS), help=topics)
-    parser.add_argument("--quick", action="store_true", help="small cases, to see that everything runs")
+    small = "small cases, to see that everything runs; figures of full size, times among them, have no limits there"
+    parser.add_argument("--quick", action="store_true", help=small)
+    folder = f"folder with kodim01.png to kodim24.png: {' and '.join(ON_KODAK)} measure on some of them"
+    parser.add_argument("--kodak", type=Path, metavar="FOLDER", help=f"{folder} (default: scikit-image's)")
     parser.add_argument("--out", type=Path, help="JSON with every figure")
     options = parser.parse_args(arguments)
     figures: dict[str, list[Figure]] = {}
     for topic in options.topics:
         print(f"{topic}: {TOPICS[topic]}", flush=True)
-        figures[topic] = list(importlib.import_module(f"benchmarks.training.{topic}").measure(quick=options.quick))
+        measure = importlib.import_module(f"benchmarks.training.{topic}").measure
+        photographs = {"kodak": options.kodak} if topic in ON_KODAK else {}
+        figures[topic] = list(measure(quick=options.quick, **photographs))
         print(table(figures[topic]), flush=True)
     if options.out:
         options.out.parent.mkdir(parents=True, exist_ok=True)

@@ -29,31 +29,21 @@ from nlfilter_torch import (
     region_mask,
     sharpen,
 )
+from tests.problems import inverse, oriented
 
 LIMIT, LEVELS = 0.05, 255
-TRANSFORMATIONS = range(1, 8)  # number 1 flips the rows, 2 the columns, 4 exchanges the axes afterwards
+ORIENTATIONS = range(1, 8)  # all others, see tests.problems.oriented
 PICTURES = ("chelsea", "coffee", "rocket")
 EDITED = "astronaut"
 SIZES = ((127, 171), (301, 397))  # of the pictures that are edited; larger ones are reduced within some edits
 Edit = Callable[..., Tensor]
 
 
-def turned(planes: Tensor, number: int) -> Tensor:
-    """Planes (..., H, W) in one of the eight orientations."""
-    flipped = planes.flip([axis for axis, bit in ((-2, 1), (-1, 2)) if number & bit])
-    return flipped.mT if number & 4 else flipped
-
-
-def turned_back(planes: Tensor, number: int) -> Tensor:
-    """The planes of which these are the orientation."""
-    return turned(planes.mT if number & 4 else planes, number & 3)
-
-
 def differences(edit: Edit, planes: list[Tensor], numbers: range) -> Tensor:
     """Differences in grey levels, of all pixels, between results for turned planes and turned results."""
     with torch.no_grad():
         expected = edit(*planes)
-        results = [turned_back(edit(*(turned(part, number) for part in planes)), number) for number in numbers]
+        results = [inverse(edit(*(oriented(part, number) for part in planes)), number) for number in numbers]
     return torch.stack([(result - expected).abs().flatten() for result in results]).flatten() * LEVELS
 
 
@@ -137,7 +127,7 @@ def of_layers(numbers: range) -> Iterator[Figure]:
 
 def measure(*, quick: bool) -> Iterator[Figure]:
     """Measure layers, masks and edits."""
-    numbers = range(5, 6) if quick else TRANSFORMATIONS
+    numbers = range(5, 6) if quick else ORIENTATIONS
     yield from of_layers(numbers)
     for size in SIZES[:1] if quick else SIZES:
         image = photograph(EDITED, *size)

@@ -1,5 +1,6 @@
 """A figure with its limit, and the table of several."""
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -24,7 +25,9 @@ class Figure:
 
     @property
     def holds(self) -> bool:
-        """Whether the value keeps the limit."""
+        """Whether the value is finite, and keeps the limit if there is one."""
+        if not math.isfinite(self.value):
+            return False
         return self.limit is None or (self.value <= self.limit if self.at_most else self.value >= self.limit)
 
 
@@ -33,6 +36,6 @@ def table(figures: Iterable[Figure]) -> str:
     lines = []
     for figure in figures:
         bound = "" if figure.limit is None else f"{'at most' if figure.at_most else 'at least'} {figure.limit:.4g}"
-        verdict = "" if figure.limit is None else "holds" if figure.holds else "FALLS SHORT"
+        verdict = "FALLS SHORT" if not figure.holds else "" if figure.limit is None else "holds"
         lines.append(f"{figure.name:<78} {figure.value:>10.4g} {figure.unit:<7} {bound:<18} {verdict}".rstrip())
     return "\n".join(lines)

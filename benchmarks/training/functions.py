@@ -1,17 +1,22 @@
 """f(W) of any response: its error against the dense eigen-decomposition, its cost at a megapixel, and the methods.
 
-The forms and limits of the methods were chosen on the astronaut; the figures are of other photographs.
+The forms and limits of the methods were chosen on the astronaut; coffee, chelsea and camera were looked at meanwhile.
+The figures are of other photographs (:mod:`benchmarks.training.held_out`).
 """
 
 import math
 import time
 from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
 
 import torch
 from torch import Tensor
 
-from benchmarks.photographs import photograph
+from benchmarks.photographs import middle
 from benchmarks.training.figures import Figure
+from benchmarks.training.held_out import held_out, large
 from nlfilter_torch import (
     NonlocalOperator,
     apply_function,
@@ -27,13 +32,29 @@ from nlfilter_torch.filtering.rational_product import rational_product
 from nlfilter_torch.operator.pixel_matrix import PixelMatrix
 
 LEVELS = 255
-PICTURES = ("coffee", "chelsea", "camera")
 Response = Callable[[Tensor], Tensor]
 
 
-def picture(name: str, height: int, width: int, dtype: torch.dtype = torch.float32) -> Tensor:
-    """The middle of a photograph, (1, C, height, width), reduced."""
-    return photograph(name, height, width).to(dtype)
+@dataclass(frozen=True)
+class Setup:
+    """What is measured on.
+
+    Attributes:
+        quick: small cases, whose times mean nothing.
+        kodak: folder of Kodak's photographs; None takes scikit-image's.
+    """
+
+    quick: bool
+    kodak: Path | None = None
+
+    @cached_property
+    def pictures(self) -> list[Tensor]:
+        """Photographs (1, C, H, W)."""
+        return list(held_out(self.kodak).values())[: 1 if self.quick else None]
+
+    def middles(self, side: int) -> list[Tensor]:
+        """The middle of each, (1, C, side, side)."""
+        return [middle(image, side, side) for image in self.pictures]
 
 
 def tenth_power(values: Tensor) -> Tensor:
@@ -68,9 +89,8 @@ def step_between(values: Tensor) -> dict[str, Response]:
     return {"step": lambda s: s > middle} if float(gaps.max()) >= 0.02 else {}
 
 
-def dense_errors(name: str, count: int) -> Iterator[tuple[str, float, float]]:
+def dense_errors(image: Tensor, count: int) -> Iterator[tuple[str, float, float]]:
     """Each response with its largest error in float64 and in float32, against the dense eigen-decomposition."""
-    image = picture(name, 32, 32, torch.float64)
     operator = nonlocal_operator(image, num_landmarks=count, photometric_bandwidth=20 / LEVELS)
     w = operator.to_dense()[0]
     values, vectors = torch.linalg.eigh((w + w.mT) / 2)
@@ -87,13 +107,13 @@ def dense_errors(name: str, count: int) -> Iterator[tuple[str, float, float]]:
         yield kind, errors[0], errors[1]
 
 
-def against_dense(quick: bool) -> Iterator[Figure]:
+def against_dense(setup: Setup) -> Iterator[Figure]:
     """Largest errors over pictures and numbers of landmarks."""
     double: dict[str, float] = {}
     single: dict[str, float] = {}
-    for name in PICTURES[: 1 if quick else None]:
-        for count in (20, 100) if quick else (20, 100, 1024):
-            for kind, error, rounded in dense_errors(name, count):
+    for image in setup.middles(32):
+        for count in (20, 100) if setup.quick else (20, 100, 1024):
+            for kind, error, rounded in dense_errors(image.double(), count):
                 double[kind] = max(double.get(kind, 0.0), error)
                 single[kind] = max(single.get(kind, 0.0), rounded)
     for kind, error in double.items():
@@ -103,11 +123,10 @@ def against_dense(quick: bool) -> Iterator[Figure]:
         yield Figure(f"the same in float32: {kind}", error, 1e-3 if smooth else None)
 
 
-def against_products(quick: bool) -> Iterator[Figure]:
+def against_products(setup: Setup) -> Iterator[Figure]:
     """Identity and polynomials against products with W."""
     identity, polynomials = 0.0, 0.0
-    for name in PICTURES[: 1 if quick else None]:
-        image = picture(name, 96, 96)
+    for image in setup.middles(96):
         operator = nonlocal_operator(image)
         change = spectral_filter(operator, image, lambda values: values) - operator @ image
         identity = max(identity, float(change.abs().max()))
@@ -130,13 +149,14 @@ def shortest(call: Callable[[], object], repeats: int = 3) -> float:
 
 
 @torch.no_grad()
-def at_a_megapixel(quick: bool) -> Iterator[Figure]:
+def at_a_megapixel(setup: Setup) -> Iterator[Figure]:
     """Error and time of the power 0.1, for one channel and for three."""
-    side = 256 if quick else 1024
-    image = picture("retina", side, side)
+    side = 128 if setup.quick else 1024
+    image = large(setup.kodak, side)
     operator = nonlocal_operator(image)
     for planes in (image[:, :1], image):
-        yield from _cost(operator, planes, f"power 0.1 of {side}x{side}, {planes.shape[1]} channel(s)")
+        text = f"power 0.1 of {side}x{side}, {planes.shape[1]} channel(s)"
+        yield from _cost(operator, planes, text, None if setup.quick else 15.0)
     planes = image[:, :1]
     result = apply_function(operator, planes, tenth_power)
     exact = apply_function(operator.to(torch.float64), planes.double(), tenth_power, tolerance=2e-6)
@@ -144,7 +164,7 @@ def at_a_megapixel(quick: bool) -> Iterator[Figure]:
     yield Figure(f"power 0.1 of {side}x{side}: largest error", error, 0.5, "levels")
 
 
-def _cost(operator: NonlocalOperator, planes: Tensor, text: str) -> Iterator[Figure]:
+def _cost(operator: NonlocalOperator, planes: Tensor, text: str, limit: float | None) -> Iterator[Figure]:
     """Time in turns with that of the layers, and the number of products."""
     result = apply_function(operator, planes, tenth_power)
     pairs = [
@@ -155,7 +175,7 @@ def _cost(operator: NonlocalOperator, planes: Tensor, text: str) -> Iterator[Fig
         for _ in range(3)
     ]
     ratio = min(function for function, _ in pairs) / min(layers for _, layers in pairs)
-    yield Figure(f"{text}: time in units of detail_layers", ratio, 15.0)
+    yield Figure(f"{text}: time in units of detail_layers", ratio, limit)
     yield Figure(f"{text}: products with W", result.products)
     yield Figure(f"{text}: shifted systems, each a Gram matrix and a product", result.shifts)
 
@@ -199,21 +219,30 @@ def compared(operator: NonlocalOperator, image: Tensor, decades: int) -> Iterato
 
 
 @torch.no_grad()
-def methods(quick: bool) -> Iterator[Figure]:
+def methods(setup: Setup) -> Iterator[Figure]:
     """The three methods on one picture in float64."""
-    side = 96 if quick else 256
-    image = picture("coffee", side, side, torch.float64)
+    side = 96 if setup.quick else 256
+    image = middle(setup.pictures[0], side, side).double()
     operator = nonlocal_operator(image, photometric_bandwidth=20 / LEVELS)
     yield from compared(operator, image, min(max(math.ceil(-math.log10(float(operator.remainder.min()))), 1), 16))
 
 
+def darker(image: Tensor, result: Tensor) -> float:
+    """Share of the pixels that are darker than before by more than 50 levels, in percent."""
+    return 100 * float((image - result > 50 / LEVELS).double().mean())
+
+
+def black(image: Tensor, result: Tensor) -> float:
+    """Share of the pixels that turn black: from more than 30 levels to less than 5, in percent."""
+    return 100 * float(((image > 30 / LEVELS) & (result < 5 / LEVELS)).double().mean())
+
+
 @torch.no_grad()
-def black_pixels(quick: bool) -> Iterator[Figure]:
-    """Share of the pixels that the power 0.1 darkens by more than 50 levels: eq. 10, the default, and f(W)."""
-    side = 96 if quick else 192
-    worst = {"eq. 10 (residual=0.0)": 0.0, "a spectrum, by default": 0.0, "the operator": 0.0}
-    for name in PICTURES:
-        image = picture(name, side, side)
+def black_pixels(setup: Setup) -> Iterator[Figure]:
+    """Pixels that the power 0.1 darkens: eq. 10, a spectrum by default, and f(W), which darkens a few itself."""
+    kinds = ("eq. 10 (residual=0.0)", "a spectrum, by default", "the operator")
+    darkened, blackened, beyond = dict.fromkeys(kinds, 0.0), dict.fromkeys(kinds, 0.0), 0.0
+    for image in setup.middles(96 if setup.quick else 192):
         for bandwidth in (10, 20):
             operator = nonlocal_operator(image, photometric_bandwidth=bandwidth / LEVELS)
             spectrum = operator.spectrum()
@@ -222,13 +251,18 @@ def black_pixels(quick: bool) -> Iterator[Figure]:
                 spectral_filter(spectrum, image, tenth_power),
                 spectral_filter(operator, image, tenth_power),
             )
-            for kind, result in zip(worst, results, strict=True):
-                worst[kind] = max(worst[kind], 100 * float((image - result > 50 / LEVELS).double().mean()))
-    for kind, share in worst.items():
-        yield Figure(f"power 0.1: pixels darker by 50 levels, {kind}", share, None if "eq" in kind else 0.0, "%")
+            for kind, result in zip(kinds, results, strict=True):
+                darkened[kind] = max(darkened[kind], darker(image, result))
+                blackened[kind] = max(blackened[kind], black(image, result))
+            beyond = max(beyond, darker(results[2], results[1]))
+    for kind in kinds:
+        yield Figure(f"power 0.1: pixels darker by 50 levels, {kind}", darkened[kind], unit="%")
+        yield Figure("  pixels that turn black", blackened[kind], None if "eq" in kind else 0.0, "%")
+    yield Figure("  darker by 50 levels than by the operator, a spectrum, by default", beyond, 0.0, "%")
 
 
-def measure(quick: bool = False) -> Iterable[Figure]:
-    """All figures."""
+def measure(quick: bool = False, kodak: Path | None = None) -> Iterable[Figure]:
+    """All figures, on scikit-image's photographs or on those in a folder of Kodak's."""
+    setup = Setup(quick, kodak)
     for part in (against_products, against_dense, black_pixels, methods, at_a_megapixel):
-        yield from part(quick)
+        yield from part(setup)

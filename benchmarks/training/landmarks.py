@@ -10,10 +10,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
-from skimage import data
 from torch import Tensor, nn
 
+from benchmarks.photographs import photograph
 from benchmarks.training.figures import Figure
+from benchmarks.training.held_out import held_out
 from nlfilter_torch import NonlocalFilter
 from nlfilter_torch.nn.held import Hold
 from nlfilter_torch.operator.options import Sampling
@@ -22,8 +23,7 @@ LANDMARKS = 100
 BANDWIDTH = 20 / 255
 STEPS = (1e-4, 1e-3, 1e-2)  # relative steps of the bandwidth
 SIDE = 64
-MEASURED = ("coffee", "chelsea", "rocket")
-TRAINED = ("astronaut", "camera", "cat")  # for landmarks of new images; none of them is measured
+TRAINED = ("astronaut", "camera", "chelsea")  # for landmarks of new images; none of them is measured
 SLIDERS = (3.0, 1.5, 2.0, 1.05)
 
 
@@ -64,11 +64,11 @@ CHOICES = (ASSIGNED, FIXED, UNIFORM, ANEW)
 HELD = (ASSIGNED, FIXED)
 
 
-def crop(name: str, side: int = SIDE, *, dtype: torch.dtype = torch.float64) -> Tensor:
-    """The middle of a picture of scikit-image, half its size, in luminance, (1, 1, side, side)."""
-    picture = torch.from_numpy(getattr(data, name)().copy()).double() / 255
-    grey = picture @ torch.tensor([0.299, 0.587, 0.114], dtype=torch.float64) if picture.ndim == 3 else picture
-    half = torch.nn.functional.avg_pool2d(grey[None, None], 2)
+def crop(picture: Tensor, side: int = SIDE, *, dtype: torch.dtype = torch.float64) -> Tensor:
+    """The middle of a photograph (1, C, H, W), half its size, in luminance, (1, 1, side, side)."""
+    weights = torch.tensor([0.299, 0.587, 0.114] if picture.shape[1] == 3 else [1.0], dtype=torch.float64)
+    grey = (picture.double() * weights.view(1, -1, 1, 1)).sum(1, keepdim=True)
+    half = torch.nn.functional.avg_pool2d(grey, 2)
     top, left = ((length - side) // 2 for length in half.shape[2:])
     return half[:, :, top : top + side, left : left + side].to(dtype).contiguous()
 
@@ -183,9 +183,9 @@ def fit_to_exact(choice: Choice, image: Tensor, count: int, evaluations: int) ->
     return errors
 
 
-def training_images(names: Iterable[str], side: int) -> Tensor:
+def batch_of(pictures: Iterable[Tensor], side: int) -> Tensor:
     """Crops of pictures, (B, 1, side, side) in float32."""
-    return torch.cat([crop(name, side, dtype=torch.float32) for name in names])
+    return torch.cat([crop(picture, side, dtype=torch.float32) for picture in pictures])
 
 
 def noisy(image: Tensor, seed: int) -> Tensor:
@@ -235,9 +235,13 @@ class Denoiser(nn.Module):
         return filtered
 
 
-def train(choice: Choice, steps: int, side: int = SIDE, count: int = LANDMARKS) -> Training:
-    """Train a guide and a filter on new noise in every step; landmarks that are held are renewed every 20 steps."""
-    clean, model = training_images(TRAINED, side), Denoiser(choice, count)
+def train(choice: Choice, unseen: Tensor, steps: int, count: int = LANDMARKS) -> Training:
+    """Train a guide and a filter on new noise in every step; landmarks that are held are renewed every 20 steps.
+
+    ``unseen`` (B, 1, side, side) are the pictures on which the result is measured.
+    """
+    clean = batch_of((photograph(name) for name in TRAINED), unseen.shape[3])
+    model = Denoiser(choice, count)
     optimizer, losses, start = torch.optim.Adam(model.parameters(), lr=0.01), [], time.process_time()
     for step in range(steps):
         image = noisy(clean, step)
@@ -249,7 +253,7 @@ def train(choice: Choice, steps: int, side: int = SIDE, count: int = LANDMARKS) 
         optimizer.step()
         losses.append(loss.item())
     seconds = time.process_time() - start
-    return Training(losses, *qualities(model, training_images(MEASURED, side), steps), seconds)
+    return Training(losses, *qualities(model, unseen, steps), seconds)
 
 
 @torch.no_grad()
@@ -267,10 +271,11 @@ def qualities(model: Denoiser, unseen: Tensor, seed: int) -> tuple[float, float]
     return values[0], values[1]
 
 
-def measure(quick: bool) -> Iterable[Figure]:
-    """Measure every figure; ``quick`` uses one small picture."""
-    side, names = (24, MEASURED[:1]) if quick else (SIDE, MEASURED)
-    images = [crop(name, side) for name in names]
+def measure(quick: bool, kodak: Path | None = None) -> Iterable[Figure]:
+    """Measure every figure on scikit-image's photographs or on Kodak's; ``quick`` uses one small picture."""
+    side = 24 if quick else SIDE
+    pictures = list(held_out(kodak).values())
+    images = [crop(picture, side) for picture in pictures[: 1 if quick else None]]
     for choice in CHOICES:
         worst = max(slope_error(choice, image, step) for image in images for step in STEPS)
         limit = 0.01 if choice in HELD else None
@@ -284,7 +289,7 @@ def measure(quick: bool) -> Iterable[Figure]:
         limit = 1e-6 if choice in HELD else None
         yield Figure(f"error of (alpha, h) recovered by L-BFGS: {choice.name}", worst, limit)
     yield from _fits(images, quick)
-    yield from _trainings(quick)
+    yield from _trainings(batch_of(pictures, side), 3 if quick else 150)
 
 
 def _fits(images: list[Tensor], quick: bool) -> Iterable[Figure]:
@@ -295,10 +300,9 @@ def _fits(images: list[Tensor], quick: bool) -> Iterable[Figure]:
             yield Figure(f"50 landmarks fitted to a filter with all: {choice.name}{name}", mean, unit="levels")
 
 
-def _trainings(quick: bool) -> Iterable[Figure]:
-    side, steps = (24, 3) if quick else (SIDE, 150)
+def _trainings(unseen: Tensor, steps: int) -> Iterable[Figure]:
     for choice, count in ((FIXED, LANDMARKS), (FIXED, 3 * LANDMARKS), (UNIFORM, LANDMARKS), (ANEW, LANDMARKS)):
-        run, name = train(choice, steps, side, count), f"{choice.name}, m = {count}"
+        run, name = train(choice, unseen, steps, count), f"{choice.name}, m = {count}"
         yield Figure(f"new pictures denoised after training: {name}", run.quality, unit="dB")
         if choice.hold:
             yield Figure(f"the same, renewed for each picture: {name}", run.renewed, unit="dB")
@@ -309,7 +313,7 @@ def draw(path: Path) -> None:
     """Draw the loss over the bandwidth and the course of L-BFGS."""
     from matplotlib.figure import Figure as Plot
 
-    image = crop(MEASURED[0])
+    image = crop(photograph("coffee"))
     plot = Plot(figsize=(9, 3.4), dpi=100, layout="constrained")
     near, course = plot.subplots(1, 2)
     for choice in CHOICES:

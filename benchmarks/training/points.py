@@ -16,6 +16,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from benchmarks.denoising.cases import psnr
 from benchmarks.memory import forget_peak, resident
 from benchmarks.training.figures import Figure
 from nlfilter_torch import NonlocalOperator, fit_alpha, nonlocal_operator, operator_from_features, polynomial_filter
@@ -95,11 +96,6 @@ def nonlocal_means(noisy: Tensor, _: Tensor, patch: int, distance: int, bandwidt
         noisy[0, 0].numpy(), patch_size=patch, patch_distance=distance, h=bandwidth * NOISE, sigma=NOISE
     )
     return torch.from_numpy(result)[None, None]
-
-
-def psnr(result: Tensor, clean: Tensor) -> float:
-    """In dB, for a range of 1."""
-    return -10 * math.log10(float((result - clean).square().mean()))
 
 
 def cloud(quick: bool) -> Iterator[Figure]:

@@ -31,7 +31,7 @@ from nlfilter_torch.operator.coverage import (
     LARGEST_SHARE,
     LEAST_POINTS,
     SAMPLED,
-    sampled_places,
+    sampled_points,
     share_above,
 )
 from nlfilter_torch.operator.eigenvalue_bound import exceeds, is_bounded, limiter, shifted_gram, slack
@@ -511,7 +511,7 @@ def _landmarks(
 
 def _places(points: int, features: Tensor) -> Tensor:
     """Numbers of the points whose features are kept, on the device of features."""
-    return sampled_places(points).to(features.device)
+    return sampled_points(points).to(features.device)
 
 
 def _least(weights: Tensor | None, communicator: Communicator) -> Tensor | None:

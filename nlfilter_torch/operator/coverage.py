@@ -21,7 +21,7 @@ GOLDEN = 0.6180339887498949  # whose multiples, without their whole parts, sprea
 HALF = 0.5  # share of its weight by which the row of a badly covered point is off
 
 
-def sampled_places(points: int) -> Tensor:
+def sampled_points(points: int) -> Tensor:
     """Numbers (S,) of the points whose features are kept, spread over all ``points``; always the same."""
     if points <= 2 * SAMPLED:
         return torch.arange(points)

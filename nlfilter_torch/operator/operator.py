@@ -23,7 +23,7 @@ from nlfilter_torch.core.precision import full_precision, trainable, uncompiled
 from nlfilter_torch.core.torch_internals import outside_transforms, refuse_transforms
 from nlfilter_torch.operator.assignment import Assignment
 from nlfilter_torch.operator.columns import Columns
-from nlfilter_torch.operator.coverage import SAMPLED, SampledRows, sampled_places
+from nlfilter_torch.operator.coverage import SAMPLED, SampledRows, sampled_points
 from nlfilter_torch.operator.eigenvalue_bound import largest_eigenvalue, shifted_gram
 from nlfilter_torch.operator.features import GuideFeatures
 from nlfilter_torch.operator.nystrom import nystrom_factor
@@ -46,7 +46,7 @@ class Kernel:
         limiter: (B, M, M) matrix by which the factor is multiplied so that no eigenvalue of W exceeds 1, or None.
         features: computes features of a guide; None if the operator was made from features.
         assignment: of which points the landmarks are made; None if they were passed as features.
-        sample: features (B, D, S) of the :func:`sampled_places` of the operator's own points; None in compiled
+        sample: features (B, D, S) of the :func:`sampled_points` of the operator's own points; None in compiled
             programs, and if rows are distributed. Without a gradient.
     """
 
@@ -442,7 +442,7 @@ class NonlocalOperator(Batch):
         if self.kernel.sample is None:
             return self.factor.new_full((len(self),), torch.nan, dtype=torch.float64)
         points = self.communicator.pixels(self.factor.shape[2])
-        places = sampled_places(points).to(self.device)
+        places = sampled_points(points).to(self.device)
         weights = torch.ones_like(self.scaling) if self.weights is None else self.weights.expand_as(self.scaling)
         planes = torch.stack([self.scaling, self.remainder, weights.to(self.scaling)], dim=1)
         factor, planes = (self.communicator.columns(tensor, places) for tensor in (self.factor, planes))

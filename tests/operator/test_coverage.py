@@ -11,7 +11,7 @@ from torch import Tensor
 
 from nlfilter_torch import NonlocalOperator, nonlocal_operator, operator_from_features
 from nlfilter_torch.operator.build import operator_from_points
-from nlfilter_torch.operator.coverage import LARGEST_SHARE, LEAST_POINTS, SAMPLED, sampled_places, share_above
+from nlfilter_torch.operator.coverage import LARGEST_SHARE, LEAST_POINTS, SAMPLED, sampled_points, share_above
 from nlfilter_torch.operator.options import Construction
 from tests.problems import noise, seeded
 
@@ -95,10 +95,10 @@ def test_points_that_do_not_count_have_no_share() -> None:
 
 def test_sampled_places_are_distinct_and_the_same_in_every_call() -> None:
     for points in (1, 2 * SAMPLED, 2 * SAMPLED + 1, 10**6):
-        places = sampled_places(points)
+        places = sampled_points(points)
         assert len(places.unique()) == len(places) == (points if points <= 2 * SAMPLED else SAMPLED)
         assert places.max() < points
-        assert places.equal(sampled_places(points))
+        assert places.equal(sampled_points(points))
 
 
 @pytest.mark.parametrize(("sampled", "error"), [(0, ValueError), (2.5, TypeError)])

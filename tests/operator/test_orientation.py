@@ -17,19 +17,9 @@ from nlfilter_torch.operator.orientation import (
     source_pixels,
 )
 from tests.images import hard_images, photograph
+from tests.problems import inverse, oriented
 
 LEVELS = 0.05 / 255  # difference of images that counts as rounding
-
-
-def oriented(image: Tensor, number: int) -> Tensor:
-    """An image (..., H, W) in one of its eight orientations."""
-    flipped = image.flip([axis for axis, bit in ((-2, 1), (-1, 2)) if number & bit])
-    return flipped.mT if number & 4 else flipped
-
-
-def inverse(image: Tensor, number: int) -> Tensor:
-    """The image of which this is the orientation."""
-    return oriented(image.mT if number & 4 else image, number & 3)
 
 
 def every_orientation(image: Tensor) -> list[Tensor]:

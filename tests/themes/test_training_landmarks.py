@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
+from benchmarks.photographs import photograph
 from benchmarks.training import landmarks
 from benchmarks.training.__main__ import main
 
@@ -16,7 +17,7 @@ def test_every_limit_holds_on_a_small_picture(capsys: pytest.CaptureFixture[str]
 
 
 def test_slopes_and_recovery_with_landmarks_that_are_held() -> None:
-    image = landmarks.crop("coins", 24)
+    image = landmarks.crop(photograph("coins"), 24)
     for choice in landmarks.HELD:
         assert landmarks.slope_error(choice, image, 1e-3) < 0.01
         assert landmarks.answer_to_noise(choice, image) < 1e-4
