@@ -3,7 +3,7 @@
 import csv
 import statistics
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from io import StringIO
 from pathlib import Path
@@ -15,8 +15,10 @@ from matplotlib.figure import Figure
 from safetensors.torch import save as as_bytes
 from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel
+from torch.utils.data import DataLoader
 
-from benchmarks.denoiser_training.examples import SHARES, Examples, Source
+from benchmarks.denoiser_training.examples import SHARES, Batches, Examples, Source
+from benchmarks.denoiser_training.graphs import graphed_pivots
 from benchmarks.denoiser_training.pictures import Pictures
 from nlfilter_torch.nn.denoiser.network import PLANES, SLOPE, WIDTH, Layer, NonlocalDenoiser, shapes_of
 from nlfilter_torch.nn.denoiser.weights import read_weights
@@ -30,10 +32,12 @@ ADAM_RATE = 0.5  # of Adam, for all other weights, relative to that of Muon
 BANDWIDTH_RATE = 2.5  # of Adam, for bandwidths, which are scalars learned as logarithms, likewise
 EXPECTED = 0.55  # exponent with which the error of a denoiser grows with the noise
 WARM_UP = 200  # steps over which the learning rate rises
-FALL = 0.5  # final share of the steps, over which the learning rate falls to zero along half a cosine
+FALL = 0.7  # final share of the steps, over which the learning rate falls to zero along half a cosine
+EXACT = 0.3  # final share of the steps with convolutions in float32, where the others have bfloat16
 LARGEST_GRADIENT = 0.5  # norm to which gradients are clipped
 LATE = 10  # the running mean of the weights is over the last 1/LATE of the steps, about
 EVERY = 250  # steps between checkpoints
+PREFETCHED = 4  # batches that each process makes ahead
 ASIDE, ASIDE_SEED = 16, 1_000_000  # examples of each kind set aside for judging, and their seed
 
 
@@ -62,9 +66,13 @@ class Plan:
         rate: of Muon, for kernels of convolutions; those of Adam are in proportion.
         seed: of crops and noise, and of weights that are drawn.
         plain: whether to train the network without the filter.
-        half: whether convolutions run in bfloat16.
+        half: whether convolutions run in bfloat16, but for the last :data:`EXACT` of the steps.
         side: of crops, in pixels.
         start: file of the initial weights; None draws them.
+        batch: crops in a step.
+        parts: crops from each photograph by a simulated camera.
+        device: on which the network is trained.
+        workers: processes that make examples; with none, the training makes them itself.
     """
 
     steps: int
@@ -74,6 +82,10 @@ class Plan:
     half: bool = False
     side: int = SIDE
     start: Path | None = None
+    batch: int = BATCH
+    parts: int = 1
+    device: str = "cpu"
+    workers: int = 0
 
 
 def errors(image: Tensor, clean: Tensor) -> Tensor:
@@ -108,7 +120,7 @@ def new_denoiser(plan: Plan) -> NonlocalDenoiser:
         model = PlainDenoiser() if plan.plain else NonlocalDenoiser()
     if plan.start is not None:
         model.load_state_dict(read_weights(plan.start, shapes_of(model)))
-    return model.to(memory_format=torch.channels_last)
+    return model.to(plan.device, memory_format=torch.channels_last)
 
 
 class Training:
@@ -135,30 +147,30 @@ class Training:
             torch.optim.Adam([{"params": others}, {"params": bandwidths}], lr=plan.rate),
         ]
         self.rates = (plan.rate, ADAM_RATE * plan.rate, BANDWIDTH_RATE * plan.rate)
-        self.source = Source(pictures, plan.side, plan.seed)
+        self.batches = Batches(pictures, plan.side, plan.seed, plan.batch, plan.parts)
         judged = Source(aside, plan.side, ASIDE_SEED, exact=True)
         self.aside = {
-            f"{kind}, {colours}": judged.batch(ASIDE, grey=colours == "grey", kind=kind)
+            f"{kind}, {colours}": judged.batch(ASIDE, grey=colours == "grey", kind=kind).to(plan.device)
             for kind in SHARES
             for colours in ("grey", "colour")
         }
         self.number = 0
-        self.losses: list[float] = []  # since the last checkpoint
+        self.losses: list[Tensor] = []  # since the last checkpoint
         self.curve: list[dict[str, float]] = []
         self.seconds = 0.0
 
     def denoise(self, model: nn.Module, examples: Examples) -> Tensor:
         """Denoise crops as in training."""
-        with torch.autocast("cpu", torch.bfloat16, enabled=self.plan.half):
+        half = self.plan.half and self.number < (1 - EXACT) * self.plan.steps
+        with torch.autocast(torch.device(self.plan.device).type, torch.bfloat16, enabled=half):
             noise: Tensor = model.estimate_noise(examples.noisy, examples.levels)  # type: ignore[operator]
         return examples.noisy - noise
 
-    def step(self) -> None:
-        """Train one step."""
+    def step(self, examples: Examples) -> None:
+        """Train one step with a batch of examples."""
         groups = [group for optimizer in self.optimizers for group in optimizer.param_groups]
         for group, rate in zip(groups, self.rates, strict=True):
             group["lr"] = rate * rate_at(self.number, self.plan.steps)
-        examples = self.source.batch(BATCH, grey=self.number % 2 == 0)
         denoised = self.denoise(self.model, examples)
         loss = loss_of(*map(without_rim, (denoised, examples.clean, examples.noisy)))
         self.model.zero_grad()
@@ -169,7 +181,7 @@ class Training:
         for optimizer in self.optimizers:
             optimizer.step()
         self.mean.update_parameters(self.model)
-        self.losses.append(loss.item())
+        self.losses.append(loss.detach())
         self.number += 1
 
     @torch.no_grad()
@@ -188,18 +200,35 @@ class Training:
 
     def run(self, folder: Path | None = None) -> None:
         """Train up to the planned number of steps; with a folder, save a checkpoint every :data:`EVERY` steps."""
+        with graphed_pivots(self.plan.device):
+            self._run(folder)
+
+    def _run(self, folder: Path | None) -> None:
         if not self.curve:
             self._check(folder)
         start, before = time.perf_counter(), self.seconds
-        while self.number < self.plan.steps:
-            self.step()
+        for examples in self.examples():
+            self.step(examples.to(self.plan.device))
             self.seconds = before + time.perf_counter() - start
             if self.number % EVERY == 0 or self.number == self.plan.steps:
                 self._check(folder)
 
+    def examples(self) -> Iterable[Examples]:
+        """The batches of the steps that are left, in order."""
+        return DataLoader(
+            self.batches,
+            batch_size=None,
+            sampler=range(self.number, self.plan.steps),
+            num_workers=self.plan.workers,
+            prefetch_factor=PREFETCHED if self.plan.workers else None,
+            pin_memory=self.plan.device != "cpu",
+            worker_init_fn=_with_one_thread,
+            generator=torch.Generator(),  # which DataLoader draws from, needlessly; not from the global one
+        )
+
     def _check(self, folder: Path | None) -> None:
         """Judge, print a line and save a checkpoint."""
-        loss = statistics.mean(self.losses) if self.losses else float("nan")
+        loss = float(torch.stack(self.losses).mean()) if self.losses else float("nan")
         figures = {"step": float(self.number), "seconds": round(self.seconds), "loss": loss, **self.judge()}
         self.curve.append({name: round(value, 4) for name, value in figures.items()})
         self.losses.clear()
@@ -212,8 +241,9 @@ class Training:
         with open_beside(folder / "state.pt") as stream:
             torch.save(self.state(), stream)
         latest = self.curve[-1]
-        weights = {name: value.contiguous() for name, value in self.mean.module.state_dict().items()}
-        content = as_bytes(weights, {"seed": str(self.plan.seed), **{name: f"{x:g}" for name, x in latest.items()}})
+        weights = {name: value.cpu().contiguous() for name, value in self.mean.module.state_dict().items()}
+        planned = {name: str(getattr(self.plan, name)) for name in ("steps", "batch", "parts", "side", "rate", "seed")}
+        content = as_bytes(weights, {**planned, **{name: f"{x:g}" for name, x in latest.items()}})
         best = min(row["judged"] for row in self.curve)
         for name in ("latest", *(["denoiser"] if latest["judged"] == best else [])):
             with open_beside(folder / f"{name}.safetensors") as stream:
@@ -232,7 +262,6 @@ class Training:
             "model": self.model.state_dict(),
             "mean": self.mean.state_dict(),
             "optimizers": [optimizer.state_dict() for optimizer in self.optimizers],
-            "generator": self.source.draws.generator.get_state(),
             "number": self.number,
             "curve": self.curve,
             "seconds": self.seconds,
@@ -244,7 +273,6 @@ class Training:
         self.mean.load_state_dict(state["mean"])
         for optimizer, saved in zip(self.optimizers, state["optimizers"], strict=True):
             optimizer.load_state_dict(saved)
-        self.source.draws.generator.set_state(state["generator"])
         self.number, self.curve, self.seconds = state["number"], state["curve"], state["seconds"]
 
 
@@ -266,6 +294,10 @@ def plotted(curve: list[dict[str, float]]) -> Figure:
     axes.grid(alpha=0.3)
     axes.legend()
     return figure
+
+
+def _with_one_thread(worker: int) -> None:
+    torch.set_num_threads(1)
 
 
 def _as_matrix(kernel: Tensor) -> Tensor:

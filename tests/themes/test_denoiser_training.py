@@ -1,6 +1,7 @@
 """The denoiser's training: it learns, resumes, and refuses unusable input before it starts."""
 
 import copy
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -15,6 +16,7 @@ from benchmarks.denoiser_training.__main__ import main
 from benchmarks.denoiser_training.crops import CONTRASTS, Crops
 from benchmarks.denoiser_training.draws import Draws
 from benchmarks.denoiser_training.examples import LARGEST, Examples, Source
+from benchmarks.denoiser_training.graphs import graphed_pivots
 from benchmarks.denoiser_training.pictures import LONGEST, PICTURES, RIGHT_HALVES, Pictures, read_pictures
 from benchmarks.denoiser_training.training import (
     EXPECTED,
@@ -28,6 +30,7 @@ from benchmarks.denoiser_training.training import (
 )
 from benchmarks.denoising.cases import HELD_OUT, LEFT_HALVES
 from nlfilter_torch import NonlocalDenoiser
+from nlfilter_torch.operator import landmarks
 
 ALL, _ = read_pictures(None)
 
@@ -128,12 +131,50 @@ def test_errors_in_the_rim_of_crops_do_not_count() -> None:
     assert kept[0, 0, 0, 0] == 8 * 32 + 8
 
 
+def test_processes_make_the_batches_that_the_training_would_make() -> None:
+    plan = Plan(3, side=16, batch=4, parts=2)
+    here, apart = (list(Training(replace(plan, workers=workers), ALL, ALL).examples()) for workers in (0, 2))
+    assert [batch.clean.shape for batch in here] == [(4, 1, 16, 16), (4, 3, 16, 16), (4, 1, 16, 16)]
+    for one, other in zip(here, apart, strict=True):
+        assert torch.equal(one.noisy, other.noisy)
+        assert torch.equal(one.levels, other.levels)
+
+
+def test_half_precision_ends_before_the_last_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = []
+    monkeypatch.setattr(
+        NonlocalDenoiser,
+        "estimate_noise",
+        lambda self, noisy, levels: seen.append(torch.is_autocast_enabled("cpu")) or 0,
+    )
+    result = Training(Plan(10, side=16, half=True), ALL, ALL)
+    for result.number in (0, 6, 7, 9):
+        result.denoise(result.model, result.aside["clean, grey"])
+    assert seen == [True, True, False, False]
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_landmarks_are_chosen_by_graphs_on_a_gpu() -> None:
+    points = torch.rand(2, 5, 64, generator=torch.Generator().manual_seed(0)).cuda()
+    draws = landmarks.pivot_draws(8, torch.Generator().manual_seed(1)).to(points)
+    expected = landmarks.pivots(points, draws, 1e-3)
+    with graphed_pivots("cuda"):
+        for _ in range(2):
+            assert torch.equal(landmarks.pivots(points, draws, 1e-3), expected)
+
+
+def test_landmarks_are_chosen_as_usual_on_processors() -> None:
+    usual = landmarks.pivots
+    with graphed_pivots("cpu"):
+        assert landmarks.pivots is usual
+
+
 def test_the_rate_rises_stays_and_falls() -> None:
     rates = [rate_at(step, 1000) for step in range(1000)]
     assert rates[0] == pytest.approx(1 / training.WARM_UP)
     assert max(rates) == 1
     assert rates[training.WARM_UP :] == sorted(rates[training.WARM_UP :], reverse=True)
-    assert rates[499] == 1
+    assert rates[299] == 1
     assert rates[-1] < 1e-4
 
 
@@ -233,6 +274,8 @@ def test_pictures_of_a_folder_are_reduced_and_some_are_set_aside(tmp_path: Path)
         (["--steps", "0"], "--steps must be at least 1, got 0"),
         (["--seed", "-1"], "--seed must not be negative, got -1"),
         (["--rate", "0"], "--rate must be between 0 and 1, got 0"),
+        (["--workers", "-1"], "--workers must not be negative, got -1"),
+        (["--batch", "6", "--parts", "4"], "--batch must be a multiple of --parts, both at least 1, got 6 and 4"),
         (["--start", "absent"], "--start must be a file of weights, got absent, which is not there"),
         (["--start", "absent", "--scratch"], "not allowed with argument"),
         (["--pictures", "absent"], "--pictures must be a folder, got absent"),

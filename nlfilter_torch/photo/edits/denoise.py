@@ -149,8 +149,7 @@ class Denoise(FilteredEdit):
                 source.check_all_in_memory(
                     "noise_level must be a number for a picture processed in tiles, got a map; denoise it in memory"
                 )
-            told = _as_trained(noise) if isinstance(noise, NoiseProfile) else noise
-            return Fitted(first_channel, NetworkDenoising(told, self.strength), margin=2 * STEP, step=STEP)
+            return Fitted(first_channel, NetworkDenoising(noise, self.strength), margin=2 * STEP, step=STEP)
         if is_map:
             raise ValueError(
                 "noise_level must be a number or have shape (B,) for method rule, got a map; use method network"
@@ -236,15 +235,6 @@ def _described(noise: NoiseProfile) -> str:
         return f", {coarseness:.1f} times as much as white noise in means of 4x4 pixels"
     dark, bright = (LEVELS * float(replace(noise, light=torch.full_like(noise.light, end)).level) for end in (0, 1))
     return f" ({dark:.2f} in black, {bright:.2f} in white)" if abs(dark - bright) > EVEN * max(dark, bright) else ""
-
-
-def _as_trained(noise: NoiseProfile) -> NoiseProfile:
-    """Noise as the network is told it: as white noise, of the level between scales 2 and 4.
-
-    Of the noise that is left, most is coarse; finer noise is removed with it.
-    """
-    levels = (noise.levels[:, 1:2] * noise.levels[:, 2:3]).sqrt()
-    return replace(noise, levels=levels.expand_as(noise.levels))
 
 
 @cached_constants
