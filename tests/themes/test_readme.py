@@ -24,8 +24,8 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_python_blocks_run_in_order(folder: Path) -> None:
     assert [kind for kind, _ in README.blocks()].count("python") == 5
     names = README.run_python()
-    with Image.open(folder / "crisp.png") as crisp:
-        assert crisp.size == (150, 100)
+    with Image.open(folder / "strong.png") as strong:
+        assert strong.size == (150, 100)
     assert names["layers"].shape == (1, 4, 3, 100, 150)  # type: ignore[attr-defined]
     assert names["mask"].shape == (1, 1, 100, 150)  # type: ignore[attr-defined]
     for edit in ("repainted", "crisper", "portrait", "painting"):

@@ -13,7 +13,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from torch import Tensor
 
-ALPHA = (3.0, 3.0, 4.0, 1.05)
+ALPHA = (3.0, 3.0, 4.0, 1.05)  # of the response that is drawn
+BLUE = (0.1, 0.3, 0.9)  # of the stroke on the suit
 SELECTION = (slice(300, 320), slice(60, 80))  # rows and columns of a patch of the astronaut's suit
 # Chosen by eye: half the default width keeps the mask on the suit, three times the default time fills its folds.
 SELECTION_WIDTH = 2.0
@@ -30,13 +31,15 @@ def demo(folder: Folder = Path("out")) -> None:
     import skimage.data
     import torch
 
-    from nlfilter_torch.filtering.filters import detail_layers, polynomial_filter
+    from nlfilter_torch.filtering.filters import detail_layers
     from nlfilter_torch.filtering.masks import diffusion_mask
     from nlfilter_torch.operator.build import nonlocal_operator
     from nlfilter_torch.operator.features import reduce_channels
     from nlfilter_torch.photo.cli.progress import steps
+    from nlfilter_torch.photo.declared.presets import find_recipe
+    from nlfilter_torch.photo.edits.applying import apply_recipe
+    from nlfilter_torch.photo.edits.recolor import recolor
     from nlfilter_torch.photo.io.writing import check_folder
-    from nlfilter_torch.photo.picture.colour import edit_luminance
     from nlfilter_torch.photo.plotting import (
         plot_response,
         show_eigenvectors,
@@ -53,9 +56,11 @@ def demo(folder: Folder = Path("out")) -> None:
         operator = nonlocal_operator(luminance)
         spectrum = operator.spectrum()
 
-        begin("Filtering")
-        alpha = torch.tensor(ALPHA)
-        crisp = edit_luminance(image, lambda planes: polynomial_filter(operator, planes, alpha))
+        begin("Editing")
+        stroke = select(luminance)
+        paint = torch.tensor(BLUE).view(1, 3, 1, 1) * stroke
+        blue = recolor(image, paint, stroke)
+        crisp = apply_recipe(find_recipe("crisp"), image)
         figures = summarize(operator, spectrum, luminance)
 
         begin("Selecting a region")
@@ -64,14 +69,19 @@ def demo(folder: Folder = Path("out")) -> None:
 
         begin("Drawing")
         folder.mkdir(exist_ok=True)
-        sliders = ", ".join(f"{value:g}" for value in ALPHA)
         paths = save_figures(
             folder,
             {
-                "1-before-after": show_images({"Before": image, f"After, alpha = ({sliders})": crisp}),
+                "1-before-after": show_images(
+                    {
+                        "Before, with one blue stroke": torch.lerp(image, paint, stroke),
+                        "After: recolor": blue,
+                        "After: detail, preset crisp": crisp,
+                    }
+                ),
                 "2-layers": show_layers(detail_layers(operator, luminance)),
                 "3-eigenvectors": show_eigenvectors(spectrum),
-                "4-sliders": plot_response(alpha, spectrum),
+                "4-sliders": plot_response(torch.tensor(ALPHA), spectrum),
                 "5-selection": show_mask(image, select(luminance), mask),
             },
         )

@@ -23,11 +23,12 @@ def test_demo(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         with Image.open(folder / f"{name}.png") as picture:
             assert min(picture.size) > 400
             assert np.asarray(picture.convert("L")).std() > 20
-    # Before and after: the left panel is the photograph itself, the right one is another picture.
+    # Before and after: the left panel is the photograph with a stroke, the middle one is blue where the suit is.
     with Image.open(folder / "1-before-after.png") as picture:
         panels = np.asarray(picture.convert("RGB"))
     before, after = panels[35:547, 15:527].astype(int), panels[35:547, 542:1054].astype(int)
-    assert np.abs(before - skimage.data.astronaut()).max() <= 1
+    assert (np.abs(before - skimage.data.astronaut()).max(2) > 1).sum() == 400  # pixels of the stroke
+    assert after[290:330, 50:90, 2].mean() > after[290:330, 50:90, 0].mean() + 30
     assert np.abs(after - before).mean() > 5
     # The selection covers the suit, on which the region lies, and nothing of the background.
     with Image.open(folder / "5-selection.png") as picture:
