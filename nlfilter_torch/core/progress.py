@@ -9,6 +9,9 @@ KNOWN = 0.05  # fraction of a stage after which the remaining time can be estima
 class Progress:
     """Current stage of a computation and the fraction completed; called to report, converted to text for display.
 
+    The time left is estimated at each report, from the time that the second half of the part done has taken, and
+    counted down until the next one.
+
     Args:
         clock: returns the time in seconds.
 
@@ -25,17 +28,24 @@ class Progress:
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
         self._stage, self._share, self._begun, self._first = "", 0.0, clock(), 0.0
+        self._reports = [(self._first, self._begun)]  # shares done, with their times
 
     def __call__(self, stage: str, done: int, total: int) -> None:
         """Report that ``done`` of ``total`` units of a stage are complete."""
         share = done / max(total, 1)
         if stage != self._stage or share < self._share:
-            self._stage, self._begun, self._first = stage, self._clock(), share
-        self._share = share
+            self._begin(stage, share)
+        elif share > self._share:
+            self._share = share
+            self._reports.append((share, self._clock()))
 
     def begin(self, stage: str) -> None:
         """Begin a stage without progress reports."""
-        self._stage, self._begun, self._first, self._share = stage, self._clock(), 0.0, 0.0
+        self._begin(stage, 0.0)
+
+    def _begin(self, stage: str, share: float) -> None:
+        self._stage, self._share, self._begun, self._first = stage, share, self._clock(), share
+        self._reports = [(self._first, self._begun)]  # shares done, with their times
 
     @property
     def seconds_left(self) -> float | None:
@@ -43,7 +53,10 @@ class Progress:
         done = self._share - self._first
         if done < KNOWN:
             return None
-        return (self._clock() - self._begun) * (1 - self._share) / done
+        share, then = max(report for report in self._reports if report[0] <= self._first + done / 2)
+        last = self._reports[-1][1]
+        estimate = (last - then) * (1 - self._share) / (self._share - share)
+        return max(0.0, estimate - (self._clock() - last))
 
     def __str__(self) -> str:
         """The stage with the fraction done and the time left, or with the elapsed time if that is unknown."""

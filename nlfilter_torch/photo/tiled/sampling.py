@@ -162,7 +162,13 @@ class PassOverPicture:
 
     def __call__(self, function: Callable[[Block], Result]) -> Iterator[Result]:
         """Apply a function to each block, and yield the results in order."""
-        return in_order(partial(self._applied, function), self._tiles(), self.workers)
+        picture = self.picture
+        height, rows = picture.size[0], picture.statistics_rows
+        tiles = picture.picture.tiles(self._radius + picture.margin, rows)
+        self.report(self.stage, 0, height)
+        for number, result in enumerate(in_order(partial(self._applied, function), tiles, self.workers), start=1):
+            yield result
+            self.report(self.stage, min(number * rows, height), height)
 
     def _applied(self, function: Callable[[Block], Result], tile: Tile) -> Result:
         return function(self._block(tile))
@@ -171,12 +177,6 @@ class PassOverPicture:
     def _radius(self) -> int:
         """Radius of a patch."""
         return self.kernel.recipe.patch_weights.shape[0] // 2
-
-    def _tiles(self) -> Iterator[Tile]:
-        picture = self.picture
-        for tile in picture.picture.tiles(self._radius + picture.margin, picture.statistics_rows):
-            self.report(self.stage, tile.start, picture.size[0])
-            yield tile
 
     def _block(self, tile: Tile) -> Block:
         image, first = tile.inner.flatten(2), tile.start * self.picture.size[1]

@@ -331,15 +331,12 @@ class Tiled:
 
         The first tile is finished before the others begin, since it may compute the sums of an operator.
         """
-        tiles = self._tiles(rows, stage)
+        tiles, height = self.picture.tiles(0, rows), self.size[0]
+        self.passes.report(stage, 0, height)
         yield function(next(tiles))
-        yield from in_order(function, tiles, self.passes.workers(1))
-
-    def _tiles(self, rows: int, stage: str) -> Iterator[Tile]:
-        """Yield tiles of so many rows, and report the progress."""
-        for tile in self.picture.tiles(0, rows):
-            self.passes.report(stage, tile.start, self.size[0])
-            yield tile
+        for number, result in enumerate(in_order(function, tiles, self.passes.workers(1)), start=1):
+            self.passes.report(stage, min(number * rows, height), height)  # those before this one
+            yield result
 
     def blocks(self, step: float, floats: int) -> InMemory:
         """The picture, reduced by means over blocks of an integer number of pixels along each axis, in memory.

@@ -140,15 +140,11 @@ class Tiling:
 
     def __iter__(self) -> Rows:
         """Yield the edited rows, in order."""
-        for part, values, comparison in in_order(self._rows, self._tiles(), self.workers):
+        self.passes.report(self.stage, 0, self.picture.size[0])
+        for part, values, comparison in in_order(self._rows, self.picture.tiles(self.margin, self.rows), self.workers):
             self.note(comparison)
             yield part, values
-        self.passes.report(self.stage, self.picture.size[0], self.picture.size[0])
-
-    def _tiles(self) -> Iterator[Tile]:
-        for tile in self.picture.tiles(self.margin, self.rows):
-            self.passes.report(self.stage, tile.start, self.picture.size[0])
-            yield tile
+            self.passes.report(self.stage, part.stop, self.picture.size[0])
 
     def _rows(self, tile: Tile) -> tuple[slice, Stored, list[Comparison]]:
         """The place of a tile's rows, these rows after the edit, and what :attr:`compare` returns for them."""
