@@ -95,6 +95,7 @@ QUICK := \
 	'streaming_cpu --quick' \
 	'streaming_busy --quick' \
 	'busy --quick sharpen' \
+	'scribbles --quick' \
 	'app --side 96 --megapixels 0.05' \
 	'denoising --quick --megapixel' \
 	'denoising --quick --patterns --methods noisy ours' \

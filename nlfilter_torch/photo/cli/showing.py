@@ -22,8 +22,9 @@ from nlfilter_torch.photo.io.photographs import Photograph, write_photograph
 from nlfilter_torch.photo.picture.colour import hundredths_of_lab
 from nlfilter_torch.photo.picture.drawn import Drawn
 from nlfilter_torch.photo.picture.edit import PhotoEdit, Rows
-from nlfilter_torch.photo.picture.in_memory import edit_image
+from nlfilter_torch.photo.picture.in_memory import InMemory, edit_image
 from nlfilter_torch.photo.selections.scribbled_colours import frame_places
+from nlfilter_torch.photo.selections.stray import strays
 
 Read = Callable[[slice], Tensor]  # rows of the photograph as (1, C, h, W) in [0, 1]
 MAX_PIXELS = 500_000  # largest size of the picture that shows scribbles
@@ -31,6 +32,7 @@ LARGE_DISTANCE = 0.2  # Lab distance, divided by 100, beyond which two colours a
 BORDER_SHARE = 0.9  # selected share of the picture's borders above which a note is printed
 NOTE_SHARE = 0.15  # share of such pixels above which a note is printed
 CHUNK_ROWS = 64
+HATCHING = 4  # pixels from one line to the next
 OUTSIDE_BRIGHTNESS = 0.4  # brightness outside the mask, where the picture is shown in grey
 
 
@@ -87,6 +89,8 @@ class Scribbled:
             marks = {"scribbles": painted} | ({} if kept is None else {"background": kept})
             mask = edit_image(selection, image, Drawn(marks))
         shown = drawn_over(image, mask, region[:, :3] if coloured else None, painted, kept)
+        for drawn in (painted, kept):
+            shown = shown if drawn is None else hatched(shown, stray_parts(image, drawn))
         write_photograph(Photograph(shown), target)
 
 
@@ -133,6 +137,20 @@ def drawn_over(image: Tensor, mask: Tensor, colours: Tensor | None, painted: Ten
         painted = painted.maximum(kept.ceil())
     rim = F.max_pool2d(painted, 3, stride=1, padding=1) - painted
     return torch.where(rim > 0, torch.ones_like(shown), shown)
+
+
+def stray_parts(image: Tensor, painted: Tensor) -> Tensor:
+    """The parts (1, 1, H, W) of scribbles on an image that do not count, since they are on something else."""
+    source = InMemory(image)
+    scribbles = source.scribbles(painted, None, "scribbles", needed=False)
+    return scribbles.weighted(strays(scribbles, source.size).to(image)).planes(source)
+
+
+def hatched(shown: Tensor, places: Tensor) -> Tensor:
+    """A picture (1, 3, H, W) with black lines on some pixels, (1, 1, H, W)."""
+    height, width = shown.shape[-2:]
+    lines = (torch.arange(height).unsqueeze(1) + torch.arange(width)) % HATCHING < HATCHING // 2
+    return torch.where((places > 0) & lines, torch.zeros_like(shown), shown)
 
 
 def tell_selected(mask: Tensor, background: list[str] | None) -> None:

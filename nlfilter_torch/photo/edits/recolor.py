@@ -23,6 +23,7 @@ from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles
 from nlfilter_torch.photo.picture.source import Fitted, Pixels, Source
 from nlfilter_torch.photo.selections.border_colours import Sides, colours_beside, refine_mask
 from nlfilter_torch.photo.selections.mask import ObjectEdit, Regions, background_of, fit_regions
+from nlfilter_torch.photo.selections.stray import without_strays
 
 EPSILON = 1e-12  # keeps the derivative of a root finite
 END_MARGIN = 0.1  # masks closer to 0 or 1 are set to 0 or 1: a faint tint far away is visible, a less soft edge is not
@@ -116,8 +117,9 @@ class Recolor(ObjectEdit):
         kept = background_of(source, drawn.masks.get("keep"), scribbles, "keep")
 
         colours, regions, valid = _grouped(scribbles)
+        counted = without_strays(scribbles.weighted(regions), source.size).weights
         brightness, old = (
-            region_means(part, regions.unsqueeze(2)) for part in split_luminance(scribbles.image.unsqueeze(2))
+            region_means(part, counted.unsqueeze(2)) for part in split_luminance(scribbles.image.unsqueeze(2))
         )
         colours = with_room(colours, brightness)
         inside = [scribbles.weighted(part) for part in regions.split(1, dim=1)]

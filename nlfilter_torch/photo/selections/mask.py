@@ -34,6 +34,7 @@ from nlfilter_torch.photo.picture.viewing import viewed_size
 from nlfilter_torch.photo.selections.closed_form import LinearMasks, linear_mask, linear_models, solve_linear
 from nlfilter_torch.photo.selections.random_walker import solve_mask
 from nlfilter_torch.photo.selections.rough_mask import RoughMasks
+from nlfilter_torch.photo.selections.stray import without_strays
 
 SOLVED = 1 << 17  # pixels
 VIEWED = VIEWING_SIZE.default_number  # megapixels; larger pictures are first reduced to this size
@@ -63,6 +64,8 @@ def region_mask(
     similar to background scribbles do not. An even area with a scribble, such as a sky, belongs to the region as a
     whole. Points along the borders of the picture also count as background unless they resemble the region or are part
     of such an area, so one scribble is enough. The borders of the mask are then aligned with those of the picture.
+    Where a scribble that is at least three times as long as wide leaves its object, it does not count: at most 30 % of
+    it, in one or two pieces of a very different colour, that no other scribble is meant for.
     :func:`diffusion_mask` is the paper's mask, which selects everything similar to one region.
 
     Args:
@@ -258,6 +261,7 @@ def fit_regions(
 ) -> Regions:
     """Compute the masks of regions from scribbles on each, and on the background: none, for all, or for each."""
     MASK.check(source.batch, reach=settings.reach)
+    inside, background = ([without_strays(drawn, source.size) for drawn in side] for side in (inside, background))
     several = len(background) > 1
     scribbles = [_against(inside, k, background[k : k + 1] if several else background) for k in range(len(inside))]
     check_positive(settings.photometric_bandwidth, "photometric_bandwidth", source.batch)

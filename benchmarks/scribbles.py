@@ -1,0 +1,183 @@
+"""Strokes with strays beside clean ones: ``python -m benchmarks.scribbles [--quick] [--set choosing]``.
+
+Recolouring by one natural stroke, a bent line, of which a fifth lies on something else, against the same stroke without
+that part. On composites (:mod:`benchmarks.composites`) the covered share of the object and the changed share of the
+background are known. On free photographs of scikit-image the strokes are stored in ``scribbles.json`` as lists of
+points, the last of them on something else, and the result of the clean stroke is the reference: "covered" is the share
+of what it changes that is changed, "outside" the share of the rest that is.
+
+Limit: each mean differs by at most 2 points with and without strays. ``--plain`` counts strays like the rest of a
+stroke. ``--out FOLDER`` writes the photographs with stroke, and both results. ``--set choosing`` takes the composites
+on which the constants were chosen.
+"""
+
+import argparse
+import json
+import sys
+from collections.abc import Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import mean
+from unittest import mock
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from benchmarks.composites import FIRST_SEED, RADIUS, SIZE, composites, sources
+from benchmarks.photographs import photograph, reduced_to
+from benchmarks.recolor import CHANGED, COLOURS, recoloured, tinted
+from benchmarks.training.figures import Figure, table
+from nlfilter_torch import recolor
+from nlfilter_torch.photo.io.photographs import Photograph, write_photograph
+
+STRAY = 0.2  # of a stroke
+LENGTH, BEND, POINTS, TRIES = 0.35, 0.4, 40, 400  # of the strokes on composites; length as a share of the short side
+COUNT, FIRST = 25, 20_000  # composites, and what is added to the seeds of their set
+SIDE = 240  # short side of photographs
+LIMIT = 2.0  # points
+STORED = Path(__file__).with_suffix(".json")
+
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Job:
+    """A recolouring by one stroke.
+
+    Attributes:
+        name: of the picture and what is recoloured.
+        image: (1, 3, H, W).
+        colour: of the stroke, (1, 3, 1, 1).
+        clean: the stroke without its stray part, (1, 1, H, W).
+        whole: with it.
+    """
+
+    name: str
+    image: Tensor
+    colour: Tensor
+    clean: Tensor
+    whole: Tensor
+
+    def result(self, mask: Tensor) -> Tensor:
+        """The photograph, recoloured by a part of the stroke."""
+        return recolor(self.image, (self.colour * mask).expand_as(self.image), mask)
+
+
+def line(points: NDArray[np.float64], size: tuple[int, int], width: int) -> Mask:
+    """Draw a line through points (n, 2) of rows and columns, (H, W)."""
+    drawn = np.zeros(size, np.uint8)
+    cv2.polylines(drawn, [np.round(points[:, ::-1]).astype(np.int32)], False, 1, width)
+    return drawn > 0
+
+
+def as_mask(drawn: Mask) -> Tensor:
+    """Convert (H, W) to (1, 1, H, W)."""
+    return torch.from_numpy(drawn)[None, None].float()
+
+
+def leaving(inside: Mask, outside: Mask, random: np.random.Generator) -> NDArray[np.float64]:
+    """Points (n, 2) of a bent line that begins inside and of which the last fifth lies outside, as far as possible."""
+    size, short = inside.shape, min(inside.shape)
+    depth = cv2.distanceTransform(np.pad(inside, 1).astype(np.uint8), cv2.DIST_L2, 5)[1:-1, 1:-1]
+    places = np.argwhere(depth >= min(depth.max(), 2 * RADIUS * short))
+    cut = round(POINTS * (1 - STRAY))
+    best, chosen = -1.0, np.repeat(places[:1].astype(np.float64), POINTS, axis=0)
+    for _ in range(TRIES):
+        angles = random.uniform(0, 2 * np.pi) + random.normal(0, BEND) * np.linspace(0, 1, POINTS)
+        steps = np.stack([np.sin(angles), np.cos(angles)], axis=1) * LENGTH * short / POINTS
+        points = places[random.integers(len(places))] + np.cumsum(steps, axis=0)
+        if points.min() < 1 or (points >= np.array(size) - 1).any():
+            continue
+        at = tuple(np.round(points).astype(int).T)
+        score = inside[at][: cut - 2].mean() + outside[at][cut + 2 :].mean()
+        if score > best:
+            best, chosen = score, points
+    return chosen
+
+
+def on_composites(count: int, first: int, images: dict[str, Tensor]) -> Iterator[list[float]]:
+    """Covered and outside in percent, by clean strokes and by those with strays, of one composite after the other."""
+    for number, composite in enumerate(composites(count, first, images, SIZE)):
+        scene = tinted(composite, number)
+        alpha = scene.alpha[0, 0].numpy()
+        points = leaving(alpha > 0.98, alpha < 0.02, np.random.default_rng(first + number))
+        whole = line(points, SIZE, max(1, round(2 * RADIUS * min(SIZE))))
+        colour = torch.tensor(COLOURS[number % len(COLOURS)]).view(1, 3, 1, 1)
+        job = Job(scene.name, scene.image, colour, as_mask(whole & (alpha > 0.5)), as_mask(whole))
+        ideal = recoloured(scene, colour, job.clean) - scene.image
+        visible = (scene.alpha > 0.98) & (ideal.abs().amax(1, keepdim=True) > CHANGED)
+        shares = list[float]()
+        for mask in (job.clean, job.whole):
+            change = job.result(mask) - scene.image
+            along = (change * ideal).sum(1, keepdim=True) / ideal.square().sum(1, keepdim=True).clamp(min=1e-8)
+            shares.append(100 * float((along > 0.5)[visible].float().mean()))
+            moved = change.abs().amax(1, keepdim=True) > CHANGED
+            shares.append(100 * float(moved[scene.alpha < 0.02].float().mean()))
+        yield shares
+
+
+def jobs() -> Iterator[Job]:
+    """The recolourings of photographs that are stored."""
+    for entry in json.loads(STORED.read_text(encoding="utf-8")):
+        image = reduced_to(photograph(entry["photograph"])[:, :3], SIDE)
+        size = (image.shape[-2], image.shape[-1])
+        points = np.array(entry["points"], dtype=np.float64)[:, ::-1] * size  # of columns and rows, from 0 to 1
+        width = max(1, round(2 * RADIUS * min(size)))
+        clean = line(points[: -entry["stray"]], size, width)
+        whole = line(points, size, width)
+        colour = torch.tensor(entry["colour"]).view(1, 3, 1, 1)
+        yield Job(f"{entry['photograph']}: {entry['what']}", image, colour, as_mask(clean), as_mask(whole))
+
+
+def on_photograph(job: Job, out: Path | None) -> list[float]:
+    """Covered and outside in percent, by a stroke with strays against a clean one."""
+    results = [job.result(mask) for mask in (job.clean, job.whole)]
+    if out is not None:
+        out.mkdir(parents=True, exist_ok=True)
+        seen = torch.lerp(job.image, job.colour.expand_as(job.image), job.whole)
+        name = job.name.replace(": ", "-").replace(" ", "-")
+        write_photograph(Photograph(torch.cat([seen, *results], dim=3).clamp(0, 1)), out / f"{name}.png")
+    before, after = ((result - job.image).abs().amax(1, keepdim=True) > 5 * CHANGED for result in results)
+    return [100 * float(after[before].float().mean()), 100 * float(after[~before].float().mean())]
+
+
+def counted(drawn: object, _: object) -> object:
+    """Scribbles as they are."""
+    return drawn
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Measure, print a table, and return 1 if a figure falls short of its limit."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.scribbles", description=__doc__)
+    parser.add_argument("--quick", action="store_true", help="one composite and photograph, to see that it runs")
+    parser.add_argument("--set", choices=tuple(FIRST_SEED), default="reporting", help="photographs of the composites")
+    parser.add_argument("--plain", action="store_true", help="strays count like the rest of a stroke")
+    parser.add_argument("--out", type=Path, help="folder for pictures")
+    options = parser.parse_args(arguments)
+    with ExitStack() as stack:
+        for module in ("edits.recolor", "selections.mask") if options.plain else ():
+            stack.enter_context(mock.patch(f"nlfilter_torch.photo.{module}.without_strays", counted))
+        first = FIRST_SEED[options.set] + FIRST
+        number = 1 if options.quick else COUNT
+        rows = list(on_composites(number, first, sources(None, options.set)))
+        covered, outside, covered_stray, outside_stray = (mean(column) for column in zip(*rows, strict=True))
+        shares = [on_photograph(job, options.out) for job in list(jobs())[: 1 if options.quick else None]]
+    figures = [
+        Figure("composites: covered by clean strokes", covered, unit="%"),
+        Figure("composites: outside of clean strokes", outside, unit="%"),
+        Figure("composites: less covered with strays", covered - covered_stray, LIMIT, "points"),
+        Figure("composites: more outside with strays", outside_stray - outside, LIMIT, "points"),
+        Figure("photographs: not covered with strays, mean", 100 - mean(row[0] for row in shares), LIMIT, "points"),
+        Figure("photographs: outside with strays, mean", mean(row[1] for row in shares), LIMIT, "points"),
+        Figure("photographs: outside with strays, worst", max(row[1] for row in shares), unit="points"),
+    ]
+    print(table(figures))
+    return int(not options.quick and any(not each.holds for each in figures))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
