@@ -43,7 +43,7 @@ def read_webp(path: Path, data: bytes | mmap, check_size: CheckSize) -> Decoded:
     by_name = dict(chunks)
     check_size(_webp_size(by_name))
     upright = exif_tags.read_upright(by_name.get(b"EXIF"))
-    packet, left_out = xmp.upright(by_name.get(b"XMP "))
+    packet, left_out = xmp.upright(by_name.get(b"XMP "), upright.orientation)
     left_out += [f"the chunk {name.decode('latin-1').strip()}" for name in by_name if name not in WEBP_CHUNKS]
     channels = np.asarray(imagecodecs.webp_decode(data))
     metadata = Metadata(by_name.get(b"ICCP"), upright.block, Extras(packet, left_out=(*left_out, *upright.left_out)))
@@ -87,7 +87,7 @@ def read_avif(path: Path, data: bytes | mmap, check_size: CheckSize) -> Decoded:
         # The block as stored: image.info may hold one that Pillow wrote anew.
         block, orientation = image._decoder.get_info()[4:6]
         upright = exif_tags.read_upright(block, orientation)
-        packet, left_out = xmp.upright(image.info.get("xmp"))
+        packet, left_out = xmp.upright(image.info.get("xmp"), upright.orientation)
         left_out += [xmp.GAIN_MAP] * (b"tmap" in data[:HEAD])
         channels = _decoded(image, data)
         extras = Extras(packet, left_out=(*left_out, *upright.left_out))

@@ -9,7 +9,7 @@ fields and moves the notes, piexif knows fixed lists of fields, and Exiv2 is und
 
 import io
 import struct
-from collections.abc import Iterable
+from collections.abc import Container, Iterable, Sequence
 from itertools import product
 from typing import NamedTuple, TypeVar
 
@@ -26,6 +26,8 @@ SIZES = ((256, 257), (282, 283), (40962, 40963), (41486, 41487))  # horizontal a
 RESOLUTION = (282, 283, 296)  # horizontal, vertical, and their unit
 SCALES = {2: 1.0, 3: 2.54}  # of inch and centimetre
 IN_PIXELS = (256, 40962)  # of these
+IN_EXIF = (40962, 40963)  # those that cameras write
+AREAS = (37396, 41492)  # places of the main subject: centre, and perhaps diameter, or width and height
 HIDDEN = 0xFFFE  # the number of no tag
 COMPRESSION, PLACE, LENGTH = 259, 513, 514  # of a thumbnail
 JPEG = 6  # a compression
@@ -99,20 +101,52 @@ def read_upright(block: bytes | None, orientation: int | None = None, size: tupl
         orientation = orientation_of(tables.number(first[0])) if first else 1
     for field in first:
         _straighten(tables, field)
-    damaged = _drop_damaged(tables)
+    damaged = _drop(tables)
+    lost = orientation > 1 and not _turn_areas(tables, orientation) and _drop(tables, AREAS)
     fields = list(tables.walk())
     _resize(tables, {field.code: field for field in fields}, orientation >= 5, size)
     only = all(field.code == ORIENTATION for field in fields) and not _thumbnail(tables)
-    left_out = ("damaged fields of EXIF",) if damaged else ()
-    return Upright(orientation, None if only else PREFIX + bytes(tables.data), left_out)
+    left_out = ["damaged fields of EXIF"] * damaged + ["the place of the subject, as the picture is turned"] * lost
+    return Upright(orientation, None if only else PREFIX + bytes(tables.data), tuple(left_out))
 
 
-def _drop_damaged(tables: Block) -> bool:
-    """Remove fields without a valid value from the first table and that of EXIF; whether there were any."""
+def _turn_areas(tables: Block, orientation: int) -> bool:
+    """Turn the places of the subject with the picture, whose stored size the block says; False if that fails."""
+    fields = {field.code: field for field in tables.walk()}
+    numbers = [tables.number(fields[code]) for code in IN_EXIF if code in fields]
+    size = [number for number in numbers if number is not None]
+    areas = [fields[code] for code in AREAS if code in fields]
+    if len(size) != 2 or any(f.kind != SHORT or f.count not in (2, 3, 4) for f in areas):
+        return False
+    for field in areas:
+        code = f"{tables.order}{field.count}H"
+        place = struct.unpack(code, tables.raw(field))
+        tables.data[field.place : field.end] = struct.pack(code, *turned_place(place, orientation, *size))
+    return True
+
+
+def turned_place(place: Sequence[int], orientation: int, width: int, height: int) -> list[int]:
+    """A place in a stored picture as it is in the upright one: the centre, and perhaps a diameter, or width and height.
+
+    >>> turned_place((10, 20, 3, 4), 6, 100, 50)
+    [29, 10, 4, 3]
+    """
+    across, down, *extent = place
+    if orientation >= 5:
+        across, down, width, height, extent = down, across, height, width, extent[::-1]
+    across = width - 1 - across if orientation in (2, 3, 6, 7) else across
+    down = height - 1 - down if orientation in (3, 4, 7, 8) else down
+    return [max(across, 0), max(down, 0), *extent]
+
+
+def _drop(tables: Block, unwanted: Container[int] = ()) -> bool:
+    """Remove fields without a valid value, or unwanted, from the first table and that of EXIF; whether any were."""
     starts = [tables.first, *(tables.number(f) or 0 for f in tables.fields(tables.first) if f.code == EXIF)]
     damaged = False
     for start in starts[::-1]:
-        fields = [f for f in tables.fields(start) if f.code not in POINTERS or tables.inner(f)]
+        fields = [
+            f for f in tables.fields(start) if (f.code not in POINTERS or tables.inner(f)) and f.code not in unwanted
+        ]
         pointer, count = tables.next(start), tables.count(start)
         if len(fields) == count:
             continue

@@ -162,8 +162,8 @@ def _metadata(contents: list[tuple[int, bytes]], behind: bytes) -> tuple[int, Me
             parts.append(Part("JPEG", name, bytes((0xFF, marker)) + struct.pack(">H", len(content) + 2) + content))
         elif APP <= marker < APP + 16 and marker != ADOBE:
             left_out.append(_described(marker, content))
-    packet, stated = xmp.upright(packet)
     orientation, exif, damaged = exif_tags.read_upright(exif_tags.PREFIX + b"".join(blocks) if blocks else None)
+    packet, stated = xmp.upright(packet, orientation)
     dpi = sound(dpi) or sound(exif_tags.resolution(exif))
     extras = Extras(
         packet,

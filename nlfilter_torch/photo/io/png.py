@@ -171,7 +171,7 @@ def _metadata(contents: list[tuple[bytes, bytes]]) -> tuple[int, Metadata]:
     texts = {key: text for name, content in contents for key, text in _text(name, content)}
     exif, packet = by_name.get(b"eXIf"), texts.get(XMP_KEY)
     orientation, exif, damaged = exif_tags.read_upright(exif or _from_hexadecimal(texts.get(RAW_KEY + b"exif")))
-    packet, left_out = xmp.upright(packet or _from_hexadecimal(texts.get(RAW_KEY + b"xmp")))
+    packet, left_out = xmp.upright(packet or _from_hexadecimal(texts.get(RAW_KEY + b"xmp")), orientation)
     kept = []
     for name, content in contents:
         if name in STORAGE or name in READ or (name in TEXTS and _key(content) in KEYS):

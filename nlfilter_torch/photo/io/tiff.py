@@ -132,7 +132,7 @@ def read_metadata(file: tifffile.TiffFile, stream: BinaryIO, depth: str) -> tupl
         packet = next((tables.raw(field) for field in fields if field.code == XMP), None)
         ratios = {field.code: tables.ratio(field) for field in fields if field.code in RESOLUTION[:2]}
         units = [tables.number(field) for field in fields if field.code == RESOLUTION[2]]
-    packet, left_out = xmp.upright(packet)
+    packet, left_out = xmp.upright(packet, orientation)
     left_out += [exif_in_tiff.MOVED] * moved + ["smaller versions and masks"] * any(f.code == SUB_FILES for f in fields)
     scale = exif_tags.SCALES.get((units or [INCH])[0] or 0)
     pair = None if scale is None or len(ratios) < 2 else sound([ratios[code] * scale for code in RESOLUTION[:2]])

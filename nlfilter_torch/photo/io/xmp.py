@@ -1,4 +1,4 @@
-"""XMP packets: what they say about the orientation, and about other pictures in the file, which are not copied."""
+"""XMP packets: what they say about the orientation, places in the picture, and other pictures in the file."""
 
 import re
 
@@ -23,15 +23,28 @@ STATEMENTS: dict[bytes, tuple[bytes, bytes | None, str]] = {
     b"http://ns.apple.com/pixeldatainfo/1.0/": (b"apdi", None, PICTURES),
     b"http://ns.adobe.com/xmp/note/": (b"xmpNote", b"HasExtendedXMP", "an extension of XMP"),
 }
+REGIONS = "regions of the picture such as faces, as it is turned"
+#: Statements about places in the picture.
+PLACES: dict[bytes, tuple[bytes, bytes | None, str]] = {
+    b"http://www.metadataworkinggroup.com/schemas/regions/": (b"mwg-rs", None, REGIONS),
+    b"http://ns.microsoft.com/photo/1.2/": (b"MP", b"RegionInfo", REGIONS),
+    b"http://ns.apple.com/faceinfo/1.0/": (b"apple-fi", None, REGIONS),
+}
 
 
-def upright(xmp: bytes | None) -> tuple[bytes | None, list[str]]:
-    """An XMP packet with the orientation upright and without statements about other pictures; and what these named."""
+def upright(xmp: bytes | None, orientation: int = 1) -> tuple[bytes | None, list[str]]:
+    """An XMP packet of an upright picture, and what was in it and is left out.
+
+    Args:
+        xmp: as it stands in the file. Its orientation is set to 1, and statements about other pictures are left out.
+        orientation: of the picture as it is stored; of a turned one, places in it are left out.
+    """
     if not isinstance(xmp, bytes) or not xmp.strip(b"\0 \r\n\t"):
         return None, []
     xmp = ORIENTATION.sub(rb"\g<1>1", xmp)
     named = []
-    for namespace, (usual, names, content) in STATEMENTS.items():
+    statements = STATEMENTS | (PLACES if orientation > 1 else {})
+    for namespace, (usual, names, content) in statements.items():
         declared = re.findall(rb"xmlns:([\w.-]+)\s*=\s*[\"']" + re.escape(namespace) + rb"[\"']", xmp)
         for prefix in dict.fromkeys([*declared, usual]):
             shorter = _without(xmp, prefix, names or rb"[\w.-]+")
@@ -44,15 +57,16 @@ def upright(xmp: bytes | None) -> tuple[bytes | None, list[str]]:
 def _without(xmp: bytes, prefix: bytes, names: bytes) -> bytes:
     """The packet without attributes and elements of these names."""
     name = re.escape(prefix) + rb":(" + names + rb")"
-    xmp = re.sub(rb"\s+" + name + rb"\s*=\s*(?:\"[^\"]*\"|'[^']*')", b"", xmp)
+    # One space before it, since many of them at a time would take quadratic time in packets with padding.
+    xmp = re.sub(rb"\s" + name + rb"\s*=\s*(?:\"[^\"]*\"|'[^']*')", b"", xmp)
     end = rb"</" + re.escape(prefix) + rb":\1\s*>"
     return re.sub(rb"<" + name + rb"(?=[\s/>])(?:[^<>]*/>|[^<>]*>.*?" + end + rb")\s*", b"", xmp, flags=re.DOTALL)
 
 
 def _without_declarations(xmp: bytes) -> bytes:
     """The packet without declarations of these namespaces that are not used any more."""
-    for namespace in STATEMENTS:
-        declaration = rb"\s+xmlns:([\w.-]+)\s*=\s*[\"']" + re.escape(namespace) + rb"[\"']"
+    for namespace in STATEMENTS | PLACES:
+        declaration = rb"\sxmlns:([\w.-]+)\s*=\s*[\"']" + re.escape(namespace) + rb"[\"']"
         for prefix in re.findall(declaration, xmp):
             rest = re.sub(declaration, b"", xmp)
             xmp = xmp if re.search(rb"[\s<]" + re.escape(prefix) + rb":", rest) else rest

@@ -9,6 +9,7 @@ import pytest
 import torch
 from PIL import ExifTags, Image, ImageOps
 
+from nlfilter_torch.photo.io.exif import read_upright, upright
 from nlfilter_torch.photo.io.photographs import read_photograph, write_photograph
 from tests.files import exif_block, photograph, same, stored_values, tags
 
@@ -129,3 +130,34 @@ def test_a_pointer_of_exif_to_nothing_is_left_out(tmp_path: Path) -> None:
         write_photograph(read_photograph(tmp_path / "in.png"), tmp_path / "out.tif")
     with Image.open(tmp_path / "out.tif") as image:
         assert image.getexif().get_ifd(ExifTags.IFD.Exif) == {ExifTags.Base.LensModel: "a lens"}
+
+
+SUBJECT_AREA = 0x9214
+
+
+def subject_block(orientation: int, *, sized: bool) -> bytes:
+    """An EXIF block with the place of the main subject, in a picture of 40 x 30 pixels."""
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = orientation
+    details = exif.get_ifd(ExifTags.IFD.Exif)
+    details[SUBJECT_AREA] = (9, 5, 4, 2)
+    if sized:
+        details[ExifTags.Base.ExifImageWidth], details[ExifTags.Base.ExifImageHeight] = 40, 30
+    return exif.tobytes()
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_the_place_of_the_subject_turns_with_the_picture(orientation: int) -> None:
+    stored = np.zeros((30, 40, 1), np.uint8)
+    stored[5, 9] = 255
+    (row,), (column,), _ = upright(stored, orientation).nonzero()
+    turned = read_upright(subject_block(orientation, sized=True))
+    _, details, _ = tags(turned.block)
+    wanted = (4, 2) if orientation < 5 else (2, 4)
+    assert details[SUBJECT_AREA] == (column, row, *wanted)
+    assert turned.left_out == ()
+    unsized = read_upright(subject_block(orientation, sized=False))
+    if orientation == 1:
+        assert tags(unsized.block)[1][SUBJECT_AREA] == (9, 5, 4, 2)
+    else:
+        assert unsized.left_out == ("the place of the subject, as the picture is turned",)

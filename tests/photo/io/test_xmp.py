@@ -27,3 +27,26 @@ def test_usual_prefixes_need_no_declaration() -> None:
     assert packet == b'<rdf:Description a:b="c"/>'
     assert named == [xmp.GAIN_MAP, xmp.MOTION]
     assert xmp.upright(None) == xmp.upright(b" \n") == (None, [])
+
+
+FACES = b"""<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF><rdf:Description xmlns:MP="http://ns.microsoft.com/photo/1.2/"
+ xmlns:mwg="http://www.metadataworkinggroup.com/schemas/regions/" xmlns:stArea="http://ns.adobe.com/xmp/sType/Area#"
+ xmp:Rating="4"><mwg:Regions rdf:parseType="Resource"><mwg:RegionList><rdf:Bag><rdf:li><rdf:Description mwg:Name="Ann">
+<mwg:Area stArea:x="0.2" stArea:y="0.3"/></rdf:Description></rdf:li></rdf:Bag></mwg:RegionList></mwg:Regions>
+<MP:RegionInfo><rdf:li/></MP:RegionInfo></rdf:Description></rdf:RDF></x:xmpmeta>"""
+
+
+def test_places_in_a_turned_picture_are_removed() -> None:
+    assert xmp.upright(FACES) == (FACES, [])
+    packet, named = xmp.upright(FACES, 6)
+    assert packet is not None
+    assert set(named) == {xmp.REGIONS}
+    assert b"Area " not in packet
+    assert b"mwg" not in packet
+    assert b"MP:" not in packet
+    assert b'xmp:Rating="4"' in packet
+
+
+def test_long_padding_takes_little_time() -> None:
+    packet = PACKET.replace(b"</x:xmpmeta>", b" " * 1_000_000 + b"</x:xmpmeta>")  # quadratic time would be an hour
+    assert xmp.upright(packet)[1] == [xmp.GAIN_MAP, xmp.MOTION, xmp.PICTURES]
