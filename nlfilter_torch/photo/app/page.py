@@ -112,7 +112,7 @@ class Editor:
             self._tasks = Tasks()
             show_error = self._tasks.show_error
             photographs = Upload(self._take_photograph, "image/*", LARGEST, show_error)
-            presets = Upload(self._take_preset, ".json,application/json", LARGEST_PRESET, show_error)
+            presets = Upload(self._take_preset, ".json,.cube,.png,.tif,application/json", LARGEST_PRESET, show_error)
             kinds = f"A PNG, JPEG, TIFF, WebP or AVIF file of at most {LARGEST / 1e9:g} GB"
             _button("Open", "folder_open", kinds, js=photographs.choosing)
             self._undo_button = _button("Undo", "undo", "Ctrl+Z", self._undo)

@@ -373,4 +373,4 @@ class Session:
     def load_preset(self, content: bytes, name: str) -> None:
         """Load an edit from the content of a file; raises ValueError if it has none, or if no photograph is open."""
         self._opened_to("edit")
-        self.load(Recipe.from_json(content, name))
+        self.load(Recipe.from_file(content, name))

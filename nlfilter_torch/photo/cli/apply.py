@@ -12,9 +12,9 @@ Edits = Annotated[
     typer.Option(
         "--preset",
         metavar="FILE|NAME",
-        help="A file saved by the editor (`nlfilter-torch app`) or written by `nlfilter-torch fit`, or the name of a "
-        "preset (see `nlfilter-torch presets`). May be repeated, each time with the --mask of its region; the rest of "
-        "the photograph stays unchanged.",
+        help="A file saved by the editor (`nlfilter-torch app`) or written by `nlfilter-torch fit`, a colour table (a "
+        ".cube file or a Hald), or the name of a preset (see `nlfilter-torch presets`). May be repeated, each "
+        "time with the --mask of its region; the rest of the photograph stays unchanged.",
     ),
 ]
 

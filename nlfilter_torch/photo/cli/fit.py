@@ -11,6 +11,7 @@ import typer
 
 from nlfilter_torch.photo.cli import options
 from nlfilter_torch.photo.cli.edits import step_of, with_options
+from nlfilter_torch.photo.cli.fit_tables import Cube, Hald, Tables
 from nlfilter_torch.photo.declared.json_values import Value
 from nlfilter_torch.photo.declared.parameters import EDITS
 
@@ -73,6 +74,8 @@ def fit(
     mask: options.MasksOfPairs = None,
     preview: Preview = None,
     left: Map = None,
+    cube: Cube = None,
+    hald: Hald = None,
     **values: Value,
 ) -> None:
     """Find the look that turns a photograph into an edited one, or a folder of them, whatever program made the edit.
@@ -84,6 +87,8 @@ def fit(
 
     `nlfilter-torch apply other.jpg out.jpg --preset look.json`
 
+    For other programs: `nlfilter-torch fit before.jpg after.jpg look.json --cube look.cube`
+
     Each --mask is a region that has a look of its own, in numbered files:
 
     `nlfilter-torch fit before.jpg after.jpg look.json --mask sky.png --mask ground.png`
@@ -92,12 +97,15 @@ def fit(
 
     from nlfilter_torch.photo.cli.progress import steps
     from nlfilter_torch.photo.io.writing import open_beside
+    from nlfilter_torch.photo.look_fitting.alignment import explained
     from nlfilter_torch.photo.look_fitting.fit_look import fit_look
 
+    tables = Tables(cube, hald)
     paths = _paths(before, after)
     regions = _regions(mask or [], paths, Path(before).is_dir())
     results = [preset.with_stem(f"{preset.stem}-{i + 1}") for i in range(len(mask))] if mask else [preset]
     _check_results(results, preview, left, photographs=[*chain(*paths)], mask=[*chain(*regions)])
+    tables.check(photographs=[*chain(*paths)], mask=[*chain(*regions)])
     alone = len(paths) == 1
     judged = (alone and not mask) or preview is not None or left is not None
     with steps(len(paths) + 1) as begin:
@@ -111,10 +119,12 @@ def fit(
         for look, path in zip(looks, results, strict=True):
             with open_beside(path) as stream:
                 stream.write(look.to_json().encode())
+        tables.write(looks)
     whole = judgement if alone and not mask else None
     for look, path in zip(looks, results, strict=True):
-        _report(look, look.fitted if whole is None else _explained(*whole), path, alone=alone)
+        _report(look, look.fitted if whole is None else explained(*whole), path, alone=alone)
     if whole is not None and pairs.first is not None:
+        tables.report(looks[0], *whole[:2])
         _tell_where(*whole, stride=pairs.first[0].shape[-1] / whole[0].shape[-1])
 
 
@@ -279,16 +289,6 @@ def _judged(
     return image, edited, results[0] if masks is None else blend_edited(image, results, masks)
 
 
-def _explained(before: "Tensor", after: "Tensor", result: "Tensor") -> float:
-    """Share of the energy of the change that a result explains, 1 at best, without a frame around the picture."""
-    from nlfilter_torch.photo.look_fitting.alignment import inside_frame
-
-    shown = inside_frame(before[0], after[0])
-    before, after, result = (image[..., shown] for image in (before, after, result))
-    rest, change = ((after.double() - image.double()).square().sum() for image in (result, before))
-    return 1.0 - float(rest / change)
-
-
 def _report(look: "FittedLook", share: float, path: Path, *, alone: bool) -> None:
     """Print what a look is and what it is worth."""
     typer.echo(f"{'explained of the change by':40}{'fitted':>8}{'left out':>10}")
@@ -310,11 +310,11 @@ def _tell_where(before: "Tensor", after: "Tensor", result: "Tensor", stride: flo
     """Say where the rest of the change is, if it is in a few places; a pixel is ``stride`` pixels of the photograph."""
     from torch.nn.functional import avg_pool2d
 
-    from nlfilter_torch.photo.look_fitting.alignment import inside_frame
+    from nlfilter_torch.photo.look_fitting.alignment import explained, inside_frame
 
     rest = (after - result).square().mean(1, keepdim=True) * inside_frame(before[0], after[0])
     rest = avg_pool2d(rest, SQUARE, ceil_mode=True)[0, 0]
-    if _explained(before, after, result) > ENOUGH or rest.numel() < 1 / FEW:
+    if explained(before, after, result) > ENOUGH or rest.numel() < 1 / FEW:
         return
     largest = rest.flatten().topk(max(1, int(FEW * rest.numel())))
     if float(largest.values.sum() / rest.sum()) < MOST:

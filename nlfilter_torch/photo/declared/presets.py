@@ -16,12 +16,18 @@ that an edit made on a preview applies to the photograph. Does not import torch.
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
+from nlfilter_torch.photo.declared.colour_tables import step_of_cube, step_of_hald
 from nlfilter_torch.photo.declared.json_values import Value, parse_json, shown
 from nlfilter_torch.photo.declared.parameters import EDITS
 from nlfilter_torch.photo.declared.steps import VERSION, Step, acting_steps, json_of
 
+if TYPE_CHECKING:
+    from nlfilter_torch.photo.declared.colour_tables import Values
+
 ORDER = tuple(EDITS)  # order in which the editor adds steps
+PICTURES = (b"\x89PNG", b"II*\0", b"MM\0*", b"\xff\xd8\xff")  # how files of pictures start
 REMEDY = "save one in the editor"
 
 
@@ -107,6 +113,32 @@ class Recipe:
             raise ValueError(f"{name} is not a preset: it must hold a list of steps; {remedy}")
         return Recipe(tuple(_read_steps(entries, name)))
 
+    @staticmethod
+    def from_file(content: bytes, name: str) -> "Recipe":
+        """Parse a file of steps, as :meth:`from_json` does, or a colour table: a ``.cube`` file, or a Hald picture.
+
+        Raises:
+            ValueError: if it is neither. ``name`` is the file's name in the message.
+        """
+        if name.lower().endswith(".cube"):
+            return Recipe((step_of_cube(content.decode("utf-8", "replace"), name),))
+        if content.startswith(PICTURES):
+            return Recipe((step_of_hald(_decoded(content, name), name),))
+        return Recipe.from_json(content, name)
+
+
+def _decoded(content: bytes, name: str) -> "Values":
+    """The pixels (H, W, C) of a picture, or (H, W)."""
+    try:
+        import imagecodecs
+    except ImportError as error:
+        raise ImportError(f"{name} is a picture, and reading it needs nlfilter-torch[cli]; install that") from error
+    try:
+        picture: Values = imagecodecs.imread(content)
+    except (ValueError, RuntimeError) as error:
+        raise ValueError(f"{name} must be a Hald, got a picture that cannot be read; save it as PNG") from error
+    return picture
+
 
 def _read_steps(entries: dict[str, object], name: str) -> list[Step]:
     """Parse the steps of a file."""
@@ -164,7 +196,9 @@ PURPOSES: dict[str, str] = {
 
 
 def find_recipe(name: str) -> Recipe:
-    """Return the preset of that name (``soft-skin`` is ``soft skin``), or read the recipe in the file at that path.
+    """Return the preset of that name (``soft-skin`` is ``soft skin``), or read the file at that path.
+
+    It holds a recipe, or is a colour table of another program: a ``.cube`` file, or a Hald as a PNG or TIFF file.
 
     Raises:
         ValueError: if there is neither, or the file holds no recipe.
@@ -182,4 +216,4 @@ def find_recipe(name: str) -> Recipe:
             f"{name} is neither a file nor one of the presets {', '.join(PRESETS)}; "
             "create a file with nlfilter-torch fit"
         )
-    return Recipe.from_json(path.read_bytes(), name)
+    return Recipe.from_file(path.read_bytes(), name)

@@ -97,6 +97,14 @@ def inside_frame(before: Tensor, after: Tensor) -> Tensor:
     return mask
 
 
+def explained(before: Tensor, after: Tensor, result: Tensor) -> float:
+    """Share of the energy of the change that a result explains, 1 at best, without a frame around the picture."""
+    shown = inside_frame(before[0], after[0])
+    before, after, result = (image[..., shown] for image in (before, after, result))
+    rest, change = ((after.double() - image.double()).square().sum() for image in (result, before))
+    return 1.0 - float(rest / change)
+
+
 def _plain_edges(image: Tensor) -> tuple[int, int, int, int]:
     """Number of lines along each edge of a picture (C, H, W) that have the colour of its first pixel."""
     plain = ((image - image[:, :1, :1]).abs() <= PLAIN).all(0)

@@ -14,9 +14,10 @@ from tests.looks import CAT, CUP, FEW, SUIT, explained, in_bytes, single_look
 
 
 def by_hue(image: Tensor) -> Tensor:
-    """An edit that no curve or matrix says: warm colours become lighter, cold ones darker and paler."""
-    warmth = (image[:, :1] - image[:, 2:]) * (1 - image)
-    return in_bytes(image**0.8 + 0.6 * warmth * image[:, 1:2] - 0.3 * warmth.clamp(max=0))
+    """An edit that no curve or matrix says: colours become lighter or darker by their hue."""
+    red, green, blue = image.split(1, dim=1)
+    across, along = red - green, (red + green) / 2 - blue
+    return in_bytes(image**0.8 + 0.6 * torch.hypot(across, along) * torch.sin(3 * torch.atan2(across, along)))
 
 
 def test_edits_by_hue_need_a_lattice_and_carry_over() -> None:

@@ -1,0 +1,95 @@
+"""Colour tables of other programs as looks, and looks as colour tables."""
+
+from pathlib import Path
+
+import imagecodecs
+import numpy as np
+import pytest
+import torch
+
+from nlfilter_torch.photo.declared.colour_tables import cube_of, hald_of, in_order, step_of_cube, step_of_hald
+from nlfilter_torch.photo.declared.presets import Recipe, find_recipe
+from nlfilter_torch.photo.edits.applying import apply_step
+from tests.looks import CAT
+
+HEAD = "LUT_3D_SIZE 2\n"
+ROWS = "0 0 0\n1 0 0\n0 1 0\n1 1 0\n0 0 1\n1 0 1\n0 1 1\n1 1 1\n"
+
+
+def test_red_changes_first() -> None:
+    swapped = HEAD + "".join(f"{row[4]} {row[2]} {row[0]}\n" for row in ROWS.splitlines())  # red and blue
+    result = apply_step(step_of_cube(swapped, "it"), CAT)
+    torch.testing.assert_close(result, CAT.flip(1), atol=1e-6, rtol=0)
+
+
+def test_comments_titles_and_ranges_from_zero_to_one_are_read() -> None:
+    text = f'# by hand\nTITLE "a b"\n\n{HEAD}DOMAIN_MIN 0 0 0\nDOMAIN_MAX 1.0 1 1\nLUT_3D_INPUT_RANGE 0.0 1.0\n'
+    step = step_of_cube(text + ROWS.replace("1 1 1\n", "1 1 1 # white\n"), "it")
+    torch.testing.assert_close(apply_step(step, CAT), CAT, atol=1e-6, rtol=0)
+    assert step["lattice"] == (0.0,) * 24
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (ROWS, "it must have a line LUT_3D_SIZE, got none; export"),
+        (HEAD + ROWS + "0 0 0\n", r"it must hold 2\^3 = 8 colours, got 9; export it again"),
+        (HEAD + "0 0 0\n", r"it must hold 2\^3 = 8 colours, got 1; export it again"),
+        ("LUT_1D_SIZE 4\n", "it must be a 3-D table, got a 1-D table; export"),
+        (f"DOMAIN_MAX 4 4 4\n{HEAD}{ROWS}", "DOMAIN_MAX of it must be 1 1 1, got 4 4 4; export"),
+        (f"DOMAIN_MIN -1 0 0\n{HEAD}{ROWS}", "DOMAIN_MIN of it must be 0 0 0, got -1 0 0; export"),
+        (f"LUT_3D_INPUT_RANGE 0 2\n{HEAD}{ROWS}", "LUT_3D_INPUT_RANGE of it must be 0 1, got 0 2; export"),
+        (f"DOMAIN_MIN 0\n{HEAD}{ROWS}", "DOMAIN_MIN of it must hold 3 numbers, got 0; export"),
+        ("LUT_3D_SIZE 200\n", "LUT_3D_SIZE of it must be a whole number from 2 to 65, got 200; export"),
+        ("LUT_3D_SIZE x\n", "LUT_3D_SIZE of it must be a whole number from 2 to 65, got x; export"),
+        (HEAD + ROWS.replace("1 1 1", "1 1"), "line 9 of it must hold 3 numbers, got 1 1; export"),
+        (HEAD + ROWS.replace("1 1 1", "1 nan 1"), "line 9 of it must hold 3 numbers, got 1 nan 1; export"),
+        (HEAD + ROWS.replace("1 1 1", "nan 1 1"), "line 9 of it must hold 3 numbers, got nan 1 1; export"),
+        ("hello\n", "it must be a table of colours, got a line hello; export"),
+        ("", "it must have a line LUT_3D_SIZE, got none; export"),
+    ],
+)
+def test_other_tables_are_refused_in_a_sentence(text: str, message: str) -> None:
+    with pytest.raises(ValueError, match=message) as error:
+        step_of_cube(text, "it")
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("dtype", ["uint8", "uint16", "float32"])
+def test_halds_of_all_depths(dtype: str) -> None:
+    levels = {"uint8": 255, "uint16": 65535}.get(dtype, 1)
+    colours = np.stack(np.meshgrid(*[np.arange(16) / 15] * 3, indexing="ij"))
+    picture = in_order(1 - colours).reshape(64, 64, 3) * levels
+    step = step_of_hald((np.rint(picture) if levels > 1 else picture).astype(dtype), "it")
+    torch.testing.assert_close(apply_step(step, CAT), 1 - CAT, atol=1e-5 if levels != 255 else 1e-3, rtol=0)
+
+
+@pytest.mark.parametrize(
+    ("shape", "message"),
+    [
+        ((64, 65, 3), "must be a Hald, a square picture in colour of 8, 27, 64, .* got 65x64; edit"),
+        ((63, 63, 3), "must be a Hald"),
+        ((64, 64, 1), "must be a Hald"),
+        ((1, 1, 3), "must be a Hald"),
+        ((729, 729, 3), "must be a Hald of level 8 at most, got 9; make a smaller one"),
+    ],
+)
+def test_pictures_that_are_no_halds_are_refused(shape: tuple[int, int, int], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        step_of_hald(np.zeros(shape, np.uint8), "it")
+
+
+def test_files_are_recipes(tmp_path: Path) -> None:
+    colours = np.stack(np.meshgrid(*[np.arange(16) / 15] * 3, indexing="ij"))
+    table = colours**1.5
+    cube, hald, grey = tmp_path / "a.CUBE", tmp_path / "b.png", tmp_path / "c.png"
+    cube.write_text(cube_of(table, "a"))
+    hald.write_bytes(imagecodecs.png_encode(hald_of(table)))
+    grey.write_bytes(imagecodecs.png_encode(np.zeros((64, 64), np.uint8)))
+    first, second = (apply_step(find_recipe(str(path)).steps[0], CAT) for path in (cube, hald))
+    torch.testing.assert_close(first, second, atol=2e-5, rtol=0)
+    assert float((first - CAT**1.5).abs().max()) < 0.5 / 255 * 3
+    with pytest.raises(ValueError, match="must be a Hald"):
+        find_recipe(str(grey))
+    with pytest.raises(ValueError, match="must be a Hald, got a picture that cannot be read"):
+        Recipe.from_file(b"\x89PNG and nothing", "it.png")
