@@ -7,6 +7,8 @@ values for each channel, a colour table of 17^3 entries (trilinear, with a ridge
 changes), and histograms matched. Only three of scikit-image's photographs were not used to choose parameters
 (``--set reporting``), enough for one pair: figures for several are to be reported on a folder of others. The parameters
 of the colour table were not tuned. "Best" is by held-out means as they are printed, and without a tie.
+
+``python -m benchmarks.looks_of_people`` measures edits that stand for those by people.
 """
 
 import argparse
@@ -178,33 +180,33 @@ def curves_of(pairs: Pairs) -> Predict:
     return predict
 
 
-def trilinear(image: Tensor) -> sparse.csr_matrix:
-    """Weights (N, 17^3) of the entries of a colour table."""
-    place = image[0].flatten(1).double().numpy() * (NODES - 1)
-    below = np.clip(np.floor(place), 0, NODES - 2).astype(np.int64)
+def trilinear(image: Tensor, nodes: int = NODES) -> sparse.csr_matrix:
+    """Weights (N, n^3) of the entries of a colour table."""
+    place = image[0].flatten(1).double().numpy() * (nodes - 1)
+    below = np.clip(np.floor(place), 0, nodes - 2).astype(np.int64)
     part, count = place - below, place.shape[1]
     columns, values = [], []
     for corner in np.ndindex(2, 2, 2):
-        columns.append(np.ravel_multi_index(tuple(below + np.array(corner)[:, None]), (NODES,) * 3))
+        columns.append(np.ravel_multi_index(tuple(below + np.array(corner)[:, None]), (nodes,) * 3))
         values.append(np.prod([part[i] if corner[i] else 1 - part[i] for i in range(3)], axis=0))
     rows = np.tile(np.arange(count), 8)
-    return sparse.csr_matrix((np.concatenate(values), (rows, np.concatenate(columns))), (count, NODES**3))
+    return sparse.csr_matrix((np.concatenate(values), (rows, np.concatenate(columns))), (count, nodes**3))
 
 
-def table_of(pairs: Pairs) -> Predict:
+def table_of(pairs: Pairs, nodes: int = NODES, smooth: float = SMOOTH) -> Predict:
     """A colour table by least squares."""
-    line, eye = sparse.diags([-1.0, 1.0], [0, 1], shape=(NODES - 1, NODES)), sparse.identity(NODES)
+    line, eye = sparse.diags([-1.0, 1.0], [0, 1], shape=(nodes - 1, nodes)), sparse.identity(nodes)
     kinds = [(line, eye, eye), (eye, line, eye), (eye, eye, line)]
     steps = sparse.vstack([sparse.kron(sparse.kron(a, b), c) for a, b, c in kinds])
-    gram, right = sparse.csr_matrix((NODES**3, NODES**3)), np.zeros((NODES**3, 3))
+    gram, right = sparse.csr_matrix((nodes**3, nodes**3)), np.zeros((nodes**3, 3))
     for before, after in pairs:
-        weights = trilinear(before)
-        share = weights.shape[0] * len(pairs) / NODES**3
+        weights = trilinear(before, nodes)
+        share = weights.shape[0] * len(pairs) / nodes**3
         gram = gram + weights.T @ weights / share
         right += weights.T @ (after - before)[0].flatten(1).T.double().numpy() / share
-    gram = gram + SMOOTH * steps.T @ steps + RIDGE * sparse.identity(NODES**3)
+    gram = gram + smooth * steps.T @ steps + RIDGE * sparse.identity(nodes**3)
     table = np.stack([cg(gram, right[:, c], rtol=1e-5, maxiter=500)[0] for c in range(3)], axis=1)
-    return lambda image: image + torch.from_numpy((trilinear(image) @ table).T).float().view_as(image)
+    return lambda image: image + torch.from_numpy((trilinear(image, nodes) @ table).T).float().view_as(image)
 
 
 def histograms_of(pairs: Pairs) -> Predict:
