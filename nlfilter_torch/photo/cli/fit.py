@@ -292,8 +292,9 @@ def _judged(
 def _report(look: "FittedLook", share: float, path: Path, *, alone: bool) -> None:
     """Print what a look is and what it is worth."""
     typer.echo(f"{'explained of the change by':40}{'fitted':>8}{'left out':>10}")
+    without_lattice = tuple(part for part in look.parts if part != "lattice")
     for parts, (fitted, left_out) in look.explained.items():
-        if len(parts) == 1 or parts == look.parts:
+        if len(parts) == 1 or parts in (without_lattice, look.parts):
             name = " + ".join(CALLED[part] for part in parts)
             typer.echo(f"{name:40}{100 * fitted:7.1f} %{100 * left_out:8.1f} %")
     typer.echo("alpha: " + ", ".join(f"{slider:.3f}" for slider in look.step["alpha"]))

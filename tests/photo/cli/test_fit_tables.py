@@ -3,7 +3,6 @@
 from pathlib import Path
 
 import pytest
-import torch
 
 from nlfilter_torch import apply_look
 from nlfilter_torch.photo.cli import main
@@ -34,7 +33,7 @@ def test_tables_are_the_look(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     folder.mkdir()
     write_photograph(Photograph(CUP), folder / "cup.png")
     assert main(["batch", str(folder), str(tmp_path / "done"), "--preset", cube]) == 0
-    assert torch.equal(read_photograph(tmp_path / "done" / "cup.png").pixels, read_photograph(out).pixels)
+    assert float((read_photograph(tmp_path / "done" / "cup.png").pixels - exact).abs().max()) < 1.01 / 255
 
 
 def test_files_of_other_kinds_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
