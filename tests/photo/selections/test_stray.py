@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from benchmarks.scribbles import jobs
 from nlfilter_torch import recolor, region_mask
 from nlfilter_torch.photo.picture.in_memory import InMemory
 from nlfilter_torch.photo.selections.stray import strays
@@ -84,3 +85,17 @@ def test_masks_and_colours_do_not_follow_strays() -> None:
     assert selected[..., 25:75, 92:100].max() < 0.5
     blue = [recolor(image, paint(0.1, 0.2, 0.9, mask), mask) for mask in (clean, whole)]
     assert (blue[0] - blue[1]).abs().max() < 0.05
+
+
+def test_stored_strokes_on_photographs_lose_what_leaves_the_object() -> None:
+    """Strokes of benchmarks.scribbles, whose stray part is known, on photographs of scikit-image."""
+    names = ("the suit, with its collar", "the sky, with the rocket", "the retina, with the frame")
+    chosen = [job for job in jobs() if job.name.split(": ")[1] in names]
+    assert len(chosen) == len(names)
+    for job in chosen:
+        size = (job.image.shape[-2], job.image.shape[-1])
+        scribbles = InMemory(job.image).regions(job.whole, "scribbles")[0]
+        ignored = strays(scribbles, size)[0, 0]
+        stray = (job.whole - job.clean).flatten()[scribbles.places] > 0
+        assert ignored[stray].float().mean() > 0.5
+        assert ignored[~stray].float().mean() < 0.05
