@@ -187,17 +187,21 @@ def nonlocal_operator(
     return operator
 
 
-def operator_from_guide(guide: Tensor, options: OperatorOptions) -> NonlocalOperator:
-    """:func:`nonlocal_operator` for a guide whose scale has been checked: without the warning about values above 16."""
-    drawn = options.generator is not None or options.group is not None  # neither can be compiled
-    return (_built_uncompiled if drawn else _built)(guide, options)
+def operator_from_guide(guide: Tensor, options: OperatorOptions, weights: Tensor | None = None) -> NonlocalOperator:
+    """:func:`nonlocal_operator` for a guide whose scale has been checked: without the warning about values above 16.
+
+    ``weights`` (B, 1, H, W) are in range, have the dtype of the guide, and are not 0 in all pixels of an image. Where
+    they are 0, patches read the guide as it is: :func:`fill_nearby` has filled it.
+    """
+    drawn = options.generator is not None or options.group is not None or weights is not None  # none can be compiled
+    return (_built_uncompiled if drawn else _built)(guide, options, weights)
 
 
 @outside_transforms
 @full_precision
-def _built(guide: Tensor, options: OperatorOptions) -> NonlocalOperator:
+def _built(guide: Tensor, options: OperatorOptions, weights: Tensor | None) -> NonlocalOperator:
     _check_guide(guide, options)
-    return _from_guide(guide, options)
+    return _from_guide(guide, options, weights, filled=True)
 
 
 _built_uncompiled = uncompiled(_built)
@@ -225,15 +229,21 @@ def _check_guide(guide: Tensor, options: OperatorOptions) -> None:
         )
 
 
-def _from_guide(guide: Tensor, options: OperatorOptions, weights: Tensor | None = None) -> NonlocalOperator:
-    """Build an operator from a checked guide, checked options and weights (B, 1, H, W)."""
+def _from_guide(
+    guide: Tensor, options: OperatorOptions, weights: Tensor | None = None, *, filled: bool = False
+) -> NonlocalOperator:
+    """Build an operator from a checked guide, checked options and weights (B, 1, H, W).
+
+    With ``filled``, patches read the guide also where weights are 0.
+    """
     guide = reduce_channels(trainable(guide).to(working_dtype(guide)), options.guide_channels)
     communicator = all_gather_shapes(guide, options.group)
     size = tuple(guide.shape[2:])  # of the rows of this rank
     patch_weights = communicator.copy_to_group(options.patch_weights)
     window = unit_window(options.patch_size, patch_weights, len(size)).to(guide)
     guide, halo = communicator.with_halo(guide, max(window.shape[0] // 2, 1))
-    bandwidth = _bandwidth(guide, halo, options, communicator, weights)
+    counts = None if weights is None or filled else weights > 0
+    bandwidth = _bandwidth(guide, halo, options, communicator, weights, counts)
     largest = _largest(guide.detach())
     check_scale(bandwidth, "photometric_bandwidth", largest, "values of the guide")
     spatial = options.spatial_bandwidth
@@ -243,7 +253,6 @@ def _from_guide(guide: Tensor, options: OperatorOptions, weights: Tensor | None 
             check_scale(axis_bandwidth, "spatial_bandwidth", farthest, "coordinates")
         spatial = tuple(_copy(communicator.copy_to_group(value)) for value in bandwidths_of(spatial))
     recipe = GuideFeatures(window, _copy(bandwidth), spatial, options.guide_channels)
-    counts = None if weights is None else weights > 0
     features = recipe(guide, origin=(communicator.first_row - halo[0], 0), halo=halo, counts=counts)
     weights = None if weights is None else weights.flatten(1)
     return _assemble(features, size, options, recipe=recipe, weights=weights, communicator=communicator)
@@ -255,13 +264,14 @@ def _bandwidth(
     options: OperatorOptions,
     communicator: Communicator,
     weights: Tensor | None,
+    counts: Tensor | None,
 ) -> float | Tensor:
-    """The photometric bandwidth, estimated from the guide if it is ``"auto"``."""
+    """The photometric bandwidth, estimated from the guide, or where it ``counts``, if it is ``"auto"``."""
     if not isinstance(options.photometric_bandwidth, str):
         bandwidth: float | Tensor = communicator.copy_to_group(options.photometric_bandwidth)
         return bandwidth
     if weights is not None:
-        return bandwidth_of_weighted(guide, weights)
+        return bandwidth_of_weighted(guide, weights, counts)
     return bandwidth_of_rows(guide, halo, communicator)
 
 

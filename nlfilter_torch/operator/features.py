@@ -306,15 +306,23 @@ def estimate_bandwidth(
     with torch.no_grad():
         rows = reduce_channels(guide.to(working_dtype(guide)), guide_channels)
         if weights is not None:
-            return bandwidth_of_weighted(rows, check_pixel_weights(weights, rows, group))
+            weights = check_pixel_weights(weights, rows, group)
+            return bandwidth_of_weighted(rows, weights, weights > 0)
         communicator = all_gather_shapes(rows, group)
         return bandwidth_of_rows(*communicator.with_halo(rows, 1), communicator)
 
 
-def bandwidth_of_weighted(guide: Tensor, weights: Tensor) -> Tensor:
-    """:func:`estimate_bandwidth` of a whole image whose pixels have weights (B, 1, H, W)."""
+def bandwidth_of_weighted(guide: Tensor, weights: Tensor, counts: Tensor | None) -> Tensor:
+    """:func:`estimate_bandwidth` of a whole image whose pixels have weights (B, 1, H, W).
+
+    Hidden pixels are filled where ``counts`` is not true; with None, gradients are :func:`gradients_within`.
+    """
     with torch.no_grad():
-        magnitude = _magnitude(fill_hidden(guide / 2, weights > 0, 1, mirrored=False)).mean(1, keepdim=True).double()
+        if counts is None:
+            magnitude = gradients_within(guide, weights > 0)
+        else:
+            magnitude = _magnitude(fill_hidden(guide / 2, counts, 1, mirrored=False))
+        magnitude = magnitude.mean(1, keepdim=True).double()
         mean = (magnitude * weights).flatten(1).sum(1) / weights.double().flatten(1).sum(1)
         return bandwidth_of_gradient(mean).clamp(max=torch.finfo(guide.dtype).max).to(guide)
 
@@ -334,6 +342,19 @@ def gradients(guide: Tensor, halo: tuple[int, int]) -> Tensor:
     # Central differences by slicing take a twentieth of the time of a convolution, not counting the import of kornia.
     padded = F.pad(guide / 2, (1, 1) * (guide.ndim - 2), mode="replicate")  # halved, so that no finite value overflows
     return _magnitude(padded)[:, :, halo[0] : guide.shape[2] - halo[1]]
+
+
+def gradients_within(guide: Tensor, counts: Tensor) -> Tensor:
+    """Gradient magnitude (B, C, H, W) of a guide, with a pixel itself in place of neighbours that do not count."""
+    half, squares = guide / 2, torch.zeros((), dtype=guide.dtype, device=guide.device)
+    for axis in (2, 3):
+        length, slope = guide.shape[axis], torch.zeros_like(guide)
+        if length > 1:
+            first, last = half.narrow(axis, 0, length - 1), half.narrow(axis, 1, length - 1)
+            slope.narrow(axis, 0, length - 1).add_((last - first) * counts.narrow(axis, 1, length - 1))
+            slope.narrow(axis, 1, length - 1).add_((last - first) * counts.narrow(axis, 0, length - 1))
+        squares = squares + slope.square()
+    return squares.sqrt()
 
 
 def _magnitude(padded: Tensor) -> Tensor:

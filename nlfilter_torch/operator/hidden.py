@@ -4,6 +4,11 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+NEAR = 32  # pixels of its row or column up to which :func:`fill_nearby` looks for one that counts
+MIRRORED = 8  # pixels that are continued by their mirror images
+#: Rows around a hidden pixel that its value by :func:`fill_nearby` depends on.
+REACH = 2 * (NEAR + MIRRORED + 1)
+
 
 def fill_hidden(planes: Tensor, counts: Tensor, margin: int, *, mirrored: bool = True) -> Tensor:
     """Pad planes by ``margin`` pixels on all sides, and replace there and at hidden pixels what is unknown.
@@ -31,13 +36,34 @@ def fill_hidden(planes: Tensor, counts: Tensor, margin: int, *, mirrored: bool =
     return planes
 
 
-def _filled_along_axes(planes: Tensor, counts: Tensor, reach: int) -> tuple[Tensor, Tensor]:
-    """Fill pixels of rows and columns with pixels that count; return the planes and what counts now."""
+def fill_nearby(planes: Tensor, counts: Tensor) -> Tensor:
+    """Replace hidden pixels of planes (B, C, H, W) by pixels that count nearby, as :func:`fill_hidden`; else by 0.
+
+    Where no pixel of row and column within :data:`NEAR` counts, this is repeated once with the filled ones. A value
+    depends on :data:`REACH` rows around a pixel at most, so that parts of an image can be filled by themselves.
+    ``counts`` is (B or 1, 1, H, W), true where a pixel counts. Differentiable.
+    """
+    planes = torch.where(counts, planes, 0.0)
+    for _ in range(2):
+        if bool(counts.all()):
+            break
+        planes, counts = _filled_along_axes(planes, counts, MIRRORED, NEAR)
+    return planes
+
+
+def _filled_along_axes(
+    planes: Tensor, counts: Tensor, reach: int, farthest: int | None = None
+) -> tuple[Tensor, Tensor]:
+    """Fill pixels of rows and columns with pixels that count; return the planes and what counts now.
+
+    Up to ``reach`` pixels are mirrored. Pixels farther than ``farthest`` are not used.
+    """
     total, shares = torch.zeros_like(planes), torch.zeros_like(planes[:, :1])
     for axis in range(2, planes.ndim):
         for backwards in (False, True):
             source, distance = _mirror_images(counts, axis, reach, backwards=backwards)
-            share = torch.where(distance > 0, 1.0 / distance.clamp(min=1), 0.0).to(planes)
+            near = distance > 0 if farthest is None else (distance > 0) & (distance <= farthest)
+            share = torch.where(near, 1.0 / distance.clamp(min=1), 0.0).to(planes)
             total = total + share * planes.gather(axis, source.expand(*planes.shape[:2], *source.shape[2:]))
             shares = shares + share
     filled = total / torch.where(shares > 0, shares, 1.0)

@@ -215,11 +215,13 @@ def _candidates_by_weight(weights: Tensor, count: int, generator: torch.Generato
     """Draw k-means candidates by :func:`stratified` sampling of the pixels represented by points of weights (N,)."""
     summed = weights.double().cumsum(0).cpu()
     summed = summed * (len(summed) / summed[-1]).clamp(min=1.0)  # a point may represent less than a pixel
-    pixels = round(float(summed[-1]))
-    wanted = min(pixels, _bounded(PER_LANDMARK * count, MOST_CANDIDATES, count))
-    return torch.searchsorted(summed, stratified(pixels, wanted, generator).double(), right=True).clamp_(
-        max=len(summed) - 1
-    )
+    draws = weighted_draws(round(float(summed[-1])), count, generator)
+    return torch.searchsorted(summed, draws.double(), right=True).clamp_(max=len(summed) - 1)
+
+
+def weighted_draws(pixels: int, count: int, generator: torch.Generator) -> Tensor:
+    """Draw from so many ``pixels`` that points represent, as candidates for ``count`` landmarks."""
+    return stratified(pixels, min(pixels, _bounded(PER_LANDMARK * count, MOST_CANDIDATES, count)), generator)
 
 
 def condense(subset: Tensor, count: int, generator: torch.Generator, points: Tensor | None = None) -> Tensor:

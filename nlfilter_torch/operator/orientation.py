@@ -87,13 +87,23 @@ def canonical_points(subset: Tensor, orientation: Orientation, layout: Layout, c
     return subset.gather(1, order.unsqueeze(2).expand_as(subset))
 
 
-def orientation_sums(rows: Tensor, first_row: int, size: Sequence[int]) -> Tensor:
+def orientation_sums(rows: Tensor, first_row: int, size: Sequence[int], counted: Tensor | None = None) -> Tensor:
     """Sums (B, C, 6, 6) over rows of a guide (B, C, h, W) in [0, 1], to be added up for :func:`orientation_of`.
 
-    The rows begin at ``first_row`` of an image of ``size`` (H, W).
+    The rows begin at ``first_row`` of an image of ``size`` (H, W). Where ``counted`` (B, h, W) is 0, no pixel counts.
     """
     channels = rows.unbind(1)[:MOST_CHANNELS]
-    return torch.stack([whole_sums(channel, first_row, size) for channel in channels], dim=1)
+    return torch.stack([whole_sums(channel, first_row, size, counted) for channel in channels], dim=1)
+
+
+def stretched_sums(sums: Tensor, counted: Tensor, least: float, most: float) -> Tensor:
+    """Sums (B, C, 6, 6) over pixels that count, as if their values had been stretched from [least, most] to [0, 1].
+
+    ``counted`` (B, 1, 6, 6) are those of values of 0.
+    """
+    span = most - least if most > least else 1.0
+    inside = (sums - counted).double() - LEVELS * least * counted.double()
+    return (inside / span).round().long() + counted
 
 
 def orientation_of(sums: Tensor, channels: int) -> Orientation:

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.operator.features import pad_border
-from nlfilter_torch.operator.hidden import fill_hidden
+from nlfilter_torch.operator.hidden import MIRRORED, NEAR, REACH, fill_hidden, fill_nearby
 from tests.problems import noise
 
 
@@ -56,3 +56,29 @@ def test_gradcheck_and_hidden_values_have_no_gradient() -> None:
     assert torch.autograd.gradcheck(lambda planes: fill_hidden(planes, counts, 2), image)
     (gradient,) = torch.autograd.grad(fill_hidden(image, counts, 2).sum(), image)
     assert not bool(gradient[(~counts).expand_as(gradient)].any())
+
+
+def test_what_is_near_is_mirrored_and_what_is_far_is_0() -> None:
+    image = noise(1, 2, 60, 20)
+    canvas, counts = torch.zeros(1, 2, 200, 20).double(), torch.zeros(1, 1, 200, 20)
+    canvas[:, :, :60], counts[:, :, :60] = image, 1
+    filled = fill_nearby(canvas, counts > 0)
+    assert torch.equal(filled[:, :, :60], image)
+    expected = torch.cat([image, image[:, :, 59 - MIRRORED : 59].flip(2)], dim=2)
+    torch.testing.assert_close(filled[:, :, : 60 + MIRRORED], expected, atol=1e-14, rtol=0)
+    assert bool((filled[:, :, 60 + NEAR - 1] != 0).all())
+    assert not filled[:, :, 60 + 2 * NEAR :].any()
+
+
+def test_rows_are_filled_as_in_the_whole_image() -> None:
+    image = noise(1, 1, 400, 30)
+    counts = torch.rand(1, 1, 400, 30, generator=torch.Generator().manual_seed(0)) > 0.9
+    counts[..., 150:300, :] = False
+    whole = fill_nearby(image, counts)
+    for start, stop in ((0, 20), (170, 200), (290, 310), (390, 400)):
+        first, last = max(start - REACH, 0), min(stop + REACH, 400)
+        part = fill_nearby(image[:, :, first:last], counts[:, :, first:last])
+        assert torch.equal(part[:, :, start - first : stop - first], whole[:, :, start:stop])
+    everything = torch.ones_like(counts)
+    assert torch.equal(fill_nearby(image, everything), image)
+    assert not fill_nearby(image, ~everything).any()

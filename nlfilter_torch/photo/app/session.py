@@ -282,7 +282,8 @@ class Session:
         if width * height * recipe.bytes_per_pixel > WHOLE:
             return None
         check_memory(Path(opened.name), width, height, recipe.bytes_per_pixel)
-        return apply_recipe(recipe, opened.photograph.pixels, partial(report, "Editing"))
+        photograph = opened.photograph
+        return apply_recipe(recipe, photograph.pixels, partial(report, "Editing"), weights=photograph.weights)
 
     def _opened_to(self, purpose: str) -> Opened:
         """The open photograph; if there is none, raises a ValueError that names the purpose."""

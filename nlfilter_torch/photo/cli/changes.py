@@ -12,7 +12,7 @@ from torch import Tensor
 from nlfilter_torch.photo.cli.options import LEVELS
 from nlfilter_torch.photo.io.photographs import Depth, Photograph, write_photograph
 from nlfilter_torch.photo.picture.edit import Rows
-from nlfilter_torch.photo.tiled.pictures import WHITE
+from nlfilter_torch.photo.tiled.pictures import WHITE, is_hidden
 from nlfilter_torch.photo.tiled.tiles import Tiling
 
 MAP_DEPTH: Depth = "uint16"
@@ -55,8 +55,14 @@ def write_map(map_of: Callable[[Tensor], Tensor], rows: Rows, path: Path) -> Non
 
 
 def squared_difference(before: NDArray[np.generic], after: NDArray[np.generic]) -> tuple[float, int]:
-    """Sum of the squared differences of stored rows (h, W, S) without their transparency, and the number of values."""
+    """Sum of the squared differences of the colours of stored rows (h, W, S), and the number of values.
+
+    Pixels that are hidden by the transparency before do not count.
+    """
     colours = 3 if after.shape[2] >= 3 else 1
+    if before.shape[2] in (2, 4):
+        visible = ~is_hidden(before)
+        before, after = before[visible], after[visible]
     difference = _scaled(after[..., :colours]) - _scaled(before[..., :colours])
     return float(np.square(difference, dtype=np.float64).sum()), difference.size
 

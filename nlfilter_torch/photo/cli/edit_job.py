@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+import torch
 import typer
 from torch import Tensor
 
@@ -73,11 +74,14 @@ class EditJob:
         with ExitStack() as files:
             drawn = self._drawn(rows, Opener(files, editing.allowed_memory(self.memory)))
             self._tell(rows, drawn)
-            edit = self._measured(InMemory(photograph.pixels), rows)
-            pixels = edit_image(edit, photograph.pixels, at_once(self.step.declared, drawn))
+            weights = photograph.weights
+            edit = self._measured(InMemory(photograph.pixels, weights=weights), rows)
+            pixels = edit_image(edit, photograph.pixels, at_once(self.step.declared, drawn), weights=weights)
         if edit.reports_change:
             kind = options.DEPTHS[self.depth] if self.depth else photograph.depth  # the files are compared
-            before, after = stored_as(photograph.pixels, photograph.depth), stored_as(pixels, kind)
+            planes = [photograph.pixels] if weights is None else [photograph.pixels, weights]
+            before = stored_as(torch.cat(planes, dim=1), photograph.depth)
+            after = stored_as(pixels, kind)
             meter = ChangeMeter()
             meter.add(squared_difference(before, after))
             typer.echo(edit.summary(meter.change))
@@ -87,15 +91,15 @@ class EditJob:
     def tiling(self, job: Job) -> Iterator[Tiling]:
         """The edited rows of a photograph that does not fit in memory, which are computed within the block."""
         passes = job.passes(self.full, Path(self.target).parent)
-        tiled = Tiled(Picture(job.picture.rows, self.source), passes, self.scribbles.called)
+        tiled = Tiled(Picture(job.picture.marked, self.source), passes, self.scribbles.called)
         rows = Rows(self.source, job.size, tiled.channels, partial(pixels_of, tiled.picture))
         drawn = self._drawn(rows, job.open)
         self._tell(rows, drawn)
         edit = self._measured(tiled, rows)
         with single_threaded(tiled.passes.workers(1)):
             fitted = fit_edit(edit, tiled, as_rows(drawn))
-        with tiled.tiling(fitted) as tiling:
-            meter = ChangeMeter()
+        with tiled.tiling(fitted) as whole:
+            meter, tiling = ChangeMeter(), job.picture.unmarked(whole)
             yield meter.watched(tiling) if edit.reports_change else tiling
         if edit.reports_change:
             typer.echo(edit.summary(meter.change))

@@ -121,7 +121,7 @@ class MaskJob:
         rows = rows_of(photograph, self.source)
         with ExitStack() as files:
             drawn = self._drawn(rows, Opener(files, allowed))
-        image = InMemory(photograph.pixels)
+        image = InMemory(photograph.pixels, weights=photograph.weights)
         return mask.with_pixels(image.all(self._fitted(image, at_once(MASK, drawn))))
 
     def _check_rows(self, picture: StoredPicture, allowed: int) -> StoredPicture:
@@ -138,7 +138,7 @@ class MaskJob:
 
     def _by_rows(self, job: editing.Job, plain: StoredPicture) -> None:
         """Compute the mask in tiles and write it."""
-        tiled = Tiled(Picture(job.picture.rows, self.source), job.passes(self.full, self.target.parent), "--region")
+        tiled = Tiled(Picture(job.picture.marked, self.source), job.passes(self.full, self.target.parent), "--region")
         rows = Rows(self.source, job.size, tiled.channels, partial(pixels_of, tiled.picture))
         drawn = self._drawn(rows, job.open)
         with single_threaded(tiled.passes.workers(1)):

@@ -1,7 +1,7 @@
 """Recipes that are applied to one photograph, each in a region of its own, in memory or in tiles."""
 
-from collections.abc import Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -13,6 +13,7 @@ from nlfilter_torch.photo.cli.editing import Job, pixels_of, rows_of
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.edits.applying import apply_recipe, edit_of
 from nlfilter_torch.photo.io.photographs import Photograph
+from nlfilter_torch.photo.io.rows import StoredPicture
 from nlfilter_torch.photo.picture.changes import blend_edited
 from nlfilter_torch.photo.picture.edit import Rows
 from nlfilter_torch.photo.tiled.pictures import Picture
@@ -51,17 +52,19 @@ class RecipeJob:
     def edited(self, photograph: Photograph) -> Tensor:
         """The edited pixels of a photograph in memory, (1, C, H, W)."""
         self._tell(rows_of(photograph, self.source))
-        pixels = [apply_recipe(recipe, photograph.pixels) for recipe in self.recipes]
+        weights = photograph.weights
+        pixels = [apply_recipe(recipe, photograph.pixels, weights=weights) for recipe in self.recipes]
         if not self.masks:
             return pixels[0]
         return blend_edited(photograph.pixels, pixels, editing.read_masks(self.masks, self.source, photograph.size))
 
     def tiling(self, job: Job) -> AbstractContextManager[Tiling]:
         """The edited rows of a photograph that does not fit in memory."""
-        passes, picture = job.passes(self.full, Path(self.target).parent), Picture(job.picture.rows, self.source)
+        passes, source = job.passes(self.full, Path(self.target).parent), job.picture.marked
+        picture = Picture(source, self.source)
         self._tell(Rows(self.source, job.size, picture.colours, partial(pixels_of, picture)))
         if not self.masks:
-            return edit_tiling(passes, job.picture.rows, self.recipes[0].steps, self.source)
+            return unmarked(edit_tiling(passes, source, self.recipes[0].steps, self.source), job.picture)
         masks = [job.open(path) for path in self.masks]
         for path, mask in zip(self.masks, masks, strict=True):
             if tuple(mask.shape[:2]) != job.size:
@@ -70,10 +73,18 @@ class RecipeJob:
                     f"{mask.shape[1]}x{mask.shape[0]}; resize it"
                 )
         edits = [recipe.steps for recipe in self.recipes]
-        return edit_regions(passes, job.picture.rows, edits, [mask.rows for mask in masks], self.source)
+        tiling = edit_regions(passes, source, edits, [mask.rows for mask in masks], self.source)
+        return unmarked(tiling, job.picture)
 
     def _tell(self, rows: Rows) -> None:
         """Print the notes of all steps, without repeating any."""
         steps = [step for recipe in self.recipes for step in recipe.acting]
         for note in dict.fromkeys(note for step in steps for note in edit_of(step, rows.size).notes(rows)):
             options.note(note)
+
+
+@contextmanager
+def unmarked(whole: AbstractContextManager[Tiling], picture: StoredPicture) -> Iterator[Tiling]:
+    """Edited rows of :attr:`StoredPicture.marked` without its channel of pixels without data."""
+    with whole as tiling:
+        yield picture.unmarked(tiling)

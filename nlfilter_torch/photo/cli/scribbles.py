@@ -327,4 +327,4 @@ def _picture(size: Size, path: Path | None, read: Open, *, transparent: bool = F
         )
     if transparent and not stored.alpha:
         raise ValueError(f"{path} {Strokes.opaque}")
-    return Picture(stored.rows, str(path))
+    return Picture(stored.rows, str(path), hides=False)

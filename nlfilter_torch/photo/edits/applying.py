@@ -105,10 +105,15 @@ def fit_step(
 
 
 @full_precision
-def apply_step(step: Step, image: Tensor, *, generator: torch.Generator | None = None) -> Tensor:
-    """Apply a step to an image (B, C, H, W) in [0, 1]; without a generator, with the seed of the command line."""
+def apply_step(
+    step: Step, image: Tensor, *, weights: Tensor | None = None, generator: torch.Generator | None = None
+) -> Tensor:
+    """Apply a step to an image (B, C, H, W) in [0, 1]; without a generator, with the seed of the command line.
+
+    ``weights`` (B or 1, 1, H, W) say how much pixels count, from 0 to 1; None is 1 each.
+    """
     (check_image if EDIT_OF[step.edit].relative else check_photograph)(image, "image")
-    source = InMemory(image.to(working_dtype(image)))
+    source = InMemory(image.to(working_dtype(image)), weights=weights)
     drawn = scribbles_of(step, source.size, TensorPainter())
     return source.all(fit_step(step, source, drawn, generator=generator)).to(image.dtype)
 
@@ -152,6 +157,7 @@ def apply_recipe(
     image: Tensor,
     report: Callable[[int, int], object] | None = None,
     *,
+    weights: Tensor | None = None,
     generator: torch.Generator | None = None,
 ) -> Tensor:
     """Edit a photograph as ``nlfilter-torch apply`` does.
@@ -160,6 +166,8 @@ def apply_recipe(
         recipe: the steps to apply.
         image: (B, C, H, W) in [0, 1], C = 1 or 3.
         report: called before each step with how many are done, and of how many.
+        weights: how much pixels count, (B or 1, 1, H, W) from 0 to 1, such as :attr:`Photograph.weights`; None is 1
+            each.
         generator: source of randomness for the landmarks; None draws the same for every step and call.
 
     Returns:
@@ -181,7 +189,8 @@ def apply_recipe(
     for done, step in enumerate(steps):
         if report is not None:
             report(done, len(steps))
-        result = apply_step(step, image if result is image else _limited(result, image), generator=generator)
+        before = image if result is image else _limited(result, image)
+        result = apply_step(step, before, weights=weights, generator=generator)
     return result
 
 

@@ -23,6 +23,7 @@ from nlfilter_torch.nn.denoiser.tiles import STEP
 from nlfilter_torch.operator.options import Completion, GuideChannels, Sampling
 from nlfilter_torch.photo.declared.declaration import Edit
 from nlfilter_torch.photo.declared.parameters import DENOISE
+from nlfilter_torch.photo.edits.hot_pixels import HotPixels, hot_pixels_of
 from nlfilter_torch.photo.edits.noise import noise_of, profile_of
 from nlfilter_torch.photo.edits.synthesis import remainder
 from nlfilter_torch.photo.picture.drawn import Drawn, M
@@ -63,9 +64,10 @@ def denoise(
 ) -> Tensor:
     """Remove noise of known or estimated level.
 
-    The network is :meth:`NonlocalDenoiser.trained`. With ``method="rule"`` nothing is learned: the sliders of eq. (12)
-    are set for each pixel, to the share of a detail layer's energy that is not due to noise. W averages this energy
-    over similar patches in the whole image.
+    The network is :meth:`NonlocalDenoiser.trained`. Before it, single pixels that are far from all around them, such as
+    hot and dead pixels of sensors, are replaced by the median around them, if they are rare. With ``method="rule"``
+    nothing is learned: the sliders of eq. (12) are set for each pixel, to the share of a detail layer's energy that is
+    not due to noise. W averages this energy over similar patches in the whole image.
 
     Args:
         image: (B, C, H, W); with C = 3 it is RGB.
@@ -116,7 +118,10 @@ def denoise(
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Denoise(FilteredEdit):
-    """The edit of :func:`denoise`; ``noise_level`` may also be the estimated noise."""
+    """The edit of :func:`denoise`; ``noise_level`` may also be the estimated noise.
+
+    ``hot_pixels`` are those of the picture, or None if they are not known.
+    """
 
     declared: ClassVar[Edit] = DENOISE
     relative: ClassVar[bool] = True
@@ -126,6 +131,7 @@ class Denoise(FilteredEdit):
     method: Method
     guide_channels: GuideChannels = "all"
     working: WorkingRange | None = None
+    hot_pixels: HotPixels | None = None
 
     def in_range(self, working: WorkingRange) -> Self:
         """Return the edit with the noise level as the network sees it; an estimated one is already."""
@@ -139,7 +145,8 @@ class Denoise(FilteredEdit):
         is_map = is_noise_map(self.noise_level, source.size)
         if not isinstance(self.noise_level, (Noise, NoiseProfile)) and not is_map:
             DENOISE.check(source.batch, noise_level=self.noise_level)
-        noise = self._estimated(source) if self.noise_level is None else self.noise_level
+        hot_pixels = self._hot_pixels_of(source) if self.hot_pixels is None else self.hot_pixels
+        noise = self._estimated(source, hot_pixels) if self.noise_level is None else self.noise_level
         if isinstance(noise, NoiseProfile) and len(noise.levels) not in (1, source.batch):
             raise ValueError(
                 f"noise_level must be the profile of 1 or {source.batch} images, got {len(noise.levels)}; select some"
@@ -149,7 +156,9 @@ class Denoise(FilteredEdit):
                 source.check_all_in_memory(
                     "noise_level must be a number for a picture processed in tiles, got a map; denoise it in memory"
                 )
-            return Fitted(first_channel, NetworkDenoising(noise, self.strength), margin=2 * STEP, step=STEP)
+            denoising = NetworkDenoising(noise, self.strength, hot_pixels)
+            repaired = None if hot_pixels is None else hot_pixels.repaired
+            return Fitted(first_channel, denoising, margin=2 * STEP, step=STEP, repaired=repaired)
         if is_map:
             raise ValueError(
                 "noise_level must be a number or have shape (B,) for method rule, got a map; use method network"
@@ -170,15 +179,28 @@ class Denoise(FilteredEdit):
         return Fitted(RuleDenoising(layers, energy, noise, level))
 
     def measured(self, source: Source[M]) -> Self:
-        """Return the edit with the noise of the picture, if its level is not set, as it is in the working range."""
+        """Return the edit with hot pixels of the picture, and its noise if the level is not set, as it sees both."""
         working = range_of(source)
-        edit = self if working is None else self.in_range(working)
-        if self.noise_level is not None:
-            return edit
-        return replace(edit, noise_level=edit._estimated(source if working is None else Seen(source, working)))
+        if working is None:
+            return self._measured(source)
+        return self.in_range(working)._measured(Seen(source, working))
 
-    def _estimated(self, source: Source[M]) -> Noise | NoiseProfile:
-        return profile_of(source) if self.method == "network" else noise_of(source)
+    def _measured(self, source: Source[M]) -> Self:
+        if self.noise_level is not None and self.hot_pixels is not None:
+            return self
+        hot_pixels = self._hot_pixels_of(source)
+        noise = self._estimated(source, hot_pixels) if self.noise_level is None else self.noise_level
+        return replace(self, noise_level=noise, hot_pixels=hot_pixels)
+
+    def _hot_pixels_of(self, source: Source[M]) -> HotPixels | None:
+        """The hot pixels of a picture; None if nothing is to be changed, or for the rule."""
+        idle = any(not isinstance(value, Tensor) and value == 0 for value in (self.noise_level, self.strength))
+        return None if idle or self.method != "network" else hot_pixels_of(source)
+
+    def _estimated(self, source: Source[M], hot_pixels: HotPixels | None) -> Noise | NoiseProfile:
+        if self.method != "network":
+            return noise_of(source)
+        return profile_of(source, None if hot_pixels is None else hot_pixels.removed_at)
 
     def map_of(self, image: Tensor) -> Tensor:
         """Levels (B, 3, H, W) of the noise at scales 4, 2 and 1 as red, green and blue, 1 at :data:`WHITE_LEVELS`."""
@@ -204,6 +226,9 @@ class Denoise(FilteredEdit):
             size, changed = (self.working.described(share / LEVELS) for share in (level, change))
             changed, least = f"pixels changed by {changed} (RMS)", f"{100 * NEGLIGIBLE_NOISE:.2g} %"
         text = f"denoise: {'estimated' if estimated else 'given'} noise of {size}{_described(noise)}"
+        replaced = 0 if self.hot_pixels is None else int(self.hot_pixels.count.sum())
+        if replaced:
+            return f"{text}; {replaced} hot or dead pixel{'' if replaced == 1 else 's'} replaced; {changed}"
         if level < LEVELS * NEGLIGIBLE_NOISE:
             hint = NO_ESTIMATE if estimated and not bool(noise.levels.any()) else ""
             return f"{text}, less than {least}; no pixel changed{hint}"
@@ -254,9 +279,11 @@ class NetworkDenoising:
 
     noise: float | Tensor | Noise | NoiseProfile
     strength: float | Tensor
+    hot_pixels: HotPixels | None = None
 
     def __call__(self, image: Tensor, _: Tensor, inner: Inner) -> Tensor:
         """Denoise an image."""
+        image = image if self.hot_pixels is None else self.hot_pixels.removed(image)
         noise = self.noise.at(image) if isinstance(self.noise, Noise) else self.noise
         levels = level_planes(noise, image, "noise_level")
         strength = per_image(self.strength, levels, 4).expand(len(image), -1, -1, -1)

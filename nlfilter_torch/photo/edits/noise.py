@@ -1,5 +1,6 @@
 """Estimation of the noise of any source."""
 
+from collections.abc import Callable
 from functools import partial
 
 import torch
@@ -12,6 +13,8 @@ from nlfilter_torch.operator.options import GuideChannels
 from nlfilter_torch.photo.picture.drawn import M
 from nlfilter_torch.photo.picture.source import Source
 
+Repaired = Callable[[Tensor, Tensor], Tensor]  # of places (n,) and their colours (B, C, n)
+
 
 @torch.no_grad()
 def noise_of(source: Source[M], channels: GuideChannels = "all") -> Noise:
@@ -20,14 +23,24 @@ def noise_of(source: Source[M], channels: GuideChannels = "all") -> Noise:
 
 
 @torch.no_grad()
-def profile_of(source: Source[M]) -> NoiseProfile:
-    """Estimate the noise of any source by scale, plane and brightness."""
-    return profile_of_measured(source.measured(_measured_profile))
+def profile_of(source: Source[M], repaired: Repaired | None = None) -> NoiseProfile:
+    """Estimate the noise of any source, some of whose colours are replaced, by scale, plane and brightness."""
+    return profile_of_measured(source.measured(partial(_measured_profile, repaired=repaired)))
 
 
-def _measured_profile(source: Source[M]) -> Tensor:
-    return measured_profile(source.size, source.colours(profile_places(source.size)))
+def _measured_profile(source: Source[M], repaired: Repaired | None) -> Tensor:
+    places = profile_places(source.size)
+    colours = _visible(source, places)
+    if repaired is not None:
+        colours = repaired(places.to(colours.device), colours)
+    return measured_profile(source.size, colours)
+
+
+def _visible(source: Source[M], places: Tensor) -> Tensor:
+    """Colours of single pixels, 0 where they do not count: windows with much black are not measured."""
+    colours, weights = source.colours(places), source.weights_at(places)
+    return colours if weights is None else colours * (weights > 0)
 
 
 def _measured(source: Source[M], channels: GuideChannels) -> Tensor:
-    return measured_noise(source.size, source.colours(window_places(source.size)), channels)
+    return measured_noise(source.size, _visible(source, window_places(source.size)), channels)

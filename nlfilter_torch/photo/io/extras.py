@@ -1,6 +1,7 @@
 """Metadata of image files besides profile and EXIF: XMP, print resolution, tags of TIFF, and what is not copied."""
 
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
@@ -87,6 +88,15 @@ class Extras:
     depth: str = ""
     parts: tuple[Part, ...] = ()
     left_out: tuple[str, ...] = ()
+
+    @property
+    def nodata(self) -> float | None:
+        """The value of pixels without data, by the tag of GDAL; None without one."""
+        for tag in self.tags:
+            if tag.code == NODATA:
+                with suppress(ValueError):  # not a number
+                    return float(tag.data.split(b"\0")[0].decode("ascii", "replace").replace(",", "."))
+        return None
 
     def tags_for(self, size: tuple[int, int], depth: str) -> tuple[Tag, ...]:
         """The tags that are true of a picture of a size (H, W) and depth."""

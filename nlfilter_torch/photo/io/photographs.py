@@ -14,16 +14,26 @@ from typing import BinaryIO, Literal
 import numpy as np
 import psutil
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from nlfilter_torch.core.checks import check_count
+from nlfilter_torch.operator.hidden import REACH
 from nlfilter_torch.photo.io import by_pillow, cameras, jpeg, png, tiff
 from nlfilter_torch.photo.io import exif as exif_tags
 from nlfilter_torch.photo.io.decoded import Channels, CheckSize, Decoded, Metadata, UnhandledImage, decoding
 from nlfilter_torch.photo.io.exif_in_tiff import shortened
 from nlfilter_torch.photo.io.extras import NO_EXTRAS, Extras, note_left_out
 from nlfilter_torch.photo.io.writing import check_file, open_beside
-from nlfilter_torch.photo.tiled.pictures import Picture, stored_as
+from nlfilter_torch.photo.tiled.pictures import (
+    NodataRows,
+    Picture,
+    is_hidden,
+    keep_apart,
+    put_back,
+    stored_as,
+    transparency,
+)
 
 Depth = Literal["uint8", "uint16", "float16", "float32", "float64"]
 
@@ -46,17 +56,43 @@ SUFFIXES |= {".tif": "TIFF", ".tiff": "TIFF"}
 
 
 @dataclass(frozen=True)
+class HiddenPixels:
+    """The pixels of a file that do not count: transparent ones, and those without data.
+
+    Attributes:
+        places: where they are, (H, W).
+        colours: as they are stored, (n, C).
+        nodata: the value that says that there is no data, or None.
+    """
+
+    places: NDArray[np.bool_]
+    colours: Channels
+    nodata: float | None = None
+
+    def put_back(self, channels: Channels) -> None:
+        """Put them back into the channels (H, W, S) of the file; no other pixel gets the value of those without data.
+
+        Several channels of one that is stored are colours.
+        """
+        colours = channels[..., : 3 if channels.shape[2] >= 3 else 1]
+        put_back(colours, self.colours, self.places)
+        if self.nodata is not None:
+            keep_apart(colours, self.places, self.nodata)
+
+
+@dataclass(frozen=True)
 class Photograph:
     """An image file in memory: pixels to compute with, and the metadata to write back.
 
     Attributes:
         pixels: (1, C, H, W), C = 1 or 3, upright. Integer files are scaled to [0, 1]; float files keep their own
-            values. float32, or float64 for a file of 64-bit floats.
+            values. float32, or float64 for a file of 64-bit floats. Hidden pixels have colours of pixels nearby.
         depth: How a channel is stored in the file, as the name of a numpy dtype.
         alpha: (1, 1, H, W), scaled like the pixels, or None. It is not edited.
         icc: The colour profile, or None. Pixels are not converted.
         exif: The EXIF block, with orientation 1 since the pixels are upright, or None.
         extras: XMP and print resolution.
+        hidden: The pixels that do not count, which are written back as they were, or None.
     """
 
     pixels: Tensor
@@ -65,6 +101,15 @@ class Photograph:
     icc: bytes | None = None
     exif: bytes | None = None
     extras: Extras = NO_EXTRAS
+    hidden: HiddenPixels | None = None
+
+    @property
+    def weights(self) -> Tensor | None:
+        """How much pixels count, (1, 1, H, W) in [0, 1]; None if all count, or none do."""
+        weights = self.pixels.new_ones(1, 1, *self.size) if self.alpha is None else self.alpha.clamp(0, 1)
+        if self.hidden is not None:
+            weights = weights * torch.from_numpy(~self.hidden.places)
+        return weights if 0 < float(weights.sum()) < weights.numel() else None
 
     @property
     def metadata(self) -> Metadata:
@@ -110,18 +155,32 @@ def read_photograph(path: str | Path, *, bytes_per_pixel: int = 0, memory: int |
     decoded = read_channels(path, bytes_per_pixel=bytes_per_pixel, memory=memory)
     channels, metadata = decoded.channels, decoded.metadata
     depth = check_depth(path, channels.dtype)
-    planes = _planes(Picture(channels, str(path), channels=channels.shape[2]))
+    planes, hidden = _planes_of(channels, metadata.extras.nodata, str(path))
     colours = 3 if planes.shape[1] >= 3 else 1
     alpha = planes[:, colours:] if planes.shape[1] > colours else None
-    return Photograph(planes[:, :colours], depth, alpha, metadata.icc, metadata.exif, metadata.extras)  # type: ignore[arg-type]
+    return Photograph(planes[:, :colours], depth, alpha, metadata.icc, metadata.exif, metadata.extras, hidden)  # type: ignore[arg-type]
 
 
-def _planes(picture: Picture) -> Tensor:
-    """All channels (1, S, H, W) of a picture, converted a few rows at a time, which takes the least memory."""
-    planes = torch.empty(1, picture.samples, *picture.size, dtype=picture.dtype)
-    for tile in picture.tiles(0, max(1, CONVERTED // picture.size[1])):
-        planes[:, :, tile.start : tile.start + tile.pixels.shape[2]] = tile.pixels
-    return planes
+def _planes_of(channels: Channels, nodata: float | None, name: str) -> tuple[Tensor, HiddenPixels | None]:
+    """All channels (1, S, H, W) of a picture, converted a few rows at a time to save memory, and what it hides."""
+    marked = nodata is not None and channels.shape[2] in (1, 3)
+    picture = Picture(NodataRows(channels, nodata) if marked and nodata is not None else channels, name)
+    picture.accept_any_scale()  # until it is edited
+    planes = torch.empty(1, channels.shape[2], *picture.size, dtype=picture.dtype)
+    places = np.zeros(picture.size if picture.hides else (0, 0), np.bool_)
+    rows = max(CONVERTED // picture.size[1], 4 * REACH if picture.hides else 1)
+    for tile in picture.tiles(0, rows):
+        part = slice(tile.start, tile.start + len(tile.stored))
+        planes[:, : picture.colours, part] = tile.pixels
+        if picture.hides:
+            places[part] = is_hidden(tile.stored)
+        if channels.shape[2] > picture.colours:
+            planes[:, picture.colours :, part] = torch.from_numpy(
+                transparency(tile, planes.numpy().dtype.name)
+            ).movedim(2, 0)
+    if not places.any():
+        return planes, None
+    return planes, HiddenPixels(places, channels[places][:, : picture.colours], nodata if marked else None)
 
 
 def check_depth(path: str | Path, dtype: np.dtype[np.generic]) -> str:
@@ -229,6 +288,8 @@ def write_photograph(photograph: Photograph, path: str | Path, *, quality: int |
     rows = max(1, CONVERTED // photograph.size[1])
     parts = zip(*(plane.split(rows, dim=2) for plane in planes), strict=True)
     channels = np.concatenate([stored_as(torch.cat(part, dim=1), photograph.depth) for part in parts])  # (H, W, S)
+    if photograph.hidden is not None:
+        photograph.hidden.put_back(channels)
     alpha = photograph.alpha is not None
     with open_beside(path) as stream:
         metadata, left_out = with_thumbnail(photograph.metadata, None if kind == "TIFF" else channels)

@@ -36,7 +36,7 @@ from nlfilter_torch.photo.io.photographs import (
 from nlfilter_torch.photo.io.scratch import Scratch, upright_copy
 from nlfilter_torch.photo.io.tiff import TiffRows
 from nlfilter_torch.photo.io.writing import check_file, claimed, link_target, name_beside, open_beside, part_beside
-from nlfilter_torch.photo.tiled.pictures import Rows, RowSource
+from nlfilter_torch.photo.tiled.pictures import NodataRows, Rows, RowSource
 from nlfilter_torch.photo.tiled.tiles import Tiling
 
 ZARR = ".zarr"
@@ -73,6 +73,20 @@ class StoredPicture:
         """(H, W, S)."""
         height, width, *samples = self.rows.shape
         return height, width, samples[0] if samples else 1
+
+    @property
+    def nodata(self) -> float | None:
+        """The value of pixels without data, if there is one and no transparency."""
+        return None if self.alpha else self.metadata.extras.nodata
+
+    @property
+    def marked(self) -> RowSource:
+        """The rows, with one more channel if pixels have no data; see :class:`NodataRows`."""
+        return self.rows if self.nodata is None else NodataRows(self.rows, self.nodata)
+
+    def unmarked(self, tiling: Tiling) -> Tiling:
+        """Edited rows of :attr:`marked` without that channel."""
+        return tiling if self.nodata is None else replace(tiling, nodata=self.nodata)
 
     def in_colour(self) -> "StoredPicture":
         """Return shape and metadata of the colour version, without pixels; the profile of a grey picture is dropped."""

@@ -1,7 +1,7 @@
 """An image or a batch in memory as the source of an edit, with gradients."""
 
 from collections.abc import Callable, Hashable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import cast
 
@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.core.checks import check_image, check_photograph, check_same_size, check_tensor, check_unit_range
-from nlfilter_torch.core.inner import EVERYWHERE
+from nlfilter_torch.core.inner import EVERYWHERE, Inner
 from nlfilter_torch.core.precision import full_precision, working_dtype
 from nlfilter_torch.core.rational import RationalForm
 from nlfilter_torch.filtering.filters import detail_layers
@@ -17,14 +17,15 @@ from nlfilter_torch.filtering.rational_product import pole_terms, rational_produ
 from nlfilter_torch.filtering.scribbles import check_painted
 from nlfilter_torch.operator.build import operator_from_guide
 from nlfilter_torch.operator.columns import Columns
+from nlfilter_torch.operator.hidden import fill_nearby
 from nlfilter_torch.operator.operator import NonlocalOperator
 from nlfilter_torch.operator.pixel_matrix import PixelMatrix
 from nlfilter_torch.operator.spectrum import RitzPairs, Spectrum
 from nlfilter_torch.photo.picture.drawn import Drawn, M
 from nlfilter_torch.photo.picture.edit import PhotoEdit
-from nlfilter_torch.photo.picture.ends import ends_of
+from nlfilter_torch.photo.picture.ends import ends_of, mean_of, usable
 from nlfilter_torch.photo.picture.pixels import Fitted, Planes, part_of, strips_of
-from nlfilter_torch.photo.picture.resizing import block_means, resize
+from nlfilter_torch.photo.picture.resizing import block_means, counted_means, resize, weights_of
 from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles
 from nlfilter_torch.photo.picture.seen import Seen, in_own_units, of_picture, range_of
 from nlfilter_torch.photo.picture.source import SAMPLE, Blocks, Guide, Kept, Source, sampled_pairs, sampled_places
@@ -36,13 +37,16 @@ Cache = dict[Hashable, tuple[Sequence[Tensor], object]]  # results by their name
 class InMemory:
     """An image (B, C, H, W), float32 or float64, in memory: both a source and the set of all its pixels.
 
-    ``cache`` holds its operators, by their options, and other results, by name; None caches nothing.
+    ``cache`` holds its operators, by their options, and other results, by name; None caches nothing. ``weights``
+    (B or 1, 1, H, W) say how much pixels count, from 0 to 1; None is 1 each.
     """
 
     first = 0
 
-    def __init__(self, image: Tensor, cache: Cache | None = None) -> None:
+    def __init__(self, image: Tensor, cache: Cache | None = None, weights: Tensor | None = None) -> None:
         self.image, self.cache, self.dtype = image.contiguous(), cache, image.dtype
+        weights = usable(weights)
+        self.weights = None if weights is None else weights.to(image).expand(len(image), -1, -1, -1)
         self.batch, self.channels, *size = image.shape
         self.size, self.width = (size[0], size[1]), size[1]
 
@@ -64,7 +68,11 @@ class InMemory:
         return self.kept((guide.transform, guide.blur, *named), copies, partial(self._build, guide))
 
     def _build(self, guide: Guide) -> "InMemoryOperator":
-        operator = operator_from_guide(guide(self.image), guide.options)
+        options = guide.options
+        if self.weights is not None:
+            counted = int((self.weights > 0).flatten(1).sum(1).min())
+            options = replace(options, num_landmarks=min(options.num_landmarks, counted))
+        operator = operator_from_guide(guide(self.image), options, self.weights)
         return InMemoryOperator(operator, self, guide.sampled, None if self.cache is None else {})
 
     def scribbles(self, mask: Tensor | None, colours: Tensor | None, name: str, *, needed: bool = True) -> Scribbles:
@@ -82,7 +90,12 @@ class InMemory:
             check_painted(mask, name)
         else:
             check_unit_range(mask, name)
-        weights = mask.to(self.image).expand(self.batch, -1, -1, -1).flatten(2)
+        weights = mask.to(self.image).expand(self.batch, -1, -1, -1)
+        if self.weights is not None:
+            weights = weights * self.weights
+            if needed and not bool((weights > 0).any()):
+                raise ValueError(f"{name} must cover a pixel that is not hidden, got none that does; move it")
+        weights = weights.flatten(2)
         marked = torch.ones_like(weights[0, 0], dtype=torch.bool)
         if not weights.requires_grad:  # pixels of weight 0 matter only to the derivative by the weights
             marked = (weights > 0).any(0).squeeze(0)
@@ -97,7 +110,10 @@ class InMemory:
         """Resize the image."""
         if size == self.size:
             return self
-        return InMemory(resize(self.image, size))
+        if self.weights is None:
+            return InMemory(resize(self.image, size))
+        weights = weights_of(resize(self.weights, size))
+        return InMemory(fill_nearby(resize(self.image, size), weights > 0), weights=weights)
 
     def shrunk(self, planes: Planes, size: tuple[int, int]) -> Tensor:
         """Planes of all pixels in another size."""
@@ -112,11 +128,22 @@ class InMemory:
         if step == 1:
             return self
         cache: Cache | None = None if self.cache is None else {}
-        return self.kept(("blocks", step), [], lambda: InMemory(block_means(self.image, step), cache))
+        return self.kept(("blocks", step), [], partial(self._blocks, step, cache))
+
+    def _blocks(self, step: float, cache: Cache | None) -> "InMemory":
+        weights = None if self.weights is None else weights_of(block_means(self.weights, step))
+        return InMemory(self._block_means(self.image, step), cache, weights)
+
+    def _block_means(self, planes: Tensor, step: float) -> Tensor:
+        """Means over blocks of the pixels that count; of all pixels in blocks where none does."""
+        means = block_means(planes, step)
+        if self.weights is None:
+            return means
+        return counted_means(means, block_means(planes * self.weights, step), block_means(self.weights, step))
 
     def like(self, image: Tensor) -> "InMemory":
         """Another image (B, C, H, W), with a cache if this one has one."""
-        return InMemory(image, None if self.cache is None else {})
+        return InMemory(image, None if self.cache is None else {}, self.weights)
 
     def resized_weights(self, weights: Tensor, size: tuple[int, int], name: str) -> Tensor:
         """Resize weights."""
@@ -139,11 +166,15 @@ class InMemory:
 
     def mean_of(self, fitted: Fitted, function: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
         """Means of a function of the image and of the result of an edit."""
-        return self.all(fitted.then(function)).mean((2, 3), keepdim=True)
+        return mean_of(self.all(fitted.then(function)), self.weights)
 
     def colours(self, places: Tensor) -> Tensor:
         """Colours of single pixels."""
         return self.image.flatten(2)[:, :, places]
+
+    def weights_at(self, places: Tensor) -> Tensor | None:
+        """The weights of single pixels."""
+        return None if self.weights is None else self.weights.flatten(2)[:, :, places]
 
     def regions(self, masks: Tensor, name: str) -> list[Scribbles]:
         """Read the scribbles of K regions from a tensor (B, K, H, W)."""
@@ -160,15 +191,19 @@ class InMemory:
 
     def mean(self, planes: Planes) -> Tensor:
         """Means over all pixels."""
-        return planes(self).mean((2, 3), keepdim=True)
+        return mean_of(planes(self), self.weights)
 
     def ends(self, planes: Planes) -> tuple[Tensor, Tensor]:
         """Least and largest values over all pixels."""
-        return ends_of(planes(self))
+        return ends_of(planes(self), self.weights)
 
     def reduced(self, planes: Planes, step: int) -> Tensor:
         """Means over blocks of pixels."""
-        return block_means(planes(self), step)
+        return self._block_means(planes(self), step)
+
+    def parts(self, function: Callable[[Tensor, Inner, int], Kept], margin: int) -> list[Kept]:
+        """The result for the image."""
+        return [function(self.image, EVERYWHERE, 0)]
 
     def measured(self, function: Callable[[Source[Tensor]], Tensor]) -> Tensor:
         """Apply a measurement to the image."""
@@ -198,7 +233,10 @@ class InMemoryOperator:
         if not self.sampled or count <= SAMPLE:
             return self.operator.spectrum()
         operator, places = self.operator, sampled_places(self.source.size).to(self.operator.factor.device)
-        columns = Columns(operator.factor[:, :, places], operator.scaling[:, places], operator.remainder[:, places])
+        scaling = operator.scaling[:, places]
+        if operator.weights is not None:
+            scaling = scaling * operator.weights[:, places].sqrt()
+        columns = Columns(operator.factor[:, :, places], scaling, operator.remainder[:, places])
         return sampled_pairs([columns], count, operator.factor.dtype)
 
     def of_columns(self, function: Callable[[Columns], Tensor]) -> Planes:
@@ -232,7 +270,7 @@ class InMemoryOperator:
 
     def mean(self, planes: Planes) -> Tensor:
         """Means over all pixels."""
-        return planes(self.source).mean((2, 3))
+        return mean_of(planes(self.source), self.source.weights)[..., 0, 0]
 
     def at(self, places: Tensor) -> Blocks:
         """Columns of the factor at single pixels."""
@@ -290,11 +328,13 @@ def edit_image(
     *,
     name: str = "image",
     channels: int | None = None,
+    weights: Tensor | None = None,
 ) -> Tensor:
     """Edit an image (B, C, H, W) in [0, 1]; the result has its dtype.
 
-    ``name`` is that of the image in errors, and ``channels`` the number that it must have, if any.
+    ``name`` is that of the image in errors, and ``channels`` the number that it must have, if any. ``weights`` are
+    those of :class:`InMemory`.
     """
     (check_image if edit.relative else check_photograph)(image, name, channels=channels)
-    source = InMemory(image.to(working_dtype(image)))
+    source = InMemory(image.to(working_dtype(image)), weights=weights)
     return source.all(fit_edit(edit, source, Drawn() if drawn is None else drawn)).to(image.dtype)

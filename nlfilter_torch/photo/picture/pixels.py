@@ -90,12 +90,15 @@ class Fitted:
         margin: radius of this neighbourhood in pixels.
         step: period, in rows and in columns, of what ``finish`` does, counted from the first row and column that it is
             given; tiles begin at multiples of it, and ``margin`` is a multiple of it.
+        repaired: function of the image, and of what is 1 for the edit in its units, (B, 1, 1, 1), that replaces defects
+            which ``finish`` does not see as far from others as they are; None for edits that replace none.
     """
 
     pixels: Planes
     finish: Callable[[Tensor, Tensor, Inner], Tensor] | None = None
     margin: int = 0
     step: int = 1
+    repaired: Callable[[Tensor, Tensor], Tensor] | None = None
 
     def then(self, function: Callable[[Tensor, Tensor], Tensor]) -> "Fitted":
         """Apply a pointwise function of the image and of the result."""

@@ -14,6 +14,7 @@ from nlfilter_torch.core.torch_internals import cached_constants
 Read = Callable[[int, int], Tensor]  # returns the rows (B, C, n, W) of a picture from start to stop
 BLOCK = 64  # rows resized at once
 PIECE = 1 << 21  # pixels, at most, that are reduced along rows at once
+SMALL_SHARE = 1e-3  # share of a block that must count
 
 
 def resized(
@@ -119,6 +120,22 @@ def block_means(planes: Tensor, step: float) -> Tensor:
         strips = planes.split(round(step) * BLOCK, dim=2)
         return torch.cat([F.avg_pool2d(strip.double(), round(step)).to(planes) for strip in strips], dim=2)
     return block_parts(planes, 0, size, step)[1].to(planes)
+
+
+def weights_of(planes: Tensor) -> Tensor:
+    """Weights from reduced weights (B, 1, H, W): from 0 to 1, without what interpolation leaves far from any."""
+    return torch.where(planes < SMALL_SHARE, 0.0, planes).clamp(max=1.0)
+
+
+def counted_means(means: Tensor, weighted: Tensor, weights: Tensor) -> Tensor:
+    """Means over the pixels of blocks that count, of all pixels where none does.
+
+    Args:
+        means: over all pixels, (B, C, n, m).
+        weighted: of the pixels times their weights.
+        weights: means of the weights, (B, 1, n, m).
+    """
+    return torch.where(weights > SMALL_SHARE, weighted / weights.clamp(min=SMALL_SHARE), means)
 
 
 def block_parts(rows: Tensor, start: int, size: tuple[int, int], step: float) -> tuple[int, Tensor]:

@@ -56,6 +56,17 @@ class Scribbles:
         """Replace the weights by others, (B, K, n)."""
         return replace(self, weights=weights)
 
+    def weighted_by(self, weights: Tensor) -> "Scribbles":
+        """The scribbles on pixels with weights (n,), without those of weight 0."""
+        kept = weights > 0
+        return replace(
+            self,
+            places=self.places[kept],
+            weights=(self.weights * weights.to(self.weights))[..., kept],
+            image=self.image[..., kept],
+            colours=None if self.colours is None else self.colours[..., kept],
+        )
+
     def planes(self, pixels: Pixels) -> Tensor:
         """Return the weights (B, K, h, w) at some pixels of the picture."""
         height, width = pixels.image.shape[-2:]

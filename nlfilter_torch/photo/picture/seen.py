@@ -75,9 +75,14 @@ def _crossings(size: tuple[int, int]) -> Tensor:
 
 def _used_at(places: Tensor, source: Source[M]) -> Tensor:
     """Range that the values of some pixels comprise, and the step of their depth or 0: (3, B)."""
-    values = source.colours(places).detach().flatten(1)
-    values = values.to(torch.promote_types(values.dtype, torch.float32))
-    ends = torch.quantile(values, values.new_tensor([RARE, 1 - RARE]), dim=1)
+    colours, weights = source.colours(places).detach(), source.weights_at(places)
+    colours = colours.to(torch.promote_types(colours.dtype, torch.float32))
+    values, quantile = colours.flatten(1), torch.quantile
+    if weights is not None and bool((weights > 0).any(2).all()):
+        values = torch.where(weights > 0, colours, torch.nan).flatten(1)
+        quantile = torch.nanquantile
+    ends = quantile(values, values.new_tensor([RARE, 1 - RARE]), dim=1)
+    values = colours.flatten(1)
     step = values.new_zeros(len(values))
     for white in reversed(WHOLE):
         steps = values * white
@@ -307,6 +312,10 @@ class Seen(Generic[M]):
         """Colours of single pixels."""
         return self._seen(self.source.colours(places))
 
+    def weights_at(self, places: Tensor) -> Tensor | None:
+        """The weights of single pixels."""
+        return self.source.weights_at(places)
+
     def mean(self, planes: Planes) -> Tensor:
         """Means over all pixels."""
         return self.source.mean(OfPixels(planes, self.working))
@@ -328,6 +337,10 @@ class Seen(Generic[M]):
         """Result of a function of picture and tensors, which a preview keeps."""
         return self.source.kept(name, tensors, compute)
 
+    def parts(self, function: Callable[[Tensor, Inner, int], Kept], margin: int) -> list[Kept]:
+        """Results of a function of parts that make up the picture."""
+        return self.source.parts(partial(_part_as_seen, function, self.working), margin)
+
     def measured(self, function: Callable[[Source[M]], Tensor]) -> Tensor:
         """Apply a measurement to the picture."""
         return self.source.measured(partial(_measured_as_seen, function, self.working))
@@ -337,6 +350,12 @@ def _of_seen(
     function: Callable[[Tensor, Tensor], Tensor], working: WorkingRange, image: Tensor, result: Tensor
 ) -> Tensor:
     return function(working.seen(image), result)
+
+
+def _part_as_seen(
+    function: Callable[[Tensor, Inner, int], Kept], working: WorkingRange, image: Tensor, inner: Inner, first_row: int
+) -> Kept:
+    return function(working.seen(image), inner, first_row)
 
 
 def _measured_as_seen(function: Callable[[Source[M]], Tensor], working: WorkingRange, source: Source[M]) -> Tensor:
@@ -372,4 +391,6 @@ class FinishInOwnUnits:
     def __call__(self, image: Tensor, planes: Tensor, inner: Inner) -> Tensor:
         """The edited image (B, C, H, W)."""
         assert self.fitted.finish is not None  # for mypy
+        if self.fitted.repaired is not None:
+            image = self.fitted.repaired(image, self.working.span)
         return self.working.edited(image, self.fitted.finish(image, planes, inner))

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.core.blocks import symmetric_places
+from nlfilter_torch.core.inner import Inner
 from nlfilter_torch.core.kernels.grams import compute_grams
 from nlfilter_torch.core.rational import RationalForm
 from nlfilter_torch.operator.columns import Columns
@@ -102,7 +103,11 @@ class Operator(Protocol):
 
 
 class Source(Protocol[M]):
-    """A picture to edit, whose masks and scribbles have the type M."""
+    """A picture to edit, whose masks and scribbles have the type M.
+
+    Pixels count in proportion to their opacity in operators, means and scribbles, and those that are hidden, which have
+    colours of pixels nearby, for nothing.
+    """
 
     @property
     def size(self) -> tuple[int, int]:
@@ -173,6 +178,9 @@ class Source(Protocol[M]):
     def colours(self, places: Tensor) -> Tensor:
         """Colours (B, C, n) of single pixels, given by ascending row-major indices."""
 
+    def weights_at(self, places: Tensor) -> Tensor | None:
+        """How much single pixels count, (B, 1, n), given by row-major indices; None is 1 each."""
+
     def mean(self, planes: Planes) -> Tensor:
         """Means (B, C, 1, 1) over all pixels."""
 
@@ -193,6 +201,15 @@ class Source(Protocol[M]):
 
     def kept(self, name: Hashable, tensors: Sequence[Tensor], compute: Callable[[], Kept]) -> Kept:
         """Result, called ``name``, of a function of picture and tensors; a preview keeps it for the next edit."""
+
+    def parts(self, function: Callable[[Tensor, Inner, int], Kept], margin: int) -> list[Kept]:
+        """Results of a function of parts that make up the picture, without gradients.
+
+        Args:
+            function: of some rows (B, C, h, W), of which of them are the part, and of the number of the first of these
+                in the picture. The other rows, up to ``margin`` on both sides, are there to be seen.
+            margin: in rows.
+        """
 
     def measured(self, function: Callable[["Source[M]"], Tensor]) -> Tensor:
         """Apply a measurement to the picture; for a frame of a film, average it over the reference frames."""

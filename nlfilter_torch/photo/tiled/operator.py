@@ -386,10 +386,18 @@ class TiledOperator:
         """The spectrum."""
         count = self.guide.pixels
         if self.guide.guide.sampled and count > SAMPLE:
-            features = self.features_at(sampled_places(self.guide.size))
-            return sampled_pairs(map(self.columns, features.split(sampling.CHUNK, dim=2)), count, self.guide.dtype)
+            places = sampled_places(self.guide.size)
+            blocks = map(self._weighted_columns, places.split(sampling.CHUNK))
+            return sampled_pairs(blocks, count, self.guide.dtype)
         sums = next(iter(self._sums.values()), None) or self.sums(first_plane, 1)
         return RitzPairs.of_sums(sums.grams[:, :2] + self._grams, sums.dtype)
+
+    def _weighted_columns(self, places: Tensor) -> Columns:
+        """Columns of single pixels, whose scaling is multiplied by the roots of their weights."""
+        columns, counted = self.columns(self.features_at(places)), self.guide.counted
+        if counted is None:
+            return columns
+        return replace(columns, scaling=columns.scaling * counted.at(places).to(columns.scaling).sqrt())
 
     def of_columns(self, function: Callable[[Columns], Tensor]) -> Planes:
         """Planes computed by a function of columns."""

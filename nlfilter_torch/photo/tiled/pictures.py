@@ -14,6 +14,7 @@ from torch import Tensor
 
 from nlfilter_torch.core.checks import warn_of_scale
 from nlfilter_torch.operator.features import reduce_channels
+from nlfilter_torch.operator.hidden import REACH, fill_nearby
 
 WHITE = {"uint8": 255, "uint16": 65535}  # the integer that stands for 1.0
 KINDS = ("uint8", "uint16", "float16", "float32", "float64")
@@ -93,6 +94,50 @@ class FileRows:
         return np.frombuffer(data, self.dtype).reshape(-1, *self.shape[1:])
 
 
+@dataclass(frozen=True)
+class NodataRows:
+    """Rows of a picture without transparency, and one more channel: 0 where they hold no data, white elsewhere.
+
+    Attributes:
+        rows: (H, W) or (H, W, S).
+        nodata: the value of pixels without data, see :func:`lacks_data`.
+    """
+
+    rows: RowSource
+    nodata: float
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """(H, W, S + 1)."""
+        height, width, *samples = self.rows.shape
+        return height, width, (samples[0] if samples else 1) + 1
+
+    @property
+    def dtype(self) -> np.dtype[np.generic]:
+        """Of the rows."""
+        return self.rows.dtype
+
+    def __getitem__(self, rows: slice) -> Stored:
+        """The rows from ``rows.start`` to ``rows.stop``."""
+        stored = np.asarray(self.rows[rows])
+        stored = stored.reshape(*stored.shape[:2], -1)
+        white = stored.dtype.type(WHITE.get(stored.dtype.name, 1))
+        counts = np.where(lacks_data(stored, self.nodata), stored.dtype.type(0), white)
+        return np.concatenate([stored, counts[..., None]], axis=2)
+
+
+def lacks_data(stored: Stored, nodata: float) -> NDArray[np.bool_]:
+    """Where pixels (..., S) hold no data, (...).
+
+    These are the pixels all of whose channels have the value ``nodata``; of floats, all pixels with such a channel.
+    """
+    if stored.dtype.kind != "f":
+        return (stored == nodata).all(-1)
+    with np.errstate(over="ignore"):  # a value that the dtype does not hold
+        value = np.asarray(nodata).astype(stored.dtype)
+    return np.any(np.isnan(stored) if np.isnan(nodata) else np.equal(stored, value), axis=-1)
+
+
 class RowTarget(Protocol):
     """Rows to write, of the source's shape."""
 
@@ -149,15 +194,25 @@ class Picture:
 
     Attributes:
         size: (H, W).
-        colours: 1 or 3; a further channel is transparency, which is ignored.
+        colours: 1 or 3; a further channel is transparency.
         dtype: of the computation.
         checks_scale: whether a warning is due if values are far outside [0, 1].
+        hides: whether pixels are hidden where the transparency is 0: they have the colours of pixels nearby that are
+            not, see :func:`fill_nearby`.
     """
 
-    def __init__(self, source: RowSource, name: str = "source", *, channels: int | None = None) -> None:
+    def __init__(
+        self,
+        source: RowSource,
+        name: str = "source",
+        *,
+        channels: int | None = None,
+        hides: bool = True,
+    ) -> None:
         """Check the shape and type of ``source``, called ``name`` in error messages.
 
         ``channels`` is that of something other than a picture: all of them are read, and none is transparency.
+        ``hides`` is False for what is laid over a picture, whose transparent pixels are not used.
         """
         self.source, self.name = source, name
         shape, kind = tuple(source.shape), np.dtype(source.dtype).name
@@ -173,6 +228,7 @@ class Picture:
         self.colours = channels or (3 if self.samples >= 3 else 1)
         self.kind, self.checks_scale = kind, channels is None and kind not in WHITE
         self.dtype = torch.float64 if kind == "float64" else torch.float32
+        self.hides = hides and channels is None and self.samples in (2, 4)
 
     def accept_any_scale(self) -> None:
         """Do not warn of values far outside [0, 1] from now on."""
@@ -190,6 +246,18 @@ class Picture:
             ValueError: if the source returns rows of another shape than declared.
         """
         first, last = max(start - margin, 0), min(stop + margin, self.size[0])
+        stored = self._read(first, last)
+        halo = (start - first, last - stop)
+        convert = partial(self._converted, stored)
+        if self.hides and is_hidden(stored).any():
+            above, below = self._read(max(first - REACH, 0), first), self._read(last, min(last + REACH, self.size[0]))
+            convert = partial(self._filled, np.concatenate([above, stored, below]), len(above), last - first)
+        return Tile(start, convert, halo, stored[halo[0] : last - first - halo[1]])
+
+    def _read(self, first: int, last: int) -> Stored:
+        """The rows (h, W, S) from ``first`` to ``last``."""
+        if first == last:
+            return np.empty((0, self.size[1], self.samples), self.kind)
         stored = np.asarray(self.source[first:last])
         wanted = (last - first, *self.source.shape[1:])
         if stored.shape != wanted or tuple(self.source.shape[:2]) != self.size:
@@ -197,9 +265,17 @@ class Picture:
                 f"{self.name} must keep its size while it is read, {self.size[0]} rows of {self.size[1]}, but gave "
                 f"{stored.shape} for {wanted}; make sure that nothing writes to it"
             )
-        stored = stored.reshape(last - first, self.size[1], self.samples)
-        halo = (start - first, last - stop)
-        return Tile(start, partial(self._converted, stored), halo, stored[halo[0] : last - first - halo[1]])
+        return stored.reshape(last - first, self.size[1], self.samples)
+
+    def opacity(self, start: int, stop: int) -> Stored:
+        """The transparency (h, W) of rows, as it is stored."""
+        return self._read(start, stop)[..., -1].copy()
+
+    def _filled(self, stored: Stored, first: int, count: int) -> Tensor:
+        """The colours (1, C, count, W) of ``count`` rows of (h, W, S), from ``first`` on, without hidden ones."""
+        hidden = is_hidden(stored)
+        image = self._converted(np.where(hidden[..., None], stored.dtype.type(0), stored))
+        return fill_nearby(image, torch.from_numpy(~hidden)[None, None])[:, :, first : first + count]
 
     def _converted(self, stored: Stored) -> Tensor:
         """The colours (1, C, h, W) of rows (h, W, S)."""
@@ -243,11 +319,43 @@ def stored_as(values: Tensor, kind: str) -> Stored:
     return np.ascontiguousarray(rows.astype(kind))
 
 
+def is_hidden(stored: Stored) -> NDArray[np.bool_]:
+    """Where pixels (..., S), whose last channel is transparency, are hidden, (...)."""
+    return np.less_equal(stored[..., -1], 0)
+
+
+def put_back(values: Stored, colours: Stored, hidden: NDArray[np.bool_]) -> None:
+    """Put the stored colours (n, C) of the hidden pixels (h, W) of a picture back into its rows (h, W, D).
+
+    They keep their bits where the dtype is the same. Those of a grey picture become red, green and blue.
+    """
+    if colours.dtype != values.dtype:
+        white = WHITE.get(colours.dtype.name, 1)
+        planes = torch.from_numpy(colours.astype(np.float64) / white).T[None, :, None]
+        colours = stored_as(planes, values.dtype.name)[0]
+    values[hidden] = colours
+
+
+def keep_apart(values: Stored, hidden: NDArray[np.bool_], nodata: float) -> None:
+    """Move the values of pixels (h, W, C) that are not hidden by a step if they say that there is no data."""
+    if np.isnan(nodata):
+        return
+    taken = lacks_data(values, nodata) & ~hidden
+    if not taken.any():
+        return
+    if values.dtype.kind != "f":
+        values[taken] = nodata + 1 if nodata < np.iinfo(values.dtype.name).max else nodata - 1
+        return
+    pixels, value = values[taken], np.asarray(nodata).astype(values.dtype)
+    beside = np.nextafter(value, np.asarray(0 if nodata else 1).astype(values.dtype))
+    values[taken] = np.where(pixels == value, beside, pixels)
+
+
 def transparency(tile: Tile, kind: str) -> Stored:
     """The transparency (h, W, 0 or 1) of a tile, as dtype ``kind``."""
     extra = tile.stored[..., 3 if tile.stored.shape[2] >= 3 else 1 :]
     if extra.dtype.name == kind:
-        return extra
+        return np.ascontiguousarray(extra)
     values = torch.from_numpy(np.ascontiguousarray(extra.astype(np.float64)).transpose(2, 0, 1))[None]
     return stored_as(values / WHITE.get(extra.dtype.name, 1), kind)
 

@@ -4,6 +4,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -37,7 +38,7 @@ def edit_tiling(passes: Passes, source: RowSource, steps: Sequence[Step], name: 
     limits = Picture(source, name).limits if len(steps) > 1 else (0.0, 1.0)
     with ExitStack() as stack:
         for step in steps[:-1]:
-            with step_tiling(step, replace(passes, kind="float32"), source, name) as tiling:
+            with step_tiling(step, between_steps(passes, source), source, name) as tiling:
                 source = stack.enter_context(passes.stored(clipped(tiling, limits)))
         if steps:
             yield stack.enter_context(step_tiling(steps[-1], passes, source, name))
@@ -56,13 +57,18 @@ def edit_regions(
     Raises:
         ValueError, OSError: as :func:`edit_tiling`.
     """
-    floats, edited = replace(passes, kind="float32"), []
+    floats, edited = between_steps(passes, source), []
     with ExitStack() as stack:
         for steps in edits:
             with edit_tiling(floats, source, steps, name) as tiling:
                 edited.append(Picture(stack.enter_context(passes.stored(tiling))))
         blend = Blend(edited, [Picture(mask) for mask in masks])
         yield tile_by_tile(passes, Picture(source, name), blend)
+
+
+def between_steps(passes: Passes, source: RowSource) -> Passes:
+    """Tiling options for the rows between two steps: floats, which hold all values of the source."""
+    return replace(passes, kind="float64" if source.dtype == np.float64 else "float32")
 
 
 @dataclass(frozen=True)

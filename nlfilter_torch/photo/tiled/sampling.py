@@ -6,7 +6,7 @@ for the sums that define the filter, favours rare pixels and has no gaps.
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Literal
 
@@ -23,6 +23,7 @@ from nlfilter_torch.operator.features import (
     GuideFeatures,
     bandwidth_of_gradient,
     gradients,
+    gradients_within,
     pad_border,
     reduce_channels,
     unit_window,
@@ -39,9 +40,11 @@ from nlfilter_torch.operator.orientation import (
     orientation_of,
     orientation_sums,
     source_pixels,
+    stretched_sums,
 )
 from nlfilter_torch.operator.sinkhorn import sinkhorn_balance
 from nlfilter_torch.photo.picture.source import Guide
+from nlfilter_torch.photo.tiled.counted import CountedPixels
 from nlfilter_torch.photo.tiled.pictures import Picture, Tile
 from nlfilter_torch.photo.tiled.statistics import Block, Result
 
@@ -63,17 +66,22 @@ class GuidePicture(Picture):
         picture: whose guide this is.
         guide: computes the guide from the picture.
         stored: the whole guide (1, C, H, W), if kept in memory.
+        counted: how much its pixels count; None is 1 each.
     """
 
-    def __init__(self, picture: Picture, guide: Guide) -> None:
-        super().__init__(picture.source, picture.name)
+    def __init__(self, picture: Picture, guide: Guide, counted: CountedPixels | None = None) -> None:
+        super().__init__(picture.source, picture.name, hides=picture.hides)
         self.checks_scale = picture.checks_scale
-        self.picture, self.guide = picture, guide
+        self.picture, self.guide, self.counted = picture, guide, counted
         self.stored: Tensor | None = None
 
     def __getstate__(self) -> dict[str, object]:
         """The guide in another process, which computes it from the picture."""
-        return self.__dict__ | {"stored": None}
+        return self.__dict__ | {"stored": None, "counted": None}
+
+    def weights(self, tile: Tile) -> Tensor | None:
+        """The weights (1, 1, h, W) of a tile's pixels; None is 1 each."""
+        return None if self.counted is None else self.counted.rows(tile.start, tile.start + len(tile.stored))
 
     def store(self, rows: int, workers: int) -> None:
         """Compute the whole guide in tiles of ``rows``, and keep it in memory for further passes."""
@@ -185,7 +193,8 @@ class PassOverPicture:
             guide = self.picture.seen(tile, self._radius)
             columns = self.kernel.columns(guide.pixels, origin=guide.origin, halo=guide.halo)
             self.cache.keep(first, columns)
-        return Block(*columns, image, torch.ones_like(columns[1]), tile.start)
+        weights, ones = self.picture.weights(tile), torch.ones_like(columns[1])
+        return Block(*columns, image, ones if weights is None else weights.to(ones).view_as(ones), tile.start)
 
 
 @dataclass(frozen=True)
@@ -231,20 +240,34 @@ class PatchReader:
         """Number of rows of the guide around a tile that are read."""
         return max(self.patch_size // 2, 1)
 
-    def __call__(self, part: tuple[Tile, Tensor]) -> tuple[Tensor, Tensor, float, Tensor]:
+    def __call__(self, part: tuple[Tile, Tensor]) -> tuple[Tensor, Tensor, float, Tensor, Tensor]:
         """Patches (1, C p^2, n) and colours (1, C, n) of the pixels, and two sums over all pixels of the tile.
 
-        These are the sum of the gradients, and those of :func:`orientation_sums`, (1, C, 6, 6).
+        These are the sum of the gradients, and those of :func:`orientation_sums`, (1, C, 6, 6). If pixels differ in how
+        much they count, they are those of :func:`counted_sums`, to which the limits of the values belong.
         """
         tile, chosen = part
         seen = self.picture.seen(tile, self.margin)
         guide = reduce_channels(seen.pixels, self.guide_channels)
-        gradient = 0.0
+        gradient, weights = 0.0, self.picture.weights(tile)
         if self.measures_gradient:
-            gradient = float(gradients(guide, seen.halo).double().mean((0, 1)).sum())
+            gradient = self._gradient(guide, seen, weights)
         rows = guide[:, :, seen.halo[0] : guide.shape[2] - seen.halo[1]]
-        sums = orientation_sums(rows, tile.start, self.picture.size)
-        return patches_at(guide, seen, chosen, self.patch_size), tile.inner.flatten(2)[:, :, chosen], gradient, sums
+        counted = self.picture.counted
+        if counted is None:
+            sums = orientation_sums(rows, tile.start, self.picture.size), rows.new_tensor([0.0, 1.0])
+        else:
+            sums = counted_sums(rows, tile.start, counted)
+        return patches_at(guide, seen, chosen, self.patch_size), tile.inner.flatten(2)[:, :, chosen], gradient, *sums
+
+    def _gradient(self, guide: Tensor, seen: Tile, weights: Tensor | None) -> float:
+        """Sum of the gradients of a tile's guide, times the weights (1, 1, h, W) of its pixels."""
+        counted, (above, below) = self.picture.counted, seen.halo
+        if counted is None or weights is None:
+            return float(gradients(guide, seen.halo).double().mean((0, 1)).sum())
+        counts = counted.rows(seen.start - above, seen.start + guide.shape[2] - above) > 0
+        slopes = gradients_within(guide, counts)[:, :, above : guide.shape[2] - below]
+        return float((slopes.double().mean((0, 1)) * weights[0, 0]).sum())
 
 
 def take_pilot(
@@ -270,51 +293,189 @@ def take_pilot(
     check_construction(method)
     window = unit_window(patch_size, None).to(picture.dtype)
     check_bandwidths(photometric_bandwidth, spatial_bandwidth)
-    num_landmarks = landmark_count(method, picture.pixels)
+    count = landmark_count(method, picture.pixels)
+    if picture.counted is not None:
+        count = min(count, picture.counted.count)
 
     generator = torch.Generator().manual_seed(0) if generator is None else generator
-    drawn = candidate_pixels(picture.size, num_landmarks, landmarks, generator).cpu()
-    rest = torch.Generator().manual_seed(int(drawn.sum()) % 2**32)  # ``generator`` is for the landmarks alone
-    even = stratified(picture.pixels, min(PILOT, picture.pixels), rest)
-    # The orientation of the picture, which decides which pixels are candidates, is known after the pass.
-    turned = landmarks == "kmeans" and len(drawn) > num_landmarks
-    candidates = source_pixels(torch.arange(ORIENTATIONS if turned else 1), picture.size, drawn)
-    wanted = torch.cat([candidates.flatten(), even])
     reader = PatchReader(picture, patch_size, guide_channels, isinstance(photometric_bandwidth, str))
-    parts = visit(picture.picture, reader.margin + picture.margin, wanted.sort().values, report, "Looking")
-    patches, values, slopes, sums = zip(*in_order(reader, parts, workers), strict=True)
-    if isinstance(photometric_bandwidth, str):
-        photometric_bandwidth = float(
-            bandwidth_of_gradient(torch.tensor(sum(slopes) / picture.pixels, dtype=torch.float64))
-        )
-    order = torch.empty_like(wanted)
-    order[wanted.argsort()] = torch.arange(len(wanted))  # position of each wanted pixel in reading order
-    recipe = GuideFeatures(window, photometric_bandwidth, spatial_bandwidth, guide_channels)
-    total = torch.stack(sums).sum(0)
-    orientation = orientation_of(total, patches[0].shape[1] // patch_size**2)
-    if not turned:
-        orientation = Orientation(torch.zeros(1, dtype=torch.long))
-    first = int(orientation.numbers) * len(drawn)
-    used = torch.cat([torch.arange(first, first + len(drawn)), torch.arange(candidates.numel(), len(wanted))])
-    features = scaled_patches(torch.cat(patches, dim=2)[:, :, order[used]], wanted[used], picture, recipe)
-    image = torch.cat(values, dim=2)[:, :, order[candidates.numel() :]]
-    weights = torch.full((1, len(even)), picture.pixels / len(even), dtype=picture.dtype)
+    recipe = GuideFeatures(window, 1.0, spatial_bandwidth, guide_channels)
+    recipe = (
+        recipe
+        if isinstance(photometric_bandwidth, str)
+        else replace(recipe, photometric_bandwidth=photometric_bandwidth)
+    )
+    look = Look(reader, recipe, replace(method, num_landmarks=count, generator=generator), report, workers)
+    sample = look.at_all() if picture.counted is None else look.at_counted(picture.counted)
     with single_threaded(workers):  # so few pixels that a second thread would wait most of the time
-        subset, coordinates = features[:, :, : len(drawn)], None
-        if spatial_bandwidth is not None:
-            coordinates = coordinates_of(
-                source_pixels(orientation.numbers, picture.size, drawn, flipped=False)[0], picture, recipe
-            )
-        canonical = canonical_points(
-            subset, orientation, Layout(patch_size, spatial_bandwidth is not None), coordinates
-        )
-        points = condense(subset, num_landmarks, generator, canonical)
-        kernel = Kernel(points, inverse_cholesky(points), completion, features=recipe)
-        columns = kernel.factor(features[:, :, len(drawn) :])
+        points = condense(sample.subset, count, generator, sample.canonical)
+        kernel = Kernel(points, inverse_cholesky(points), completion, features=sample.recipe)
+        columns = kernel.factor(sample.features)
         balancing = sinkhorn_balance(
-            *columns, tolerance=PILOT_TOLERANCE, completed=completion == "diagonal", weights=weights
+            *columns, tolerance=PILOT_TOLERANCE, completed=completion == "diagonal", weights=sample.weights
         )
-        return Pilot(kernel, Block(*columns, image, weights), balancing.moment, rest.initial_seed())
+        return Pilot(kernel, Block(*columns, sample.image, sample.weights), balancing.moment, sample.seed)
+
+
+@dataclass(frozen=True, eq=False)
+class PilotSample:
+    """What a pilot is computed from.
+
+    Attributes:
+        recipe: of the features.
+        subset: features (1, D, S) of the candidates for landmarks.
+        canonical: those by which they are clustered, for the canonical orientation.
+        features: of an even sample of the pixels, (1, D, n).
+        image: their colours, (1, C, n).
+        weights: number of pixels that each represents, (1, n).
+        seed: for further samples.
+    """
+
+    recipe: GuideFeatures
+    subset: Tensor
+    canonical: Tensor
+    features: Tensor
+    image: Tensor
+    weights: Tensor
+    seed: int
+
+
+@dataclass(frozen=True, eq=False)
+class Look:
+    """The first look at a picture.
+
+    Attributes:
+        reader: reads patches of its guide, and measures the gradient if the photometric bandwidth is automatic.
+        recipe: of the features, with the photometric bandwidth unless that is automatic.
+        method: of choosing landmarks, with their number.
+        report: called with the progress.
+        workers: number of tiles looked at at once.
+    """
+
+    reader: PatchReader
+    recipe: GuideFeatures
+    method: Construction
+    report: Report
+    workers: int
+
+    @property
+    def picture(self) -> GuidePicture:
+        """The guide of the picture."""
+        return self.reader.picture
+
+    def at_all(self) -> PilotSample:
+        """The sample of a picture all of whose pixels count, in one pass."""
+        picture, count, generator = self.picture, self.method.num_landmarks, self._generator
+        drawn = candidate_pixels(picture.size, count, self._sampling, generator).cpu()
+        rest = torch.Generator().manual_seed(int(drawn.sum()) % 2**32)  # ``generator`` is for the landmarks alone
+        even = stratified(picture.pixels, min(PILOT, picture.pixels), rest)
+        # The orientation of the picture, which decides which pixels are candidates, is known after the pass.
+        turned = self._sampling == "kmeans" and len(drawn) > count
+        candidates = source_pixels(torch.arange(ORIENTATIONS if turned else 1), picture.size, drawn)
+        wanted = torch.cat([candidates.flatten(), even])
+        patches, values, slope, total = self._read(wanted)
+        recipe = self._with_bandwidth(slope / picture.pixels)
+        orientation = orientation_of(total, patches.shape[1] // recipe.patch_weights.numel())
+        if not turned:
+            orientation = Orientation(torch.zeros(1, dtype=torch.long))
+        first = int(orientation.numbers) * len(drawn)
+        used = torch.cat([torch.arange(first, first + len(drawn)), torch.arange(candidates.numel(), len(wanted))])
+        features = scaled_patches(patches[:, :, used], wanted[used], picture, recipe)
+        subset = features[:, :, : len(drawn)]
+        places = source_pixels(orientation.numbers, picture.size, drawn, flipped=False)[0]
+        return PilotSample(
+            recipe,
+            subset,
+            self._canonical(subset, orientation, places, picture.size[1]),
+            features[:, :, len(drawn) :],
+            values[:, :, candidates.numel() :],
+            torch.full((1, len(even)), picture.pixels / len(even), dtype=picture.dtype),
+            rest.initial_seed(),
+        )
+
+    def at_counted(self, counted: CountedPixels) -> PilotSample:
+        """The sample of the pixels of a picture that count, in two passes, of which the second reads candidates."""
+        picture, count, generator = self.picture, self.method.num_landmarks, self._generator
+        rest = torch.Generator().manual_seed(generator.initial_seed() % 2**32)
+        wanted = min(picture.pixels, math.ceil(PILOT * picture.pixels / counted.count))
+        spread = stratified(picture.pixels, wanted, rest)
+        even = spread[counted.at(spread) > 0]
+        if len(even) == 0:
+            even = counted.whole(counted.candidates(1, "random", rest, 0))
+        patches, image, slope, total = self._read(even)
+        recipe = self._with_bandwidth(slope / counted.total)
+        orientation = Orientation(torch.zeros(1, dtype=torch.long))
+        if self._sampling == "kmeans" and count < counted.count:
+            orientation = orientation_of(total, patches.shape[1] // recipe.patch_weights.numel())
+        drawn = counted.candidates(count, self._sampling, generator, int(orientation.numbers))
+        candidates = counted.whole(source_pixels(orientation.numbers, counted.box, drawn)[0])
+        subset = scaled_patches(self._read(candidates)[0], candidates, picture, recipe)
+        places = source_pixels(orientation.numbers, counted.box, drawn, flipped=False)[0]
+        represented = counted.at(even).to(picture.dtype) * (counted.count / len(even))
+        return PilotSample(
+            recipe,
+            subset,
+            self._canonical(subset, orientation, places, counted.box[1]),
+            scaled_patches(patches, even, picture, recipe),
+            image,
+            represented.unsqueeze(0),
+            rest.initial_seed(),
+        )
+
+    @property
+    def _generator(self) -> torch.Generator:
+        assert self.method.generator is not None  # for mypy
+        return self.method.generator
+
+    @property
+    def _sampling(self) -> Sampling:
+        assert isinstance(self.method.landmarks, str)  # for mypy
+        return self.method.landmarks
+
+    def _read(self, wanted: Tensor) -> tuple[Tensor, Tensor, float, Tensor]:
+        """What the reader returns for pixels, in their order, and its sums over the picture."""
+        ascending = wanted.sort()
+        margin = self.reader.margin + self.picture.margin
+        parts = visit(self.picture.picture, margin, ascending.values, self.report, "Looking")
+        patches, values, slopes, sums, ends = zip(*in_order(self.reader, parts, self.workers), strict=True)
+        order = torch.empty_like(wanted)
+        order[ascending.indices] = torch.arange(len(wanted))  # position of each wanted pixel in reading order
+        total, limits = torch.stack(sums).sum(0), torch.stack(ends)
+        if self.picture.counted is not None:
+            least, most = float(limits[:, 0].amin()), float(limits[:, 1].amax())
+            total = stretched_sums(total[:, :-1], total[:, -1:], least, most)
+        return torch.cat(patches, dim=2)[:, :, order], torch.cat(values, dim=2)[:, :, order], sum(slopes), total
+
+    def _with_bandwidth(self, slope: float) -> GuideFeatures:
+        """The recipe, with the bandwidth for a mean slope if it is automatic."""
+        if not self.reader.measures_gradient:
+            return self.recipe
+        bandwidth = float(bandwidth_of_gradient(torch.tensor(slope, dtype=torch.float64)))
+        return replace(self.recipe, photometric_bandwidth=bandwidth)
+
+    def _canonical(self, subset: Tensor, orientation: Orientation, places: Tensor, width: int) -> Tensor:
+        """Features of candidates for the canonical orientation; ``places`` are in a picture of some width."""
+        layout, coordinates = Layout(self.reader.patch_size, self.recipe.spatial_bandwidth is not None), None
+        if layout.coordinates:
+            located = torch.stack([places // width, places % width]).to(self.recipe.patch_weights)
+            coordinates = self.recipe.coordinates(located).to(subset)
+        return canonical_points(subset, orientation, layout, coordinates)
+
+
+def counted_sums(rows: Tensor, first_row: int, counted: CountedPixels) -> tuple[Tensor, Tensor]:
+    """:func:`orientation_sums` over rows of a guide from ``first_row`` on, of the pixels that count.
+
+    Returns:
+        The sums, (1, C + 1, 6, 6), the last ones those of values of 0, and the least and largest value, (2,).
+    """
+    (top, left), (height, width) = counted.corner, counted.box
+    first, last = max(top - first_row, 0), max(min(top + height - first_row, rows.shape[2]), 0)
+    part = rows[:, :, first : max(first, last), left : left + width]
+    inside = torch.from_numpy(counted.in_box(slice(first_row + first, first_row + max(first, last))))[None]
+    part = torch.cat([part, torch.zeros_like(part[:, :1])], dim=1)
+    values = part[:, :-1, inside[0]]
+    ends = torch.tensor([torch.inf, -torch.inf]) if values.numel() == 0 else torch.stack([values.amin(), values.amax()])
+    return orientation_sums(part, first_row + first - top, counted.box, inside), ends
 
 
 def visit(
@@ -376,7 +537,7 @@ class Draws:
     def __init__(self, pilot: Pilot, columns: Columns, count: int, pixels: int) -> None:
         """``columns`` are the columns of the pilot's sample."""
         self.completed, self.seed, self.even = pilot.completed, pilot.seed, EVEN_SHARE * count / pixels
-        weight = float(pilot.sample.weights[0, 0])
+        weight = float(pilot.sample.weights.max())
         self.rate = _rate(self.leverage(pilot.sample, columns), weight, self.even, count)
 
     def leverage(self, block: Block, columns: Columns) -> Tensor:
@@ -386,9 +547,9 @@ class Draws:
 
     def __call__(self, block: Block, columns: Columns) -> Block:
         """Draw pixels from a block."""
-        likely = (self.even + self.rate * self.leverage(block, columns)).clamp(max=1.0)
+        likely = (self.even + self.rate * self.leverage(block, columns)).clamp(max=1.0) * (block.weights[0] > 0)
         chosen, counts = draw(likely, np.random.default_rng([self.seed, block.start_row]))
-        weights = (counts / likely[chosen]).to(block.weights)[None]
+        weights = (counts / likely[chosen]).to(block.weights)[None] * block.weights[:, chosen]
         factor, diagonal, image = (planes[..., chosen] for planes in (block.factor, block.diagonal, block.image))
         return Block(factor, diagonal, image, weights)
 

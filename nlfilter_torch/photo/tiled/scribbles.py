@@ -138,7 +138,7 @@ def _overlay(picture: Picture, rows: RowSource, name: str) -> Picture:
             f"{name} must have the height and width of {picture.name}, {picture.size[0]}x{picture.size[1]}, got "
             f"{'x'.join(map(str, rows.shape[:2]))}; resize one"
         )
-    return Picture(rows, name)
+    return Picture(rows, name, hides=False)
 
 
 def floats_per_scribbled_pixel(num_features: int) -> int:

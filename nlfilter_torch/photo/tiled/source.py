@@ -4,10 +4,11 @@ import math
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from nlfilter_torch.core.checks import check_count
@@ -15,14 +16,23 @@ from nlfilter_torch.core.inner import Inner
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.core.workers import Result, in_order, single_threaded
 from nlfilter_torch.operator.eigenvalue_bound import is_bounded
+from nlfilter_torch.operator.hidden import fill_nearby
 from nlfilter_torch.photo.picture.ends import ends_of
 from nlfilter_torch.photo.picture.in_memory import InMemory
-from nlfilter_torch.photo.picture.pixels import part_of
-from nlfilter_torch.photo.picture.resizing import block_counts, block_parts, resized, resized_parts
+from nlfilter_torch.photo.picture.pixels import Pixels, part_of, whole_image
+from nlfilter_torch.photo.picture.resizing import (
+    block_counts,
+    block_parts,
+    counted_means,
+    resized,
+    resized_parts,
+    weights_of,
+)
 from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles
 from nlfilter_torch.photo.picture.source import Fitted, Guide, Kept, Planes, Source
+from nlfilter_torch.photo.tiled.counted import CountedPixels, counted_pixels
 from nlfilter_torch.photo.tiled.operator import TiledOperator, TilePixels
-from nlfilter_torch.photo.tiled.pictures import Picture, Rows, RowSource, Tile
+from nlfilter_torch.photo.tiled.pictures import Picture, Rows, RowSource, Stored, Tile
 from nlfilter_torch.photo.tiled.sampling import ColumnCache, GuidePicture, take_pilot, visit
 from nlfilter_torch.photo.tiled.scribbles import (
     check_scribble_memory,
@@ -43,6 +53,11 @@ def _pixels(tile: Tile) -> Tensor:
 
 def _features(tile: Tile, operator: TiledOperator) -> Tensor:
     return operator.features(tile)
+
+
+def _of_tile(function: Callable[[Tensor, Inner, int], Kept], tile: Tile) -> Kept:
+    above, below = tile.halo
+    return function(tile.pixels, (slice(above, tile.pixels.shape[2] - below), slice(None)), tile.start)
 
 
 def _call(compute: Callable[[], Tensor]) -> Tensor:
@@ -126,6 +141,30 @@ class Tiled:
         """Do not warn of values far outside [0, 1] from now on."""
         self.picture.accept_any_scale()
 
+    def __getstate__(self) -> dict[str, object]:
+        """The source in another process, which takes no means over it."""
+        return {name: value for name, value in self.__dict__.items() if name != "counted"}
+
+    @cached_property
+    def counted(self) -> CountedPixels | None:
+        """How much the pixels count; None is 1 each."""
+        if not self.picture.hides:
+            return None
+        (height, _), step = self.size, self.picture.statistics_rows
+        parts = [self.picture.opacity(start, min(start + step, height)) for start in range(0, height, step)]
+        return counted_pixels(np.concatenate(parts))
+
+    @property
+    def weight(self) -> float:
+        """Sum of the weights."""
+        return self.picture.pixels if self.counted is None else self.counted.total
+
+    def weights(self, tile: Tile) -> Tensor | None:
+        """The weights (1, 1, h, W) of a tile's pixels; None is 1 each."""
+        if self.counted is None:
+            return None
+        return self.counted.rows(tile.start, tile.start + len(tile.stored)).to(self.dtype)
+
     @torch.no_grad()
     @full_precision
     def operator(self, guide: Guide) -> "TiledOperator":
@@ -144,7 +183,7 @@ class Tiled:
             other.cache = ColumnCache(1, 0)  # frees memory
         self.cached_floats = 0
         self.fitting_rows(num_features, count)
-        passes, picture = self.passes, GuidePicture(self.picture, guide)
+        passes, picture = self.passes, GuidePicture(self.picture, guide, self.counted)
         workers = passes.workers(count)
         if guide.margin and passes.stores_guide(picture.pixels * compared * self.dtype.itemsize):
             self.guide_floats += picture.pixels * compared
@@ -205,6 +244,10 @@ class Tiled:
             memory=self.passes.memory,
             report=self.passes.report,
         )
+        if self.counted is not None and len(scribbles.places):
+            scribbles = scribbles.weighted_by(self.counted.at(scribbles.places))
+            if needed and len(scribbles.places) == 0:
+                raise ValueError(f"{name} must cover a pixel that is not hidden, got none that does; move it")
         if needed and len(scribbles.places) == 0:
             called = self.strokes if mask is None else name
             raise ValueError(f"{called} must hold a painted pixel, got none; paint at least one")
@@ -234,12 +277,24 @@ class Tiled:
         parts = visit(self.picture, 0, places, self.passes.report, "Looking", every=False)
         return torch.cat([tile.inner.flatten(2)[:, :, chosen] for tile, chosen in parts], dim=2)
 
+    def weights_at(self, places: Tensor) -> Tensor | None:
+        """The weights of single pixels."""
+        return None if self.counted is None else self.counted.at(places).to(self.dtype)[None, None]
+
     @torch.no_grad()
     def resized(self, size: tuple[int, int]) -> "Tiled":
         """The picture in a smaller size, in memory, as another tiled source."""
-        planes = self._resized(_pixels, size)[0].permute(1, 2, 0).numpy()
-        passes = replace(self.plain, tile_rows=None)
-        return Tiled(Picture(np.ascontiguousarray(planes), self.picture.name), passes, self.strokes)
+        planes, passes = self._resized(_pixels, size), replace(self.plain, tile_rows=None)
+        if self.counted is not None:
+            weights = weights_of(self._resized(self._weights_of_tile, size))
+            planes = torch.cat([fill_nearby(planes, weights > 0), weights], dim=1)
+        rows = np.ascontiguousarray(planes[0].permute(1, 2, 0).numpy())
+        return Tiled(Picture(rows, self.picture.name), passes, self.strokes)
+
+    def _weights_of_tile(self, tile: Tile) -> Tensor:
+        """The weights (1, 1, h, W) of a tile."""
+        weights = self.weights(tile)
+        return torch.ones_like(tile.inner[:, :1]) if weights is None else weights
 
     @torch.no_grad()
     def shrunk(self, planes: Planes, size: tuple[int, int]) -> Tensor:
@@ -286,18 +341,25 @@ class Tiled:
     @torch.no_grad()
     def mean_of(self, fitted: Fitted, function: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
         """Means over all pixels, in a pass over the picture."""
-        total = sum(values.sum((0, 1), dtype=np.float64) for _, values in self.rows(fitted.then(function), plain=True))
-        return torch.as_tensor(total / self.picture.pixels).to(self.dtype).view(1, -1, 1, 1)
+        total = sum(self._row_sums(rows, values) for rows, values in self.rows(fitted.then(function), plain=True))
+        return torch.as_tensor(total / self.weight).to(self.dtype).view(1, -1, 1, 1)
+
+    def _row_sums(self, rows: slice, values: Stored) -> NDArray[np.float64]:
+        """Sums (S,) of values (h, W, S) of rows."""
+        if self.counted is not None:
+            values = values * self.counted.rows(rows.start, rows.start + len(values))[0, 0, :, :, None].numpy()
+        return np.asarray(values.sum((0, 1), dtype=np.float64))
 
     @torch.no_grad()
     def mean(self, planes: Planes) -> Tensor:
         """Means (1, C, 1, 1) over all pixels."""
         total = sum(self._map_tiles(partial(self._sums_of, planes), self.picture.statistics_rows, "Averaging"))
-        return torch.as_tensor(total / self.picture.pixels).to(self.dtype)
+        return torch.as_tensor(total / self.weight).to(self.dtype)
 
     def _sums_of(self, planes: Planes, tile: Tile) -> Tensor:
         """Sums (1, C, 1, 1) of planes over a tile."""
-        return self._planes_of(planes, tile).double().sum((2, 3), keepdim=True)
+        values, weights = self._planes_of(planes, tile).double(), self.weights(tile)
+        return (values if weights is None else values * weights).sum((2, 3), keepdim=True)
 
     @torch.no_grad()
     def ends(self, planes: Planes) -> tuple[Tensor, Tensor]:
@@ -309,11 +371,27 @@ class Tiled:
 
     def _ends_of(self, planes: Planes, tile: Tile) -> tuple[Tensor, Tensor]:
         """Least and largest values of planes in a tile."""
-        return ends_of(self._planes_of(planes, tile))
+        return ends_of(self._planes_of(planes, tile), self.weights(tile))
 
     @torch.no_grad()
     def reduced(self, planes: Planes, step: int) -> Tensor:
         """Means over blocks of ``step`` pixels in both directions."""
+        if self.counted is None:
+            return self._reduced(planes, step)
+        means, weighted = self._reduced(partial(self._weighted, planes), step).tensor_split([-1], dim=1)
+        means, weighted, weights = *means.chunk(2, dim=1), weighted
+        return counted_means(means, weighted, weights)
+
+    def _weighted(self, planes: Planes, pixels: Pixels) -> Tensor:
+        """Planes of pixels, the same times their weights, and the weights."""
+        values, start = planes(pixels), pixels.first // pixels.width
+        weights = torch.ones_like(values[:, :1])
+        if self.counted is not None:
+            weights = self.counted.rows(start, start + values.shape[2]).to(values)
+        return torch.cat([values, values * weights, weights], dim=1)
+
+    def _reduced(self, planes: Planes, step: int) -> Tensor:
+        """Means over blocks of all pixels."""
         rows, counts = max(1, self.picture.statistics_rows // step) * step, block_counts(self.size, step)
         total: Tensor | None = None
         for first, part in self._map_tiles(partial(self._block_parts, planes, step), rows, "Reducing"):
@@ -326,12 +404,14 @@ class Tiled:
         """What a tile contributes to the means over blocks."""
         return block_parts(self._planes_of(planes, tile), tile.start, self.size, step)
 
-    def _map_tiles(self, function: Callable[[Tile], Result], rows: int, stage: str) -> Iterator[Result]:
+    def _map_tiles(
+        self, function: Callable[[Tile], Result], rows: int, stage: str, margin: int = 0
+    ) -> Iterator[Result]:
         """Apply a function to each tile, and yield the results in order.
 
         The first tile is finished before the others begin, since it may compute the sums of an operator.
         """
-        tiles, height = self.picture.tiles(0, rows), self.size[0]
+        tiles, height = self.picture.tiles(margin, rows), self.size[0]
         self.passes.report(stage, 0, height)
         yield function(next(tiles))
         for number, result in enumerate(in_order(function, tiles, self.passes.workers(1)), start=1):
@@ -350,11 +430,20 @@ class Tiled:
                 f"{self.picture.name} needs at least {needed / 1e6:.0f} MB of memory, but only "
                 f"{self.passes.memory / 1e6:.0f} MB may be used; allow more, or use a smaller picture"
             )
-        return InMemory(self.reduced(lambda pixels: pixels.image, round(step)))
+        weights = None
+        if self.counted is not None:
+            weights = weights_of(self._reduced(partial(self._weighted, whole_image), round(step))[:, -1:])
+        return InMemory(self.reduced(whole_image, round(step)), weights=weights)
 
     def kept(self, name: Hashable, tensors: Sequence[Tensor], compute: Callable[[], Kept]) -> Kept:
         """The result of a function, of which nothing is kept."""
         return compute()
+
+    @torch.no_grad()
+    def parts(self, function: Callable[[Tensor, Inner, int], Kept], margin: int) -> list[Kept]:
+        """The results for tiles."""
+        rows = self.picture.statistics_rows
+        return list(self._map_tiles(partial(_of_tile, function), rows, "Looking closely", margin))
 
     @torch.no_grad()
     def measured(self, function: Callable[[Source[RowSource]], Tensor]) -> Tensor:

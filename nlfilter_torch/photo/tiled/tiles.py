@@ -25,6 +25,9 @@ from nlfilter_torch.photo.tiled.pictures import (
     RowTarget,
     Stored,
     Tile,
+    is_hidden,
+    keep_apart,
+    put_back,
     stored_as,
     transparency,
 )
@@ -116,7 +119,8 @@ class Tiling:
         rows: of a tile, a multiple of ``together``.
         together: number of rows that are always computed together; tiles begin at multiples of it.
         workers: number of threads of this process, with a tile each.
-        transparent: whether the output has the transparency of the picture.
+        transparent: whether the output has the transparency of the picture, and the stored colours of hidden pixels.
+        nodata: value of hidden pixels in the output, which then has no transparency; None otherwise.
         stage: its name for the progress.
         compare: compares rows before and after the edit, both as they are stored.
         compared: called with each of these comparisons, in this process.
@@ -130,6 +134,7 @@ class Tiling:
     together: int = 1
     workers: int = 1
     transparent: bool = True
+    nodata: float | None = None
     stage: str = "Filtering"
     compare: Callable[[Stored, Stored], Comparison] | None = None
     compared: Callable[[Comparison], None] | None = None
@@ -172,6 +177,11 @@ class Tiling:
     def _edited(self, tile: Tile) -> Stored:
         values = stored_as(self.edit(tile), self.passes.kind)
         if not self.transparent:
+            return values
+        if self.picture.hides and (hidden := is_hidden(tile.stored)).any():
+            put_back(values, tile.stored[hidden][:, : self.picture.colours], hidden)
+        if self.nodata is not None:
+            keep_apart(values, is_hidden(tile.stored), self.nodata)
             return values
         return np.concatenate([values, transparency(tile, self.passes.kind)], axis=2)
 

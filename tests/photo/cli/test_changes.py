@@ -104,8 +104,10 @@ def test_differences_are_compared_in_the_depth_of_each_file() -> None:
 def test_transparency_is_not_compared() -> None:
     before, after = np.zeros((4, 5, 4), np.uint8), np.zeros((4, 5, 4), np.uint8)
     after[..., 3] = 255
-    assert squared_difference(before, after) == (0, 60)
-    assert squared_difference(before[..., :2], after[..., 2:]) == (0, 20)  # grey
+    assert squared_difference(before, after) == (0, 0)
+    before[1:, :, 3] = 1
+    assert squared_difference(before, after) == (0, 45)
+    assert squared_difference(before[..., 2:], after[..., 2:]) == (0, 15)  # grey
 
 
 def neighbours(image: torch.Tensor) -> torch.Tensor:

@@ -72,7 +72,7 @@ def test_a_mask_by_a_pyramid_is_the_same_by_rows(tmp_path: Path) -> None:
 
 def test_grey_becomes_colour_and_transparency_stays(tmp_path: Path) -> None:
     grey = cat()[:, :1]
-    source = np.concatenate([rows_of(grey), np.linspace(0, 1, 15000, dtype=np.float32).reshape(100, 150, 1)], axis=2)
+    source = np.concatenate([rows_of(grey), np.full(15000, 1, np.float32).reshape(100, 150, 1)], axis=2)
     detail, colorize = Step("detail", alpha=(2.0, 1.0), landmarks=30), Step("colorize", (BLUE,))
     edited = by_rows(Recipe((detail, colorize)), source, tmp_path)
     # Differences of 1e-5 before colorizing may change its landmarks, so its input is that of the first step by rows.
