@@ -5,6 +5,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 
+from nlfilter_torch.photo.picture import resizing
 from nlfilter_torch.photo.picture.in_memory import InMemory
 from nlfilter_torch.photo.picture.resizing import block_means, enlarged, resize, resized
 from nlfilter_torch.photo.tiled.pictures import Picture
@@ -69,3 +70,17 @@ def test_blocks_of_a_fractional_step() -> None:
     torch.testing.assert_close(
         enlarged(blocks, (5 + 1e-9,) * 2, (7, 12), (20, 30)), enlarged(blocks, (5, 5), (7, 12), (20, 30))
     )
+
+
+def test_wide_pictures_are_reduced_in_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
+    image = noise(1, 3, 150, 90)
+    whole = resize(image, (20, 12))
+    rows: list[int] = []
+
+    def read(start: int, stop: int) -> torch.Tensor:
+        rows.append(stop - start)
+        return image[:, :, start:stop]
+
+    monkeypatch.setattr(resizing, "PIECE", 10 * 90)
+    assert torch.equal(resized(read, (150, 90), (20, 12)), whole)
+    assert max(rows) == 10

@@ -1,8 +1,11 @@
 """Sources of rows: what is read of them, and errors that name them."""
 
+import io
+
 import numpy as np
 import pytest
 
+from nlfilter_torch.photo.tiled.pictures import FileRows
 from tests.streams import stream_detail
 from tests.tiles import ALPHA, FEW, PLAIN, Rows, Shrinking, cat, streamed
 
@@ -21,3 +24,11 @@ def test_source_that_changes_its_size_is_named() -> None:
     source = Shrinking(cat(40, 30), most=100)
     with pytest.raises(ValueError, match="source must keep its size while it is read, 40 rows of 30"):
         stream_detail(source, np.empty_like(source.picture), ALPHA, num_landmarks=20, tile_rows=10)
+
+
+def test_rows_of_a_file_are_those_that_were_written() -> None:
+    rows = np.arange(60, dtype=np.uint16).reshape(5, 4, 3)
+    stored = FileRows(io.BytesIO(rows.tobytes()), rows.shape, rows.dtype)
+    assert np.array_equal(stored[2:4], rows[2:4])
+    assert np.array_equal(stored[:], rows)
+    assert stored[5:9].shape == (0, 4, 3)
