@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.photo.look_fitting.lattice_fit import ColourChange, fit_lattice
-from nlfilter_torch.photo.look_fitting.look_choice import SHRINK, Candidate
+from nlfilter_torch.photo.look_fitting.look_choice import SHRINK, SLACK, Candidate
 from nlfilter_torch.photo.look_fitting.look_pixels import PixelSample
 from nlfilter_torch.photo.look_fitting.look_sums import MOST, Layout, Sums, columns_of
 from nlfilter_torch.photo.looks.lattice import colours_of_nodes, resampled
@@ -17,9 +17,10 @@ from nlfilter_torch.photo.looks.look_filter import tone_curve
 SQUARES = 3  # a single pair is divided into so many parts along each side, which are the folds
 KEPT = 2 * MOST  # pixels of all pairs
 COLOURS = ("curves", "matrix", "saturation")  # parts that are functions of the colour
-# A lattice is chosen if a look without it leaves more than CLEARLY times what it leaves, plus CLEAR. Where an edit
-# depends on the surroundings of pixels, lattices gain a little on the picture, and lose as much on others.
-CLEARLY, CLEAR = 1.75, 0.001
+# A lattice is chosen if a look without it leaves more than SLACK times what it leaves, plus CLEAR. Where an edit may
+# depend on the surroundings of pixels, since more than SURROUNDINGS is left, lattices gain a little on the picture and
+# lose as much on others; there it is CLEARLY times as much.
+CLEARLY, CLEAR, SURROUNDINGS = 1.75, 1e-4, 0.004
 NEAR = 3  # steps between nodes that colours may be away from greys to change with them
 BATCH = 1 << 14  # pixels whose columns are in memory at once
 
@@ -102,7 +103,7 @@ class KeptPixels:
         colours = ColourChange(before, after, self._predicted(looks, layout), weights / weights.sum(), group)
         fitted = fit_lattice(colours)
         left, without = 1 - fitted.left_out, 1 - fitted.without
-        if CLEARLY * left + CLEAR >= without:
+        if (CLEARLY if left > SURROUNDINGS else SLACK) * left + CLEAR >= without:
             return None
         lattice = rising(fitted.changes, looks[-1], layout, fitted.density)
         strength = 1 - SHRINK * min(max(left, 0.0), 1.0) if alone else 1.0
