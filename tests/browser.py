@@ -60,11 +60,15 @@ class Editor:
         self.url = address[0]
 
     def stop(self) -> None:
-        """Interrupt the process, as Ctrl+C does."""
-        self.process.terminate()
-        self.process.wait(30)
+        """Interrupt the process, as Ctrl+C does; one that does not end within 30 s is killed, and the test fails."""
         assert self.process.stdout is not None
-        self.process.stdout.close()
+        self.process.terminate()
+        try:
+            self.process.wait(30)
+        finally:
+            self.process.kill()
+            self.process.wait()
+            self.process.stdout.close()
 
 
 @contextmanager
