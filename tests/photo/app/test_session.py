@@ -146,6 +146,8 @@ def test_presets_come_back(session: Session) -> None:
     assert session.recipe == recipe
     session.undo()
     assert session.recipe == Recipe()
-    with pytest.raises(ValueError, match=r"photo\.jpg is not a preset: it is not JSON"):
+    with pytest.raises(ValueError, match=r"edit\.txt is not a preset: it is not JSON"):
+        session.load_preset(b"{no", "edit.txt")
+    with pytest.raises(ValueError, match=r"photo\.jpg must be a Hald, got a picture that cannot be read"):
         session.load_preset(b"\xff\xd8\xff", "photo.jpg")
     assert session.recipe == Recipe()
