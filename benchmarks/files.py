@@ -80,7 +80,7 @@ def random_case(draw: random.Random) -> Case:
     depth = draw.choice(depths)
     channels = draw.choice({".jpg": (1, 3), ".webp": (3, 4), ".avif": (3, 4)}.get(source, (1, 2, 3, 4)))
     targets = [suffix for suffix in HOLDS[depth] if suffix != ".jpg" or channels in (1, 3)]
-    names = ["exif", "thumbnail", "xmp", "claims", "icc", "dpi", "comment", "behind", "ground"]
+    names = ["exif", "thumbnail", "xmp", "claims", "icc", "dpi", "comment", "behind", "ground", "hidden"]
     return Case(
         source,
         draw.choice(targets),
@@ -101,8 +101,24 @@ def pixels(case: Case, number: int) -> np.ndarray:
     rows, columns = (np.linspace(0, 5, length).round().astype(int) for length in case.size)
     levels = low[rows][:, columns] * 0.9 + 0.1 * draw.random((*case.size, case.channels))
     if case.depth == "float32":
-        return levels.astype(np.float32)
-    return (levels * np.iinfo(case.depth).max).astype(case.depth)
+        stored = levels.astype(np.float32)
+    else:
+        stored = (levels * np.iinfo(case.depth).max).astype(case.depth)
+    if "hidden" in case.parts and case.channels in (2, 4):
+        stored[: case.size[0] // 3, :, -1] = 0
+    elif has_nodata(case):
+        stored[: case.size[0] // 3] = float(nodata_of(case))
+    return stored
+
+
+def has_nodata(case: Case) -> bool:
+    """Whether pixels of a case have the value that its file says is none."""
+    return "hidden" in case.parts and case.source == ".tif" and case.channels in (1, 3)
+
+
+def nodata_of(case: Case) -> str:
+    """That value."""
+    return "0" if case.depth != "float32" else ("nan" if case.size[0] % 2 else "-9999")
 
 
 def block_of(case: Case) -> bytes:
@@ -169,6 +185,7 @@ def write_tiff(case: Case, path: Path, flat: np.ndarray, packet: bytes) -> None:
     tags: list[tuple[object, ...]] = [(274, "H", 1, case.orientation, True), (315, "s", 0, "artist", True)]
     tags += [(700, "B", len(packet), packet, True)] * ("xmp" in case.parts)
     tags += GROUND * ("ground" in case.parts)
+    tags += [(42113, "s", 0, nodata_of(case), True)] * has_nodata(case)
     tifffile.imwrite(
         path,
         flat,
@@ -199,11 +216,13 @@ def differences(case: Case, before: Path, after: Path, notes: list[str]) -> Iter
     """What differs between the files of a case without being named."""
     first, second = read_photograph(before), read_photograph(after)
     step = {"uint8": 1 / 255, "uint16": 1 / 65535}.get(case.depth, 1e-6)
-    allowed = step / 2 if case.target in LOSSLESS else 0.2
+    allowed = step / 2 if case.target in LOSSLESS else 0.4 if "hidden" in case.parts else 0.2
     for plane, again in zip(levels_of(first), levels_of(second), strict=False):
         grey = again[:, :1] if again.shape[1] > plane.shape[1] else again  # WebP and AVIF store grey in colour
-        if plane.shape != grey.shape or np.abs(plane - grey).max() > allowed:
+        visible = np.ones(plane.shape[2:], bool) if first.hidden is None else ~first.hidden.places
+        if plane.shape != grey.shape or np.abs(plane - grey)[..., visible].max() > allowed:
             yield "pixels"
+    yield from hidden_differences(case, first, second, notes)
     yield from exif_differences(case, first, second, notes)
     if first.icc != second.icc:
         yield "profile"
@@ -229,6 +248,27 @@ def differences(case: Case, before: Path, after: Path, notes: list[str]) -> Iter
             yield f"tag {code}"
     parts = {part.name for part in first.extras.parts} - {part.name for part in second.extras.parts}
     yield from (name for name in parts if not named(notes, name))
+
+
+def hidden_differences(case: Case, first: Photograph, second: Photograph, notes: list[str]) -> Iterator[str]:
+    """What differs between the pixels that do not count, which come back bit for bit."""
+    if first.hidden is None:
+        if "hidden" in case.parts and (case.channels in (2, 4) or has_nodata(case)):
+            yield "nothing hidden"
+        return
+    kept = second.hidden is not None or named(notes, "42113")
+    if not kept:
+        yield "hidden pixels"
+    if second.hidden is None or case.target not in LOSSLESS:
+        return
+    if not np.array_equal(first.hidden.places, second.hidden.places):
+        yield "places of hidden pixels"
+    elif first.hidden.colours.dtype != second.hidden.colours.dtype:
+        return
+    elif second.hidden.colours.shape == first.hidden.colours.shape and not np.array_equal(
+        first.hidden.colours.view(np.uint8), second.hidden.colours.view(np.uint8)
+    ):
+        yield "colours of hidden pixels"
 
 
 def exif_differences(case: Case, first: Photograph, second: Photograph, notes: list[str]) -> Iterator[str]:
