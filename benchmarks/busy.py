@@ -68,7 +68,7 @@ def edits(image: "torch.Tensor") -> dict[str, Job]:
     other[..., : side // 10, : side // 10] = 1
     colours = torch.tensor([0.1, 0.3, 0.9]).view(1, 3, 1, 1) * region
     noisy = image + 0.06 * torch.randn(image.shape, generator=torch.Generator().manual_seed(1))
-    grey = image.mean(dim=1, keepdim=True).expand_as(image)
+    grey = image.mean(dim=1, keepdim=True)
     look = photo.fit_look([(image[..., ::4, ::4], image[..., ::4, ::4] ** 0.8)])
     alpha = torch.tensor([3.0, 3.0, 4.0, 1.05])
     return {
@@ -82,7 +82,7 @@ def edits(image: "torch.Tensor") -> dict[str, Job]:
         "defocus": lambda: photo.defocus(image, region),
         "mask": lambda: region_mask(image, region, other),
         "abstract": lambda: photo.abstract(image),
-        "look": lambda: photo.apply_look(image, look),
+        "look": lambda: look.apply(image),
     }
 
 
