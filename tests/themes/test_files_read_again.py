@@ -115,7 +115,7 @@ def check_equal(kind: str, before: Photograph, after: Photograph, notes: str) ->
     assert after.pixels.shape == before.pixels.shape
     assert (after.alpha is None) == (before.alpha is None)
     if kind not in LOSSY:
-        opaque = None if before.alpha is None or kind != "WebP" else before.alpha > 0  # colours count where it shows
+        opaque = None if before.alpha is None else before.alpha > 0  # colours count where it shows
         same = after.pixels == before.pixels
         assert bool(same.all() if opaque is None else same[opaque.expand_as(same)].all())
         assert before.alpha is None or torch.equal(after.alpha, before.alpha)  # type: ignore[arg-type]
