@@ -68,6 +68,10 @@ int nlfilter_convolution(int level, int threads, long images, long height, long 
                          long padded_outputs, long dilation, float slope, const float *features, const float *weights,
                          const float *bias, const float *added, float *out);
 
+/* Values (B, 3, N) at colours (B, 3, N), interpolated in lattices (B, n, n, n, 4) whose fourth value is 0. */
+int nlfilter_lattice(int level, int threads, long pixels, long images, long nodes, const float *colours,
+                     long colours_step, long colours_stride, const float *lattice, long lattice_step, float *out);
+
 /* Solutions (B, C, H, W) of linear systems of pixels and their eight neighbours. */
 int nlfilter_stencil(int level, int threads, long images, long height, long width, long sides, const double *stencil,
                      const double *right, double *out);

@@ -1,5 +1,6 @@
 /* Kernels for x86-64 and AArch64: columns of the Nystrom factor and their gradients, products with the factor, Gram
- * matrices, landmarks, and convolutions, in float32; linear systems of pixels and their neighbours, in float64.
+ * matrices, landmarks, convolutions and lattices of colours, in float32; linear systems of pixels and their neighbours,
+ * in float64.
  *
  * Each part names the Python file that defines the same computation in torch. Where torch makes several passes over
  * memory, these kernels keep distances, exponentials and norms in registers, and skip the zero triangle of the inverse
@@ -43,9 +44,9 @@
 const struct set SETS[] = {
     {0},
     {3, columns_avx2, backward_avx2, spread_avx2, gather_avx2, sweep_avx2, grams_avx2, assign_avx2, pivots_avx2,
-     convolution_avx2, eliminate_avx2, substitute_avx2},
+     convolution_avx2, lattice_avx2, eliminate_avx2, substitute_avx2},
     {6, columns_avx512, backward_avx512, spread_avx512, gather_avx512, sweep_avx512, grams_avx512, assign_avx512,
-     pivots_avx512, convolution_avx512, eliminate_avx512, substitute_avx512},
+     pivots_avx512, convolution_avx512, lattice_avx512, eliminate_avx512, substitute_avx512},
 };
 
 /* The best supported instruction set: 2 for AVX-512, 1 for AVX2 with FMA, 0 for neither. */
@@ -69,7 +70,7 @@ int nlfilter_level(void)
 const struct set SETS[] = {
     {0},
     {6, columns_neon, backward_neon, spread_neon, gather_neon, sweep_neon, grams_neon, assign_neon, pivots_neon,
-     convolution_neon, eliminate_neon, substitute_neon},
+     convolution_neon, lattice_neon, eliminate_neon, substitute_neon},
 };
 
 /* Every AArch64 processor has NEON. */

@@ -138,6 +138,7 @@ INLINE const float *NAME(fetch)(const float *source, long width, float fill, flo
 #include "convolution.h"
 #include "grams.h"
 #include "landmarks.h"
+#include "lattice.h"
 #include "stencil.h"
 #include "tall_skinny.h"
 

@@ -72,6 +72,7 @@ def use(library: ctypes.CDLL, best: int) -> None:
     library.nlfilter_pivots.argtypes = [*shared, *[_LONG] * 3, _FLOAT, *[_POINTER] * 3]
     library.nlfilter_grams.argtypes = [*shared, *factor, _LONG, *[_POINTER] * 3]
     library.nlfilter_convolution.argtypes = [*shared, *[_LONG] * 6, _FLOAT, *[_POINTER] * 5]
+    library.nlfilter_lattice.argtypes = [*shared, _LONG, _LONG, *planes, _POINTER, _LONG, _POINTER]
     library.nlfilter_stencil.argtypes = [*shared, *[_LONG] * 3, *[_POINTER] * 3]
 
 

@@ -92,6 +92,13 @@ struct convolution {
     float slope;                   /* of negative features */
 };
 
+struct lattice {
+    const float *colours, *lattice; /* (3, N), and the nodes' values, (n, n, n, 4) */
+    float *out;                     /* (3, N) */
+    long nodes, pixels;
+    long colours_step, colours_stride, lattice_step; /* from one image of a batch, or row, to the next */
+};
+
 /* The kernels of an instruction set, on pixels first to last; documented in the headers. */
 struct set {
     long rows; /* rows in a block of a packed matrix */
@@ -105,6 +112,7 @@ struct set {
                    float *sums);
     void (*pivots)(const struct pivots *, const float *points, long *pivots, float *scratch);
     void (*convolution)(const struct convolution *, long first, long last, float *scratch);
+    void (*lattice)(const struct lattice *, long first, long last);
     void (*eliminate)(double *equations, long own, long count, long stride);
     void (*substitute)(const double *equations, long own, long count, long length, long sides, double *values);
 };

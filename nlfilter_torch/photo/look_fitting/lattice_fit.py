@@ -14,7 +14,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from nlfilter_torch.photo.looks.lattice import corners
+from nlfilter_torch.core.kernels.lattice import corners
 
 SMOOTH = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6)  # strengths of the penalty on second derivatives
 RIDGE = 1e-3  # of the changes where there are no pixels, see :meth:`Penalised.ridge`

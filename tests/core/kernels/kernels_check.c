@@ -277,6 +277,39 @@ static void check_convolution(int level, int threads, int apart, int adds)
     judge("convolution", status, 1e-5);
 }
 
+/* Along the axis of the largest coordinate within the cell, then of the middle, then of the least. */
+static void check_lattice(int level, int threads)
+{
+    enum { NODES = 9 };
+    static float colours[B][3][N], lattice[B][NODES][NODES][NODES][4], values[B][3][N];
+    fill(colours[0][0], sizeof colours, -0.2f, 1.2f);
+    fill(lattice[0][0][0][0], sizeof lattice, -1, 1);
+    const int status = nlfilter_lattice(level, threads, N, B, NODES, colours[0][0], 3 * N, N, lattice[0][0][0][0],
+                                        NODES * NODES * NODES * 4, values[0][0]);
+    for (int k = 0; k < B * 3 * N; k++) {
+        const int b = k / (3 * N), c = k / N % 3, i = k % N;
+        double parts[3], sum;
+        int node[3];
+        for (int a = 0; a < 3; a++) {
+            const double place = fmin(fmax(colours[b][a][i], 0), 1) * (NODES - 1);
+            node[a] = fmin(floor(place), NODES - 2);
+            parts[a] = place - node[a];
+        }
+        sum = lattice[b][node[0]][node[1]][node[2]][c];
+        for (int step = 0; step < 3; step++) {
+            const double before = lattice[b][node[0]][node[1]][node[2]][c];
+            int axis = 0;
+            for (int a = 1; a < 3; a++)
+                axis = parts[a] > parts[axis] ? a : axis;
+            node[axis]++;
+            sum += parts[axis] * (lattice[b][node[0]][node[1]][node[2]][c] - before);
+            parts[axis] = -1;
+        }
+        compare(values[b][c][i], sum);
+    }
+    judge("lattice", status, 1e-5);
+}
+
 /* Each equation holds for the solution. */
 static void check_stencil(int level, int threads)
 {
@@ -348,6 +381,7 @@ int main(void)
             check_landmarks(level, threads);
             for (int apart = 1; apart <= 5; apart++)
                 check_convolution(level, threads, apart, apart % 2);
+            check_lattice(level, threads);
             check_stencil(level, threads);
         }
     return failures != 0;

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch import nonlocal_operator
-from nlfilter_torch.core.kernels import columns, convolution, definitions_only, library, stencil  # noqa: F401, register
+from nlfilter_torch.core.kernels import columns, convolution, definitions_only, lattice, library, stencil  # noqa: F401, register
 from nlfilter_torch.core.kernels.clusters import TRIALS, lloyd, pivots  # noqa: F401, registers both
 from nlfilter_torch.core.kernels.grams import sum_grams
 from nlfilter_torch.core.kernels.tall_skinny import moment, spread
@@ -23,7 +23,7 @@ from tests import reference
 from tests.native import by_torch, needs_kernels, random
 
 BATCH, SIZE, LANDMARKS, PIXELS, ROWS = 2, 4, 5, 33, 3
-DERIVED = ("spread", "moment", "invert", "convolve", "solve")
+DERIVED = ("spread", "moment", "invert", "convolve", "interpolate", "solve")
 
 
 def arguments(dtype: torch.dtype) -> dict[str, tuple[Any, ...]]:
@@ -53,6 +53,7 @@ def arguments(dtype: torch.dtype) -> dict[str, tuple[Any, ...]]:
         "choose": (features, [1, PIXELS], LANDMARKS, "kmeans", 2, False),
         "without": (factor, norms > norms.median()),
         "convolve": (images16, weight, random(5, seed=7).to(dtype), 2, random(BATCH, 5, 7, 9, seed=8).to(dtype)),
+        "interpolate": (images.sigmoid(), random(BATCH, 3, 4, 4, 4, seed=11).to(dtype)),
         "solve": (coefficients, random(BATCH, 2, 6, 7, seed=10).to(dtype)),
         "sinkhorn": (factor, (1 - norms).clamp(min=0.0), 1e-5, True, False),
     }
@@ -221,7 +222,7 @@ def test_ctypes_converts_to_the_types_that_the_header_declares() -> None:
     header = Path(library.__file__).with_name("interface.h").read_text(encoding="utf-8")
     prototypes = dict(re.findall(r"^int (nlfilter_\w+)\(([^)]*)\);", header, flags=re.MULTILINE))
     assert prototypes.pop("nlfilter_level") == "void"
-    assert len(prototypes) == 10
+    assert len(prototypes) == 11
     for name, prototype in prototypes.items():
         assert getattr(library._library, name).argtypes == parameters_of(" ".join(prototype.split())), name
         assert getattr(library._library, name).restype is ctypes.c_int
