@@ -1,13 +1,15 @@
 """Time and memory of fitting looks: ``python -m benchmarks.look_costs [--megapixels 1] [--pairs 100]``.
 
 Processor and wall seconds of one pair edited by Pillow, and by sliders of this library, which are to be found to 1e-3
-through 8 bits; then the most memory that one pair needs, and that many pairs need, beyond what the process has at the
-start. The photograph is scikit-image's cat, enlarged, and shifted for each of many pairs. Linux only.
+through 8 bits; then processor time of applying looks with and without lattices of colours; then the most memory that
+one pair needs, and that many pairs need, beyond what the process has at the start. The photograph is scikit-image's
+cat, enlarged, and shifted for each of many pairs. Linux only.
 """
 
 import argparse
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -15,9 +17,11 @@ from torch import Tensor
 from benchmarks.looks import EDITS, applied
 from benchmarks.memory import forget_peak, resident
 from benchmarks.whole import photograph
-from nlfilter_torch import fit_look
+from nlfilter_torch import apply_look, fit_look
+from nlfilter_torch.core.kernels import definitions_only
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.edits.applying import apply_step
+from nlfilter_torch.photo.looks.lattice import lattice_change
 
 ALPHA = (2.2, 1.6, 1.3, 1.02)
 SLIDERS = "sliders of this library"
@@ -45,6 +49,35 @@ def told(name: str, image: Tensor, repeats: int) -> str:
         return told
     error = (torch.tensor(look.step["alpha"]) - torch.tensor(ALPHA)).abs().max()
     return f"{told}, alpha off by {float(error):.1e} at most"
+
+
+def least(function: Callable[[], object], repeats: int) -> float:
+    """The least processor time in ms of some calls, after a first one."""
+    function()
+    times = []
+    for _ in range(repeats):
+        ran = time.process_time()
+        function()
+        times.append(time.process_time() - ran)
+    return 1000 * min(times)
+
+
+def with_lattices(image: Tensor, repeats: int) -> Iterator[str]:
+    """How long a look takes without a lattice, with lattices of some numbers of nodes, and these alone."""
+    megapixels = image[0, 0].numel() / 1e6
+    parts = {"red": (0.0, 0.2, 0.5, 1.0), "green": (0.0, 0.25, 0.5, 1.0), "blue": (0.0, 0.3, 0.6, 1.0)}
+    without = partial(apply_look, image, saturation=(1.2, 1.1, 1.0, 1.0, 1.1, 1.2), **parts)
+    for nodes in (9, 17, 33):
+        lattice = 0.05 * torch.rand(3, *[nodes] * 3, generator=torch.Generator().manual_seed(0))
+        plain, whole = least(without, repeats), least(partial(without, lattice=lattice), repeats)
+        alone = partial(lattice_change, image, lattice)
+        own = least(alone, repeats)
+        with definitions_only():
+            by_torch = least(alone, 2)
+        yield (
+            f"lattice of {nodes:2d}^3: {own / megapixels:5.2f} ms a megapixel, by torch {by_torch / megapixels:5.1f}; "
+            f"look without {plain / megapixels:5.1f}, with {whole / megapixels:5.1f}, {whole / plain:.2f} times"
+        )
 
 
 def shifted(image: Tensor, count: int) -> Iterator[tuple[Tensor, Tensor]]:
@@ -77,6 +110,8 @@ def main() -> None:
     fit_look([(image, image**0.9)])  # loads what is loaded once
     for name in NAMES:
         print(told(name, image, options.repeats), flush=True)
+    for line in with_lattices(image, 5 * options.repeats):
+        print(line, flush=True)
     small = (photograph(options.small) * 255).round() / 255
     peak(small, 1)
     for count in (1, options.pairs):
