@@ -142,7 +142,7 @@ def test_floats_whose_white_is_0_are_read(folder: Path) -> None:
 @pytest.mark.skipif(os.name == "nt", reason="permissions of POSIX")
 def test_a_replaced_file_keeps_its_permissions(folder: Path) -> None:
     Path("in.png").chmod(0o600)
-    assert main(["tone", "in.png", "in.png", "--contrast", "1.1"]) == 0
+    assert main(["tone", "in.png", "in.png", "--contrast", "1.1", "--force"]) == 0
     assert stat.S_IMODE(Path("in.png").stat().st_mode) == 0o600
 
 

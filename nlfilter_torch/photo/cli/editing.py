@@ -4,6 +4,7 @@ import sys
 from collections.abc import Iterable, Sequence
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, replace
+from os.path import realpath
 from pathlib import Path
 from typing import Protocol
 
@@ -103,7 +104,7 @@ def check_not_input(source: str, target: str, *, force: bool) -> None:
         return
     paths = Path(source), Path(target)
     linked = all(path.exists() for path in paths) and paths[0].samefile(paths[1])
-    if linked or paths[0].resolve() == paths[1].resolve():
+    if linked or realpath(source) == realpath(target):  # Path.resolve fails for links in circles
         raise ValueError(
             f"OUT must be another file than the photograph, got {target}, which the edit would replace; choose another "
             "name, or insist by --force"

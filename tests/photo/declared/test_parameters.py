@@ -64,7 +64,7 @@ def test_docstrings_describe_the_arguments_of_the_function_of_an_image(name: str
 def test_settings_of_an_edit_are_arguments_of_its_function(edit: type[PhotoEdit]) -> None:
     function = inspect.signature(getattr(nlfilter_torch, edit.declared.function or edit.declared.name)).parameters
     drawn = {"image", "grey", "strokes", *(scribble.argument for scribble in edit.declared.scribbles)}
-    settings = {field.name for field in fields(edit)} - {"names", "working"}  # of masks; measured
+    settings = {field.name for field in fields(edit)} - {"names", "working", "hot_pixels"}  # of masks; measured
     fixed = {"sharpen": {"guide_channels"}}.get(edit.declared.name, set())  # its guide is grey
     assert settings - fixed == set(function) - drawn
     assert {parameter.keyword for parameter in edit.declared if parameter.is_option} <= settings

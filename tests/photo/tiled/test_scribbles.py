@@ -100,9 +100,9 @@ def coloured(picture: Array, *painted: Array, kind: Any = None, **options: Any) 
 def test_full_passes_recolour_as_in_memory(
     options: dict[str, Any], kept: bool, dtype: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def balanced_well(guide: torch.Tensor, built: OperatorOptions) -> NonlocalOperator:
+    def balanced_well(guide: torch.Tensor, built: OperatorOptions, weights: torch.Tensor | None) -> NonlocalOperator:
         """In float32, to a tolerance that does not hide differences."""
-        return operator_from_guide(guide, replace(built, tolerance=1e-6 if dtype == np.float32 else None))
+        return operator_from_guide(guide, replace(built, tolerance=1e-6 if dtype == np.float32 else None), weights)
 
     monkeypatch.setattr("nlfilter_torch.photo.picture.in_memory.operator_from_guide", balanced_well)
     picture = cat(83, 121).astype(dtype)
