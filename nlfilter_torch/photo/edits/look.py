@@ -162,8 +162,9 @@ class LookEdit(FilteredEdit):
         parts = self._parts(source.dtype)
         for name, value in parts.items():
             check_part(value, name, source.batch)
-        change = partial(self._change, parts)
-        fitted = fit_change(source, change, whole_image, self.viewing_size, "none")
+        detailed = any(acts(parts[name]) for name in ("alpha", "bands", "texture"))
+        viewing_size = self.viewing_size if detailed else 0.0  # colours need no smaller picture
+        fitted = fit_change(source, partial(self._change, parts), whole_image, viewing_size, "none")
         strength = torch.as_tensor(self.amount).to(source.dtype).reshape(-1, 1, 1, 1)
         light = _change_of_light(source, parts["stretch"], parts["local"])
         colours = {name: parts[name] for name in ("curves", "matrix", "saturation")}

@@ -9,6 +9,7 @@ from torch import Tensor
 from nlfilter_torch import Look, apply_look
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.edits.applying import apply_step
+from nlfilter_torch.photo.picture.in_memory import InMemory
 from nlfilter_torch.photo.tiled.recipe import edit_rows
 from nlfilter_torch.photo.tiled.tiles import Passes
 from tests.looks import ALPHA, BANDS, BENT, CAT, CUP, LOCAL, SEPIA, STRETCH, TEXTURE, VIVID
@@ -102,3 +103,13 @@ def test_bad_parts_are_refused(options: dict[str, tuple[float, ...]], message: s
 def test_complex_numbers_are_refused() -> None:
     with pytest.raises(TypeError, match=r"stretch must be real numbers, got torch\.complex64; pass"):
         apply_look(CAT, stretch=torch.zeros(3, dtype=torch.complex64))
+
+
+def test_looks_of_colours_need_no_smaller_picture(monkeypatch: pytest.MonkeyPatch) -> None:
+    image = torch.rand(1, 3, 40, 60, generator=torch.Generator().manual_seed(0))
+    curve = [(step / 16) ** 0.8 for step in range(17)]
+    whole = apply_look(image, red=curve, viewing_size=0.0)
+    monkeypatch.delattr(InMemory, "resized")
+    assert torch.equal(apply_look(image, red=curve, viewing_size=0.001), whole)
+    with pytest.raises(AttributeError, match="resized"):
+        apply_look(image, alpha=(2.0, 1.0, 1.0, 1.0), red=curve, viewing_size=0.001)
