@@ -81,8 +81,8 @@ def test_a_film_by_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str
         ),
         (["--preset", "crisp", "--landmarks", "30"], (Step("detail", landmarks=30),)),
         (
-            ["--edit", "denoise", "--noise-level", "9", "--landmarks", "30"],
-            (Step("denoise", noise_level=9.0, landmarks=30),),
+            ["--edit", "denoise", "--noise-level", "20", "--landmarks", "30"],
+            (Step("denoise", noise_level=20.0, landmarks=30),),
         ),
     ):
         assert main([*arguments, *more]) == 0
