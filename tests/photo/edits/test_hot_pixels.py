@@ -13,7 +13,7 @@ from torch import Tensor
 from nlfilter_torch.photo import Step, denoise, stream
 from nlfilter_torch.photo.cli import editing, main
 from nlfilter_torch.photo.edits import hot_pixels
-from nlfilter_torch.photo.edits.hot_pixels import MARGIN, hot_pixels_of
+from nlfilter_torch.photo.edits.hot_pixels import MARGIN, hot_pixels_of, in_order
 from nlfilter_torch.photo.picture.in_memory import InMemory
 from tests.problems import colour, luminance
 
@@ -227,3 +227,9 @@ def test_the_command_says_how_many(
     edited = np.empty_like(bad)
     stream(Step("denoise"), bad, edited, tile_rows=16)
     assert np.abs(after.astype(int) - edited).max() <= 1
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 5, 8, 24])
+def test_few_values_of_many_pixels_are_sorted(count: int) -> None:
+    values = torch.rand(count, 50, generator=torch.Generator().manual_seed(count)).round(decimals=1)
+    assert torch.equal(torch.stack(in_order(values)), values.sort(0).values)
