@@ -94,17 +94,20 @@ def check_apart(option: str, path: str | Path | None, **files: str | Path | Iter
         return
     for what, names in files.items():
         for file in [names] if isinstance(names, str | Path) else names or []:
-            if Path(path).resolve() == Path(file).resolve():
+            if is_same_file(path, file):
                 raise ValueError(f"{option} must be another file than the {what}, got {path}; choose another name")
+
+
+def is_same_file(path: str | Path, other: str | Path) -> bool:
+    """Whether two paths lead to the same file, through symbolic or hard links too; neither needs to exist."""
+    if realpath(path) == realpath(other):  # Path.resolve fails for links in circles
+        return True
+    return Path(path).exists() and Path(other).exists() and Path(path).samefile(other)
 
 
 def check_not_input(source: str, target: str, *, force: bool) -> None:
     """Raise ValueError if the output would replace the photograph, unless the user insists by ``--force``."""
-    if force:
-        return
-    paths = Path(source), Path(target)
-    linked = all(path.exists() for path in paths) and paths[0].samefile(paths[1])
-    if linked or realpath(source) == realpath(target):  # Path.resolve fails for links in circles
+    if not force and is_same_file(source, target):
         raise ValueError(
             f"OUT must be another file than the photograph, got {target}, which the edit would replace; choose another "
             "name, or insist by --force"
