@@ -113,7 +113,7 @@ QUICK := \
 	'compilation --quick --only export' \
 	'memory --side 128 --repeats 1' \
 	'training points block floors refinement clusters --quick' \
-	'training functions sizes equivariance landmarks --quick' \
+	'training functions sizes equivariance landmarks styles --quick' \
 	'fuzz --cases 20'
 
 # Trains the denoiser further, from the weights of the package, on the pictures of scikit-image and on all of a folder:

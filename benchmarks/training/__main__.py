@@ -19,6 +19,7 @@ TOPICS: dict[str, str] = {  # name of a module of this package: what it measures
     "clusters": "landmarks of clusters and manifolds beside scikit-learn's k-means++, and how well they cover points",
     "equivariance": "layers, masks and edits of pictures that are flipped, transposed or rotated",
     "landmarks": "landmarks that are held: slopes, noise, recovered parameters, training",
+    "styles": "networks that predict a look for each photograph: weights of a few lattices beside tone curves",
 }
 ON_KODAK = ("functions", "landmarks")  # topics with a choice of photographs
 

@@ -11,6 +11,7 @@ import torch
 from benchmarks.training import __main__ as program
 from benchmarks.training.figures import Figure, table
 from benchmarks.training.held_out import NUMBERS, PIECES, held_out, large
+from benchmarks.training.styles import StyleNetwork, style
 from nlfilter_torch.photo.io.photographs import Photograph, write_photograph
 
 
@@ -56,3 +57,24 @@ def test_pictures_are_those_of_scikit_image_or_kodak(tmp_path: Path) -> None:
     mosaic = large(tmp_path, 100)
     assert mosaic.shape == (1, 3, 100, 100)
     assert {round(float(value) * 255) for value in mosaic.unique()} == set(PIECES)
+
+
+def test_the_style_of_the_benchmark_depends_on_the_photograph_and_keeps_greys() -> None:
+    grey = torch.linspace(0.1, 0.9, 64).view(1, 1, 8, 8).expand(-1, 3, -1, -1)
+    styled = style(grey)
+    torch.testing.assert_close(styled, styled.mean(1, keepdim=True).expand(-1, 3, -1, -1))
+    patch = torch.tensor([0.2, 0.6, 0.3]).view(1, 3, 1, 1)
+    warm, cold = (
+        torch.tensor(colour).view(1, 3, 1, 1).expand(-1, -1, 8, 8) for colour in ((0.7, 0.4, 0.1), (0.1, 0.4, 0.7))
+    )
+    results = [style(torch.cat([patch.expand(-1, -1, 8, 1), around], dim=3))[0, :, 0, 0] for around in (warm, cold)]
+    assert (results[0] - results[1]).abs().max() > 0.05
+
+
+def test_networks_of_the_benchmark_start_from_a_look_and_learn() -> None:
+    image = torch.rand(2, 3, 8, 8, generator=torch.Generator().manual_seed(0))
+    network = StyleNetwork(curves=True, matrix=True, lattices=2)
+    result = network(image)
+    assert result.shape == image.shape
+    result.square().mean().backward()
+    assert all(parameter.grad is not None and parameter.grad.any() for parameter in network.parameters())
