@@ -33,6 +33,7 @@ from nlfilter_torch.photo.tiled.sampling import Report
 
 Save = Callable[[str, Report], Path]  # name and progress
 LARGEST_PRESET = 20_000_000  # bytes
+PRESET_KINDS = ".json,.cube,.png,.tif,.tiff,.jpg,.jpeg,application/json"
 INSIDE, OUTSIDE = "#4ade80", "#60a5fa"  # colours of the sliders' response in the region, and elsewhere
 EDITORS: dict[str, "Editor"] = {}  # open pages by the token in the addresses of their pictures
 
@@ -112,7 +113,7 @@ class Editor:
             self._tasks = Tasks()
             show_error = self._tasks.show_error
             photographs = Upload(self._take_photograph, "image/*", LARGEST, show_error)
-            presets = Upload(self._take_preset, ".json,.cube,.png,.tif,application/json", LARGEST_PRESET, show_error)
+            presets = Upload(self._take_preset, PRESET_KINDS, LARGEST_PRESET, show_error)
             kinds = f"A PNG, JPEG, TIFF, WebP or AVIF file of at most {LARGEST / 1e9:g} GB"
             _button("Open", "folder_open", kinds, js=photographs.choosing)
             self._undo_button = _button("Undo", "undo", "Ctrl+Z", self._undo)
@@ -120,7 +121,12 @@ class Editor:
             self._reset_button = _button(
                 "Reset", "restart_alt", "Begin the edit anew; Undo brings it back", self._reset
             )
-            _button("Load edit", "tune", "A saved edit, or sliders found by nlfilter-torch fit", js=presets.choosing)
+            _button(
+                "Load edit",
+                "tune",
+                "A saved edit, a look found by nlfilter-torch fit, or a colour table (.cube or a Hald)",
+                js=presets.choosing,
+            )
             _button("Save edit", "bookmark_add", "For other photographs, and for the command line", self._ask_edit_name)
             _button("Save photo", "save", "At full size, into a file", self._ask_photo_name).props(
                 "color=primary unelevated", remove="flat"

@@ -132,9 +132,10 @@ def _check_ends(words: list[str], wanted: str, place: str) -> None:
 def _numbers(words: list[str], count: int, place: str) -> list[float]:
     """That many finite numbers."""
     try:
-        values = [float(word) for word in words]
+        values = [float(word) for word in words if "_" not in word]  # Python takes 1_0 for 10
     except ValueError:
         values = []
     if len(values) != count or not all(map(math.isfinite, values)):
-        raise ValueError(f"{place} must hold {count} numbers, got {' '.join(words)[:60]}; export it again")
+        shown = "".join(letter if letter.isprintable() else "?" for letter in " ".join(words)[:60])
+        raise ValueError(f"{place} must hold {count} numbers, got {shown}; export it again")
     return values

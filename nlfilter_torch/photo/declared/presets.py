@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 
 ORDER = tuple(EDITS)  # order in which the editor adds steps
 PICTURES = (b"\x89PNG", b"II*\0", b"MM\0*", b"\xff\xd8\xff")  # how files of pictures start
+OTHER_PICTURES = (b"BM", b"RIFF", b"GIF8", b"P6", b"\0\0\0")  # of kinds that are not read here
+MARKS = ((b"\xff\xfe", "utf-16"), (b"\xfe\xff", "utf-16"), (b"", "utf-8-sig"))  # how files of text start
 REMEDY = "save one in the editor"
 
 
@@ -121,9 +123,14 @@ class Recipe:
             ValueError: if it is neither. ``name`` is the file's name in the message.
         """
         if name.lower().endswith(".cube"):
-            return Recipe((step_of_cube(content.decode("utf-8", "replace"), name),))
+            encoding = next(encoding for mark, encoding in MARKS if content.startswith(mark))
+            return Recipe((step_of_cube(content.decode(encoding, "replace"), name),))
         if content.startswith(PICTURES):
             return Recipe((step_of_hald(_decoded(content, name), name),))
+        if content.startswith(OTHER_PICTURES):
+            raise ValueError(
+                f"{name} must be a preset, a .cube file or a Hald, got a file of another kind; save a Hald as PNG"
+            )
         return Recipe.from_json(content, name)
 
 

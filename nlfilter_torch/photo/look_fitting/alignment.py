@@ -136,6 +136,8 @@ def _shift(before: Tensor, after: Tensor) -> tuple[int, int]:
     from skimage.registration import phase_cross_correlation
 
     first, second = _grey(before), _grey(after)
+    if bool((first == first[0, 0]).all()) or bool((second == second[0, 0]).all()):
+        return 0, 0  # of one brightness: every shift is as good
     shifts = phase_cross_correlation(second.numpy(), first.numpy(), normalization=None)[0]
     down, right = (round(float(shift)) for shift in shifts)
     limit = MAX_SHIFT * min(first.shape)

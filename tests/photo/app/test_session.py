@@ -2,12 +2,16 @@
 
 from pathlib import Path
 
+import imagecodecs
+import numpy as np
 import pytest
 import skimage.data
 import torch
 from PIL import Image
 
+from nlfilter_torch.photo.app.page import PRESET_KINDS
 from nlfilter_torch.photo.app.session import Session
+from nlfilter_torch.photo.declared.colour_tables import cube_of, hald_of
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.declared.strokes import Stroke
@@ -133,6 +137,24 @@ def test_another_photograph_begins_a_new_edit(session: Session, tmp_path: Path) 
     assert session.recipe == Recipe()
     assert not session.undo()
     assert session.suggested_name() == "coffee-edited.jpg"
+
+
+def test_colour_tables_are_loaded_as_looks(session: Session) -> None:
+    colours = np.stack(np.meshgrid(*[np.arange(4) / 3] * 3, indexing="ij"))
+    table = np.stack([colours[0] ** 1.4, colours[1], 0.7 * colours[2]])
+    uploads = {"look.cube": cube_of(table, "look").encode(), "hald.png": imagecodecs.png_encode(hald_of(table))}
+    lattices = []
+    for name, content in uploads.items():
+        assert Path(name).suffix in PRESET_KINDS.split(",")
+        session.load_preset(content, name)
+        assert [step.edit for step in session.recipe.steps] == ["look"]
+        lattices.append(torch.tensor(session.recipe.steps[0]["lattice"]))
+    torch.testing.assert_close(*lattices, atol=1e-4, rtol=0)
+    with pytest.raises(ValueError, match=r"LUT_3D_SIZE of look\.cube must be a whole number"):
+        session.load_preset(b"LUT_3D_SIZE 500\n", "look.cube")
+    with pytest.raises(ValueError, match=r"photo\.png must be a Hald, a square picture in colour of 8, 27"):
+        session.load_preset(imagecodecs.png_encode(np.zeros((60, 60, 3), np.uint8)), "photo.png")
+    assert torch.equal(torch.tensor(session.recipe.steps[0]["lattice"]), lattices[1])
 
 
 def test_presets_come_back(session: Session) -> None:

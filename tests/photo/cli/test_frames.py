@@ -5,12 +5,14 @@ import sys
 from pathlib import Path
 
 import av
+import imagecodecs
 import numpy as np
 import pytest
 import torch
 
 from nlfilter_torch.photo.cli import main
-from nlfilter_torch.photo.declared.presets import PRESETS, Recipe
+from nlfilter_torch.photo.declared.colour_tables import cube_of, hald_of
+from nlfilter_torch.photo.declared.presets import PRESETS, Recipe, find_recipe
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.declared.strokes import Stroke
 from nlfilter_torch.photo.edits.applying import apply_step
@@ -170,6 +172,29 @@ def test_frames_by_every_preset(name: str, tmp_path: Path) -> None:
     assert (read_photograph(paths[0]).pixels - wanted.clamp(0, 1)).abs().max() < 0.6 / 255
     for path, before in zip(paths, stored, strict=True):
         assert (read_photograph(path).pixels - before).abs().max() > 1 / 255
+
+
+def test_colour_tables_of_films_and_folders(tmp_path: Path) -> None:
+    colours = np.stack(np.meshgrid(*[np.arange(9) / 8] * 3, indexing="ij"))
+    table = np.stack([colours[0] ** 1.4, colours[1], 0.7 * colours[2]])
+    (tmp_path / "look.cube").write_text(cube_of(table, "look"))
+    (tmp_path / "hald.png").write_bytes(imagecodecs.png_encode(hald_of(table)))
+    (tmp_path / "shots").mkdir()
+    shot = pan(1, 6, 30, 40)[0]
+    write_photograph(Photograph(shot), tmp_path / "shots" / "0.png")
+    film, preset = write(tmp_path / "film.mp4", 2), str(tmp_path / "look.cube")
+    assert main(["frames", str(film), str(tmp_path / "out.mp4"), "--references", "1", "--preset", preset]) == 0
+    with open_film(film) as before, open_film(tmp_path / "out.mp4") as after:
+        for first, second in zip(before.frames(), after.frames(), strict=True):
+            pixels = torch.from_numpy(before.pixels(first)).permute(2, 0, 1)[None]
+            wanted = rows_of(apply_step(find_recipe(preset).steps[0], pixels).clamp(0, 1))
+            assert np.abs(_grey(after.pixels(second)) - _grey(wanted)).mean() < 3 / 255
+            assert np.abs(_grey(after.pixels(second)) - _grey(before.pixels(first))).mean() > 6 / 255
+    for name in ("look.cube", "hald.png"):
+        preset = str(tmp_path / name)
+        assert main(["frames", str(tmp_path / "shots"), str(tmp_path / "done"), "--preset", preset]) == 0
+        wanted = apply_step(find_recipe(preset).steps[0], read_photograph(tmp_path / "shots" / "0.png").pixels)
+        assert (read_photograph(tmp_path / "done" / "0.png").pixels - wanted.clamp(0, 1)).abs().max() < 0.6 / 255
 
 
 def test_folders_that_cannot_be(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

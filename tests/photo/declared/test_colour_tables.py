@@ -45,6 +45,10 @@ def test_comments_titles_and_ranges_from_zero_to_one_are_read() -> None:
         (HEAD + ROWS.replace("1 1 1", "1 1"), "line 9 of it must hold 3 numbers, got 1 1; export"),
         (HEAD + ROWS.replace("1 1 1", "1 nan 1"), "line 9 of it must hold 3 numbers, got 1 nan 1; export"),
         (HEAD + ROWS.replace("1 1 1", "nan 1 1"), "line 9 of it must hold 3 numbers, got nan 1 1; export"),
+        (HEAD + ROWS.replace("1 1 1", "1_0 1 1"), "line 9 of it must hold 3 numbers, got 1_0 1 1; export"),
+        (HEAD + ROWS.replace(" ", ","), "line 2 of it must hold 3 numbers, got 0,0,0; export"),
+        ("\0\1\n", r"line 1 of it must hold 3 numbers, got \?\?; export"),
+        ("LUT_IN_VIDEO_RANGE\n", "it must be a table of colours, got a line LUT_IN_VIDEO_RANGE; export"),
         ("hello\n", "it must be a table of colours, got a line hello; export"),
         ("", "it must have a line LUT_3D_SIZE, got none; export"),
     ],
@@ -77,6 +81,19 @@ def test_halds_of_all_depths(dtype: str) -> None:
 def test_pictures_that_are_no_halds_are_refused(shape: tuple[int, int, int], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         step_of_hald(np.zeros(shape, np.uint8), "it")
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "latin-1"])
+@pytest.mark.parametrize("ending", ["\n", "\r\n", "\r"])
+def test_text_of_any_encoding_and_line_ending(encoding: str, ending: str) -> None:
+    text = ('TITLE "\u00e9t\u00e9"\n' + HEAD.lower() + ROWS.replace(" ", "\t")).replace("\n", ending)
+    assert Recipe.from_file(text.encode(encoding), "it.cube").steps[0]["lattice"] == (0.0,) * 24
+
+
+@pytest.mark.parametrize("content", [b"BM and more", b"RIFF....WEBP", b"P6\n64 64\n255\n"])
+def test_pictures_of_other_kinds_are_told(content: bytes) -> None:
+    with pytest.raises(ValueError, match=r"it must be a preset, a \.cube file or a Hald, got a file of another kind"):
+        Recipe.from_file(content, "it")
 
 
 def test_files_are_recipes(tmp_path: Path) -> None:

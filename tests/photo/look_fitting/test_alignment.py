@@ -40,3 +40,12 @@ def test_shifts_and_sizes_are_found() -> None:
     assert "enlarged to 100x80" in done
     with pytest.raises(ValueError, match="after must have the size of before"):
         align(CAT, CUP[..., :30, :70], "before", "after")
+
+
+def test_pictures_of_one_brightness_are_not_shifted(recwarn: pytest.WarningsRecorder) -> None:
+    for before, after in ((torch.zeros_like(CAT), CAT), (CAT, torch.full_like(CAT, 0.4))):
+        first, second, done = align(before, after, "before", "after")
+        assert torch.equal(first, before)
+        assert torch.equal(second, after)
+        assert done == ""
+    assert not recwarn
