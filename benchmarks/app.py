@@ -66,7 +66,7 @@ def in_the_library(path: Path) -> None:
 
     def slide(value: float) -> None:
         session.set("detail", alpha=(value, 1.0, 1.0, 1.0))
-        session.render("detail")
+        session.render(0)
 
     report("first slider: the operator and its layers", [milliseconds(lambda: slide(2.0))])
     report("slider to pixels", [milliseconds(lambda i=i: slide(1 + i / 10)) for i in range(REPEATS)])

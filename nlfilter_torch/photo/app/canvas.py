@@ -18,8 +18,8 @@ class Painted(Protocol):
 
     recipe: Recipe
 
-    def render(self, upto: str | None = None) -> Tensor:
-        """The preview under the edit up to a step, (1, C, h, w) in [0, 1]."""
+    def render(self, moving: int | None = None) -> Tensor:
+        """The preview under the edit, (1, C, h, w) in [0, 1], quickly while a slider of a step moves."""
 
     def mask(self) -> Tensor | None:
         """The mask of the region, (1, 1, h, w) in [0, 1]."""
@@ -125,12 +125,12 @@ class Canvas:
         self.draw_strokes()
         self.draw_mask()
 
-    def draw(self, upto: str | None) -> None:
-        """Compute the picture after a step, or after the last one, and its mask; may run in a thread."""
+    def draw(self, moving: int | None) -> None:
+        """Compute the picture and its mask, quickly while a slider of a step moves; may run in a thread."""
         session = self._session
         if session is None:
             return
-        self.take(session.render(upto))
+        self.take(session.render(moving))
         mask = session.mask()
         self.pictures["mask"] = b"" if mask is None else drawing.mask_picture(mask)
 

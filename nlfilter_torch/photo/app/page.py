@@ -62,7 +62,7 @@ class Editor:
         self.session = photographs.new()
         self._told: str | None = None  # the last trouble of the session that was shown
         self._token = secrets.token_urlsafe(16)
-        self._wanted: list[str | None] = []  # at most one: the last step of the picture to draw next
+        self._wanted: list[int | None] = []  # at most one picture to draw next: the place of a step that moves, or None
         self._drawing = False
 
     def build(self, image: Path | None, address: str = "") -> None:
@@ -82,7 +82,7 @@ class Editor:
             with ui.column().classes("panel"):
                 handle = ui.button(icon="drag_handle").props('flat dense aria-label="Show or hide the controls"')
                 handle.classes("handle").on("click", js_handler="() => page.fold()")
-                link = Link(lambda: self.session.recipe, brush, self._change, self._clear_strokes)
+                link = Link(lambda: self.session.recipe, brush, self._change, self._clear_strokes, self._replace)
                 self._panel = Panel(link, self._canvas.switch)
         ui.keyboard(on_key=self._key)
         ui.on("closeup", lambda event: self._look(event.args))
@@ -140,12 +140,21 @@ class Editor:
             self._panel.follow()
             return
         self.session.set(step, strokes=None, **values)
-        if complete:
+        self._follow_change(None if complete else self.session.recipe.place_of(step))
+
+    def _replace(self, recipe: Recipe, moving: int | None) -> None:
+        """Replace the edit; ``moving`` is the place of a step whose slider moves, or None if the change is complete."""
+        self.session.recipe = recipe
+        self._follow_change(moving)
+
+    def _follow_change(self, moving: int | None) -> None:
+        """Show a changed edit, quickly while a slider of a step moves."""
+        if moving is None:
             self.session.commit()
             self._changed()
         else:
             self._closeup.hold()
-            self._redraw(step)
+            self._redraw(moving)
 
     def _clear_strokes(self, step: str) -> None:
         if self.session.opened is not None:
@@ -197,12 +206,12 @@ class Editor:
 
     # Pictures
 
-    def _redraw(self, upto: str | None = None) -> None:
-        """Draw the picture again, once the drawing in progress is done."""
+    def _redraw(self, moving: int | None = None) -> None:
+        """Draw the picture again, once the drawing in progress is done; quickly while a slider of a step moves."""
         self._canvas.draw_strokes()
         if self.session.opened is None:
             return
-        self._wanted = [upto]
+        self._wanted = [moving]
         if not self._drawing:
             self._tasks.start(self._keep_drawing())
 
@@ -210,11 +219,11 @@ class Editor:
         self._drawing = True
         try:
             while self._wanted:
-                upto = self._wanted.pop()
-                await self._tasks.run("Working", partial(self._canvas.draw, upto))
+                moving = self._wanted.pop()
+                await self._tasks.run("Working", partial(self._canvas.draw, moving))
                 self._show()
                 self._draw_response()
-                self._canvas.draw_mask(moving=upto is not None)
+                self._canvas.draw_mask(moving=moving is not None)
         finally:
             self._drawing = False
         self._at_rest.drawn(self.session)

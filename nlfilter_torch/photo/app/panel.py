@@ -1,10 +1,11 @@
-"""The controls beside the picture: a tab for each edit, and the histogram."""
+"""The controls beside the picture: a tab for each edit, the list of its steps, and the histogram."""
 
 from collections.abc import Callable
 
 from nicegui import ui
 
 from nlfilter_torch.photo.app.detail_tab import DetailTab
+from nlfilter_torch.photo.app.step_list import StepList
 from nlfilter_torch.photo.app.tabs import EditTab, Link
 from nlfilter_torch.photo.declared.parameters import DETAIL, EDITS
 
@@ -14,22 +15,23 @@ CLIPPED = 0.001  # share of the picture that an edit may clip without a warning
 
 
 class Panel:
-    """Tabs of all edits and a histogram, built into the open element.
+    """Tabs of all edits, the list of steps and a histogram, built into the open element.
 
     ``switch`` is called with the name of the edit whose tab was opened.
     """
 
     def __init__(self, link: Link, switch: Callable[[str], None]) -> None:
+        self._recipe = link.recipe
         with ui.tabs(on_change=lambda event: switch(event.value)).classes("w-full") as bar:
             bar.props("dense no-caps align=justify")
-            for edit in TABS:
-                ui.tab(edit, label=edit.capitalize())
+            self._titles = {edit: ui.tab(edit, label=edit.capitalize()) for edit in TABS}
         panels = ui.tab_panels(bar, value=next(iter(TABS)), animated=False, keep_alive=True)
         self._tabs: list[EditTab] = []
         with panels.classes("w-full bg-transparent"):
             for edit, kind in TABS.items():
                 with ui.tab_panel(edit).classes("gap-1"):
                     self._tabs.append(kind(edit, link))
+        self._steps = StepList(link.recipe, link.replace, bar.set_value)
         ui.label("Histogram").classes("group q-px-sm")
         self._histogram = ui.html("", sanitize=False).classes("w-full q-px-sm")
         self._clipped = ui.label("").classes("hint q-px-sm")
@@ -39,6 +41,11 @@ class Panel:
         """Show the current edit."""
         for tab in self._tabs:
             tab.follow()
+        self._steps.follow()
+        acting = {step.edit for step in self._recipe().acting}
+        for edit, title in self._titles.items():
+            state = f'alert=amber aria-label="{edit.capitalize()}, in use"'
+            title.props(state if edit in acting else "", remove="" if edit in acting else "alert aria-label")
 
     def draw_levels(self, histogram: str, clipped: tuple[float, float], before: tuple[float, float]) -> None:
         """Show the histogram, and how much of the picture is white or black, now and before the edit."""

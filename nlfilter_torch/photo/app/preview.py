@@ -5,7 +5,8 @@ holds. Only what depends on the full resolution is computed from the photograph 
 pixels differ a little from the saved file, which :meth:`~nlfilter_torch.photo.app.session.Session.at_rest` computes.
 
 Slow results are cached together with the settings they depend on: the layers that the sliders weigh, the filter for
-masks, the filter of the step that is being changed, and the picture after each step.
+masks, the filter of the step that is being changed, and the picture after each step. While a slider moves, the steps
+after its own are applied as they were fitted to the picture before.
 """
 
 import math
@@ -28,7 +29,7 @@ from nlfilter_torch.photo.declared.parameters import DETAIL, MASK
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.declared.shared_parameters import VIEWING_SIZE
 from nlfilter_torch.photo.declared.steps import Step
-from nlfilter_torch.photo.edits.applying import PreparedStep, edit_of, filter_key, scribbles_of
+from nlfilter_torch.photo.edits.applying import PreparedStep, edit_of, filter_key, over, scribbles_of
 from nlfilter_torch.photo.picture.changes import activity, change_of_mean, limit_by_activity, split_sliders
 from nlfilter_torch.photo.picture.in_memory import InMemory, fit_edit
 from nlfilter_torch.photo.picture.painting import TensorPainter
@@ -139,6 +140,31 @@ class Layers:
     eigenvalues: Tensor
 
 
+@dataclass(frozen=True, eq=False)
+class StepPicture:
+    """The picture after a step at full opacity.
+
+    Attributes:
+        key: the steps before it, and the step.
+        before: the picture before the step.
+        after: the picture after it.
+        fitted: the step as fitted to the picture before, or None to add the change that it made to other pictures.
+    """
+
+    key: tuple[Step, ...]
+    before: Tensor
+    after: Tensor
+    fitted: Fitted | None
+
+    def of(self, image: Tensor) -> Tensor:
+        """Apply the step to another picture of the same size without fitting it again, which is approximate."""
+        if image.shape != self.before.shape:
+            return image
+        if self.fitted is None:
+            return image + (self.after - self.before)
+        return InMemory(image.clamp(0, 1)).all(self.fitted)
+
+
 class Preview:
     """A reduced photograph under any edit.
 
@@ -164,7 +190,7 @@ class Preview:
         self._mask: tuple[Key, Tensor] | None = None
         self._active: tuple[tuple[int, int], Tensor] | None = None
         self._filter: tuple[Key, Callable[[Step], Tensor]] | None = None
-        self._pictures: dict[int, tuple[Key, Tensor]] = {}
+        self._pictures: list[StepPicture] = []
 
     def layers(self, detail: Step) -> Layers:
         """The layers for the filter of a step; slow if its settings have changed."""
@@ -230,26 +256,44 @@ class Preview:
             self._mask = (key, self._source.all(fitted))
         return self._mask[1]
 
-    def render(self, recipe: Recipe, upto: str | None = None) -> Tensor:
-        """The preview after all steps, or after the last one named ``upto``: (1, 1 or 3, h, w) in [0, 1]."""
-        result, drawn = self.pixels, False
-        key: Key = ()
-        places = [i for i, step in enumerate(recipe.steps) if step.edit == upto]
-        for i, step in enumerate(recipe.steps[: places[-1] + 1] if places else recipe.steps):
+    def render(self, recipe: Recipe, moving: int | None = None) -> Tensor:
+        """The preview after all steps, (1, 1 or 3, h, w) in [0, 1].
+
+        While a slider of the step at the place ``moving`` moves, the steps after it are approximate: they are applied
+        as fitted to the last complete picture, or make the same change as there, and are left out if there was none.
+        """
+        result, used, computed = self.pixels, list[StepPicture](), False
+        key: tuple[Step, ...] = ()
+        for place, step in enumerate(recipe.steps):
             if not step.changes():
                 continue
-            before, key = key, (*key, step)
-            if not before and self._is_of_layers(step):
-                result = self._blend(step)
+            whole = step.mixed(opacity=1.0)
+            if moving is not None and place > moving:
+                picture = next((other for other in self._pictures if other.key[-1] == whole), None)
+                if picture is not None:
+                    used.append(picture)
+                    result = over(result, picture.of(result), step.opacity)
                 continue
-            cached = self._pictures.get(i)
-            if cached is None or cached[0] != key:
+            picture = next((other for other in self._pictures if other.key == (*key, whole)), None)
+            if picture is None:
                 # The first picture that is computed again is that of the step being changed, so its filter is cached.
-                edit = self._filter_of(step, result, before, keep=not drawn)
-                cached = self._pictures[i] = (key, edit(step))
-                drawn = True
-            result = cached[1]
+                picture = self._computed(whole, result, key, keep=not computed)
+                computed = computed or bool(key) or not self._is_of_layers(step)
+            used.append(picture)
+            result, key = over(result, picture.after, step.opacity), (*key, step)
+        self._pictures = used
         return result.clamp(0, 1)
+
+    def _computed(self, step: Step, image: Tensor, before: tuple[Step, ...], *, keep: bool) -> StepPicture:
+        """Apply a step to the picture after the steps before it; ``keep`` says whether to cache its filter."""
+        key = (*before, step)
+        if not before and self._is_of_layers(step):
+            return StepPicture(key, image, self._source.all(self._blend(step)), None)
+        edit = self._filter_of(step, image, before, keep=keep)
+        after = edit(step)
+        # Edits of objects are more exact as fitted, others by the change that they made.
+        fitted = edit.fitted if isinstance(edit, PreparedStep) and step.declared.requires_strokes else None
+        return StepPicture(key, image, after, fitted)
 
     def _is_of_layers(self, step: Step) -> bool:
         """Whether a step only weighs layers of luminance, which are cached; such edits take regions, too."""
@@ -259,7 +303,8 @@ class Preview:
             return False
         return self._viewed(step) >= self.size
 
-    def _blend(self, detail: Step) -> Tensor:
+    def _blend(self, detail: Step) -> Fitted:
+        """A step that weighs layers."""
         mask = self.mask(detail)
         change = WeighedLayers(
             part_of(self.layers(detail).layers),
@@ -271,7 +316,7 @@ class Preview:
         )
         rows = [detail["alpha"], detail.sliders_inside]
         brighter = detail["alpha"][-1] - 1 if mask is None else change_of_mean(torch.tensor(rows) - 1)
-        return self._source.all(within_limits(self._source, Fitted(change), detail["limits"], brighter))
+        return within_limits(self._source, Fitted(change), detail["limits"], brighter)
 
     def _filter_of(self, step: Step, image: Tensor, before: Key, *, keep: bool) -> Callable[[Step], Tensor]:
         """A function that applies a step to the picture before it; slow unless its filter is cached."""

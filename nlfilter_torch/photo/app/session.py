@@ -165,8 +165,11 @@ class Session:
         return self.preview.stride > 1
 
     def set(self, edit: str, *, strokes: tuple[Stroke, ...] | None = None, **values: Value) -> None:
-        """Change the last step with that edit, or add such a step; :meth:`commit` completes the change."""
-        self.recipe = self.recipe.with_last(self.recipe.last(edit).changed(strokes=strokes, **values))
+        """Change the last step with that edit, or add such a step, and switch it on.
+
+        :meth:`commit` completes the change.
+        """
+        self.recipe = self.recipe.with_last(self.recipe.last(edit).changed(strokes=strokes, **values).mixed(on=True))
 
     def commit(self) -> None:
         """Complete a change, so that it can be undone."""
@@ -218,16 +221,16 @@ class Session:
             raise ValueError(f"{step} takes no strokes: it holds for the whole photograph")
         stroke = Stroke.from_entries(entries, words, step)
         last = self.recipe.last(step)
-        painted = last.changed(strokes=(*last.strokes, stroke))
+        painted = last.changed(strokes=(*last.strokes, stroke)).mixed(on=True)
         if painted.has_region() and not last.has_region():  # it begins with the sliders of the rest
             painted = painted.changed(inside=last["alpha"])
         self.recipe = self.recipe.with_last(painted)
         self.commit()
 
-    def render(self, upto: str | None = None) -> Tensor:
+    def render(self, moving: int | None = None) -> Tensor:
         """The preview under the edit, (1, C, h, w) in [0, 1]; see :meth:`Preview.render`."""
         with self._drawing:
-            return self.preview.render(self.recipe, upto)
+            return self.preview.render(self.recipe, moving)
 
     def mask(self) -> Tensor | None:
         """The mask of the region that has its own sliders; see :meth:`Preview.mask`."""

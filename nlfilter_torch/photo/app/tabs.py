@@ -9,6 +9,7 @@ from nicegui import ui
 from nlfilter_torch.photo.app import controls
 from nlfilter_torch.photo.app.brush import BRUSHES, COLOURS, Brush
 from nlfilter_torch.photo.app.controls import Change, Control, Slider
+from nlfilter_torch.photo.app.step_list import Replace
 from nlfilter_torch.photo.declared.parameters import EDITS
 from nlfilter_torch.photo.declared.presets import Recipe
 
@@ -22,12 +23,14 @@ class Link:
         brush: its settings, which the tabs show and change.
         change: is called with changes of the parameters of a step.
         clear: is called with a step whose strokes are to be removed.
+        replace: is called with another edit, and the place of the step whose slider moves, or None.
     """
 
     recipe: Callable[[], Recipe]
     brush: Brush
     change: Change
     clear: Callable[[str], None]
+    replace: Replace
 
 
 class EditTab:

@@ -23,7 +23,8 @@ NUMBERS: dict[Kind, type[float]] = {"number": float, "count": int, "odd": int}
 def plain_step(recipe: Recipe) -> Step | None:
     """The only step of a recipe, if options of a command that takes presets can express it."""
     step = recipe.steps[0] if len(recipe.steps) == 1 else None
-    return step if step is not None and step.declared.presets and not step.strokes else None
+    is_plain = step is not None and step.declared.presets and not step.strokes and step.on and step.opacity == 1
+    return step if is_plain else None
 
 
 def typed_options(context: typer.Context, names: Iterable[str]) -> list[str]:
@@ -48,7 +49,7 @@ def other_recipe(context: typer.Context, preset: str, names: Iterable[str]) -> R
 def preset_step(recipe: Recipe, edit: Edit) -> Step | None:
     """The only step of a recipe, if the command of an edit takes it as it is."""
     step = recipe.steps[0] if len(recipe.steps) == 1 else None
-    return step if step is not None and step.edit in edit.presets else None
+    return step if step is not None and step.edit in edit.presets and step.on else None
 
 
 def preset_option(help: str, *, plain: bool = True) -> object:
@@ -63,7 +64,7 @@ def preset_option(help: str, *, plain: bool = True) -> object:
             context.default_map = {entry: option_value(step.declared[entry], value) for entry, value in step.values}
         elif plain and name is not None and preset_step(find_recipe(name), DETAIL) is None:
             raise ValueError(
-                f"--preset must hold a look or a single detail step without strokes, got {name}; "
+                f"--preset must hold a look or a single detail step, without strokes and at full opacity, got {name}; "
                 "use nlfilter-torch apply, which accepts any edit"
             )
         return name

@@ -10,8 +10,9 @@ The editor saves, and ``nlfilter-torch apply`` and ``batch`` read::
       ]
     }
 
-Omitted entries have the defaults of the command of that name. Coordinates of strokes are relative to the picture, so
-that an edit made on a preview applies to the photograph. Does not import torch.
+Omitted entries have the defaults of the command of that name. A step may also have ``"on": false``, which switches it
+off, and ``"opacity"`` from 0 to 1, which mixes its result with the picture before it. Coordinates of strokes are
+relative to the picture, so that an edit made on a preview applies to the photograph. Does not import torch.
 """
 
 from dataclasses import dataclass
@@ -50,8 +51,8 @@ class Recipe:
 
     @property
     def drawn(self) -> "Recipe":
-        """The recipe without the steps that have neither an effect nor strokes."""
-        return Recipe(tuple(step for step in self.steps if step.changes() or step.strokes))
+        """The recipe without the steps that would have no effect if they were on, and have no strokes."""
+        return Recipe(tuple(step for step in self.steps if step.would_change() or step.strokes))
 
     def last(self, edit: str) -> Step:
         """Return the last step of an edit, or one that changes nothing if there is none."""
@@ -59,12 +60,29 @@ class Recipe:
 
     def with_last(self, step: Step) -> "Recipe":
         """Replace the last step of the same edit, or insert the step at its usual place if there is none."""
-        places = [i for i, other in enumerate(self.steps) if other.edit == step.edit]
-        if places:
-            return Recipe((*self.steps[: places[-1]], step, *self.steps[places[-1] + 1 :]))
+        place = self.place_of(step.edit)
+        if place is not None:
+            return self.replaced(place, step)
         rank = ORDER.index(step.edit)
         place = max((i + 1 for i, other in enumerate(self.steps) if ORDER.index(other.edit) < rank), default=0)
         return Recipe((*self.steps[:place], step, *self.steps[place:]))
+
+    def place_of(self, edit: str) -> int | None:
+        """The place of the last step of an edit, or None."""
+        return max((place for place, step in enumerate(self.steps) if step.edit == edit), default=None)
+
+    def replaced(self, place: int, *steps: Step) -> "Recipe":
+        """Replace the step at a place by others, or by none."""
+        return Recipe((*self.steps[:place], *steps, *self.steps[place + 1 :]))
+
+    def moved(self, place: int, to: int) -> "Recipe":
+        """Move the step at a place to another.
+
+        >>> [step.edit for step in Recipe((Step("tone"), Step("sharpen"), Step("denoise"))).moved(0, 2).steps]
+        ['sharpen', 'denoise', 'tone']
+        """
+        others = [*self.steps[:place], *self.steps[place + 1 :]]
+        return Recipe((*others[:to], self.steps[place], *others[to:]))
 
     @property
     def bytes_per_pixel(self) -> int:

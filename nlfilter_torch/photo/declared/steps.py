@@ -4,13 +4,14 @@ A step is an immutable value that does not depend on the photograph, so that one
 original. Does not import torch.
 """
 
+import copy
 import json
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from nlfilter_torch.photo.declared.declaration import Arguments, Edit
-from nlfilter_torch.photo.declared.json_values import Value, plain, shown
+from nlfilter_torch.photo.declared.json_values import Value, is_within, plain, shown
 from nlfilter_torch.photo.declared.parameters import EDITS
 from nlfilter_torch.photo.declared.shared_parameters import FILTER
 
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
 
 VERSION = 1  # of files of steps
 NONE = (1.0, 1.0, 1.0, 1.0)  # sliders that change nothing
+MIXING = ("on", "opacity")  # entries of all steps, whether and how much they count
 
 
 @dataclass(frozen=True, init=False)
@@ -29,15 +31,21 @@ class Step:
         edit: name of the edit, one of :data:`~nlfilter_torch.photo.declared.parameters.EDITS`.
         strokes: strokes painted for it.
         values: names and values of the parameters that differ from their defaults, in the order of declaration.
+        on: whether it is applied.
+        opacity: how much of its result is shown over the picture before it: 1 is all, 0 none.
 
     Example:
         >>> Step("abstract", edges=1.0)["power"], Step("abstract", power=0.3).values
         (0.3, ())
+        >>> Step("tone").mixed(opacity=0.5).opacity, Step("tone").mixed(on=False).changes()
+        (0.5, False)
     """
 
     edit: str
     strokes: tuple["Stroke", ...]
     values: tuple[tuple[str, Value], ...]
+    on: bool = True
+    opacity: float = 1.0
 
     def __init__(self, edit: str, strokes: tuple["Stroke", ...] = (), **values: Value) -> None:
         """Create a step; omitted parameters have their defaults."""
@@ -49,7 +57,8 @@ class Step:
             )
         values = {name: plain(value) for name, value in values.items()}
         changed = [(p.name, values[p.name]) for p in declared if p.name in values and values[p.name] != p.default]
-        for name, value in (("edit", edit), ("strokes", strokes), ("values", tuple(changed))):
+        attributes = {"edit": edit, "strokes": strokes, "values": tuple(changed), "on": True, "opacity": 1.0}
+        for name, value in attributes.items():
             object.__setattr__(self, name, value)
 
     @staticmethod
@@ -66,7 +75,16 @@ class Step:
 
     def changed(self, *, strokes: tuple["Stroke", ...] | None = None, **values: Value) -> "Step":
         """Return a copy with other strokes or parameters."""
-        return Step(self.edit, self.strokes if strokes is None else strokes, **{**dict(self.values), **values})
+        step = Step(self.edit, self.strokes if strokes is None else strokes, **{**dict(self.values), **values})
+        return step.mixed(on=self.on, opacity=self.opacity)
+
+    def mixed(self, *, on: bool | None = None, opacity: float | None = None) -> "Step":
+        """Return a copy that is switched on or off, or has another opacity."""
+        step = copy.copy(self)
+        for name, value in (("on", on), ("opacity", opacity)):
+            if value is not None:
+                object.__setattr__(step, name, value)
+        return step
 
     @property
     def declared(self) -> Edit:
@@ -94,6 +112,10 @@ class Step:
 
     def changes(self) -> bool:
         """Whether the step has any effect."""
+        return self.on and self.opacity > 0 and self.would_change()
+
+    def would_change(self) -> bool:
+        """Whether the step has any effect when it is switched on."""
         if self.declared.requires_strokes:
             return bool(self.painted(self.declared.words[0]))
         acting = [p for p in self.declared if p.idle is not ...]
@@ -129,6 +151,10 @@ class Step:
             complete: whether to write defaults, too, so that they can be edited by hand.
         """
         entries = [("edit", json.dumps(self.edit))]
+        if not self.on:
+            entries.append(("on", "false"))
+        if self.opacity != 1:
+            entries.append(("opacity", json.dumps(self.opacity)))
         for parameter in self.declared:
             value = self[parameter.name]
             acts = parameter.idle is not ... and not parameter.is_idle(value)
@@ -155,12 +181,15 @@ class Step:
         declared, values = EDITS[edit], dict[str, Value]()
         parameters = {parameter.name: parameter for parameter in declared}
         strokes: tuple[Stroke, ...] = ()
+        on, opacity = _read_mixing(entries, place)
         for entry, value in entries.items():
+            if entry in MIXING:
+                continue
             if entry == "strokes" and declared.scribbles:
                 strokes = _read_strokes(value, declared, place)
                 continue
             if entry not in parameters:
-                names = [*parameters, *(["strokes"] if declared.scribbles else [])]
+                names = [*parameters, *(["strokes"] if declared.scribbles else []), *MIXING]
                 raise ValueError(f"{place} must have no entries other than {', '.join(names)}, got {entry}; remove it")
             if not parameters[entry].is_valid(value):
                 wanted = parameters[entry].wanted
@@ -169,7 +198,7 @@ class Step:
         step = Step(edit, strokes, **values)
         if declared.regional is not None and len(step.sliders_inside) != len(step["alpha"]):
             raise ValueError(f"inside of {place} must have as many numbers as alpha; add or drop some")
-        return step
+        return step.mixed(on=on, opacity=opacity)
 
 
 def acting_steps(steps: Iterable[Step]) -> tuple[Step, ...]:
@@ -193,6 +222,16 @@ def working_bytes(landmarks: int, patch_size: int, *, factors: int = 1) -> int:
         factors: number of arrays of the factor's size at once: 1 for filtering, 5 for diagnostics.
     """
     return 4 * (factors * landmarks + 2 * patch_size**2 + 40)
+
+
+def _read_mixing(entries: dict[str, object], place: str) -> tuple[bool, float]:
+    """Whether a step is on, and its opacity."""
+    on, opacity = entries.get("on", True), entries.get("opacity", 1.0)
+    if not isinstance(on, bool):
+        raise ValueError(f"on of {place} must be true or false, got {shown(on)}; correct it")
+    if not is_within(opacity, 0, 1):
+        raise ValueError(f"opacity of {place} must be a number from 0 to 1, got {shown(opacity)}; correct it")
+    return on, float(opacity)
 
 
 def _read_strokes(value: object, declared: Edit, place: str) -> tuple["Stroke", ...]:

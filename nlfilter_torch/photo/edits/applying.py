@@ -1,6 +1,7 @@
 """Applying a step to an image, and caching what later steps of the same kind can reuse."""
 
 from collections.abc import Callable
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -101,7 +102,13 @@ def fit_step(
     """
     edit = edit_of(step, source.size, stride=stride, generator=generator)
     edit.check_channels(source.channels)
-    return fit_edit(edit, source, drawn, working=working)
+    fitted = fit_edit(edit, source, drawn, working=working)
+    return fitted if step.opacity == 1 else fitted.then(partial(over, opacity=step.opacity))
+
+
+def over(image: Tensor, edited: Tensor, opacity: float) -> Tensor:
+    """An edited image, mixed with the one before it."""
+    return edited if opacity == 1 else torch.lerp(image.to(edited.dtype), edited, opacity)
 
 
 @full_precision
@@ -123,17 +130,19 @@ class PreparedStep:
 
     The filter is computed once, for the first of them, and strokes are rasterised once. ``stride`` is the sampling step
     of the image relative to the photograph, and ``working`` the range in which steps see it, see :func:`fit_edit`.
+    ``fitted`` is the step applied last, as fitted to the image.
     """
 
     def __init__(self, image: Tensor, *, stride: float = 1, working: WorkingRange | None = None) -> None:
         self._source, self._dtype, self._stride = InMemory(image.to(working_dtype(image)), {}), image.dtype, stride
         self._painter, self._working = TensorPainter(), working
+        self.fitted: Fitted | None = None
 
     def __call__(self, step: Step) -> Tensor:
         """Apply a step."""
         drawn = scribbles_of(step, self._source.size, self._painter)
-        fitted = fit_step(step, self._source, drawn, stride=self._stride, working=self._working)
-        return self._source.all(fitted).to(self._dtype)
+        self.fitted = fit_step(step, self._source, drawn, stride=self._stride, working=self._working)
+        return self._source.all(self.fitted).to(self._dtype)
 
 
 def viewed_stride(step: Step, size: tuple[int, int], stride: float) -> float:

@@ -21,8 +21,13 @@ class Controls:
         self.brush = Brush()
         self.changes: list[tuple[str, Mapping[str, object], bool]] = []
         self.cleared: list[str] = []
+        self.replaced: list[tuple[Recipe, int | None]] = []
         self.link = Link(
-            lambda: self.recipe, self.brush, lambda *change: self.changes.append(change), self.cleared.append
+            lambda: self.recipe,
+            self.brush,
+            lambda *change: self.changes.append(change),
+            self.cleared.append,
+            lambda *change: self.replaced.append(change),
         )
 
     def show(self, tab: EditTab, recipe: Recipe) -> None:

@@ -59,3 +59,16 @@ def test_levels(panel: Panel) -> None:
     panel.draw_levels("<svg></svg>", (0.02, 0.0), (0.012, 0.0))
     assert panel._clipped.text.endswith("; before the edit 1.2 % and 0.0 %")
     assert "warning" in panel._clipped.classes
+
+
+def test_tabs_of_acting_steps_are_marked_and_opened_from_the_list(
+    shown: Controls, panel: Panel, opened: list[str]
+) -> None:
+    shown.recipe = Recipe((Step("tone"), Step("sharpen").mixed(on=False)))
+    panel.follow()
+    assert [tab.props["name"] for tab in shown.of(ui.tab) if "alert" in tab.props] == ["tone"]
+    shown.click("Sharpen")
+    assert opened[-1] == "sharpen"
+    shown.recipe = Recipe()
+    panel.follow()
+    assert not any("alert" in tab.props for tab in shown.of(ui.tab))

@@ -105,7 +105,7 @@ def test_preset_keeps_every_entry() -> None:
         ("alpha = 1", "look.json is not a preset: it is not JSON"),
         ("[1, 2]", "look.json is not a preset: it must hold a list of steps"),
         ('{"bandwidth": 3}', "look.json is not a preset: it must hold a list of steps"),
-        ('{"version": 1, "steps": [{"edit": "tone"}]}', "--preset must hold a look or a single detail step without"),
+        ('{"version": 1, "steps": [{"edit": "tone"}]}', "--preset must hold a look or a single detail step, without"),
         ('{"alpha": [2, 1]}', "look.json is not a preset: it must hold a list of steps"),
         (
             detail_file('"alpha": [1]'),

@@ -108,6 +108,16 @@ def test_files_hold_the_whole_edit() -> None:
     assert [step["edit"] for step in entries["steps"]] == ["detail", "colorize", "recolor", "defocus", "abstract"]
 
 
+def test_steps_are_replaced_and_moved() -> None:
+    recipe = Recipe((Step("tone"), Step("sharpen"), Step("tone", clarity=2.0)))
+    assert recipe.place_of("tone") == 2
+    assert recipe.place_of("detail") is None
+    assert recipe.replaced(1).steps == (recipe.steps[0], recipe.steps[2])
+    assert recipe.replaced(1, Step("detail")).steps[1] == Step("detail")
+    assert recipe.moved(2, 0).steps == (recipe.steps[2], *recipe.steps[:2])
+    assert recipe.moved(0, 1).moved(1, 0) == recipe
+
+
 def test_presets_are_edits(tmp_path: Path) -> None:
     crisp = PRESETS["crisp"]
     assert find_recipe("crisp") == crisp

@@ -84,3 +84,32 @@ def test_files_of_steps_have_defaults_only_on_request() -> None:
     assert Step.from_entries("abstract", entries, "abstract") == step
     assert acting_steps([step, Step.idle("tone")]) == (step,)
     assert json.loads(json_of([])) == {"version": 1, "steps": []}
+
+
+def test_steps_that_are_off_or_mixed_come_back_from_files(pixels: torch.Tensor) -> None:
+    """And are applied: off or at opacity 0 a step changes nothing, in between it is mixed with the picture before."""
+    step = Step("tone", contrast=1.4, landmarks=30)
+    recipe = Recipe((step.mixed(on=False), step.mixed(opacity=0.25)))
+    assert Recipe.from_json(recipe.to_json(drawn=True), "edit.json") == recipe
+    assert Recipe.from_json(recipe.to_json(), "edit.json").steps == recipe.acting == recipe.steps[1:]
+    assert step.mixed(on=False, opacity=0.5).changed(clarity=2.0) == step.changed(clarity=2.0).mixed(
+        on=False, opacity=0.5
+    )
+    assert not step.mixed(opacity=0.0).changes()
+    assert step.mixed(on=False).would_change()
+    whole = apply_recipe(Recipe((step,)), pixels)
+    assert torch.allclose(apply_recipe(recipe, pixels), pixels.lerp(whole, 0.25), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("entry", "sentence"),
+    [
+        ('"on": 1', "on of tone, step 1 in edit.json must be true or false, got 1; correct it"),
+        ('"opacity": 2', "opacity of tone, step 1 in edit.json must be a number from 0 to 1, got 2; correct it"),
+        ('"opacity": true', "opacity of tone, step 1 in edit.json must be a number from 0 to 1, got true; correct it"),
+        ('"onn": true', "entries other than contrast, .*, on, opacity, got onn; remove it"),
+    ],
+)
+def test_what_is_not_on_nor_an_opacity(entry: str, sentence: str) -> None:
+    with pytest.raises(ValueError, match=sentence):
+        Recipe.from_json(f'{{"version": 1, "steps": [{{"edit": "tone", {entry}}}]}}', "edit.json")
