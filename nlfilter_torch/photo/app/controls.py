@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Self
 
 from nicegui import ui
 
@@ -10,6 +11,7 @@ from nlfilter_torch.photo.declared.declaration import Parameter
 from nlfilter_torch.photo.declared.json_values import Value
 from nlfilter_torch.photo.declared.parameters import EDITS
 from nlfilter_torch.photo.declared.presets import Recipe
+from nlfilter_torch.photo.declared.steps import Step
 
 Change = Callable[[str, Mapping[str, Value], bool], None]  # step, values, whether the change is complete
 UNITS = {"gain": "\u00d7", "%": "%"}
@@ -47,6 +49,19 @@ class Control:
         step = recipe.last(self.edit)
         numbers: tuple[float, ...] = step[self.parameter.name]
         return step.sliders_inside if self.parameter.name == "inside" else numbers
+
+    def usual(self, recipe: Recipe) -> float:
+        """The slider's value at the start; in a region, that of the slider elsewhere.
+
+        >>> OF_EDIT["sharpen"][0].usual(Recipe())
+        1.0
+        """
+        step = Step.idle(self.edit)
+        if self.parameter.name == "inside":
+            step = step.changed(inside=recipe.last(self.edit)["alpha"])
+        elif self.index is not None:
+            step = step.changed(strokes=None, **{self.parameter.name: (1.0,) * len(self._numbers(recipe))})
+        return self.read(Recipe((step,)))
 
     def entries(self, recipe: Recipe, value: float) -> dict[str, Value]:
         """The values of the step's parameters for a value of the slider."""
@@ -99,10 +114,19 @@ OF_EDIT: dict[str, tuple[Control, ...]] = {
 }
 
 
+RESETTING = ("dblclick", "keydown.home.prevent", "keydown.delete", "keydown.backspace")
+
+
 class SteadySlider(ui.slider):
     """A slider to which the server does not send values back, since a late one would move it away from the pointer."""
 
     LOOPBACK = False
+
+    def on_reset(self, reset: Callable[[], object]) -> Self:
+        """Call a function on a double-click, or when Home, Delete or Backspace is pressed."""
+        for event in RESETTING:
+            self.on(event, lambda _: reset(), args=[])
+        return self
 
 
 class Slider:
@@ -125,6 +149,7 @@ class Slider:
             self._slider.props(f'aria-label="{control.slider.label}{suffix}" dense')
             self._slider.on_value_change(lambda event: self._moved(event.value))
             self._slider.on("change", lambda event: self._released(float(event.args)))
+            self._slider.on_reset(self.reset)
         self._value.set_text(control.show(value))
 
     def follow(self) -> None:
@@ -134,6 +159,10 @@ class Slider:
         self._slider.set_value(value)
         self._following = False
         self._value.set_text(self._control.show(value))
+
+    def reset(self) -> None:
+        """Set the slider to its value at the start."""
+        self._released(self._control.usual(self._recipe()))
 
     def _moved(self, value: float | None) -> None:
         if self._following or value is None:

@@ -32,7 +32,7 @@ class DetailTab(EditTab):
         super().follow()
         automatic = isinstance(detail["bandwidth"], str)
         self._automatic.set_value(automatic)
-        self._bandwidth.set_visibility(not automatic)
+        self._by_hand.set_visibility(not automatic)
         if not automatic:
             self._bandwidth.set_value(detail["bandwidth"])
         self._name_preset(detail)
@@ -58,17 +58,18 @@ class DetailTab(EditTab):
         self._build_brush(EDITS[self._edit].hint)
 
     def _build_bandwidth(self) -> None:
-        with ui.row().classes("w-full items-center no-wrap gap-3 q-mt-xs"):
-            label = ui.label("Detail is").classes("text-no-wrap")
-            label.tooltip(
+        self._automatic = ui.checkbox("Choose from the photograph what counts as detail", value=True)
+        self._automatic.props("dense").classes("q-mt-xs")
+        self._automatic.on_value_change(lambda event: self._set_bandwidth("auto" if event.value else BANDWIDTH))
+        with ui.column().classes("control gap-0") as self._by_hand:
+            ui.label("Largest difference that counts as detail").tooltip(
                 "How different two places may be and still count as alike, in grey levels of 255. Small values affect "
                 "only fine texture, large ones treat much as detail."
             )
-            self._automatic = ui.checkbox("as the photo suggests", value=True).props("dense")
-            self._automatic.on_value_change(lambda event: self._set_bandwidth("auto" if event.value else BANDWIDTH))
-        self._bandwidth = controls.SteadySlider(min=2, max=80, step=1, value=BANDWIDTH)
-        self._bandwidth.props('dense label aria-label="Bandwidth"')
-        self._bandwidth.on("change", lambda event: self._set_bandwidth(float(event.args)))
+            self._bandwidth = controls.SteadySlider(min=2, max=80, step=1, value=BANDWIDTH)
+            self._bandwidth.props('dense label aria-label="Bandwidth"')
+            self._bandwidth.on("change", lambda event: self._set_bandwidth(float(event.args)))
+            self._bandwidth.on_reset(lambda: self._set_bandwidth(BANDWIDTH))
 
     def _build_sliders(self, detail: Step) -> None:
         self._box.clear()
@@ -76,7 +77,7 @@ class DetailTab(EditTab):
         with self._box:
             if detail.has_region():
                 ui.label("In the region").classes("group")
-                ui.label("They begin as the sliders elsewhere, and move by themselves.").classes("hint")
+                ui.label("They start at the values of the sliders below, and change the region only.").classes("hint")
                 inside = controls.detail_sliders("inside", len(detail.sliders_inside))
                 sliders += [self._slider(control, " in the region") for control in inside]
                 sliders += [self._slider(control) for control in controls.OF_EDIT[self._edit]]

@@ -87,6 +87,7 @@ class Editor:
         ui.keyboard(on_key=self._key)
         ui.on("closeup", lambda event: self._look(event.args))
         ui.on("stroke_dropped", self._canvas.drop_stroke)
+        ui.on("save_photo", self._ask_photo_name)
         self._client.on_connect(lambda: self._begin(image, address))
 
     def picture(self, kind: str, place: str) -> bytes | None:
@@ -128,7 +129,7 @@ class Editor:
                 js=presets.choosing,
             )
             _button("Save edit", "bookmark_add", "For other photographs, and for the command line", self._ask_edit_name)
-            _button("Save photo", "save", "At full size, into a file", self._ask_photo_name).props(
+            _button("Save photo", "save", "At full size, into a file; Ctrl+S", self._ask_photo_name).props(
                 "color=primary unelevated", remove="flat"
             )
 

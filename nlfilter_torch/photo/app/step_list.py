@@ -95,6 +95,7 @@ class StepList:
             )
             opacity.on_value_change(lambda event: self._mix(place, event.value, place))
             opacity.on("change", lambda event: self._mix(place, float(event.args), None))
+            opacity.on_reset(partial(self._mix, place, 100.0, None))
             value = ui.label("").classes("value")
             last = len(places) - 1
             self._button(name, "up", "arrow_upward", number > 0, partial(self._move, place, places[max(number - 1, 0)]))

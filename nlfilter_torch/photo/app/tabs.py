@@ -7,8 +7,8 @@ from functools import partial
 from nicegui import ui
 
 from nlfilter_torch.photo.app import controls
-from nlfilter_torch.photo.app.brush import BRUSHES, COLOURS, Brush
-from nlfilter_torch.photo.app.controls import Change, Control, Slider
+from nlfilter_torch.photo.app.brush import BRUSHES, COLOURS, RADIUS, Brush
+from nlfilter_torch.photo.app.controls import Change, Control, Slider, SteadySlider
 from nlfilter_torch.photo.app.step_list import Replace
 from nlfilter_torch.photo.declared.parameters import EDITS
 from nlfilter_torch.photo.declared.presets import Recipe
@@ -51,8 +51,12 @@ class EditTab:
 
     def _build(self) -> None:
         ui.label(EDITS[self._edit].hint).classes("hint")
+        needs_strokes = EDITS[self._edit].requires_strokes  # then painting comes first
+        if needs_strokes:
+            self._build_brush()
         self._sliders += [self._slider(control) for control in controls.OF_EDIT[self._edit]]
-        self._build_brush()
+        if not needs_strokes:
+            self._build_brush()
 
     def _slider(self, control: Control, suffix: str = "") -> Slider:
         return Slider(control, self._link.recipe, self._link.change, suffix)
@@ -75,16 +79,19 @@ class EditTab:
             self._build_colours()
         with ui.row().classes("w-full items-center no-wrap gap-3 q-mt-xs"):
             ui.label("Size").tooltip("Radius of the brush, in hundredths of the short side")
-            size = ui.slider(min=0.5, max=10, step=0.5, value=100 * brush.radius[edit])
+            size = SteadySlider(min=0.5, max=10, step=0.5, value=100 * brush.radius[edit])
             size.props('dense label aria-label="Brush size"')
             size.on_value_change(lambda event: brush.radius.update({edit: event.value / 100}))
+            size.on_reset(lambda: size.set_value(100 * RADIUS))
 
     def _build_colours(self) -> None:
+        """Build a field for the colour that the brush paints, the same in all tabs, and buttons for some colours."""
         brush = self._link.brush
-        field = ui.color_input("Colour", value=brush.colour, on_change=lambda event: brush.choose_colour(event.value))
-        field.props("dense outlined").classes("w-full q-mt-xs")
         with ui.row().classes("gap-2 q-mt-xs"):
             for colour in COLOURS:
-                ui.button(on_click=partial(field.set_value, colour)).props(
+                ui.button(on_click=partial(brush.choose_colour, colour)).props(
                     f'round dense unelevated size=sm aria-label="{colour}"'
                 ).style(f"background: {colour} !important")
+        field = ui.color_input("Colour", value=brush.colour, on_change=lambda event: brush.choose_colour(event.value))
+        field.props("dense outlined").classes("w-full q-mt-xs")
+        brush.shown.append(field.set_value)

@@ -60,3 +60,19 @@ def test_a_slider_on_the_page(client: Client) -> None:
     assert slider._slider.value == 0.8
     assert slider._value.text.startswith("0.8")
     assert len(changes) == 2
+
+
+def test_sliders_are_reset(client: Client) -> None:
+    """To where they start, or in a region to the slider elsewhere; by a double-click and by keys."""
+    recipe = Recipe((Step("detail", alpha=(3.0, 2.0, 1.0), inside=(4.0, 1.0, 1.0)), Step("denoise")))
+    usual = {c.slider.label: c.usual(recipe) for c in (*controls.OF_EDIT["denoise"], *controls.OF_EDIT["abstract"])}
+    assert usual["Strength"] == usual["Flatten"] == 0.0
+    assert usual["Tones"] == 1.0
+    assert [c.usual(recipe) for c in controls.detail_sliders("alpha", 3)] == [1.0, 1.0, 1.0]
+    assert [c.usual(recipe) for c in controls.detail_sliders("inside", 3)] == [3.0, 2.0, 1.0]
+    changes: list[tuple[str, Mapping[str, object], bool]] = []
+    slider = Slider(controls.detail_sliders("alpha", 3)[0], lambda: recipe, lambda *change: changes.append(change))
+    for listener in slider._slider._event_listeners.values():
+        if listener.type in ("dblclick", "keydown.home.prevent"):
+            listener.handler(None)
+    assert changes == [("detail", {"alpha": (1.0, 2.0, 1.0)}, True)] * 2

@@ -61,10 +61,10 @@ def test_a_preset_keeps_the_sliders_of_a_region_with_as_many_layers(shown: Contr
 def test_the_bandwidth(shown: Controls, tab: DetailTab) -> None:
     shown.show(tab, Recipe((Step("detail", bandwidth=15.0),)))
     assert (tab._automatic.value, tab._bandwidth.value) == (False, 15.0)
-    assert tab._bandwidth.visible
+    assert tab._by_hand.visible
     shown.show(tab, Recipe((Step("detail", bandwidth="auto"),)))
     assert tab._automatic.value
-    assert not tab._bandwidth.visible
+    assert not tab._by_hand.visible
     tab._automatic.set_value(False)
     assert shown.changes == [("detail", {"bandwidth": 20.0}, True)]
 

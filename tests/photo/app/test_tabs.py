@@ -34,14 +34,18 @@ def test_the_sliders_follow_the_edit(shown: Controls) -> None:
 def test_the_settings_of_the_brush(shown: Controls) -> None:
     EditTab("recolor", shown.link)
     EditTab("defocus", shown.link)
-    words, others = shown.of(ui.toggle)
+    EditTab("colorize", shown.link)  # whose field shows the same colour
+    words, others, _ = shown.of(ui.toggle)
     assert (words.value, others.value) == ("colour", "in")
     words.set_value("keep")
     assert shown.brush.paint("recolor") == "keep"
     assert shown.brush.paint("defocus") == "in"
     words.set_value("colour")
-    shown.click(COLOURS[2])
+    buttons = [button for button in shown.of(ui.button) if button.props.get("aria-label") == COLOURS[2]]
+    for listener in buttons[0]._event_listeners.values():
+        listener.handler(None)
     assert shown.brush.paint("recolor") == COLOURS[2]
+    assert {field.value for field in shown.of(ui.color_input)} == {COLOURS[2]}
     sizes = [slider for slider in shown.of(ui.slider) if slider.props["aria-label"] == "Brush size"]
     sizes[1].set_value(5.0)
     assert (shown.brush.radius["recolor"], shown.brush.radius["defocus"]) == (0.02, 0.05)

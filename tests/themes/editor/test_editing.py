@@ -38,6 +38,27 @@ def test_picture_follows_a_slider_and_undo(opened: Tab) -> None:
     opened.wait_for_picture(before)
     expect(opened.page.get_by_text("4.00 ×")).to_be_visible()
 
+    before = opened.source()
+    opened.page.get_by_role("checkbox", name="Detail: on").click()
+    opened.wait_for_picture(before)
+    assert difference(opened.picture(), wanted) < 4
+    opened.page.get_by_role("checkbox", name="Detail: on").click()
+    page = opened.page
+    page.keyboard.down("o")
+    expect(page.get_by_text("before", exact=True)).to_have_css("opacity", "1")
+    page.keyboard.up("o")
+    expect(page.get_by_text("before", exact=True)).to_have_css("opacity", "0")
+    opened.slider("Texture").focus()
+    focused = (
+        "() => [document.activeElement.role, document.activeElement.ariaLabel, document.activeElement.ariaValueNow]"
+    )
+    assert page.evaluate(focused) == ["slider", "Texture", "4"]
+    page.keyboard.press("Home")
+    expect(opened.page.get_by_text("4.00 ×")).not_to_be_visible()
+    expect(opened.slider("Texture")).to_have_attribute("aria-valuenow", "1")
+    page.keyboard.press("Control+s")
+    expect(page.get_by_role("dialog", name="Save the photograph")).to_be_visible()
+
 
 def test_stroke_shows_a_mask_and_sliders_of_the_region(opened: Tab) -> None:
     """The mask is shown for a second, or while its box is checked, but never while a slider moves."""

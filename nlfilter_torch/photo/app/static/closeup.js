@@ -28,6 +28,7 @@ class Closeup {
   #address = ""; // of its pictures
   #view = views.WHOLE;
   #wipe = 0;
+  #isOriginal = false; // whether a key that shows the original is held
   #hasBrush = true;
   #gestures = new Gestures();
   #timer = 0;
@@ -75,6 +76,19 @@ class Closeup {
   wipe(share) {
     this.#wipe = share;
     this.#draw();
+  }
+
+  /** Show the photograph before the edit, or again as the wipe has it. */
+  original(isShown) {
+    if (this.#isOriginal !== isShown) {
+      this.#isOriginal = isShown;
+      this.#draw();
+    }
+  }
+
+  /** Hundredths of what is visible that show the photograph before the edit. */
+  get #before() {
+    return this.#isOriginal ? 100 : this.#wipe;
   }
 
   /** Zoom to the next larger (1) or smaller (-1) scale. */
@@ -154,7 +168,7 @@ class Closeup {
     }
     const frame = this.#frame();
     this.#view = views.withinBorders(this.#view, frame);
-    this.#place(views.placement(this.#view, frame, this.#wipe));
+    this.#place(views.placement(this.#view, frame, this.#before));
     const level = document.querySelector(".zoom-level");
     if (level) {
       level.textContent = `${Math.round(100 * views.scaleOf(this.#view, frame))} %`;
@@ -184,7 +198,7 @@ class Closeup {
       "--right": `${right}px`,
       "--down": `${down}px`,
       "--cut": cut,
-      "--wipe": this.#wipe,
+      "--wipe": this.#before,
       "--left": `${left}px`,
       "--top": `${top}px`,
     };
@@ -201,7 +215,7 @@ class Closeup {
       this.#told = text;
       emitEvent("closeup", part);
     }
-    if (part && this.#wipe > 0) {
+    if (part && this.#before > 0) {
       this.#showOriginal(part);
     }
   }
@@ -243,7 +257,8 @@ class Closeup {
     document.addEventListener("pointercancel", (event) => this.#up(event), true);
     document.addEventListener("wheel", (event) => this.#turn(event), { capture: true, passive: false });
     document.addEventListener("keydown", (event) => this.#press(event));
-    document.addEventListener("keyup", (event) => event.key === " " && this.hand(false));
+    document.addEventListener("keyup", (event) => this.#release(event));
+    window.addEventListener("blur", () => this.original(false));
   }
 
   #isOnCanvas(event) {
@@ -304,6 +319,13 @@ class Closeup {
     }
   }
 
+  #release(event) {
+    const [name] = actionOfKey(event.key, 0) ?? [];
+    if (name === "hand" || name === "original") {
+      this[name](false);
+    }
+  }
+
   /** Whether an action of a key is meant for the photograph, and not for the element that has the focus. */
   #isFor(name, target) {
     switch (name) {
@@ -320,7 +342,7 @@ class Closeup {
     if (name === "pan") {
       this.#pan(...values);
     } else {
-      this[name](...values); // step, fit, full, hand
+      this[name](...values); // step, fit, full, hand, original
     }
   }
 }

@@ -94,6 +94,10 @@ export function actionOfKey(key, width) {
       return ["full"];
     case " ":
       return ["hand", true];
+    case "o":
+    case "O":
+    case "\\":
+      return ["original", true];
     default:
       return Object.hasOwn(ARROWS, key) ? ["pan", ...ARROWS[key].map((share) => share * FAR * width)] : null;
   }

@@ -1,5 +1,9 @@
 /** What the page does beside zoom and pan: the question before it is left, and what its controls send to the server. */
 
+/* global emitEvent -- of NiceGUI: sends an event to the server */
+
+import { watchSliders } from "./sliders.js";
+
 /** The page, as the server and the controls use it. */
 class Page {
   /** Whether the edit has changed since a file was written; the server sets it. */
@@ -38,7 +42,21 @@ class Page {
       }
     });
   }
+
+  /** Ask for a name to save the photograph under on Ctrl+S, in place of the browser's dialog. */
+  saveByKey() {
+    window.addEventListener("keydown", (event) => {
+      if ((event.ctrlKey || event.metaKey) && event.key.toLowerCase() === "s" && !event.shiftKey && !event.altKey) {
+        event.preventDefault();
+        if (!event.repeat && !document.querySelector(".q-dialog")) {
+          emitEvent("save_photo");
+        }
+      }
+    });
+  }
 }
 
 window.page = new Page();
 window.page.askBeforeLeaving();
+window.page.saveByKey();
+watchSliders();

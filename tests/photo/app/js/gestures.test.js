@@ -107,6 +107,10 @@ test("keys", () => {
     ["step", -1],
   ]);
   assert.deepEqual(["0", "1", " "].map((key) => actionOfKey(key, 800)), [["fit"], ["full"], ["hand", true]]);
+  assert.deepEqual(["o", "\\"].map((key) => actionOfKey(key, 800)), [
+    ["original", true],
+    ["original", true],
+  ]);
   assert.deepEqual(actionOfKey("ArrowLeft", 800), ["pan", 120, 0]);
   assert.deepEqual(actionOfKey("ArrowDown", 800), ["pan", 0, -120]);
   assert.equal(actionOfKey("a", 800), null);
