@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
     from nlfilter_torch.photo.declared.steps import Step
     from nlfilter_torch.photo.look_fitting.fit_look import FittedLook
+    from nlfilter_torch.photo.look_fitting.own_steps import FittedSteps
 
 Before = Annotated[str, typer.Argument(metavar="BEFORE", help="The photograph before the edit, or a folder of them.")]
 After = Annotated[
@@ -89,6 +90,8 @@ def fit(
 
     For other programs: `nlfilter-torch fit before.jpg after.jpg look.json --cube look.cube`
 
+    If this program made the edit, by detail, tone or sharpen, its steps and their parameters are saved instead.
+
     Each --mask is a region that has a look of its own, in numbered files:
 
     `nlfilter-torch fit before.jpg after.jpg look.json --mask sky.png --mask ground.png`
@@ -97,8 +100,6 @@ def fit(
 
     from nlfilter_torch.photo.cli.progress import steps
     from nlfilter_torch.photo.io.writing import open_beside
-    from nlfilter_torch.photo.look_fitting.alignment import explained
-    from nlfilter_torch.photo.look_fitting.fit_look import fit_look
 
     tables = Tables(cube, hald)
     paths = _paths(before, after)
@@ -110,22 +111,47 @@ def fit(
     judged = (alone and not mask) or preview is not None or left is not None
     with steps(len(paths) + 1) as begin:
         pairs = Pairs(paths, regions, step, begin, keeps_first=judged)
-        fitted = fit_look(iter(pairs), order=layers - 1, step=step)
+        looks_only = bool(mask) or cube is not None or hald is not None
+        looks, own = _fitted(pairs, layers - 1, step, looks_only=looks_only)
         begin("Judging")
-        looks = fitted if isinstance(fitted, tuple) else (fitted,)
-        judgement = None if pairs.first is None else _judged(looks, *pairs.first)
+        changes: Sequence[FittedLook | FittedSteps] = looks if own is None else (own,)
+        judgement = None if pairs.first is None else _judged(changes, step, *pairs.first)
         if judgement is not None:
             _draw(*judgement, preview, left)
-        for look, path in zip(looks, results, strict=True):
+        for change, path in zip(changes, results, strict=True):
             with open_beside(path) as stream:
-                stream.write(look.to_json().encode())
+                stream.write(change.to_json().encode())
         tables.write(looks)
     whole = judgement if alone and not mask else None
-    for look, path in zip(looks, results, strict=True):
-        _report(look, look.fitted if whole is None else explained(*whole), path, alone=alone)
+    _report_all(looks, own, results, whole, alone=alone)
     if whole is not None and pairs.first is not None:
-        tables.report(looks[0], *whole[:2])
+        if own is None:
+            tables.report(looks[0], *whole[:2])
         _tell_where(*whole, stride=pairs.first[0].shape[-1] / whole[0].shape[-1])
+
+
+def _fitted(
+    pairs: "Pairs", order: int, step: "Step", *, looks_only: bool
+) -> "tuple[tuple[FittedLook, ...], FittedSteps | None]":
+    """Looks, one for each region, and the steps that explain more than the look does; None if there are none.
+
+    With steps that explain a single pair nearly whole, no look is fitted to it.
+    """
+    from nlfilter_torch.photo.look_fitting.fit_look import fit_look
+    from nlfilter_torch.photo.look_fitting.own_steps import StepSearch
+
+    search = None if looks_only else StepSearch(step, order)
+    if search is not None and len(pairs.paths) == 1:
+        images = list(search.watching(pairs))
+        own = search.fitted()
+        if own.are_nearly_all:
+            return (), own
+        fitted = fit_look(images, order=order, step=step)
+    else:
+        fitted = fit_look(iter(pairs) if search is None else search.watching(pairs), order=order, step=step)
+    looks = fitted if isinstance(fitted, tuple) else (fitted,)
+    steps = None if search is None else search.fitted()
+    return looks, steps if steps is not None and steps.explain_more_than(looks[0].left_out) else None
 
 
 @dataclass
@@ -273,20 +299,58 @@ def _read(before: Path, after: Path, step: "Step") -> "tuple[Tensor, Tensor]":
 
 
 def _judged(
-    looks: "Sequence[FittedLook]", image: "Tensor", edited: "Tensor", masks: "Tensor | None" = None
+    looks: "Sequence[FittedLook | FittedSteps]",
+    step: "Step",
+    image: "Tensor",
+    edited: "Tensor",
+    masks: "Tensor | None" = None,
 ) -> "tuple[Tensor, Tensor, Tensor]":
-    """A pair at the viewing size, and the result of the looks, each in its region."""
+    """A pair at the viewing size, and the result of the looks, each in its region, or of steps."""
     from nlfilter_torch.photo.picture.changes import blend_edited
     from nlfilter_torch.photo.picture.resizing import resize
     from nlfilter_torch.photo.picture.viewing import viewed_size
 
     whole = (image.shape[2], image.shape[3])
-    size = viewed_size(whole, looks[0].step["viewing_size"])
+    size = viewed_size(whole, step["viewing_size"])
     if size != whole:
         image, edited = (resize(planes, size).clamp(0, 1) for planes in (image, edited))
         masks = None if masks is None else resize(masks, size).clamp(0, 1)
     results = [look.apply(image).clamp(0, 1) for look in looks]
     return image, edited, results[0] if masks is None else blend_edited(image, results, masks)
+
+
+def _report_all(
+    looks: "Sequence[FittedLook]",
+    own: "FittedSteps | None",
+    paths: Sequence[Path],
+    whole: "tuple[Tensor, Tensor, Tensor] | None",
+    *,
+    alone: bool,
+) -> None:
+    """Print what the looks, or the steps, are and what they are worth."""
+    from nlfilter_torch.photo.look_fitting.alignment import explained
+
+    share = None if whole is None else explained(*whole)
+    if own is not None:
+        _report_steps(own, looks, own.fitted if share is None else share, paths[0], alone=alone)
+        return
+    for look, path in zip(looks, paths, strict=True):
+        _report(look, look.fitted if share is None else share, path, alone=alone)
+
+
+def _report_steps(own: "FittedSteps", looks: "Sequence[FittedLook]", share: float, path: Path, *, alone: bool) -> None:
+    """Print the steps as commands, and what they are worth beside a look."""
+    typer.echo(f"{'explained of the change by':40}{'fitted':>8}{'left out':>10}")
+    rows = {" + ".join(names): shares for names, shares in own.explained.items()}
+    if looks:
+        rows["a look"] = looks[0].fitted, looks[0].left_out
+    for name, (fitted, left_out) in rows.items():
+        typer.echo(f"{name:40}{100 * fitted:7.1f} %{100 * left_out:8.1f} %")
+    for number, step in enumerate(own.steps, 1):
+        typer.echo(f"step {number}: {step.edit} {step.as_options()}")
+    others = "parts of the picture left out of the fit" if alone else "other photographs"
+    typer.echo(f"explained: {100 * share:.1f} % of the change, {100 * own.left_out:.1f} % in {others}")
+    typer.echo(f"preset: {path}")
 
 
 def _report(look: "FittedLook", share: float, path: Path, *, alone: bool) -> None:

@@ -200,11 +200,14 @@ class Detail(FilteredEdit):
         """What is changed: luminance, or all channels."""
         return whole_image if self.channels == "all" else luminance
 
+    def guide(self, size: tuple[int, int]) -> Guide:
+        """The guide of a picture (H, W) at the viewing size, and the options of the filter."""
+        return Guide(self.filter_options(size, fewer_landmarks=True), exact=self.residual is not None)
+
     def _filtered(self, viewed: Source[M], order: int) -> Polynomial:
         """The filter of a picture, which gives changes by sliders less 1."""
-        options = self.filter_options(viewed.size, fewer_landmarks=True)
         residual = None if self.residual is None else self.residual - 1
-        operator = viewed.operator(Guide(options, exact=residual is not None))
+        operator = viewed.operator(self.guide(viewed.size))
         return Polynomial.of(operator, self.planes, order, residual)
 
     def _fit_whole(self, source: Source[M], alpha: Tensor) -> Fitted:

@@ -114,11 +114,14 @@ class Sharpen(FilteredEdit):
         SHARPEN.check(source.batch, viewing_size=self.viewing_size)
         return fit_change(source, self._change, luminance, self.viewing_size, self.limits)
 
+    def guide(self, size: tuple[int, int]) -> Guide:
+        """The guide of a picture (H, W) at the viewing size, and the options of the filter."""
+        return Guide(self.filter_options(size), transform=_grey, blur=self.guide_blur)
+
     def _change(self, viewed: Source[M]) -> Fitted:
         """The unsharp mask of a picture at the viewing size."""
         check_reach(self.guide_blur, "guide_blur", viewed.size)
-        guide = Guide(self.filter_options(viewed.size), transform=_grey, blur=self.guide_blur)
-        layers = viewed.operator(guide).layers(luminance, 1)
+        layers = viewed.operator(self.guide(viewed.size)).layers(luminance, 1)
         noise = viewed.kept("noise of luminance", [], partial(noise_of, viewed, "luminance"))
         strength = (torch.as_tensor(self.amount, dtype=viewed.dtype).reshape(-1, 1, 1, 1) - 1) / UNIT
         margin = blur_margin(RADIUS) + blur_margin(VARIANCE_SIGMA)

@@ -113,10 +113,13 @@ class Tone(FilteredEdit):
         TONE.check(source.batch, clarity=self.clarity)
         return fit_change(source, self._change, luminance, self.viewing_size, self.limits)
 
+    def guide(self, size: tuple[int, int]) -> Guide:
+        """The guide of a picture (H, W) at the viewing size, and the options of the filter."""
+        return Guide(self.filter_options(size, fewer_landmarks=True))
+
     def _change(self, viewed: Source[M]) -> Fitted:
         """The change of luminance of a picture at the viewing size."""
-        options = self.filter_options(viewed.size, fewer_landmarks=True)
-        operator, mean = viewed.operator(Guide(options)), viewed.mean(luminance)
+        operator, mean = viewed.operator(self.guide(viewed.size)), viewed.mean(luminance)
         filtered = Polynomial.of(operator, partial(_without, mean), self.order, None)
         return Fitted(partial(filtered, alpha=self._sliders(viewed.batch, viewed.dtype)))
 

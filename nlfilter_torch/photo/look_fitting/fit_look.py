@@ -132,7 +132,7 @@ def fit_look(
     choices = _choices(names)
     layout = Layout(KNOTS, SATURATIONS, order + 1)
     regions: list[_Region] = []
-    for number, (before, after, masks) in enumerate(_images(pairs)):
+    for number, (before, after, masks) in enumerate(images_of(pairs)):
         count = 1 if masks is None else len(masks)
         regions = regions or [
             _Region(layout, [], kept=KeptPixels() if "lattice" in names else None) for _ in range(count)
@@ -280,7 +280,7 @@ def _rounded(values: Tensor) -> tuple[float, ...]:
     return tuple(round(value, 6) for value in values.tolist())
 
 
-def _images(pairs: Iterable[Pair]) -> Iterator[tuple[Tensor, Tensor, Tensor | None]]:
+def images_of(pairs: Iterable[Pair]) -> Iterator[tuple[Tensor, Tensor, Tensor | None]]:
     """Each image of the pairs, in colour: (3, H, W) before and after the edit, and masks (K, H, W)."""
     number = 0
     for pair in pairs:
