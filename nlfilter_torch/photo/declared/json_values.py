@@ -68,5 +68,7 @@ def plain(value: Value) -> Value:
     (0.5, (2, 1.0), 'auto')
     """
     if isinstance(value, tuple):
+        if all(type(entry) is float for entry in value):  # quicker than the protocol, for long lists
+            return value
         return tuple(entry.item() if isinstance(entry, SupportsItem) else entry for entry in value)
     return value.item() if isinstance(value, SupportsItem) else value

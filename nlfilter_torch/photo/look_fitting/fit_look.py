@@ -277,7 +277,7 @@ FILTER_NAMES = ("bandwidth", "spatial_bandwidth", "patch_size", "landmarks", "sa
 
 
 def _rounded(values: Tensor) -> tuple[float, ...]:
-    return tuple(round(value, 6) for value in values.tolist())
+    return tuple(values.double().round(decimals=6).tolist())
 
 
 def images_of(pairs: Iterable[Pair]) -> Iterator[tuple[Tensor, Tensor, Tensor | None]]:

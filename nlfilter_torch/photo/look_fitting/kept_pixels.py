@@ -7,6 +7,7 @@ from functools import reduce
 import torch
 from torch import Tensor
 
+from nlfilter_torch.photo.look_fitting.lattice_details import refined
 from nlfilter_torch.photo.look_fitting.lattice_fit import ColourChange, fit_lattice
 from nlfilter_torch.photo.look_fitting.look_choice import SHRINK, SLACK, Candidate
 from nlfilter_torch.photo.look_fitting.look_pixels import PixelSample
@@ -101,7 +102,7 @@ class KeptPixels:
         )
         weights = torch.cat([pixels.shown for pixels, _, _ in self.samples]).double()
         colours = ColourChange(before, after, self._predicted(looks, layout), weights / weights.sum(), group)
-        fitted = fit_lattice(colours)
+        fitted = refined(colours, fit_lattice(colours))
         left, without = 1 - fitted.left_out, 1 - fitted.without
         if (CLEARLY if left > SURROUNDINGS else SLACK) * left + CLEAR >= without:
             return None

@@ -10,6 +10,7 @@ along each axis.
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -21,6 +22,7 @@ RIDGE = 1e-3  # of the changes where there are no pixels, see :meth:`Penalised.r
 SCARCE = 0.01  # pixels at a node, relative to an even distribution, at which half of the ridge remains
 STEPS, TOLERANCE = 200, 1e-3  # of conjugate gradients
 GRIDS = (9, 17)  # numbers of nodes along each axis
+LOOSER = 0.99  # a looser lattice is chosen if it leaves at most this share of what a stiffer one leaves
 FINER = 0.95  # a finer grid is chosen if it leaves at most this share of what a coarser one leaves
 
 
@@ -68,6 +70,7 @@ class FittedLattice:
         left_out: the same for pixels left out of the fit.
         without: share of the change of these that the look explains without it.
         density: weights of the pixels at the nodes, (n^3,).
+        first: changes (3, n, n, n) fitted without the first fold.
     """
 
     changes: Tensor
@@ -75,6 +78,7 @@ class FittedLattice:
     left_out: float
     without: float
     density: Tensor
+    first: Tensor
 
 
 def fit_lattice(pixels: ColourChange) -> FittedLattice:
@@ -86,17 +90,17 @@ def fit_lattice(pixels: ColourChange) -> FittedLattice:
     power = max(pixels.energy(pixels.after - pixels.before), 1e-30)
     without = sum(pixels.energy(pixels.left(0.0, fold), fold) for fold in range(number))
     problem, fine = (Problem.of(pixels, nodes) for nodes in GRIDS)
-    smooth, folds = problem.smoothest(without)
+    smooth, folds, first = problem.smoothest(without)
     left = sum(folds)
     cross = fine.cross(0)
     start = fine.solve([0], smooth, cross, torch.zeros_like(cross))
     finer = fine.left_of(0, start[0])
     if finer < FINER * folds[0]:
-        problem, left = fine, left * finer / folds[0]
+        problem, left, first = fine, left * finer / folds[0], start[0]
     changes = problem.solve_all(smooth, start if problem is fine else None)
     fitted = 1 - pixels.energy(pixels.left(problem.at_pixels(changes), number)) / power
-    changes = changes.view(3, *[problem.sums.nodes] * 3)
-    return FittedLattice(changes, fitted, 1 - left / power, 1 - without / power, problem.sums.all().density[0])
+    changes, first = (values.view(3, *[problem.sums.nodes] * 3) for values in (changes, first))
+    return FittedLattice(changes, fitted, 1 - left / power, 1 - without / power, problem.sums.all().density[0], first)
 
 
 @dataclass(frozen=True)
@@ -141,30 +145,31 @@ class Problem:
         """For each fold, products (folds, 3, n^3) of the nodes and what is left of the pixels of the others."""
         return torch.stack([self.products(fold, fold) for fold in folds])
 
-    def smoothest(self, most: float) -> tuple[float, list[float]]:
+    def smoothest(self, most: float) -> tuple[float, list[float], Tensor]:
         """The smoothness that leaves least of the folds that are left out, and what it leaves of each.
 
-        ``most`` is left without a lattice.
+        Also the changes (3, n^3) fitted without the first fold. ``most`` is left without a lattice.
         """
         cross = self.cross(*self.folds)
-        changes, best = torch.zeros_like(cross), (SMOOTH[0], [most / len(self.folds)] * len(self.folds))
+        changes = torch.zeros_like(cross)
+        best = (SMOOTH[0], [most / len(self.folds)] * len(self.folds), changes[0])
         for smooth in SMOOTH:
             changes = self.solve(self.folds, smooth, cross, changes)
             left = [self.left_of(fold, changes[fold]) for fold in self.folds]
-            if sum(left) > sum(best[1]):
+            if sum(left) > LOOSER * sum(best[1]):
                 break
-            best = smooth, left
+            best = smooth, left, changes[0]
         return best
 
     def solve(self, folds: list[int], smooth: float, cross: Tensor, start: Tensor) -> Tensor:
         """For each fold, the changes (folds, 3, n^3) fitted to the others."""
-        others = self.sums.without()
-        return Penalised(CellSums(others.nodes, others.bands[:, folds]), smooth).solve(cross, start)
+        return conjugate_gradients(Penalised(self.sums.without(*folds), smooth), cross, start)
 
     def solve_all(self, smooth: float, start: Tensor | None = None) -> Tensor:
         """Changes (3, n^3) fitted to all pixels."""
         cross = self.products(len(self.folds)).unsqueeze(0)
-        return Penalised(self.sums.all(), smooth).solve(cross, torch.zeros_like(cross) if start is None else start)[0]
+        start = torch.zeros_like(cross) if start is None else start
+        return conjugate_gradients(Penalised(self.sums.all(), smooth), cross, start)[0]
 
     def left_of(self, fold: int, changes: Tensor) -> float:
         """Energy of what is left of a fold by changes (3, n^3) that were fitted without it."""
@@ -203,9 +208,9 @@ class CellSums:
                 bands.index_add_(0, index, weights * shares[first] * shares[second])
         return CellSums(nodes, bands.view(len(offsets), number, nodes**3))
 
-    def without(self) -> "CellSums":
-        """For each fold, the sums over the others."""
-        return CellSums(self.nodes, self.bands.sum(1, keepdim=True) - self.bands)
+    def without(self, *folds: int) -> "CellSums":
+        """For each of some folds, the sums over the others."""
+        return CellSums(self.nodes, self.bands.sum(1, keepdim=True) - self.bands[:, list(folds)])
 
     def all(self) -> "CellSums":
         """The sums over all folds."""
@@ -219,11 +224,55 @@ class CellSums:
             density[:, offset:] += band[:, :-offset]
         return density
 
+    def __call__(self, changes: Tensor) -> Tensor:
+        """The matrix of the sums, times changes (folds, 3, n^3)."""
+        bands = self.bands.unsqueeze(2)
+        result = bands[0] * changes
+        for band, offset in zip(bands[1:], _offsets(self.nodes)[1:], strict=True):
+            result[..., :-offset].addcmul_(band[..., :-offset], changes[..., offset:])
+            result[..., offset:].addcmul_(band[..., :-offset], changes[..., :-offset])
+        return result
+
 
 def _offsets(nodes: int) -> list[int]:
     """Distances between the indices of two nodes of a tetrahedron, ascending."""
     red, green, blue = nodes * nodes, nodes, 1
     return [0, blue, green, green + blue, red, red + blue, red + green, red + green + blue]
+
+
+class Quadratic(Protocol):
+    """A least-squares problem for changes (folds, 3, n^3)."""
+
+    def __call__(self, changes: Tensor) -> Tensor:
+        """The matrix of the problem, times changes."""
+        ...
+
+    def conditioned(self, values: Tensor) -> Tensor:
+        """Values times the inverse of an approximate matrix."""
+        ...
+
+
+def conjugate_gradients(problem: Quadratic, cross: Tensor, start: Tensor) -> Tensor:
+    """Changes (folds, 3, n^3) at the nodes, from products with what is to be explained, in the same shape.
+
+    ``start`` is where the search starts.
+    """
+    result = start
+    rest = cross - problem(result)
+    direction = ready = problem.conditioned(rest)
+    size = (rest * ready).sum(2, keepdim=True)
+    limit = TOLERANCE**2 * (cross * problem.conditioned(cross)).sum(2, keepdim=True)
+    for _ in range(STEPS):
+        if bool((size <= limit).all()):
+            break
+        image = problem(direction)
+        length = size / (direction * image).sum(2, keepdim=True).clamp(min=1e-300)
+        result = result + length * direction
+        rest = rest - length * image
+        ready = problem.conditioned(rest)
+        size, before = (rest * ready).sum(2, keepdim=True), size
+        direction = ready + size / before.clamp(min=1e-300) * direction
+    return result
 
 
 @dataclass(frozen=True)
@@ -238,36 +287,9 @@ class Penalised:
     sums: CellSums
     smooth: float
 
-    def solve(self, cross: Tensor, start: Tensor) -> Tensor:
-        """Changes (folds, 3, n^3) at the nodes, from products with what is to be explained, in the same shape.
-
-        ``start`` is where the search starts.
-        """
-        result = start
-        rest = cross - self(result)
-        direction = ready = self.conditioned(rest)
-        size = (rest * ready).sum(2, keepdim=True)
-        limit = TOLERANCE**2 * (cross * self.conditioned(cross)).sum(2, keepdim=True)
-        for _ in range(STEPS):
-            if bool((size <= limit).all()):
-                break
-            image = self(direction)
-            length = size / (direction * image).sum(2, keepdim=True).clamp(min=1e-300)
-            result = result + length * direction
-            rest = rest - length * image
-            ready = self.conditioned(rest)
-            size, before = (rest * ready).sum(2, keepdim=True), size
-            direction = ready + size / before.clamp(min=1e-300) * direction
-        return result
-
     def __call__(self, changes: Tensor) -> Tensor:
         """The matrix of the problem, times changes (folds, 3, n^3)."""
-        bands = self.sums.bands.unsqueeze(2)
-        result = self._bent(changes).addcmul_(bands[0] + self.ridge.unsqueeze(1), changes)
-        for band, offset in zip(bands[1:], _offsets(self.sums.nodes)[1:], strict=True):
-            result[..., :-offset].addcmul_(band[..., :-offset], changes[..., offset:])
-            result[..., offset:].addcmul_(band[..., :-offset], changes[..., :-offset])
-        return result
+        return self._bent(changes).add_(self.sums(changes)).addcmul_(self.ridge.unsqueeze(1), changes)
 
     @cached_property
     def even(self) -> Tensor:
