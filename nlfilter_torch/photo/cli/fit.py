@@ -292,6 +292,8 @@ def _read(before: Path, after: Path, step: "Step") -> "tuple[Tensor, Tensor]":
     image, edited, done = align(first, second, str(before), str(after))
     if done:
         options.note(done)
+    if bool((image == image[..., :1, :1]).all()):
+        options.note(f"{before} has a single colour; what the look does to others is not known")
     if bool((image == edited).all()):
         raise ValueError(f"{after} must differ from {before}, but they are the same; give an edited photograph")
     check_belong(image[0].expand(3, -1, -1), edited[0].expand(3, -1, -1), str(before), str(after))
@@ -360,7 +362,11 @@ def _report(look: "FittedLook", share: float, path: Path, *, alone: bool) -> Non
     for parts, (fitted, left_out) in look.explained.items():
         if len(parts) == 1 or parts in (without_lattice, look.parts):
             name = " + ".join(CALLED[part] for part in parts)
-            typer.echo(f"{name:40}{100 * fitted:7.1f} %{100 * left_out:8.1f} %")
+            typer.echo(f"{name:40}{100 * fitted:z7.1f} %{100 * left_out:z8.1f} %")
+    if len(look.added) > 1:
+        typer.echo("of this, each part adds to those above it")
+        for part, (fitted, left_out) in look.added.items():
+            typer.echo(f"{CALLED[part]:40}{100 * fitted:+z7.1f} %{100 * left_out:+z8.1f} %")
     typer.echo("alpha: " + ", ".join(f"{slider:.3f}" for slider in look.step["alpha"]))
     others = "parts of the picture left out of the fit" if alone else "other photographs"
     typer.echo(f"explained: {100 * share:.1f} % of the change, {100 * look.left_out:.1f} % in {others}")

@@ -7,10 +7,14 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.operator.features import reduce_channels
+from nlfilter_torch.photo.look_fitting.scaled_crop import scaled_crop
 from nlfilter_torch.photo.picture.resizing import resize
 
 SAME_SHAPE = 0.02  # largest difference of log aspect ratios at which an edited picture counts as resized
 MIN_CORRELATION = 0.6  # correlation required between a crop and its position
+SURE = 0.95  # correlation from which on a crop of the same size needs no other search
+RESIZED_CORRELATION = 0.85  # required of a crop of another size, as some part of any landscape is like another
+BETTER = 0.003  # by which the correlation of a resized crop must be larger
 SEARCH_SIDE = 400  # short side in pixels of the reduced picture in which a crop is searched for first
 MAX_SHIFT = 0.1  # largest shift, as a share of the short side
 PLAIN = 2.5 / 255  # largest difference of colours within a frame, after lossy compression too
@@ -58,14 +62,25 @@ def _aligned_of_same_size(
 
 
 def _aligned_of_other_size(before: Tensor, after: Tensor, name: str, edited: str) -> tuple[Tensor, Tensor, str]:
-    """:func:`align` for an edited picture of another size: resize it, or find it in the original."""
+    """:func:`align` for an edited picture of another size: resize it, or find it in the original, resized or not."""
     (height, width), other = before.shape[-2:], after.shape[-2:]
     ratio = (other[1] / other[0]) / (width / height)
     resized = resize(after, (height, width)).clamp(0, 1) if abs(math.log(ratio)) < SAME_SHAPE else None
     (row, column), likeness = (0, 0), -1.0
     if other[0] <= height and other[1] <= width:
         (row, column), likeness = _place(before, after)
-    if resized is not None and _correlation(_grey(before), _grey(resized)) >= likeness:
+    whole = -1.0 if resized is None else _correlation(_grey(before), _grey(resized))
+    if (
+        likeness < SURE
+        and (scaled := _scaled_crop(before, after, max(whole, likeness, RESIZED_CORRELATION))) is not None
+    ):
+        (top, left), first, second = scaled
+        size = f"{second.shape[-1]}x{second.shape[-2]}"
+        done = (
+            f"{edited} is resized from {other[1]}x{other[0]} to {size}, a crop of {name} from row {top}, column {left}"
+        )
+        return first, second, done
+    if resized is not None and whole >= likeness:
         return before, resized, f"{edited} is resized from {other[1]}x{other[0]} to {width}x{height}"
     if likeness < MIN_CORRELATION:
         raise ValueError(
@@ -74,6 +89,20 @@ def _aligned_of_other_size(before: Tensor, after: Tensor, name: str, edited: str
         )
     part = before[..., row : row + other[0], column : column + other[1]]
     return part, after, f"{edited} is a crop of {name} from row {row}, column {column}"
+
+
+def _scaled_crop(before: Tensor, after: Tensor, likeness: float) -> tuple[tuple[int, int], Tensor, Tensor] | None:
+    """The place of a resized crop in a photograph, its part there, and the crop at that size.
+
+    None unless their correlation is clearly above ``likeness``.
+    """
+    place = scaled_crop(_grey(before), _grey(after))
+    if place is None:
+        return None
+    top, left, height, width = place
+    part = before[..., top : top + height, left : left + width]
+    resized = resize(after, (height, width)).clamp(0, 1)
+    return ((top, left), part, resized) if _correlation(_grey(part), _grey(resized)) > likeness + BETTER else None
 
 
 def frame(before: Tensor, after: Tensor) -> tuple[int, int, int, int]:

@@ -1,7 +1,7 @@
 """Looks from pairs of photographs before and after an edit."""
 
 from collections.abc import Collection, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import reduce
 
 import torch
@@ -21,6 +21,7 @@ from nlfilter_torch.photo.look_fitting.look_choice import (
     CHOICES,
     RIDGES,
     Candidate,
+    added_by_parts,
     choose,
     choose_from_one,
     fit_parts,
@@ -53,6 +54,7 @@ class FittedLook:
         fitted: share of the change of the pairs that it explains, 1 at best, clipped values aside.
         left_out: share of the change of pairs, or of parts of a single picture, explained by looks fitted without them.
         explained: the same two for every choice of parts that was tried.
+        added: what each part adds to these two, the most first; the lattice, fitted to what the others leave, is last.
     """
 
     step: Step
@@ -60,6 +62,7 @@ class FittedLook:
     fitted: float
     left_out: float
     explained: dict[Parts, tuple[float, float]]
+    added: dict[str, tuple[float, float]] = field(default_factory=dict)
 
     def apply(self, image: Tensor, *, generator: torch.Generator | None = None) -> Tensor:
         """An image (B, C, H, W) in [0, 1] under the look; values may leave [0, 1]. Differentiable in the image."""
@@ -230,8 +233,16 @@ class _Region:
                 parts = (*basis.parts, "lattice")
                 explained[parts] = more.fitted, more.left_out
                 changed = self._step(replace(basis, parts=parts, coefficients=more.coefficients), step, more.lattice)
-                return FittedLook(changed, parts, more.fitted, more.left_out, explained)
-        return FittedLook(self._step(best, step), best.parts, best.fitted, best.left_out, explained)
+                added = self._added(basis)
+                added["lattice"] = more.fitted - basis.fitted, more.left_out - basis.left_out
+                return FittedLook(changed, parts, more.fitted, more.left_out, explained, added)
+        return FittedLook(self._step(best, step), best.parts, best.fitted, best.left_out, explained, self._added(best))
+
+    def _added(self, look: Candidate) -> dict[str, tuple[float, float]]:
+        """What each part adds to the shares that a look explains."""
+        alone = len(self.folds) == 1 and bool(self.squares)
+        groups, stiff = (self.squares or [], STIFF_ALONE) if alone else (self.folds, STIFF)
+        return added_by_parts(look, groups, self.layout, stiff, alone=alone)
 
     def _step(self, look: Candidate, step: Step, lattice: Tensor | None = None) -> Step:
         """The look as a step of an edit: of detail if it consists of sliders alone."""

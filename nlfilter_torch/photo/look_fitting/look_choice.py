@@ -174,6 +174,29 @@ def choose_from_one(
     return replace(best, coefficients=coefficients, fitted=fitted), candidates
 
 
+def added_by_parts(
+    best: Candidate, folds: Sequence[Sums], layout: Layout, stiff: float, *, alone: bool = False
+) -> dict[str, tuple[float, float]]:
+    """What each part of a look adds to the share that is explained, of fitted and of left-out data, the most first.
+
+    Begins with the part that explains most of the left-out data by itself, and goes on with the one that adds most.
+    """
+    shares: dict[str, tuple[float, float]] = {}
+    total = (0.0, 0.0)
+    while len(shares) < len(best.parts):
+        trials = {}
+        for part in best.parts:
+            if part not in shares:
+                parts = tuple(other for other in best.parts if other in shares or other == part)
+                whole = len(parts) == len(best.parts)
+                trials[part] = best if whole else choose(folds, layout, [parts], stiff, alone=alone)[parts]
+        part = max(trials, key=lambda name: trials[name].left_out)
+        reached = trials[part].fitted, trials[part].left_out
+        shares[part] = reached[0] - total[0], reached[1] - total[1]
+        total = reached
+    return shares
+
+
 def _products(sums: Sums, spread: Tensor) -> tuple[Tensor, Tensor]:
     """Gram matrix (P, P) of the parameters, and their products with the change, (P,)."""
     gram = torch.einsum("cfp,cfg,cgq->pq", spread, sums.gram, spread)

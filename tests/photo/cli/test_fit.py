@@ -13,6 +13,7 @@ from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.edits.applying import apply_step
 from nlfilter_torch.photo.io.photographs import Photograph, read_photograph, write_photograph
+from nlfilter_torch.photo.picture.resizing import resize
 from tests.looks import ALPHA, CAT, CUP, SEPIA, explained, in_bytes, rgb
 
 
@@ -160,6 +161,35 @@ def test_a_preset_is_written_over(before: Path) -> None:
     preset.write_text("an older one")
     assert fit(before, edit(before), preset) == 0
     assert Recipe.from_json(preset.read_text(), "look.json").steps[0]["alpha"] == pytest.approx(ALPHA, rel=0.02)
+
+
+def test_a_small_jpeg_of_the_camera_beside_a_tiff(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    shot, camera = tmp_path / "shot.tif", tmp_path / "camera.jpg"
+    pixels = rgb("coffee", slice(0, 400, 2), slice(100, 500, 2))
+    blurred = torch.nn.functional.avg_pool2d(pixels, 3, 1, 1, count_include_pad=False)
+    developed = (pixels + 0.4 * (pixels - blurred)).clamp(0, 1) ** 0.7 * torch.tensor([1.0, 0.95, 0.8]).view(1, 3, 1, 1)
+    write_photograph(Photograph(pixels, "uint16"), shot)
+    write_photograph(Photograph(resize(developed[..., 4:-4, 6:-6], (144, 141)).clamp(0, 1)), camera)
+    assert fit(shot, camera, tmp_path / "look.json") == 0
+    told = capsys.readouterr()
+    assert "camera.jpg is resized from 141x144 to 188x192, a crop of" in told.err
+    before, added = told.out.split("of this, each part adds to those above it\n")
+    shares = [re.findall(r"([+-]\d+\.\d) %", line) for line in added.splitlines()]
+    total = [float(share) for share in re.findall(r"(\d+\.\d) %", before.splitlines()[-1])]
+    for column in (0, 1):
+        assert sum(float(row[column]) for row in shares if row) == pytest.approx(total[column], abs=0.5)
+    assert total[1] > 90
+
+
+def test_a_pair_of_one_colour(before: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    plain, after = before.with_name("plain.png"), before.with_name("after.png")
+    write_photograph(Photograph(torch.full((1, 3, 30, 40), 0.4)), plain)
+    write_photograph(Photograph(torch.tensor([0.6, 0.4, 0.2]).view(1, 3, 1, 1).expand(-1, -1, 30, 40)), after)
+    assert fit(plain, after, before.with_name("look.json")) == 0
+    told = capsys.readouterr()
+    assert "plain.png has a single colour; what the look does to others is not known" in told.err
+    assert "explained: 100.0 % of the change" in told.out
+    assert "-0.0 %" not in told.out
 
 
 def test_what_cannot_be_fitted_is_told(before: Path, capsys: pytest.CaptureFixture[str]) -> None:

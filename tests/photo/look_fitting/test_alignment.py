@@ -49,3 +49,20 @@ def test_pictures_of_one_brightness_are_not_shifted(recwarn: pytest.WarningsReco
         assert torch.equal(second, after)
         assert done == ""
     assert not recwarn
+
+
+def test_crops_of_another_size_are_found() -> None:
+    crop = (CAT**0.6)[..., 6:74, 10:94]
+    small = torch.nn.functional.interpolate(crop, (51, 63), mode="area")
+    first, second, done = align(CAT, small, "before", "after")
+    row, column = 6, 10
+    assert f"after is resized from 63x51 to {second.shape[-1]}x{second.shape[-2]}, a crop of before from row" in done
+    assert abs(second.shape[-2] - 68) <= 1
+    assert abs(second.shape[-1] - 84) <= 1
+    assert (first - CAT[..., row : row + first.shape[-2], column : column + first.shape[-1]]).abs().mean() < 0.02
+    assert (first**0.6 - second).abs().mean() < 0.02
+
+
+def test_other_photographs_of_another_size_are_refused() -> None:
+    with pytest.raises(ValueError, match="after must have the size of before"):
+        align(CAT, CUP[..., :40, :30], "before", "after")

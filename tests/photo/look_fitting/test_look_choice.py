@@ -33,3 +33,16 @@ def test_of_candidates_that_leave_as_little_the_first_is_the_simplest() -> None:
     candidates = {parts: Candidate(parts, nothing, 0.9, 0.9, risk) for parts, risk in risks.items()}
     assert simplest(candidates).parts == ("tone",)
     assert len(set(CHOICES)) == len(CHOICES)
+
+
+def test_what_parts_add_is_what_the_look_explains() -> None:
+    blurred = torch.nn.functional.avg_pool2d(CAT, 3, 1, 1, count_include_pad=False)
+    after = in_bytes((CAT + 0.5 * (CAT - blurred)).clamp(0, 1) ** 0.7 * torch.tensor([1.0, 0.9, 0.8]).view(1, 3, 1, 1))
+    look = single_look(fit_look([(CAT, after)], step=FEW))
+    assert set(look.added) == set(look.parts)
+    assert len(look.added) > 1
+    fitted, left_out = (sum(shares) for shares in zip(*look.added.values(), strict=True))
+    assert abs(fitted - look.fitted) < 1e-6
+    assert abs(left_out - look.left_out) < 1e-6
+    first = next(iter(look.added))
+    assert look.added[first] == max(look.added.values(), key=lambda shares: shares[1])

@@ -1,0 +1,37 @@
+"""Parts of photographs that other pictures show at another size."""
+
+import pytest
+import torch
+
+from nlfilter_torch.photo.look_fitting.scaled_crop import scaled_crop
+from nlfilter_torch.photo.picture.resizing import resize
+from tests.looks import CAT, CUP
+
+GREY = resize(CAT, (160, 200)).mean((0, 1)).double().clamp(0, 1)
+
+
+@pytest.mark.parametrize(
+    ("row", "column", "height", "width", "size"),
+    [
+        (4, 6, 152, 188, (76, 94)),
+        (30, 50, 100, 120, (60, 72)),
+        (3, 5, 80, 100, (80, 100)),
+        (2, 4, 154, 192, (231, 288)),
+    ],
+)
+def test_parts_are_found_to_a_pixel(row: int, column: int, height: int, width: int, size: tuple[int, int]) -> None:
+    part = resize(GREY[None, None, row : row + height, column : column + width] ** 0.6, size)[0, 0]
+    place = scaled_crop(GREY, part)
+    assert place is not None
+    assert max(abs(got - wanted) for got, wanted in zip(place, (row, column, height, width), strict=True)) <= 2
+    top, left, rows, columns = place
+    shown = resize(part[None, None], (rows, columns))[0, 0]
+    inside = GREY[top : top + rows, left : left + columns]
+    assert torch.stack([inside.flatten(), shown.flatten()]).corrcoef()[0, 1] > 0.97
+
+
+def test_pictures_without_anything_to_compare() -> None:
+    assert scaled_crop(GREY, torch.full((30, 40), 0.5, dtype=torch.float64)) is None
+    assert scaled_crop(GREY[:1, :1], GREY[:1, :1]) is None
+    place = scaled_crop(torch.zeros(40, 50, dtype=torch.float64), CUP.mean((0, 1)).double()[:20, :25])
+    assert place is None or all(isinstance(number, int) for number in place)
