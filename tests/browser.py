@@ -22,6 +22,7 @@ CHROMIUM = next(
     (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None
 )
 SCREENS = [(390, 844), (800, 600), (1280, 800), (1920, 1080)]  # width and height
+TOUCHED, POINTED = SCREENS[::2], SCREENS[1::2]  # long tests take two of them by finger, and two by mouse
 TIMEOUT = 60_000  # milliseconds, of everything that is waited for; a machine may be busy
 
 

@@ -32,6 +32,7 @@ from nlfilter_torch import (
     segment_mask,
     spectral_filter,
 )
+from nlfilter_torch.core import communicator as communicator_module
 from nlfilter_torch.core.communicator import ALONE, RowCommunicator, all_gather_shapes
 from tests.problems import noise, picture, seeded
 from tests.ranks import run_ranks
@@ -316,6 +317,7 @@ def loss_of(call: Callable[[], object]) -> tuple[str, float]:
 def work(rank: int, folder: str) -> None:
     """One of the processes."""
     torch.set_num_threads(1)
+    communicator_module.ANSWERING = timedelta(seconds=3)
     dist.init_process_group("gloo", init_method=f"file://{folder}/rendezvous", rank=rank, world_size=PROCESSES)
     for name, (members, cuts) in GROUPS.items():
         group = dist.new_group(list(members))

@@ -16,6 +16,7 @@ relative to the picture, so that an edit made on a preview applies to the photog
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -134,6 +135,7 @@ class Recipe:
         return Recipe(tuple(_read_steps(entries, name)))
 
     @staticmethod
+    @lru_cache(maxsize=4)  # a command asks for the file of an option more than once
     def from_file(content: bytes, name: str) -> "Recipe":
         """Parse a file of steps, as :meth:`from_json` does, or a colour table: a ``.cube`` file, or a Hald picture.
 

@@ -19,8 +19,8 @@ LINES = Recipe((Step("abstract", edges=0.8, tones=6),))
 
 def test_the_preview_is_replaced_by_what_a_file_holds(browser: Browser, tmp_path: Path) -> None:
     """The preview appears first and then what a file holds."""
-    photograph = Photograph(resize(cat(1), (1200, 1800)).clamp(0, 1))
-    assert PIXELS < 1200 * 1800
+    photograph = Photograph(resize(cat(1), (1010, 1515)).clamp(0, 1))
+    assert PIXELS < 1010 * 1515
     write_photograph(photograph, tmp_path / "large.png")
     photograph = read_photograph(tmp_path / "large.png")  # rounded to 256 levels, on which the tones depend
     (tmp_path / "lines.json").write_text(LINES.to_json())

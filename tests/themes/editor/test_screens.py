@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Browser, Locator, expect
 
-from tests.browser import SCREENS, Editor, Tab, by_finger
+from tests.browser import POINTED, SCREENS, TOUCHED, Editor, Tab, by_finger
 
 
 def test_keyboard_focus_can_be_seen(opened: Tab) -> None:
@@ -43,8 +43,9 @@ def test_layout_on_every_screen(
     tab.close()
 
 
-@pytest.mark.parametrize("touch", [False, True])
-@pytest.mark.parametrize(("width", "height"), SCREENS)
+@pytest.mark.parametrize(
+    ("width", "height", "touch"), [*[(*size, True) for size in TOUCHED], *[(*size, False) for size in POINTED]]
+)
 def test_an_edit_on_every_screen(
     browser: Browser, editor: Editor, folder: Path, width: int, height: int, touch: bool
 ) -> None:

@@ -9,7 +9,7 @@ from playwright.sync_api import Browser, Page, expect
 
 from nlfilter_torch.photo.declared.presets import find_recipe
 from nlfilter_torch.photo.io.photographs import Photograph, read_photograph, write_photograph
-from tests.browser import SCREENS, Editor, Fingers, Tab, running
+from tests.browser import POINTED, TOUCHED, Editor, Fingers, Tab, running
 from tests.problems import cat
 
 WIDTH, HEIGHT = 450, 300
@@ -81,7 +81,7 @@ class Zoomed(Tab):
             assert (pixels - part).abs().max() <= 1.001 / 255
 
 
-@pytest.mark.parametrize(("width", "height"), SCREENS)
+@pytest.mark.parametrize(("width", "height"), POINTED)
 def test_zoom_and_pan_by_mouse_keys_and_buttons(browser: Browser, editor: Editor, width: int, height: int) -> None:
     tab = Zoomed.at(browser, editor.url, width, height)
     tab.wait_until_ready()
@@ -121,7 +121,7 @@ def test_zoom_and_pan_by_mouse_keys_and_buttons(browser: Browser, editor: Editor
     tab.close()
 
 
-@pytest.mark.parametrize(("width", "height"), SCREENS)
+@pytest.mark.parametrize(("width", "height"), TOUCHED)
 def test_zoom_and_pan_by_fingers(browser: Browser, editor: Editor, width: int, height: int) -> None:
     tab = Zoomed.at(browser, editor.url, width, height, touch=True)
     tab.wait_until_ready()
