@@ -177,7 +177,7 @@ def in_the_browser(path: Path) -> None:
     try:
         with chromium() as browser:
             tab = Tab(browser.new_page(viewport={"width": 1400, "height": 1000}))
-            tab.page.goto(editor.url)
+            tab.page.goto(editor.with_token())
             tab.wait_for_picture()
             tab.page.locator(".response circle").first.wait_for()
             slider = tab.slider("Texture")

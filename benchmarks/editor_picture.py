@@ -52,7 +52,7 @@ class Screenshot:
             write_photograph(Photograph(pixels.permute(2, 0, 1)[None].float() / 255), photograph)
             editor = Editor(Path(name), photograph.name)
             try:
-                tab = Tab.at(browser, editor.url, *self.size, touch=self.touch)
+                tab = Tab.at(browser, editor.with_token(), *self.size, touch=self.touch)
                 tab.wait_until_ready()
                 self.work(tab)
                 tab.page.mouse.move(4, 70)  # away from what it explains

@@ -54,11 +54,16 @@ class Editor:
             )
         assert self.process.stdout is not None
         line = self.process.stdout.readline()
-        address = re.search(r"http://\S+/", line)
+        address = re.search(r"(http://\S+/)\?token=(\S+)", line)
         if address is None:
             self.stop()
             raise RuntimeError(self.log.read_text())
-        self.url = address[0]
+        self.url, self.token = address.groups()
+
+    def with_token(self, url: str = "") -> str:
+        """An address of the editor, by default that of its page, for a browser that does not know the token."""
+        url = url or self.url
+        return f"{url}{'&' if '?' in url else '?'}token={self.token}"
 
     def stop(self) -> None:
         """Interrupt the process, as Ctrl+C does; one that does not end within 30 s is killed, and the test fails."""

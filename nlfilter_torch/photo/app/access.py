@@ -1,17 +1,54 @@
-"""Access to the editor: its own pages, at an address of this machine, with files of a limited and stated size."""
+"""Access to the editor: its own pages, for those who know its token, with files of a limited and stated size."""
 
 import ipaddress
+import os
+import secrets
 import socket
-from collections.abc import Iterable
-from urllib.parse import urlsplit
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
+from http.cookies import CookieError, SimpleCookie
+from pathlib import Path
+from urllib.parse import parse_qsl, urlencode, urlsplit
 
-from starlette.datastructures import Headers
-from starlette.responses import PlainTextResponse
-from starlette.types import ASGIApp, Receive, Scope, Send
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.responses import PlainTextResponse, RedirectResponse, Response
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 LOCAL = ("127.0.0.1", "localhost", "::1")
 LARGEST = 1_000_000_000  # bytes of an uploaded file
 FORM = 100_000  # bytes that a form adds to a file, at most
+TOKEN = "token"  # in the query of the address that is printed
+UNKNOWN = "open the address that the editor printed at its start, which holds its token"
+#: No other page can show the editor in a frame and have its user click there, and none is told its address.
+PROTECTION = {
+    "Content-Security-Policy": "frame-ancestors 'none'",
+    "X-Frame-Options": "DENY",
+    "Referrer-Policy": "no-referrer",
+}
+
+
+def token_in(file: Path, *, crashed: bool) -> str:
+    """A random token, which is kept in a file that only the user can read until the editor ends.
+
+    If ``crashed``, it is the token of an earlier editor that did not come to its end, so that its pages find this one.
+    """
+    token = secrets.token_urlsafe(24)
+    with suppress(OSError, ValueError):
+        kept = file.read_text(encoding="ascii")
+        if crashed and len(kept) == len(token) and file.stat().st_mode & 0o077 == 0:
+            return kept
+    with suppress(OSError):
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.unlink(missing_ok=True)
+        with os.fdopen(os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as stream:
+            stream.write(token)
+    return token
+
+
+def forget_token(file: Path) -> None:
+    """Remove the file of a token, since the editor ends."""
+    with suppress(OSError):
+        file.unlink()
 
 
 def names_of(host: str) -> frozenset[str]:
@@ -68,21 +105,72 @@ def _is_numeric(host: str) -> bool:
     return True
 
 
-class Guard:
-    """Refuses requests to an application, and websockets, that :func:`refusal` names for the host it listens on."""
+def is_known(token: str, presented: str | None) -> bool:
+    """Whether a presented token is the right one."""
+    return presented is not None and secrets.compare_digest(token.encode(), presented.encode())
 
-    def __init__(self, app: ASGIApp, host: str) -> None:
+
+class Guard:
+    """Refuses requests to an application, and websockets, that :func:`refusal` names or that lack the token.
+
+    A token in the query of an address is exchanged for a cookie, and disappears from the address. ``name`` is that of
+    the cookie, which browsers share between all ports of a machine.
+    """
+
+    def __init__(self, app: ASGIApp, host: str, token: str, name: str = TOKEN) -> None:
         self._app, self._host, self._names = app, host, names_of(host)
+        self._token, self._name = token, name
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer or pass on."""
-        if scope["type"] in ("http", "websocket"):
-            websocket = scope["type"] == "websocket"
-            refused = refusal(Headers(scope=scope), websocket=websocket, host=self._host, names=self._names)
-            if refused is not None and websocket:
-                await send({"type": "websocket.close", "code": 1008})
-                return
-            if refused is not None:
-                await PlainTextResponse(refused[1], status_code=refused[0])(scope, receive, send)
-                return
-        await self._app(scope, receive, send)
+        if scope["type"] not in ("http", "websocket"):
+            await self._app(scope, receive, send)
+            return
+        websocket = scope["type"] == "websocket"
+        answer = self._answer(scope, websocket=websocket)
+        if answer is None:
+            await self._app(scope, receive, send if websocket else Protected(send))
+        elif websocket:
+            await send({"type": "websocket.close", "code": 1008})
+        else:
+            await answer(scope, receive, Protected(send))
+
+    def _answer(self, scope: Scope, *, websocket: bool) -> Response | None:
+        """What is answered in place of the application, or None."""
+        headers = Headers(scope=scope)
+        refused = refusal(headers, websocket=websocket, host=self._host, names=self._names)
+        if refused is not None:
+            return PlainTextResponse(refused[1], status_code=refused[0])
+        query = parse_qsl(scope.get("query_string", b"").decode("latin-1"))
+        if not websocket and is_known(self._token, dict(query).get(TOKEN)):
+            rest = urlencode([(name, value) for name, value in query if name != TOKEN])
+            response = RedirectResponse(scope["path"] + (f"?{rest}" if rest else ""), status_code=303)
+            response.set_cookie(self._name, self._token, httponly=True, samesite="strict")
+            return response
+        cookies: Mapping[str, str] = {name: cookie.value for name, cookie in _cookies(headers).items()}
+        if is_known(self._token, cookies.get(self._name)):
+            return None
+        return PlainTextResponse(UNKNOWN, status_code=403)
+
+
+def _cookies(headers: Headers) -> SimpleCookie:
+    """The cookies of a request; none if they cannot be read."""
+    cookies = SimpleCookie()
+    with suppress(CookieError):
+        cookies.load(headers.get("cookie", ""))
+    return cookies
+
+
+class Protected:
+    """Sends an answer with the headers of :data:`PROTECTION`."""
+
+    def __init__(self, send: Send) -> None:
+        self._send = send
+
+    async def __call__(self, message: Message) -> None:
+        """Send a part of an answer."""
+        if message["type"] == "http.response.start":
+            headers = MutableHeaders(scope=message)
+            for name, value in PROTECTION.items():
+                headers[name] = value
+        await self._send(message)

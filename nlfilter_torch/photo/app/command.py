@@ -20,8 +20,8 @@ Host = Annotated[
     str,
     typer.Option(
         metavar="ADDRESS",
-        help="Address to listen on. 127.0.0.1 accepts this machine only; with any other, everyone who can reach it can "
-        "use the editor and save to the folder.",
+        help="Address to listen on. 127.0.0.1 accepts this machine only; with any other, everyone who can reach it and "
+        "has its address with the token can use the editor and save to the folder.",
     ),
 ]
 Port = Annotated[int, typer.Option(min=0, max=65535, metavar="N", help="Port to listen on; 0 selects a free one.")]

@@ -9,13 +9,15 @@ import socket
 import sys
 import threading
 import time
+from functools import partial
 from typing import Protocol
 
 from fastapi import Response
 from nicegui import app, binding, ui
 
-from nlfilter_torch.photo.app.access import Guard
+from nlfilter_torch.photo.app.access import TOKEN, Guard, forget_token, token_in
 from nlfilter_torch.photo.app.assets import STATIC, STATIC_ADDRESS
+from nlfilter_torch.photo.app.sidecar import state_folder
 
 TITLE = "nlfilter-torch"
 STARTING, PAUSE = 30.0, 0.05  # seconds for the server to accept connections, and between two attempts
@@ -52,21 +54,24 @@ def serve(pages: Pages, *, host: str, port: int, open_page: bool) -> None:
     Raises:
         ValueError: if it cannot listen on that address; port 0 is a free one.
     """
-    port = _check_address(host, port)
+    port, chosen = _check_address(host, port), port
+    file = state_folder() / f"token-{port}"
+    token = token_in(file, crashed=chosen != 0)
+    app.on_shutdown(partial(forget_token, file))
     binding.MAX_PROPAGATION_TIME = 1.0  # otherwise NiceGUI warns, on standard error, whenever the machine is busy
-    app.add_middleware(Guard, host=host)
+    app.add_middleware(Guard, host=host, token=token, name=f"nlfilter-torch-{port}")
     app.config.quasar_config["loadingBar"] = {"skipHijack": True}  # the page shows what it is doing itself
     app.add_static_files(STATIC_ADDRESS, STATIC, max_cache_age=0)  # another version must not find old files
     app.get("/picture/{token}/{kind}")(Pictures(pages).answer)
     ui.page("/", title=TITLE, language="en-US")(pages.build)
-    app.on_startup(threading.Thread(target=_tell_when_ready, args=(host, port), daemon=True).start)
+    app.on_startup(threading.Thread(target=_tell_when_ready, args=(host, port, token), daemon=True).start)
     ui.run(
         host=host,
         port=port,
         title=TITLE,
         dark=True,
         reload=False,
-        show=open_page,
+        show=f"/?{TOKEN}={token}" if open_page else False,
         tailwind=True,
         binding_refresh_interval=None,
         show_welcome_message=False,
@@ -75,7 +80,7 @@ def serve(pages: Pages, *, host: str, port: int, open_page: bool) -> None:
     )
 
 
-def _tell_when_ready(host: str, port: int) -> None:
+def _tell_when_ready(host: str, port: int, token: str) -> None:
     """Print the address once the server accepts connections, which is a little after the start."""
     reachable = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)  # some systems cannot connect to these
     for _ in range(round(STARTING / PAUSE)):
@@ -85,7 +90,7 @@ def _tell_when_ready(host: str, port: int) -> None:
         except OSError:
             time.sleep(PAUSE)
     shown = f"[{host}]" if ":" in host else host
-    print(f"Editor at http://{shown}:{port}/ - Ctrl+C ends it", flush=True)
+    print(f"Editor at http://{shown}:{port}/?{TOKEN}={token} - Ctrl+C ends it", flush=True)
 
 
 def _check_address(host: str, port: int) -> int:

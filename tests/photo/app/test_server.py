@@ -46,8 +46,8 @@ def test_a_free_port() -> None:
 def test_the_address_is_printed_once_the_server_answers(capsys: pytest.CaptureFixture[str]) -> None:
     with socket.create_server(("127.0.0.1", 0)) as listening:
         port = listening.getsockname()[1]
-        server._tell_when_ready("0.0.0.0", port)
-    assert capsys.readouterr().out == f"Editor at http://0.0.0.0:{port}/ - Ctrl+C ends it\n"
+        server._tell_when_ready("0.0.0.0", port, "abc")
+    assert capsys.readouterr().out == f"Editor at http://0.0.0.0:{port}/?token=abc - Ctrl+C ends it\n"
 
 
 def test_app_says_what_it_lacks(

@@ -43,7 +43,7 @@ def tab(browser: Browser, editor: Editor, folder: Path) -> Iterator[Tab]:
     troubles: list[str] = []
     page.on("pageerror", lambda error: troubles.append(str(error)))
     page.on("request", lambda request: None if request.url.startswith(editor.url) else troubles.append(request.url))
-    page.goto(editor.url)
+    page.goto(editor.with_token())
     yield tab
     page.close()
     # Every script, font and picture is served by the editor itself.

@@ -38,7 +38,7 @@ def defects(page: Page) -> list[tuple[str, str]]:
 
 @pytest.mark.parametrize(("width", "height"), SCREENS)
 def test_no_serious_defect(browser: Browser, editor: Editor, width: int, height: int) -> None:
-    tab = Tab.at(browser, editor.url, width, height, touch=width < 500)
+    tab = Tab.at(browser, editor.with_token(), width, height, touch=width < 500)
     page = tab.page
     tab.wait_until_ready()
     result = {"Detail": defects(page)}

@@ -25,7 +25,7 @@ def test_the_preview_is_replaced_by_what_a_file_holds(browser: Browser, tmp_path
     photograph = read_photograph(tmp_path / "large.png")  # rounded to 256 levels, on which the tones depend
     (tmp_path / "lines.json").write_text(LINES.to_json())
     with running(tmp_path, "large.png") as editor:
-        tab = Tab.at(browser, editor.url)
+        tab = Tab.at(browser, editor.with_token())
         tab.wait_until_ready()
         tab.load_edit(tmp_path / "lines.json")
         size = (tab.picture().shape[-2], tab.picture().shape[-1])

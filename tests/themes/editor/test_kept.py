@@ -48,7 +48,7 @@ def test_reload_second_tab_and_new_start(browser: Browser, shots: Path) -> None:
     editor = Editor(shots, "cat.png")
     kept = shots / "cat.png.edit.json"
     try:
-        tab = Tab.at(browser, editor.url)
+        tab = Tab.at(browser, editor.with_token())
         page = tab.page
         shown(tab)
         undo = page.get_by_role("button", name="Undo")
@@ -61,7 +61,7 @@ def test_reload_second_tab_and_new_start(browser: Browser, shots: Path) -> None:
         page.reload()
         expect(page.locator("path.stroke")).to_have_count(1)
         expect(page.get_by_text("In the region")).to_be_visible()
-        other = Tab.at(browser, page.url)
+        other = Tab.at(browser, editor.with_token(page.url))
         shown(other)
         expect(other.page.locator("path.stroke")).to_have_count(1)
         other.paint((0.6, 0.2), (0.7, 0.2))
@@ -96,7 +96,7 @@ def test_a_photograph_of_another_folder(browser: Browser, shots: Path) -> None:
     """The browser does not reveal its path: its edit is stored in the user's state folder, and restored from there."""
     editor = Editor(shots)
     try:
-        tab = Tab.at(browser, editor.url)
+        tab = Tab.at(browser, editor.with_token())
         tab.open(shots.parent / "elsewhere.png")
         shown(tab)
         tab.paint((0.2, 0.9), (0.3, 0.9))
@@ -110,7 +110,7 @@ def test_a_photograph_of_another_folder(browser: Browser, shots: Path) -> None:
         port = editor.url.rstrip("/").rsplit(":", 1)[1]
         editor.stop()
         editor = Editor(shots, "--port", port)
-        tab = Tab.at(browser, address)
+        tab = Tab.at(browser, editor.with_token(address))
         expect(tab.page.get_by_text("open the photograph again")).to_be_visible()
         tab.open(shots.parent / "elsewhere.png")
         expect(tab.page.locator("path.stroke")).to_have_count(1)

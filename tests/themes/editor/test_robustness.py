@@ -96,7 +96,7 @@ def test_recolouring_a_grey_photograph_says_what_to_do(tab: Tab, folder: Path) -
 def test_two_tabs_edit_two_photographs(opened: Tab, browser: Browser, editor: Editor, folder: Path) -> None:
     coffee = torch.from_numpy(skimage.data.coffee()[::4, ::4].copy()).permute(2, 0, 1)[None].float() / 255
     write_photograph(Photograph(coffee), folder / "coffee.png")
-    other = Tab.at(browser, editor.url)
+    other = Tab.at(browser, editor.with_token())
     other.open(folder / "coffee.png")
     other.wait_for_picture()
     before, others = opened.source(), other.source()
@@ -118,10 +118,17 @@ def test_two_tabs_edit_two_photographs(opened: Tab, browser: Browser, editor: Ed
 
 def test_foreign_names_of_this_machine_are_refused(editor: Editor) -> None:
     host, port = editor.url.removeprefix("http://").rstrip("/").split(":")
-    for name, status in ((f"{host}:{port}", 200), ("evil.example", 400)):
+    known = {"Cookie": f"nlfilter-torch-{port}={editor.token}"}
+    for name, cookies, status in (
+        (f"{host}:{port}", known, 200),
+        (f"{host}:{port}", {}, 403),
+        ("evil.example", known, 400),
+    ):
         connection = http.client.HTTPConnection(host, int(port))
-        connection.request("GET", "/", headers={"Host": name})
-        assert connection.getresponse().status == status
+        connection.request("GET", "/", headers={"Host": name} | cookies)
+        answer = connection.getresponse()
+        assert answer.status == status
+        assert answer.headers["Content-Security-Policy"] == "frame-ancestors 'none'"
         connection.close()
 
 
@@ -150,7 +157,7 @@ def test_other_sites_reach_nothing(tab: Tab, editor: Editor, browser: Browser) -
 
 def test_a_tab_that_is_closed_with_a_dialog_open(opened: Tab, browser: Browser, editor: Editor, folder: Path) -> None:
     """The log stays empty, which the fixture of the editor checks."""
-    other = Tab.at(browser, editor.url)
+    other = Tab.at(browser, editor.with_token())
     other.open(folder / "cat.png")
     other.wait_for_picture()
     other.page.get_by_role("button", name="Save photo").click()
@@ -209,7 +216,7 @@ def test_stopped_in_the_midst_of_saving(browser: Browser, tmp_path: Path) -> Non
     (tmp_path / "out.png").write_bytes(b"what was there")
     editor = Editor(tmp_path, "large.png")
     try:
-        tab = Tab.at(browser, editor.url)
+        tab = Tab.at(browser, editor.with_token())
         tab.wait_until_ready()
         tab.paint((0.2, 0.9), (0.3, 0.9))
         expect(tab.page.get_by_text("In the region")).to_be_visible()
@@ -227,7 +234,7 @@ def test_stopped_in_the_midst_of_saving(browser: Browser, tmp_path: Path) -> Non
         editor = Editor(tmp_path, "large.png", "--port", editor.url.rstrip("/").rsplit(":", 1)[1])
         address = tab.page.url
         tab.close()
-        tab = Tab.at(browser, address)
+        tab = Tab.at(browser, editor.with_token(address))
         expect(tab.page.locator("path.stroke")).to_have_count(1)
         expect(tab.page.get_by_text("4.00 ×")).to_be_visible()
         tab.save("Save photo", "again.png")

@@ -26,7 +26,7 @@ def test_layout_on_every_screen(
     browser: Browser, editor: Editor, folder: Path, width: int, height: int, touch: bool
 ) -> None:
     """Nothing is outside the screen, the panel is beside the photograph, and buttons are large enough."""
-    tab = Tab.at(browser, editor.url, width, height, touch=touch)
+    tab = Tab.at(browser, editor.with_token(), width, height, touch=touch)
     page = tab.page
     tab.open(folder / "cat.png")
     tab.wait_until_ready()
@@ -50,7 +50,7 @@ def test_an_edit_on_every_screen(
     browser: Browser, editor: Editor, folder: Path, width: int, height: int, touch: bool
 ) -> None:
     """A scribble with its mask and sliders, a name that cannot be saved, saving, and loading the page again."""
-    tab = Tab.at(browser, editor.url, width, height, touch=touch)
+    tab = Tab.at(browser, editor.with_token(), width, height, touch=touch)
     page = tab.page
 
     def press(button: Locator) -> None:
