@@ -13,9 +13,7 @@ GREY = resize(CAT, (160, 200)).mean((0, 1)).double().clamp(0, 1)
 @pytest.mark.parametrize(
     ("row", "column", "height", "width", "size"),
     [
-        (4, 6, 152, 188, (76, 94)),
         (30, 50, 100, 120, (60, 72)),
-        (3, 5, 80, 100, (80, 100)),
         (2, 4, 154, 192, (231, 288)),
     ],
 )
