@@ -1,6 +1,7 @@
 """The large picture with its overlays, and the brush that draws on it."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Protocol
 
 from nicegui import ui
@@ -11,6 +12,8 @@ from nlfilter_torch.photo.app.brush import BRUSHES, Brush
 from nlfilter_torch.photo.declared.parameters import DETAIL, EDITS
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.declared.strokes import Stroke
+
+Draw = Callable[[str, Callable[[], None]], None]  # adds a stroke to a step
 
 
 class Painted(Protocol):
@@ -34,20 +37,20 @@ class Canvas:
     Args:
         brush: what draws.
         token: part of the addresses of the pictures.
-        drawn: is called when a stroke is complete.
+        draw: is called with the step and the function that adds a complete stroke to it.
         show_error: is called with a sentence for the user.
 
     Attributes:
         pictures: image files, by their kind.
     """
 
-    def __init__(self, brush: Brush, token: str, drawn: Callable[[], None], show_error: Callable[[str], None]) -> None:
+    def __init__(self, brush: Brush, token: str, draw: Draw, show_error: Callable[[str], None]) -> None:
         self.pictures: dict[str, bytes] = {}
         self.histogram = ""
         self.clipped = self.clipped_before = (0.0, 0.0)  # shares of white and of black, after and before the edit
         self._session: Painted | None = None
         self._preview_size = (1, 1)
-        self._brush, self._token, self._drawn = brush, token, drawn
+        self._brush, self._token, self._draw = brush, token, draw
         self._frame = 0
         self._flashes = 0
         self._mask_shown: bytes | None = None  # the mask that was shown last
@@ -196,8 +199,8 @@ class Canvas:
             self._line.append((x, y))
         else:
             line, self._line = self._line, []
-            self._session.add_stroke(self._step, line, self._brush.radius[self._step], self._brush.paint(self._step))
-            self._drawn()
+            stroke = line, self._brush.radius[self._step], self._brush.paint(self._step)
+            self._draw(self._step, partial(self._session.add_stroke, self._step, *stroke))
         self.draw_strokes()
 
     def drop_stroke(self) -> None:

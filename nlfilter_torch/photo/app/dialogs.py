@@ -5,7 +5,13 @@ from pathlib import Path
 
 from nicegui import ui
 
+from nlfilter_torch.photo.app.controls import SteadySlider
+from nlfilter_torch.photo.app.session import FileOptions
 from nlfilter_torch.photo.app.tasks import EXPECTED
+
+QUALITY, LEAST_QUALITY = 95, 50  # of JPEG files; below, the damage is visible
+LEAST_SIDE = 16  # pixels
+EXISTS = "A file of that name is there already."
 
 
 class NameDialog:
@@ -19,13 +25,28 @@ class NameDialog:
         with ui.dialog().props(f'aria-label="{title}"') as self._dialog, ui.card().classes("dialog"):
             ui.label(title).classes("text-h6")
             self._name = ui.input("Name", value=name).props("outlined autofocus").classes("w-full")
-            self._note = ui.label(f"In {folder.resolve()}").classes("hint")
+            self._build_options()
+            self._note = ui.label().classes("hint").props("aria-live=polite")
             with ui.row().classes("w-full justify-end"):
                 ui.button("Cancel", on_click=lambda: self._dialog.submit(None)).props("flat no-caps")
                 self._ok = ui.button("Save").props("unelevated no-caps color=primary")
-        self._name.on_value_change(lambda: self._ok.set_text("Save"))
+        self._folder = folder
+        self._name.on_value_change(self._follow)
         self._name.on("keydown.enter", self._confirm)
         self._ok.on_click(self._confirm)
+        self._follow()
+
+    def _build_options(self) -> None:
+        """Build what is asked beside the name."""
+
+    def _follow(self) -> None:
+        """Say where the file goes, and whether there is one of that name."""
+        self._ok.set_text("Save")
+        try:
+            exists = self._check(self._name.value).exists()
+        except EXPECTED:  # said once the name is complete
+            exists = False
+        self._note.set_text(EXISTS if exists else f"In {self._folder.resolve()}")
 
     async def answer(self) -> str | None:
         """The name, or None if there is none; the dialog is gone then."""
@@ -42,6 +63,59 @@ class NameDialog:
             return
         if exists and self._ok.text != "Replace":
             self._ok.set_text("Replace")
-            self._note.set_text("A file of that name is there already.")
+            self._note.set_text(f"{EXISTS} Replace it?")
             return
         self._dialog.submit(self._name.value)
+
+
+class SaveDialog(NameDialog):
+    """Asks for the name of a photograph, and for the options of its file.
+
+    ``side`` is the longest side of the photograph in pixels.
+    """
+
+    def __init__(self, title: str, name: str, folder: Path, check: Callable[[str], Path], side: int) -> None:
+        self._longest = side
+        super().__init__(title, name, folder, check)
+
+    @property
+    def options(self) -> FileOptions:
+        """The options of the file."""
+        side = self._side.value
+        shrinks = side is not None and LEAST_SIDE <= side < self._longest
+        return FileOptions(round(self._quality.value), round(side) if shrinks else None)
+
+    def _build_options(self) -> None:
+        with ui.row().classes("w-full items-center no-wrap gap-3") as self._lossy:
+            ui.label("JPEG quality").classes("text-no-wrap")
+            self._quality = SteadySlider(min=LEAST_QUALITY, max=100, step=1, value=QUALITY)
+            self._quality.props('dense label aria-label="JPEG quality"').on_reset(
+                lambda: self._quality.set_value(QUALITY)
+            )
+        self._side = ui.number(
+            "Longest side in pixels", value=self._longest, min=LEAST_SIDE, max=self._longest, precision=0
+        )
+        self._side.props("outlined dense").classes("w-full")
+
+    def _follow(self) -> None:
+        super()._follow()
+        self._lossy.set_visibility(Path(str(self._name.value).lower()).suffix in (".jpg", ".jpeg"))
+
+
+class Question:
+    """Asks whether to do something."""
+
+    def __init__(self, title: str, text: str, ok: str) -> None:
+        with ui.dialog().props(f'aria-label="{title}"') as self._dialog, ui.card().classes("dialog"):
+            ui.label(title).classes("text-h6")
+            ui.label(text)
+            with ui.row().classes("w-full justify-end"):
+                ui.button("Cancel", on_click=lambda: self._dialog.submit(False)).props("flat no-caps autofocus")
+                ui.button(ok, on_click=lambda: self._dialog.submit(True)).props("unelevated no-caps color=primary")
+
+    async def answer(self) -> bool:
+        """Whether to do it; the dialog is gone then."""
+        is_confirmed = bool(await self._dialog)
+        if not self._dialog.is_deleted:
+            self._dialog.delete()
+        return is_confirmed

@@ -21,19 +21,24 @@ from nlfilter_torch.photo.app.at_rest import AtRest
 from nlfilter_torch.photo.app.brush import Brush
 from nlfilter_torch.photo.app.canvas import Canvas
 from nlfilter_torch.photo.app.closeup import Closeup
-from nlfilter_torch.photo.app.dialogs import NameDialog
+from nlfilter_torch.photo.app.dialogs import NameDialog, Question, SaveDialog
 from nlfilter_torch.photo.app.panel import Panel
 from nlfilter_torch.photo.app.session import Session
 from nlfilter_torch.photo.app.tabs import Link
 from nlfilter_torch.photo.app.tasks import EXPECTED, Tasks
 from nlfilter_torch.photo.app.uploads import Upload
 from nlfilter_torch.photo.declared.json_values import Value
+from nlfilter_torch.photo.declared.parameters import EDITS
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.tiled.sampling import Report
 
 Save = Callable[[str, Report], Path]  # name and progress
 LARGEST_PRESET = 20_000_000  # bytes
 PRESET_KINDS = ".json,.cube,.png,.tif,.tiff,.jpg,.jpeg,application/json"
+REPLACING = (
+    "Colorize is for grey photographs: the colours of this one would all be replaced by those that you paint. "
+    "Recolor changes the colour of an object, and keeps the rest."
+)
 INSIDE, OUTSIDE = "#4ade80", "#60a5fa"  # colours of the sliders' response in the region, and elsewhere
 EDITORS: dict[str, "Editor"] = {}  # open pages by the token in the addresses of their pictures
 
@@ -78,7 +83,7 @@ class Editor:
         brush = Brush()
         with ui.element("div").classes("editor"):
             with ui.element("div").classes("viewer"):
-                self._canvas = Canvas(brush, self._token, self._changed, self._tasks.show_error)
+                self._canvas = Canvas(brush, self._token, self._draw, self._tasks.show_error)
             with ui.column().classes("panel"):
                 handle = ui.button(icon="drag_handle").props('flat dense aria-label="Show or hide the controls"')
                 handle.classes("handle").on("click", js_handler="() => page.fold()")
@@ -156,6 +161,21 @@ class Editor:
         else:
             self._closeup.hold()
             self._redraw(moving)
+
+    def _draw(self, step: str, add: Callable[[], None]) -> None:
+        """Add a stroke to a step, after a question if the photograph would lose its colours."""
+        if EDITS[step].coloured and not self.session.recipe.last(step).strokes and self.session.has_colours:
+            self._tasks.start(self._ask_to_colorize(add))
+        else:
+            add()
+            self._changed()
+
+    async def _ask_to_colorize(self, add: Callable[[], None]) -> None:
+        with self._client:
+            question = Question("Replace all colours?", REPLACING, "Replace all colours")
+        if await question.answer():
+            add()
+            self._changed()
 
     def _clear_strokes(self, step: str) -> None:
         if self.session.opened is not None:
@@ -305,23 +325,24 @@ class Editor:
             self._changed()
 
     async def _ask_photo_name(self) -> None:
-        if self.session.opened is None:
+        session = self.session
+        if session.opened is None:
             self._tasks.show_error("open a photograph first; there is nothing to save")
             return
-        session = self.session
-        await self._ask("Save the photograph", session.suggested_name(), session.check_photograph, session.save)
+        side, name = max(session.size), session.suggested_name()
+        with self._client:
+            dialog = SaveDialog("Save the photograph", name, session.folder, session.check_photograph, side)
+        chosen = await dialog.answer()
+        if chosen is not None:
+            self._tasks.start(self._save(partial(session.save, options=dialog.options), chosen))
 
     async def _ask_edit_name(self) -> None:
         name = "edit" if self.session.opened is None else Path(self.session.opened.name).stem
-        await self._ask("Save the edit", f"{name}.json", self.session.check_preset, self.session.save_preset)
-
-    async def _ask(self, title: str, name: str, check: Callable[[str], Path], save: Save) -> None:
-        """Ask for a name that passes a check, and save under it."""
         with self._client:
-            dialog = NameDialog(title, name, self.session.folder, check)
+            dialog = NameDialog("Save the edit", f"{name}.json", self.session.folder, self.session.check_preset)
         chosen = await dialog.answer()
         if chosen is not None:
-            self._tasks.start(self._save(save, chosen))
+            self._tasks.start(self._save(self.session.save_preset, chosen))
 
     async def _save(self, save: Save, name: str) -> None:
         progress = Progress()

@@ -1,7 +1,7 @@
 """A session: an open photograph, its edit, and the history of undo. It does not depend on the page."""
 
 import threading
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -17,6 +17,7 @@ from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.declared.strokes import Stroke, thin
 from nlfilter_torch.photo.edits.applying import apply_recipe
 from nlfilter_torch.photo.io import tiff
+from nlfilter_torch.photo.io.exif import read_upright
 from nlfilter_torch.photo.io.photographs import (
     BITS,
     DEPTHS,
@@ -39,7 +40,21 @@ from nlfilter_torch.photo.tiled.tiles import Passes, Statistics
 SPACING = 0.2  # distance of the points of a stroke, as a share of its radius
 UNDOS = 100
 SMALL = 1 << 18  # pixels, up to which statistics are those of all pixels; a sample is nearly as exact, and fast
+COLOURED, RARE = 0.03, 0.002  # difference of channels of a colour, and the share of pixels that need not have one
 OPEN_BYTES = 40  # per pixel, for a photograph before and after the edit and the files of both; edits work in tiles
+
+
+@dataclass(frozen=True)
+class FileOptions:
+    """How a photograph is written.
+
+    Attributes:
+        quality: of a JPEG file; None is the default.
+        side: the longest side in pixels; None keeps the size.
+    """
+
+    quality: int | None = None
+    side: int | None = None
 
 
 @dataclass(frozen=True)
@@ -158,6 +173,12 @@ class Session:
     def size(self) -> tuple[int, int]:
         """(height, width) of the photograph; raises ValueError if none is open."""
         return self._opened_to("show").photograph.size
+
+    @property
+    def has_colours(self) -> bool:
+        """Whether the photograph has colours; raises ValueError if none is open."""
+        pixels = self.preview.pixels
+        return bool((pixels.amax(1) - pixels.amin(1) > COLOURED).float().mean() > RARE)
 
     @property
     def is_reduced(self) -> bool:
@@ -340,7 +361,7 @@ class Session:
             suffix = ".tif" if BITS[photograph.depth] == "floats" else ".png"
         return f"{path.stem}-edited{suffix}"
 
-    def save(self, name: str, report: Report = in_silence) -> Path:
+    def save(self, name: str, report: Report = in_silence, options: FileOptions = FileOptions()) -> Path:
         """Edit the photograph at its full size and write it to the folder; the file appears complete or not at all.
 
         Raises:
@@ -356,7 +377,7 @@ class Session:
             for part, values in edit_rows(self._passes(photograph, report), rows, recipe.steps, opened.name):
                 pixels[0, :, part] = torch.from_numpy(values).permute(2, 0, 1)
         report("Writing", 0, 1)
-        write_photograph(photograph.with_pixels(pixels), target)
+        write_photograph(reduced(photograph.with_pixels(pixels), options.side), target, quality=options.quality)
         self.saved = recipe
         return target
 
@@ -378,3 +399,21 @@ class Session:
         """Load an edit from the content of a file; raises ValueError if it has none, or if no photograph is open."""
         self._opened_to("edit")
         self.load(Recipe.from_file(content, name))
+
+
+def reduced(photograph: Photograph, side: int | None) -> Photograph:
+    """A photograph whose longest side has at most that many pixels.
+
+    Raises:
+        ValueError: if some of its pixels hold no data, which have no place in another size.
+    """
+    height, width = photograph.size
+    if side is None or side >= max(height, width):
+        return photograph
+    if photograph.hidden is not None:
+        raise ValueError("a photograph with pixels without data must be saved in its own size; leave the size as it is")
+    scale = side / max(height, width)
+    size = (max(1, round(height * scale)), max(1, round(width * scale)))
+    pixels = resize(photograph.pixels.clamp(0, 1) if photograph.depth.startswith("uint") else photograph.pixels, size)
+    alpha = None if photograph.alpha is None else resize(photograph.alpha, size).clamp(0, 1)
+    return replace(photograph, pixels=pixels, alpha=alpha, exif=read_upright(photograph.exif, size=size[::-1]).block)

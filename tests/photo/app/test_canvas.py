@@ -1,5 +1,7 @@
 """The large picture with its overlays, and the brush that draws on it."""
 
+from collections.abc import Callable
+
 import pytest
 from nicegui import Client
 
@@ -17,9 +19,10 @@ class Page:
         self.brush = Brush()
         self.strokes = 0
         self.errors: list[str] = []
-        self.canvas = Canvas(self.brush, "token", self.drawn, self.errors.append)
+        self.canvas = Canvas(self.brush, "token", self.draw, self.errors.append)
 
-    def drawn(self) -> None:
+    def draw(self, step: str, add: Callable[[], None]) -> None:
+        add()
         self.strokes += 1
 
     def open(self, session: Session) -> None:

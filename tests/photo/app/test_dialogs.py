@@ -5,7 +5,8 @@ from pathlib import Path
 import pytest
 from nicegui import Client
 
-from nlfilter_torch.photo.app.dialogs import NameDialog
+from nlfilter_torch.photo.app.dialogs import NameDialog, SaveDialog
+from nlfilter_torch.photo.app.session import FileOptions
 
 
 @pytest.fixture
@@ -29,8 +30,9 @@ def test_a_name(client: Client, answers: list[str], tmp_path: Path) -> None:
     dialog._confirm()
     assert dialog._note.text == "photo.gif must end in .png"
     dialog._name.set_value("old.png")
+    assert (dialog._ok.text, dialog._note.text) == ("Save", "A file of that name is there already.")
     dialog._confirm()
-    assert (dialog._ok.text, dialog._note.text) == ("Replace", "A file of that name is there already.")
+    assert (dialog._ok.text, dialog._note.text) == ("Replace", "A file of that name is there already. Replace it?")
     assert answers == []
     dialog._name.set_value("new.png")
     assert dialog._ok.text == "Save"
@@ -40,3 +42,17 @@ def test_a_name(client: Client, answers: list[str], tmp_path: Path) -> None:
     dialog._name.set_value("new.png")
     dialog._confirm()
     assert answers == ["old.png", "new.png"]
+
+
+def test_options_of_a_file(client: Client, tmp_path: Path) -> None:
+    dialog = SaveDialog("Save the photograph", "photo.png", tmp_path, lambda name: tmp_path / name, 150)
+    assert not dialog._lossy.visible
+    dialog._name.set_value("photo.JPG")
+    assert dialog._lossy.visible
+    assert dialog.options == FileOptions(95, None)
+    dialog._quality.set_value(80)
+    dialog._side.set_value(75)
+    assert dialog.options == FileOptions(80, 75)
+    for side in (None, 3, 150, 4000):
+        dialog._side.set_value(side)
+        assert dialog.options.side is None

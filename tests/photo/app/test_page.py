@@ -12,6 +12,7 @@ from nicegui import Client, background_tasks, ui
 
 from nlfilter_torch.photo.app import drawing
 from nlfilter_torch.photo.app.assets import SCRIPTS, STATIC, STATIC_ADDRESS
+from nlfilter_torch.photo.app.dialogs import Question
 from nlfilter_torch.photo.app.library import Library
 from nlfilter_torch.photo.app.page import EDITORS, Editor
 from nlfilter_torch.photo.declared.presets import Recipe
@@ -139,6 +140,23 @@ def test_strokes_are_cleared(opened: Page) -> None:
     opened.finish()
     assert session.recipe.last("detail").strokes == ()
     assert not opened.picture("mask")
+
+
+def test_colorize_asks_before_it_replaces_colours(opened: Page, monkeypatch: pytest.MonkeyPatch) -> None:
+    editor, session = opened.editor, opened.editor.session
+    answers = [False, True]
+
+    async def answer(question: Question) -> bool:
+        return answers.pop(0)
+
+    monkeypatch.setattr(Question, "answer", answer)
+    editor._canvas.switch("colorize")
+    for strokes in (0, 1, 2):  # asked twice: then it has a stroke
+        for kind in ("pointerdown", "pointerup"):
+            editor._canvas._pointer(kind, 20, 20)
+        opened.finish()
+        assert len(session.recipe.last("colorize").strokes) == strokes
+    assert answers == []
 
 
 def test_a_change_before_a_photograph_is_not_kept(page: Page) -> None:

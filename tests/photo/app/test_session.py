@@ -15,7 +15,8 @@ from nlfilter_torch.photo.declared.colour_tables import cube_of, hald_of
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.declared.strokes import Stroke
-from tests.problems import LINE, difference
+from nlfilter_torch.photo.io.photographs import Photograph, write_photograph
+from tests.problems import LINE, cat, difference
 
 
 def test_undo_and_redo(session: Session) -> None:
@@ -173,3 +174,10 @@ def test_presets_come_back(session: Session) -> None:
     with pytest.raises(ValueError, match=r"photo\.jpg must be a Hald, got a picture that cannot be read"):
         session.load_preset(b"\xff\xd8\xff", "photo.jpg")
     assert session.recipe == Recipe()
+
+
+def test_grey_photographs_have_no_colours(session: Session, tmp_path: Path) -> None:
+    assert session.has_colours
+    write_photograph(Photograph(cat().mean(1, keepdim=True).expand(-1, 3, -1, -1)), tmp_path / "grey.png")
+    session.open(tmp_path / "grey.png")
+    assert not session.has_colours

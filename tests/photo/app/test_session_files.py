@@ -10,10 +10,11 @@ from PIL import Image
 
 from nlfilter_torch.__main__ import main
 from nlfilter_torch.operator.features import reduce_channels
-from nlfilter_torch.photo.app.session import Session
+from nlfilter_torch.photo.app.session import FileOptions, Session
 from nlfilter_torch.photo.declared.presets import find_recipe
 from nlfilter_torch.photo.edits.applying import apply_recipe
 from nlfilter_torch.photo.io.photographs import Photograph, read_photograph, write_photograph
+from nlfilter_torch.photo.picture.resizing import resize
 from tests.problems import LINE, cat, difference
 
 
@@ -37,6 +38,23 @@ def test_saving_is_what_the_command_line_does(session: Session, photo: Path) -> 
     assert main(["apply", str(photo), str(photo.with_name("cli.png")), "--preset", str(edit)]) == 0
     assert difference(saved, read_photograph(photo.with_name("cli.png")).pixels) <= 1
     assert difference(saved, apply_recipe(session.recipe, cat())) <= 1
+
+
+def test_a_size_and_a_quality(session: Session, photo: Path) -> None:
+    session.set("tone", contrast=1.1)
+    large = session.save("a.jpg", options=FileOptions(100)).stat().st_size
+    small = session.save("b.jpg", options=FileOptions(60, 75))
+    assert read_photograph(small).size == (50, 75)
+    assert small.stat().st_size < large / 4
+    whole = read_photograph(session.save("c.png", options=FileOptions(side=4000)))
+    assert whole.size == (100, 150)
+    half = read_photograph(session.save("d.png", options=FileOptions(side=75)))
+    assert difference(half.pixels, resize(whole.pixels, (50, 75)).clamp(0, 1)) <= 1.5
+    write_photograph(replace(whole, alpha=whole.pixels[:, :1]), photo.with_name("alpha.png"))
+    session.open(photo.with_name("alpha.png"))
+    halves = read_photograph(session.save("e.png", options=FileOptions(side=75)))
+    assert halves.alpha is not None
+    assert halves.alpha.shape == (1, 1, 50, 75)
 
 
 def test_sliders_alone_are_a_preset_of_detail(session: Session, photo: Path) -> None:

@@ -133,6 +133,8 @@ def test_other_steps_change_the_picture(opened: Tab, step: str, control: str) ->
     before = opened.source()
     if step != "Abstract":
         opened.paint((0.4, 0.4), (0.45, 0.4))
+        if step == "Colorize":
+            page.get_by_role("button", name="Replace all colours").click()
         opened.wait_for_picture(before)
         before = opened.source()
     opened.drag(opened.slider(control), 0.5, 0.7, release=False)
