@@ -92,6 +92,11 @@ class OwnEdit(ABC):
     def idle(self) -> tuple[float, ...]:
         """Values that change nothing."""
 
+    @property
+    @abstractmethod
+    def usual(self) -> tuple[tuple[float, ...], ...]:
+        """For each value, what it often is."""
+
     @abstractmethod
     def parameters(self, values: Sequence[float]) -> dict[str, Value]:
         """Parameters of the step with these values."""
@@ -142,6 +147,11 @@ class OwnDetail(OwnEdit):
         """Sliders of 1; the default threshold."""
         return (*(1.0,) * (self.order + 1), 5.0)
 
+    @property
+    def usual(self) -> tuple[tuple[float, ...], ...]:
+        """The last slider is 1, and the threshold that of the default."""
+        return (*((),) * self.order, (1.0,), (5.0, 0.0))
+
     def parameters(self, values: Sequence[float]) -> dict[str, Value]:
         """Sliders and threshold."""
         return {"alpha": tuple(values[:-1]), "threshold": float(values[-1])}
@@ -179,6 +189,11 @@ class OwnTone(OwnEdit):
         """Gains of 1."""
         return (1.0, 1.0)
 
+    @property
+    def usual(self) -> tuple[tuple[float, ...], ...]:
+        """Gains of 1."""
+        return ((1.0,), (1.0,))
+
     def parameters(self, values: Sequence[float]) -> dict[str, Value]:
         """Contrast and clarity."""
         return {"contrast": float(values[0]), "clarity": float(values[1])}
@@ -214,6 +229,11 @@ class OwnSharpen(OwnEdit):
     def idle(self) -> tuple[float, ...]:
         """An amount of 1."""
         return (1.0,)
+
+    @property
+    def usual(self) -> tuple[tuple[float, ...], ...]:
+        """The default amount."""
+        return ((4.0,),)
 
     def parameters(self, values: Sequence[float]) -> dict[str, Value]:
         """The amount."""

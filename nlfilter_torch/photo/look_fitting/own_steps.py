@@ -1,48 +1,44 @@
 """Steps of this program, with their parameters, from pairs of photographs before and after an edit.
 
 A look imitates an edit; if this program made it, the steps themselves explain more of it, and suit other photographs.
-Looked for are detail with its threshold, tone and sharpening, each with soft limits and with none.
+Looked for are detail with its threshold, tone and sharpening, each with soft limits and with none, and two of them.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
-from functools import partial
+from dataclasses import dataclass, field, replace
+from itertools import combinations
+from operator import itemgetter
 
 import torch
 from torch import Tensor
 
 from nlfilter_torch.core.checks import check_order
-from nlfilter_torch.core.precision import full_precision, working_dtype
-from nlfilter_torch.operator.features import reduce_channels
+from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.photo.declared.json_values import Value
 from nlfilter_torch.photo.declared.presets import PRESETS, Recipe
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.edits.applying import apply_recipe
-from nlfilter_torch.photo.look_fitting.alignment import inside_frame
 from nlfilter_torch.photo.look_fitting.fit_look import FILTER_NAMES, Pair, images_of
-from nlfilter_torch.photo.look_fitting.kept_pixels import squares
-from nlfilter_torch.photo.look_fitting.look_sums import sample
+from nlfilter_torch.photo.look_fitting.own_chains import Chain
 from nlfilter_torch.photo.look_fitting.own_edits import Ingredients, OwnDetail, OwnEdit, OwnSharpen, OwnTone
 from nlfilter_torch.photo.look_fitting.parameter_fit import Minimum, minimize, rounded
+from nlfilter_torch.photo.look_fitting.viewed_pair import ViewedPair
 from nlfilter_torch.photo.picture.in_memory import InMemory
-from nlfilter_torch.photo.picture.resizing import resize
-from nlfilter_torch.photo.picture.seen import range_of
-from nlfilter_torch.photo.picture.viewing import viewed_size
+from nlfilter_torch.photo.picture.limits import Limits
 
-MOST_PAIRS = 4  # that are looked at; the first ones
+MOST_PAIRS = 3  # that are looked at; the first ones
 COARSE = 4  # of this many pixels of the sample one is looked at first
 COARSE_STEPS, FINE_STEPS = 12, 3  # of least squares
-# An edit of brightness moves colours along grey, and their chroma in proportion. Shares of a change that must be so,
-# and along grey; noise of compression is not.
-ALONG_BOTH, ALONG_GREY = 0.6, 0.5
-SHADES = 256
-CURVE = 0.996  # share that a function of brightness explains from which on an edit counts as a tone curve
 NEARLY_ALL = 0.99  # share from which on nothing else is looked for
 PROMISING = 0.3  # share that edits by the default filter explain, from which on other filters are looked at
 
 
+# Two edits are fitted only if a rough model of them leaves less than this, and than this multiple of what one leaves.
+UNPROMISING, LESS = 0.15, 0.6
 # Steps are preferred to a look if they explain that much of what is left out, and it leaves that many times as much.
 ENOUGH, CLEARLY = 0.8, 1.25
+
+Key = tuple[str, tuple[tuple[str, Value], ...]]  # name and filter of an edit
 
 
 @dataclass(frozen=True)
@@ -85,11 +81,11 @@ def fit_steps(pairs: Iterable[Pair], *, order: int = 3, step: Step | None = None
     """Find the steps of this program, and their parameters, that turn photographs into edited ones.
 
     Tried are ``detail`` (sliders and threshold, also with the filters of the presets), ``tone`` and ``sharpen``, with
-    soft limits and without. The parameters minimise the squared error of the clipped result over 32,768
-    pixels of each pair at the viewing size.
+    soft limits and without, and two of them in either order. The parameters minimise the squared error of the clipped
+    result over 32,768 pixels of each pair at the viewing size.
 
     Args:
-        pairs: as for :func:`fit_look`, without masks. The first four photographs are looked at.
+        pairs: as for :func:`fit_look`, without masks. The first three photographs are looked at.
         order: k; k + 1 sliders of ``detail``.
         step: ``look`` with the parameters of the filter of ``detail`` and ``tone``; None has the defaults.
 
@@ -115,87 +111,6 @@ def fit_steps(pairs: Iterable[Pair], *, order: int = 3, step: Step | None = None
     if not search.pairs:
         raise ValueError("pairs must hold a pair of photographs, got none; pass (before, after)")
     return search.fitted()
-
-
-class ViewedPair:
-    """A photograph before and after an edit, at the viewing size, and a sample of its pixels.
-
-    Args:
-        before: (C, H, W) in [0, 1].
-        after: likewise.
-        viewing_size: in megapixels.
-        number: of the pair.
-
-    Attributes:
-        source: the photograph before the edit, as edits see it.
-        places: row-major indices (P,) of the sample.
-        before: (1, C, 1, P), in float64.
-        after: likewise.
-        weights: (P,), 0 in a frame.
-        squares: number of the square of each pixel, (P,).
-    """
-
-    def __init__(self, before: Tensor, after: Tensor, viewing_size: float, number: int) -> None:
-        dtype = working_dtype(before)
-        before, after = before.to(dtype), after.to(dtype)
-        inside = inside_frame(before, after).to(dtype)
-        size = (before.shape[-2], before.shape[-1])
-        small = viewed_size(size, viewing_size)
-        if small != size:
-            inside = (resize(inside[None, None], small)[0, 0] > 0.99).to(dtype)
-        working = range_of(InMemory(before[None]))  # of the whole picture
-        source, target = InMemory(before[None]).resized(small), resize(after[None], small)
-        if working is not None:
-            source, target = InMemory(working.seen(source.image)), working.seen(target)
-        self.source = InMemory(source.image, {})
-        places = sample(torch.ones(small))
-        self.places = places[::2] if len(places) < source.size[0] * source.size[1] else places
-        self.before, self.after = (
-            planes.flatten(2)[..., None, self.places].double() for planes in (source.image, target.clamp(0, 1))
-        )
-        self.weights = inside.flatten()[self.places].double()
-        self.squares = squares(self.places, small[1])
-        self.number = number
-
-    def errors(self, edited: Tensor, step: int) -> Tensor:
-        """Weighted errors (C P',) of edited pixels (1, C, 1, P'), each ``step``-th of the sample."""
-        return ((edited.clamp(0, 1) - self.after[..., ::step]) * self.weights[::step]).flatten()
-
-    def change(self) -> Tensor:
-        """The weighted change (C P,)."""
-        return ((self.before - self.after) * self.weights).flatten()
-
-    def groups(self, alone: bool) -> Tensor:
-        """What is left out together, (C P,): the pair or, if it is the only one, a third of its squares."""
-        group = (self.squares + self.squares // 3) % 3 if alone else torch.full_like(self.squares, self.number)
-        return group.repeat(self.before.shape[1])
-
-    def is_of_brightness(self) -> bool:
-        """Whether the change can be that of an edit of brightness, which depends on the surroundings of pixels."""
-        free = ((self.after > 0) & (self.after < 1)).all(1)[0, 0] & (self.weights > 0)
-        before, after = self.before[0, :, 0, free], self.after[0, :, 0, free]
-        change = after - before
-        power = float(change.square().sum())
-        if power == 0:
-            return False
-        if len(change) == 3:
-            grey = change.mean(0)
-            chroma = before - before.mean(0)
-            direction = chroma / chroma.norm(dim=0).clamp(min=1e-6)
-            across = change - grey - (change * direction).sum(0) * direction
-            along = 3 * float(grey.square().sum())
-            if along < ALONG_GREY * power or 1 - float(across.square().sum()) / power < ALONG_BOTH:
-                return False
-        return _explained_by_curve(before, change) < CURVE
-
-
-def _explained_by_curve(before: Tensor, change: Tensor) -> float:
-    """Share of the change of luminance (C, P) that a function of luminance explains."""
-    grey, moved = (reduce_channels(planes[None, :, None], "luminance")[0, 0, 0] for planes in (before, change))
-    shades = (grey.clamp(0, 1) * (SHADES - 1)).round().long()
-    counts = torch.zeros(SHADES, dtype=grey.dtype).index_add(0, shades, torch.ones_like(grey)).clamp(min=1)
-    means = torch.zeros(SHADES, dtype=grey.dtype).index_add(0, shades, moved) / counts
-    return 1 - float((moved - means[shades]).square().sum() / moved.square().sum().clamp(min=1e-30))
 
 
 @dataclass(frozen=True, eq=False)
@@ -249,7 +164,8 @@ class StepSearch:
         self.filter = tuple((name, step[name]) for name in names if step[name] != step.declared[name].default)
         self.pairs: list[ViewedPair] = []
         self.candidates: list[Candidate] = []
-        self._seen: dict[tuple[object, ...], list[Ingredients]] = {}
+        self._whole: dict[Key, list[Ingredients]] = {}  # of all pixels, by edit and filter
+        self._seen: dict[Key, list[Ingredients]] = {}  # of the samples
 
     def add(self, before: Tensor, after: Tensor) -> None:
         """Add a photograph (C, H, W) before and after the edit, unless there are enough of them."""
@@ -279,50 +195,91 @@ class StepSearch:
     def _best(self) -> Candidate | None:
         return max(self.candidates, key=lambda candidate: candidate.left_out, default=None)
 
+    def _edits(self, limits: Limits) -> tuple[OwnEdit, OwnEdit, OwnEdit]:
+        """The edits with the default filters; the filter of the last two is the same."""
+        size = self.viewing_size
+        return (
+            OwnSharpen(limits=limits, viewing_size=size),
+            OwnTone(limits=limits, viewing_size=size, filter=self.filter),
+            OwnDetail(limits=limits, viewing_size=size, filter=self.filter, order=self.order),
+        )
+
     def _search(self) -> None:
         """Try edits, those that take least time first, until one explains nearly all."""
-        common = {"viewing_size": self.viewing_size}
-        self._try(partial(OwnSharpen, **common))
+        sharpen, tone, detail = self._edits("soft")
+        self._try([sharpen])
         if self._explained() < NEARLY_ALL:
-            self._try(partial(OwnTone, filter=self.filter, **common))
-            self._try(partial(OwnDetail, order=self.order, filter=self.filter, **common))
+            self._try([tone, detail])
+        if self._explained() < NEARLY_ALL:
+            self._try_chain()
         promising = not self.filter and self._explained() > PROMISING
         for other in filters_of_presets() if promising else []:
             if self._explained() < NEARLY_ALL:
-                self._try(partial(OwnDetail, order=self.order, filter=other, **common))
+                self._try([replace(detail, filter=other)])
 
     def _explained(self) -> float:
         best = self._best()
         return 0.0 if best is None else best.left_out
 
-    def _try(self, edit: "partial[OwnSharpen] | partial[OwnTone] | partial[OwnDetail]") -> None:
-        """Fit an edit with each kind of limits."""
-        for limits in ("soft", "none"):
-            self.candidates.append(self._fit(edit(limits=limits)))
+    def _try(self, edits: Sequence[OwnEdit]) -> None:
+        """Fit edits with the same filter, with each kind of limits."""
+        keys = [(edit.edit, edit.filter) for edit in edits]
+        for key in keys:
+            self._whole[key] = []
+        for pair in self.pairs:
+            operator = edits[0].operator(InMemory(pair.image))  # one at a time is in memory
+            for key, edit in zip(keys, edits, strict=True):
+                self._whole[key].append(edit.ingredients(pair.image, operator))
+        for key, edit in zip(keys, edits, strict=True):
+            self._seen[key] = [seen.at(pair.places) for seen, pair in zip(self._whole[key], self.pairs, strict=True)]
+            self.candidates += [self._fit(replace(edit, limits=limits)) for limits in ("soft", "none")]
+            if edit.filter != self.filter and edit.filter:
+                del self._whole[key]  # not part of chains
 
     def _fit(self, edit: OwnEdit) -> Candidate:
         """The values of an edit that suit the pairs best, from a coarse sample to a finer one."""
-        seen = self._ingredients(edit)
+        seen = self._seen[edit.edit, edit.filter]
         coarse = minimize(Errors(edit, self.pairs, seen, COARSE), edit.start, edit.ends, COARSE_STEPS)
         errors = Errors(edit, self.pairs, seen)
         fine = minimize(errors, coarse.values.tolist(), edit.ends, FINE_STEPS)
-        return self._candidate((edit,), rounded(errors, fine, edit.idle, edit.ends))
+        return self._candidate((edit,), rounded(errors, fine, edit.usual, edit.ends))
+
+    def _try_chain(self) -> None:
+        """Try two edits, one after the other, if they look promising before the filter of the second is computed."""
+        starts = []
+        for one, two in combinations(self._edits("soft"), 2):
+            chain, step = self._chain(one, two), 2 * COARSE
+            start = chain.start(self._seen[one.edit, one.filter], self._seen[two.edit, two.filter], step)
+            starts.append((step * start.loss / self._power(), start.values, chain))
+        left, values, chain = min(starts, key=itemgetter(0))
+        if left > min(UNPROMISING, LESS * (1 - self._explained())):
+            return
+        best = chain.begin(values)
+        if not chain.is_exact(best):
+            count, turned = len(chain.first.start), self._chain(chain.second, chain.first)
+            other = turned.begin(torch.cat([values[count:], values[:count]]))
+            chain, best = min((chain, best), (turned, other), key=_loss)
+        if not chain.is_exact(best):
+            best = chain.snapped(chain.better(best))
+        best = rounded(best.predicted, best, chain.usual, chain.ends)
+        self.candidates.append(self._candidate((chain.first, chain.second), best))
+
+    def _power(self) -> float:
+        return sum(float(pair.change().square().sum()) for pair in self.pairs)
+
+    def _chain(self, one: OwnEdit, two: OwnEdit) -> Chain:
+        return Chain(one, two, self.pairs, self._whole[one.edit, one.filter])
 
     def _candidate(self, edits: tuple[OwnEdit, ...], best: Minimum) -> Candidate:
         groups = torch.cat([pair.groups(len(self.pairs) == 1) for pair in self.pairs])
-        power = sum(float(pair.change().square().sum()) for pair in self.pairs)
+        power = self._power()
         left_out = float(best.left_out(groups).square().sum())
         values = best.values.split([len(edit.start) for edit in edits])
         return Candidate(edits, values, 1 - best.loss / power, 1 - left_out / power)
 
-    def _ingredients(self, edit: OwnEdit) -> list[Ingredients]:
-        """What an edit needs to know of the samples of all pairs."""
-        key = (edit.edit, edit.filter)
-        if key not in self._seen:
-            self._seen[key] = [
-                edit.ingredients(pair.source.image, edit.operator(pair.source)).at(pair.places) for pair in self.pairs
-            ]
-        return self._seen[key]
+
+def _loss(order: tuple[Chain, Minimum]) -> float:
+    return order[1].loss
 
 
 def filters_of_presets() -> list[tuple[tuple[str, Value], ...]]:

@@ -37,6 +37,10 @@ class Minimum:
         """Sum of squares."""
         return float(self.residuals.square().sum())
 
+    def predicted(self, values: Tensor) -> Tensor:
+        """Residuals (R,) at other values, to first order."""
+        return self.residuals + self.jacobian @ (values - self.values)
+
     def left_out(self, groups: Tensor) -> Tensor:
         """Residuals (R,) of each group, by their numbers (R,), under parameters fitted to the others.
 
@@ -58,7 +62,7 @@ def minimize(residuals: Residuals, start: Sequence[float], ends: Sequence[tuple[
     best = _at(residuals, torch.tensor(start, dtype=torch.float64).clamp(least, most), most)
     damping = DAMPING
     for _ in range(steps):
-        change = _solved(best.jacobian.mT @ best.jacobian, best.jacobian.mT @ best.residuals, damping)
+        change = step_of(best, damping)
         values = (best.values - change).clamp(least, most)
         moved = residuals(values)
         gain = 1 - float(moved.square().sum()) / max(best.loss, 1e-30)
@@ -74,18 +78,24 @@ def minimize(residuals: Residuals, start: Sequence[float], ends: Sequence[tuple[
 
 
 def rounded(
-    residuals: Residuals, best: Minimum, usual: Sequence[float], ends: Sequence[tuple[float, float]]
+    residuals: Residuals,
+    best: Minimum,
+    usual: Sequence[Sequence[float]],
+    ends: Sequence[tuple[float, float]],
+    *,
+    digits: Sequence[int] = DIGITS,
+    equal: float = EQUAL,
 ) -> Minimum:
     """The minimum with values that are as short as they can be, for hardly larger residuals.
 
     One value after the other is rounded, the last one first, and those before it follow, to first order. ``usual`` are
-    tried first.
+    tried first, then values with some ``digits`` after the point, for a relative increase of ``equal`` at most.
     """
     least, most = torch.tensor(ends, dtype=torch.float64).unbind(1)
     gram, values = best.jacobian.mT @ best.jacobian, best.values
     for i, plain in reversed([*enumerate(usual)]):
-        allowed = best.loss + (1 - i / len(usual)) * (EQUAL * best.loss + len(best.residuals) * FAINT**2)
-        for value in (plain, *(round(float(values[i]), digits) + 0.0 for digits in DIGITS)):  # no -0
+        allowed = best.loss + (1 - i / len(usual)) * (equal * best.loss + len(best.residuals) * FAINT**2)
+        for value in (*plain, *(round(float(values[i]), count) + 0.0 for count in digits)):  # no -0
             moved = values.clone()
             moved[:i] -= _solved(gram[:i, :i], gram[:i, i] * (value - values[i]), 0.0)
             moved[i] = value
@@ -106,6 +116,11 @@ def _at(residuals: Residuals, values: Tensor, most: Tensor, known: Tensor | None
         moved[i] += step
         columns.append((residuals(moved) - known) / step)
     return Minimum(values, known, torch.stack(columns, dim=1))
+
+
+def step_of(best: Minimum, damping: float) -> Tensor:
+    """The step (p,) of Gauss and Newton from some values, to be subtracted, which the damping shortens."""
+    return _solved(best.jacobian.mT @ best.jacobian, best.jacobian.mT @ best.residuals, damping)
 
 
 def _solved(gram: Tensor, slope: Tensor, damping: float) -> Tensor:

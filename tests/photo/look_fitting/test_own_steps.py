@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from nlfilter_torch.photo import FittedSteps, Recipe, Step, apply_step, fit_steps
+from nlfilter_torch.photo import FittedSteps, Recipe, Step, apply_recipe, apply_step, fit_steps
 from nlfilter_torch.photo.look_fitting.own_steps import filters_of_presets
 from tests.looks import CAT, CUP, FEW, SEPIA, SUIT, explained, in_bytes
 
@@ -36,6 +36,14 @@ def test_a_step_is_found_with_its_parameters_in_8_bits(step: Step) -> None:
     assert explained(CAT, after, steps.apply(CAT)) > 0.99
     assert steps.left_out > 0.98
     assert Recipe.from_json(steps.to_json(), "it").steps == steps.steps
+
+
+def test_two_steps_are_found_in_their_order() -> None:
+    recipe = Recipe((Step("tone", contrast=1.25, landmarks=40), Step("sharpen", amount=3.0)))
+    after = in_bytes(apply_recipe(recipe, CAT))
+    steps = fit_steps([(CAT, after)], step=FEW)
+    assert Recipe(steps.steps) == recipe
+    assert explained(CAT, after, steps.apply(CAT)) > 0.99
 
 
 def test_filters_of_presets_are_tried() -> None:

@@ -23,7 +23,7 @@ def test_the_minimum_is_found_and_rounded() -> None:
     target = noisy()
     best = minimize(lambda values: decay(values) - target, (1.0, 3.0), ENDS, 20)
     assert best.values.tolist() == pytest.approx([2.0, 0.5], abs=0.01)
-    short = rounded(lambda values: decay(values) - target, best, (1.0, 0.0), ENDS)
+    short = rounded(lambda values: decay(values) - target, best, ((1.0,), ()), ENDS)
     assert short.values.tolist() == [2.0, 0.5]
     assert short.loss <= 1.02 * best.loss
 
