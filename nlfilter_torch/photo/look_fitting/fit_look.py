@@ -16,7 +16,7 @@ from nlfilter_torch.photo.declared.shared_parameters import KNOTS, SATURATIONS, 
 from nlfilter_torch.photo.declared.steps import Step, json_of
 from nlfilter_torch.photo.edits.applying import apply_step
 from nlfilter_torch.photo.look_fitting.alignment import inside_frame
-from nlfilter_torch.photo.look_fitting.kept_pixels import KeptPixels, squares
+from nlfilter_torch.photo.look_fitting.kept_pixels import KeptPixels, is_of_colours, squares
 from nlfilter_torch.photo.look_fitting.look_choice import (
     CHOICES,
     RIDGES,
@@ -227,11 +227,15 @@ class _Region:
         explained = {parts: (look.fitted, look.left_out) for parts, look in candidates.items()}
         groups = self.folds if len(self.folds) > 1 else self.squares
         if self.kept is not None and groups:
-            basis = simplest(candidates)
-            more = self.kept.lattice(basis, groups, self.layout)
+            bases = [simplest(candidates)]
+            if not is_of_colours(bases[0].parts):
+                plain = {parts: look for parts, look in candidates.items() if is_of_colours(parts)}
+                bases += [simplest(plain)] if plain else []
+            more = self.kept.lattice(bases, groups, self.layout)
             if more is not None:
-                parts = (*basis.parts, "lattice")
+                parts = (*more.parts, "lattice")
                 explained[parts] = more.fitted, more.left_out
+                basis = next(look for look in bases if look.parts == more.parts)
                 changed = self._step(replace(basis, parts=parts, coefficients=more.coefficients), step, more.lattice)
                 added = self._added(basis)
                 added["lattice"] = more.fitted - basis.fitted, more.left_out - basis.left_out

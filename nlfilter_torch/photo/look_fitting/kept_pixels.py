@@ -1,17 +1,18 @@
 """Pixels of all pairs that the lattice of a look is fitted to."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import reduce
+from typing import TypeVar
 
 import torch
 from torch import Tensor
 
 from nlfilter_torch.photo.look_fitting.lattice_details import refined
-from nlfilter_torch.photo.look_fitting.lattice_fit import ColourChange, fit_lattice
+from nlfilter_torch.photo.look_fitting.lattice_fit import ColourChange, FittedLattice, fit_lattice
 from nlfilter_torch.photo.look_fitting.look_choice import SHRINK, SLACK, Candidate
 from nlfilter_torch.photo.look_fitting.look_pixels import PixelSample
-from nlfilter_torch.photo.look_fitting.look_sums import MOST, Layout, Sums, columns_of
+from nlfilter_torch.photo.look_fitting.look_sums import MOST, Layout, Parts, Sums, columns_of
 from nlfilter_torch.photo.looks.lattice import colours_of_nodes, resampled
 from nlfilter_torch.photo.looks.look_filter import tone_curve
 
@@ -20,10 +21,11 @@ KEPT = 2 * MOST  # pixels of all pairs
 COLOURS = ("curves", "matrix", "saturation")  # parts that are functions of the colour
 # A lattice is chosen if a look without it leaves more than SLACK times what it leaves, plus CLEAR. Where an edit may
 # depend on the surroundings of pixels, since more than SURROUNDINGS is left, lattices gain a little on the picture and
-# lose as much on others; there it is CLEARLY times as much.
-CLEARLY, CLEAR, SURROUNDINGS = 1.75, 1e-4, 0.004
+# lose as much on others; there it is CLEARLY times as much, or WITHIN times if parts of all pictures are left out.
+CLEARLY, CLEAR, SURROUNDINGS, WITHIN = 1.75, 1e-4, 0.004, 2.5
 NEAR = 3  # steps between nodes that colours may be away from greys to change with them
 BATCH = 1 << 14  # pixels whose columns are in memory at once
+_Number = TypeVar("_Number", int, Tensor)
 
 
 def squares(places: Tensor, width: int) -> Tensor:
@@ -37,21 +39,43 @@ def squares(places: Tensor, width: int) -> Tensor:
     return rows * SQUARES + columns
 
 
+def latin(square: _Number) -> _Number:
+    """One of as many groups of squares as they are along a side, no two in the same row or column."""
+    return (square + square // SQUARES) % SQUARES
+
+
+def is_of_colours(parts: Parts) -> bool:
+    """Whether a look consists of parts that are functions of the colour."""
+    return {"curves" if part == "tone" else part for part in parts} <= set(COLOURS)
+
+
 @dataclass(frozen=True)
 class LookWithLattice:
     """A look with a lattice, and the shares of the change that it explains.
 
     Attributes:
+        parts: of the look beside the lattice.
         coefficients: (3, F) of the columns.
         lattice: changes (3, n, n, n).
         fitted: share of the pixels that it was fitted to.
         left_out: share of those that were left out.
     """
 
+    parts: Parts
     coefficients: Tensor
     lattice: Tensor
     fitted: float
     left_out: float
+
+
+@dataclass(frozen=True)
+class _FittedPixels:
+    """A look, its coefficients (3, F), what it leaves of pixels, and the lattice for that."""
+
+    basis: Candidate
+    coefficients: Tensor
+    colours: ColourChange
+    lattice: FittedLattice
 
 
 @dataclass
@@ -74,27 +98,40 @@ class KeptPixels:
             self.step *= 2
             self.samples = [(pixels.every(2), fold, square[::2]) for pixels, fold, square in self.samples]
 
-    def lattice(self, basis: Candidate, folds: Sequence[Sums], layout: Layout) -> LookWithLattice | None:
-        """The look with a lattice for what it leaves; None if that explains hardly more than the look alone.
+    def lattice(self, bases: Sequence[Candidate], folds: Sequence[Sums], layout: Layout) -> LookWithLattice | None:
+        """A look with a lattice for what it leaves; None if that explains hardly more than the first look alone.
 
         A look from a single pair is weakened as :func:`choose_from_one` does.
 
         Args:
-            basis: the look.
-            folds: the sums that it was chosen from, of pairs or, for a single one, of its squares.
+            bases: looks; the one is taken that leaves least with its lattice.
+            folds: the sums that they were chosen from, of pairs or, for a single one, of its squares.
             layout: of the columns.
         """
         alone = len({fold for _, fold, _ in self.samples}) == 1
         numbers = [square if alone else torch.full_like(square, fold) for _, fold, square in self.samples]
         number = torch.cat(numbers).unique(return_inverse=True)[1]
-        group = (number + number // SQUARES) % SQUARES if alone else number
-        count = int(group.max()) + 1
-        if count < 2:
+        group = latin(number) if alone else number
+        if int(group.max()) == 0:
             return None
-        groups = [(i + i // SQUARES) % SQUARES if alone else i for i in range(len(folds))]
-        others = [
-            [sums for sums, own in zip(folds, groups, strict=True) if own != left] for left in (*range(count), -1)
-        ]
+        groups = [latin(i) if alone else i for i in range(len(folds))]
+        fits = [self._fitted(basis, list(zip(folds, groups, strict=True)), group, layout) for basis in bases]
+        best = max(fits, key=lambda fit: fit.lattice.left_out)
+        left, without = 1 - best.lattice.left_out, 1 - fits[0].lattice.without
+        if SLACK * left + CLEAR >= without:
+            return None
+        if CLEARLY * left + CLEAR >= without and left > SURROUNDINGS and (alone or not self._agree(best.colours)):
+            return None
+        changes = rising(best.lattice.changes, best.coefficients, layout, best.lattice.density)
+        strength = 1 - SHRINK * min(max(left, 0.0), 1.0) if alone else 1.0
+        shares = best.lattice.fitted, best.lattice.left_out
+        return LookWithLattice(best.basis.parts, strength * best.coefficients, strength * changes, *shares)
+
+    def _fitted(
+        self, basis: Candidate, folds: Sequence[tuple[Sums, int]], group: Tensor, layout: Layout
+    ) -> "_FittedPixels":
+        """The lattice for what a look leaves of the pixels in groups (P,), to which the folds belong."""
+        others = [[sums for sums, own in folds if own != left] for left in (*range(int(group.max()) + 1), -1)]
         looks = [basis.fitted_to(reduce(Sums.__add__, sums), layout) for sums in others]
         before, after = (
             torch.cat([getattr(pixels, name) for pixels, _, _ in self.samples], dim=1).double()
@@ -102,13 +139,17 @@ class KeptPixels:
         )
         weights = torch.cat([pixels.shown for pixels, _, _ in self.samples]).double()
         colours = ColourChange(before, after, self._predicted(looks, layout), weights / weights.sum(), group)
-        fitted = refined(colours, fit_lattice(colours))
-        left, without = 1 - fitted.left_out, 1 - fitted.without
-        if (CLEARLY if left > SURROUNDINGS else SLACK) * left + CLEAR >= without:
-            return None
-        lattice = rising(fitted.changes, looks[-1], layout, fitted.density)
-        strength = 1 - SHRINK * min(max(left, 0.0), 1.0) if alone else 1.0
-        return LookWithLattice(strength * looks[-1], strength * lattice, fitted.fitted, fitted.left_out)
+        return _FittedPixels(basis, looks[-1], colours, refined(colours, fit_lattice(colours)))
+
+    def _agree(self, colours: ColourChange) -> bool:
+        """Whether one lattice explains parts of all pictures from the rest of these.
+
+        Colours of one pair that no other has say nothing when pairs are left out.
+        """
+        square = latin(torch.cat([square for _, _, square in self.samples]).unique(return_inverse=True)[1])
+        parts = replace(colours, predicted=colours.predicted[-1:] * (int(square.max()) + 2), folds=square)
+        lattice = refined(parts, fit_lattice(parts))
+        return 1 - lattice.without > WITHIN * (1 - lattice.left_out)
 
     def _predicted(self, looks: Sequence[Tensor], layout: Layout) -> list[Tensor]:
         """The pixels under looks with coefficients (3, F), (3, P) each."""

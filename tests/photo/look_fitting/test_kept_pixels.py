@@ -8,7 +8,7 @@ from nlfilter_torch import fit_look
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.edits.applying import apply_step
-from nlfilter_torch.photo.look_fitting.kept_pixels import KEPT, KeptPixels, nondecreasing
+from nlfilter_torch.photo.look_fitting.kept_pixels import KEPT, KeptPixels, is_of_colours, nondecreasing
 from nlfilter_torch.photo.look_fitting.look_pixels import EditedPhotograph
 from tests.looks import CAT, CUP, FEW, SUIT, explained, in_bytes, single_look
 
@@ -33,6 +33,20 @@ def test_edits_by_hue_need_a_lattice_and_carry_over() -> None:
     assert look.tensors["lattice"].shape[0] == 3
     again = Recipe.from_json(look.to_json(), "it").steps[0]
     assert again == look.step
+
+
+def test_pairs_without_common_colours_have_a_lattice_if_parts_of_all_agree() -> None:
+    before = [
+        in_bytes(image * (0.7 + 0.3 * torch.eye(3)[i]).view(1, 3, 1, 1)) for i, image in enumerate((CAT, CUP, SUIT))
+    ]
+    look = single_look(fit_look([(image, by_hue(image)) for image in before], step=FEW))
+    assert look.parts[-1] == "lattice"
+    assert look.left_out < 0.9  # of colours that no other pair has
+
+
+def test_parts_that_are_functions_of_the_colour() -> None:
+    assert is_of_colours(("tone", "matrix"))
+    assert not is_of_colours(("curves", "bands"))
 
 
 def test_half_a_picture_carries_over_to_the_other() -> None:
