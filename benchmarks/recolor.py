@@ -7,6 +7,11 @@ by more than two grey levels, and "border" the RMS error at the border, in grey 
 of the object that stays in focus, "blurred" the share of the background that does not, and "halo" the error beside the
 object, compared with a background that is blurred alone.
 
+With the brightness of the strokes, the object's texture in the new colour is known exactly, since it was tinted:
+"matched" is the RMS error inside the object under ``brightness=1``, "own" under the default, 0, both in grey levels,
+with one scribble, and "nothing" that of the object as it was. Where the painted texture leaves [0, 1], it is clipped in
+the expected result.
+
 Blotches are measured in smooth areas of the photographs themselves, such as skies: connected areas without borders, of
 about one colour, in which one scribble is drawn. "Covered" is as above, "spread" the standard deviation of the new
 colour over the area (a* and b* of CIE Lab), "even" what it would be if the whole area were recoloured, and "before"
@@ -92,6 +97,22 @@ def measure_recolor(composite: Composite, number: int, count: int, seed: int, *,
         "border": rms(result - wanted, border),
         "nothing": rms(ideal, border),
     }
+
+
+def measure_brightness(composite: Composite, number: int, seed: int) -> dict[str, float]:
+    """Errors of an object in the brightness of a scribble: taken from the scribble, kept, and of the object before."""
+    scene = tinted(composite, number)
+    inside = scene.scribbles(1, seed)[0]
+    tint, colour = (torch.tensor(table[number % len(table)]).view(1, 3, 1, 1) for table in (TINTS, COLOURS))
+    # The colour is that of the texture where it is painted, not of the mean texture.
+    texture = (scene.object / tint).mean(1, keepdim=True)
+    wanted = (colour * texture / ((texture * inside).sum() / inside.sum())).clamp(0, 1)
+    core = (scene.alpha > 0.98).float()
+    results = {
+        name: recolor(scene.image, (colour * inside).expand_as(scene.image), inside, brightness=brightness)
+        for name, brightness in (("matched", 1.0), ("own", 0.0))
+    }
+    return {name: rms(result - wanted, core) for name, result in (results | {"nothing": scene.image}).items()}
 
 
 def measure_defocus(composite: Composite, count: int, seed: int) -> dict[str, float]:
@@ -188,6 +209,8 @@ def main(arguments: list[str] | None = None) -> None:
     report("recolor, one scribble", single, {"covered": "covered", "outside": "outside", "border": "border"})
     two = [measure_recolor(scene, i, 2, first + 10 * i, keep=True) for i, scene in scenes]
     report("recolor, two and one to keep", two, {"covered": "covered", "outside": "outside, keep", "border": "border"})
+    bright = [measure_brightness(scene, i, first + 10 * i) for i, scene in scenes]
+    report("recolor, brightness of the scribble", bright, {})
     report("defocus, one scribble", [measure_defocus(s, 1, first + 10 * i) for i, s in scenes], {"kept": "kept"})
     report("defocus, two", [measure_defocus(s, 2, first + 10 * i) for i, s in scenes], {"kept": "kept, two"})
     size = AREA_SIZE / 16 if chosen.quick else AREA_SIZE

@@ -319,7 +319,9 @@ FUNCTIONS = {
     "recolor": Function(
         nlf.recolor,
         {"image": _image(3)} | PAINTED,
-        LOCAL | {"keep": _background, "reach": _number(0, 0.99), "photometric_bandwidth": _plain(0.03, 0.5)},
+        LOCAL
+        | {"keep": _background, "reach": _number(0, 0.99), "brightness": _number(0, 1)}
+        | {"photometric_bandwidth": _plain(0.03, 0.5)},
     ),
     "colorize": Function(
         nlf.colorize,

@@ -6,10 +6,11 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from nlfilter_torch.core.precision import squarable
+from nlfilter_torch.core.precision import per_image, squarable
 from nlfilter_torch.operator.options import Completion, Sampling
 from nlfilter_torch.photo.declared.declaration import Edit
 from nlfilter_torch.photo.declared.parameters import RECOLOR
+from nlfilter_torch.photo.looks.look_filter import acts
 from nlfilter_torch.photo.picture.colour import (
     dot,
     group_colours,
@@ -28,6 +29,8 @@ from nlfilter_torch.photo.selections.stray import without_strays
 EPSILON = 1e-12  # keeps the derivative of a root finite
 END_MARGIN = 0.1  # masks closer to 0 or 1 are set to 0 or 1: a faint tint far away is visible, a less soft edge is not
 ROOM = 0.8  # share of the chroma at which a channel reaches 1 that the mean of an object may have
+DARKEST, LIGHTEST = 0.08, 0.92  # least share of its luminance that an object keeps, and most luminance that it gets
+MOST_GAIN = 4.0  # of the shading of a dark object that becomes light: of noise, too
 GREY_CHROMA = 0.05  # chroma below this counts as grey, without variations to keep
 
 
@@ -37,6 +40,7 @@ def recolor(
     stroke_mask: Tensor,
     *,
     keep: Tensor | None = None,
+    brightness: float | Tensor = RECOLOR.defaults["brightness"],
     reach: float | Tensor = RECOLOR.defaults["reach"],
     photometric_bandwidth: float | Tensor = RECOLOR.defaults["photometric_bandwidth"],
     spatial_bandwidth: float | Tensor | None = None,
@@ -52,12 +56,14 @@ def recolor(
 
     Args:
         image: (B, 3, H, W), RGB in [0, 1].
-        strokes: (B, 3, H, W), RGB, of which only hue and saturation are used. A saturation too strong for the
-            luminance under a stroke is reduced for the whole region, so that its shading remains. Up to 16 colours are
-            distinguished, each with its own region.
+        strokes: (B, 3, H, W), RGB, of which only hue and saturation are used unless ``brightness`` is above 0. A
+            saturation too strong for the luminance of a region is reduced for the whole region, so that its shading
+            remains. Up to 16 colours are distinguished, each with its own region.
         stroke_mask: (B, 1, H, W) in [0, 1], above 0 where painted.
         keep: (B, 1, H, W) in [0, 1], background scribbles, above 0 on pixels that stay unchanged together with similar
             ones. Strokes take precedence over it.
+        brightness: in [0, 1], 0 keeps the luminance of the image, 1 gives the object's pixels under a stroke the mean
+            luminance of the stroke, and others theirs in proportion; highlights stay white.
         reach: in [0, 1), probability that a walk over similar pixels continues after each step; larger includes less
             similar pixels.
         photometric_bandwidth: in hundredths of Lab: 0.08 is 8 units.
@@ -69,8 +75,9 @@ def recolor(
         generator: source of randomness for the landmarks; None draws the same for every call.
 
     Returns:
-        (B, 3, H, W), with the luminance of ``image``, and equal to it where a pixel is similar to no stroke.
-        Differentiable in image, strokes, mask and parameters, at a fixed grouping of the colours.
+        (B, 3, H, W), with the luminance of ``image`` if ``brightness`` is 0, and equal to it where a pixel is similar
+        to no stroke. Differentiable in image, strokes, mask and parameters, at a fixed grouping of the colours: by hue
+        and saturation, and by luminance too if ``brightness`` is above 0.
 
     Raises:
         TypeError, ValueError: if a tensor has another size, a mask leaves [0, 1], nothing is painted, or ``keep`` is
@@ -86,6 +93,7 @@ def recolor(
         (True, True)
     """
     edit = Recolor(
+        brightness=brightness,
         reach=reach,
         photometric_bandwidth=photometric_bandwidth,
         spatial_bandwidth=spatial_bandwidth,
@@ -104,6 +112,7 @@ class Recolor(ObjectEdit):
     """The edit of :func:`recolor`."""
 
     declared: ClassVar[Edit] = RECOLOR
+    brightness: float | Tensor = RECOLOR.defaults["brightness"]
 
     def check_channels(self, channels: int) -> None:
         """Raise ValueError for a grey photograph."""
@@ -112,20 +121,24 @@ class Recolor(ObjectEdit):
 
     def fit(self, source: Source[M], drawn: Drawn[M]) -> Fitted:
         """Fit the new colours of the objects under the strokes."""
-        RECOLOR.check(source.batch, reach=self.reach)
+        RECOLOR.check(source.batch, reach=self.reach, brightness=self.brightness)
         scribbles = source.scribbles(drawn.masks.get("stroke_mask"), drawn.colours, "stroke_mask")
         kept = background_of(source, drawn.masks.get("keep"), scribbles, "keep")
-
-        colours, regions, valid = _grouped(scribbles)
+        matches = acts(torch.as_tensor(self.brightness), 0.0)
+        shown, regions, valid = _grouped(scribbles, matches)
         counted = without_strays(scribbles.weighted(regions), source.size).weights
         brightness, old = (
             region_means(part, counted.unsqueeze(2)) for part in split_luminance(scribbles.image.unsqueeze(2))
         )
-        colours = with_room(colours, brightness)
+        brightening = None
+        if matches:
+            brightening = Brightening.of(brightness, shown, self.brightness)
+            brightness = brightening.new
+        colours = with_room(split_colours(shown)[1] if matches else shown, brightness)
         inside = [scribbles.weighted(part) for part in regions.split(1, dim=1)]
         objects = fit_regions(source, inside, kept, self.selection_in(source.size))
-        change = Recoloring(colours, old, valid)
-        reduced = split_luminance(objects.reduced)[1]
+        change = Recoloring(colours, old, valid, brightening)
+        reduced = change.compared(objects.reduced)
         beside = []
         for share in change.shares(objects.reduced_masks()).split(1, dim=1):
             beside.append(colours_beside(reduced, refine_mask(reduced, share)).planes)
@@ -162,11 +175,68 @@ def with_room(chroma: Tensor, brightness: Tensor) -> Tensor:
     return chroma * (ROOM * limit).clamp(max=1.0)
 
 
-def _grouped(scribbles: Scribbles) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the chroma (B, K, 3) of scribbles, their regions (B, K, n), and which of them are valid, (B, K)."""
-    chroma = split_luminance(scribbles.shown.unsqueeze(2))[1]
-    regions, colours, valid = group_colours(chroma, scribbles.weights.unsqueeze(2))
+def split_colours(colours: Tensor) -> tuple[Tensor, Tensor]:
+    """Split RGB colours (B, K, 3) into luminance (B, K, 1) and chroma (B, K, 3)."""
+    luminance, chroma = split_luminance(colours.mT.unsqueeze(3))
+    return luminance.squeeze(3).mT, chroma.squeeze(3).mT
+
+
+def _grouped(scribbles: Scribbles, matches: bool) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the colours (B, K, 3) of scribbles, their regions (B, K, n), and which of them are valid, (B, K).
+
+    Colours are chroma, or RGB if their brightness counts.
+    """
+    shown = scribbles.shown.unsqueeze(2)
+    values = shown if matches else split_luminance(shown)[1]
+    regions, colours, valid = group_colours(values, scribbles.weights.unsqueeze(2))
     return colours, regions.squeeze(2), valid
+
+
+@dataclass(frozen=True, eq=False)
+class Brightening:
+    """Change of the luminance of K objects towards that of their strokes.
+
+    Darker pixels of an object than those under its stroke follow in proportion, as a surface of another colour would.
+    Lighter ones do so, too, if the object becomes darker, except for highlights, which have lost the colour of the
+    object: these stay white. If it becomes lighter, they approach white. Where few levels would become many, shading
+    is amplified no more than :data:`MOST_GAIN` times.
+
+    Attributes:
+        old: mean luminance under the strokes, (B, K, 1).
+        new: what it becomes, (B, K, 1).
+        amount: the share of the whole change, (1 or B, 1, 1, 1).
+    """
+
+    old: Tensor
+    new: Tensor
+    amount: Tensor
+
+    @staticmethod
+    def of(old: Tensor, colours: Tensor, amount: float | Tensor) -> "Brightening":
+        """Change luminance (B, K, 1) towards that of colours (B, K, 3), by a share of the change."""
+        share = per_image(amount, old, 3)
+        wanted = split_colours(colours)[0]
+        least, most = DARKEST * old, old.clamp(min=LIGHTEST)
+        return Brightening(old, old + share * (wanted.clamp(least, most) - old), share.unsqueeze(3))
+
+    def __call__(self, number: int, luminance: Tensor, relative: Tensor) -> Tensor:
+        """New luminance (B, 1, H, W) of an object with that number, whose pixels have a relative saturation."""
+        old, new = (mean[:, number, :, None, None] for mean in (self.old, self.new))
+        gain = (new / old.clamp(min=EPSILON)).clamp(max=MOST_GAIN)
+        beyond = luminance - old
+        along = new + gain * beyond
+        room, left = (1 - old).clamp(min=EPSILON), (1 - new).clamp(min=EPSILON)
+        place = (beyond / room).clamp(0.0, 1.0)
+        slope = gain * room / left
+        towards_white = new + left * slope * place / (1 + (slope - 1) * place).clamp(min=EPSILON)
+        highlight = (1 - relative).clamp(0.0, 1.0)
+        lighter = torch.where(gain > 1, towards_white, torch.lerp(along, new + left * place, highlight))
+        return torch.where(beyond > 0, lighter, along).clamp(0.0, 1.0)
+
+    def shade(self, number: int, luminance: Tensor) -> Tensor:
+        """Relative saturation (B, 1, H, W) that a grey object takes: of pixels of the luminance under the stroke 1."""
+        ratio = luminance / self.old[:, number, :, None, None].clamp(min=EPSILON)
+        return torch.lerp(torch.ones_like(ratio), ratio, self.amount)
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,11 +250,17 @@ class Recoloring:
         colours: chroma of the strokes, (B, K, 3).
         old: mean chroma of the image under the strokes, (B, K, 3).
         valid: which of the K colours each image has, (B, K).
+        brightening: change of the objects' luminance; None keeps it.
     """
 
     colours: Tensor
     old: Tensor
     valid: Tensor
+    brightening: Brightening | None = None
+
+    def compared(self, image: Tensor) -> Tensor:
+        """What is compared at the borders of an image (B, 3, H, W): chroma, or colours if luminance changes, too."""
+        return split_luminance(image)[1] if self.brightening is None else image
 
     def shares(self, masks: Tensor) -> Tensor:
         """Return the fraction of each pixel that takes each colour, (B, K, H, W), from masks (B, K, H, W)."""
@@ -196,19 +272,46 @@ class Recoloring:
         """Recolour pixels (B, 3, H, W), given masks (B, K, H, W) and the colours on both sides of their borders."""
         shares = self.shares(masks)
         luminance, chroma = split_luminance(pixels)
-        changed, total = chroma, torch.zeros_like(luminance)
+        compared = self.compared(pixels)
+        brightness, changed, total = luminance, chroma, torch.zeros_like(luminance)
         for k in range(shares.shape[1]):
             sides = beside[k]
-            share = sides.refine(chroma, shares[:, k : k + 1])
-            # Chroma of the object's part of a mixed pixel; inside the object, that of the pixel.
-            object_chroma = torch.addcmul(chroma, 1 - share, sides.across)
-            # The new colour takes the relative saturation of the old one, so that a white highlight stays white.
-            squared_saturation = squarable(self.old[:, k]).square().sum(1)[:, None, None, None]
-            limited_chroma = squarable(object_chroma)
-            product = (squared_saturation * dot(limited_chroma, limited_chroma)).clamp(min=EPSILON).sqrt()
-            relative = (product + GREY_CHROMA**2) / (squared_saturation + GREY_CHROMA**2)
-            changed = torch.addcmul(changed, share * relative.clamp(0.0, 1.5), self.colours[:, k, :, None, None])
-            changed = torch.addcmul(changed, share, object_chroma, value=-1)
+            share = shares[:, k : k + 1]
+            if self.brightening is not None:
+                # A border pixel that is a tenth white on black ground is a bright rim once the white is dark.
+                share = torch.lerp(share, masks[:, k : k + 1] * self.valid[:, k, None, None, None], sides.trust)
+            share = sides.refine(compared, share)
+            # Colour of the object's part of a mixed pixel; inside the object, that of the pixel.
+            thing = torch.addcmul(compared, 1 - share, sides.across)
+            light, thing_chroma = (None, thing) if self.brightening is None else split_luminance(thing.clamp(0.0, 1.0))
+            relative = self.relative(k, thing_chroma, light)
+            factor = share * relative.clamp(0.0, 1.5)
+            if self.brightening is not None and light is not None:
+                new = self.brightening(k, light, relative)
+                brightness = torch.addcmul(brightness, share, new - light)
+                factor = factor * in_gamut(new, relative.clamp(0.0, 1.5) * self.colours[:, k, :, None, None])
+            changed = torch.addcmul(changed, factor, self.colours[:, k, :, None, None])
+            changed = torch.addcmul(changed, share, thing_chroma, value=-1)
             total = total + share
         untouched = (total == 0).expand_as(pixels)
-        return torch.where(untouched, pixels, merge_luminance(luminance, changed))
+        return torch.where(untouched, pixels, merge_luminance(brightness.clamp(0.0, 1.0), changed))
+
+    def relative(self, number: int, chroma: Tensor, luminance: Tensor | None) -> Tensor:
+        """Saturation (B, 1, H, W) of an object's pixels relative to that under its stroke, which the new colour takes.
+
+        So a white highlight stays white. For a grey object it is 1, or follows the luminance if that is given.
+        """
+        old = squarable(self.old[:, number])
+        squared_saturation = old.square().sum(1)[:, None, None, None]
+        limited_chroma = squarable(chroma)
+        product = (squared_saturation * dot(limited_chroma, limited_chroma)).clamp(min=EPSILON).sqrt()
+        grey = GREY_CHROMA**2
+        if self.brightening is None or luminance is None:
+            return (product + grey) / (squared_saturation + grey)
+        return (product + grey * self.brightening.shade(number, luminance)) / (squared_saturation + grey)
+
+
+def in_gamut(luminance: Tensor, chroma: Tensor) -> Tensor:
+    """Factor (B, 1, H, W) of chroma (B, 3, H, W) that keeps all channels in [0, 1], at most 1."""
+    up, down = chroma.amax(1, keepdim=True).clamp(min=EPSILON), -chroma.amin(1, keepdim=True).clamp(max=-EPSILON)
+    return torch.minimum((1 - luminance) / up, luminance / down).clamp(0.0, 1.0)

@@ -5,7 +5,9 @@ import torch
 import torch.nn.functional as F
 
 from nlfilter_torch import recolor
+from nlfilter_torch.photo.edits.recolor import Brightening, Recoloring, split_colours, with_room
 from nlfilter_torch.photo.picture.colour import group_colours, split_luminance
+from nlfilter_torch.photo.selections.border_colours import colours_beside
 from tests.problems import BACKGROUND, SUIT, box, colour, luminance, noise, paint
 
 
@@ -142,3 +144,108 @@ def test_a_background_under_the_strokes_is_refused() -> None:
             recolor(image, strokes, stroke, keep=keep, num_landmarks=20)
     # A keep that reaches beyond the stroke, and none in one image, are valid.
     recolor(image, strokes, stroke, keep=torch.cat([under + beside, 0 * under]), num_landmarks=20)
+
+
+def lit(*tint: float, low: float = 0.3, high: float = 0.95) -> torch.Tensor:
+    """A surface (1, 3, 40, 40) of one colour, from shade at the left to light at the right."""
+    shade = torch.linspace(low, high, 40).view(1, 1, 1, 40).expand(1, 1, 40, 40)
+    return torch.tensor(tint).view(1, 3, 1, 1) * shade
+
+
+def changed(image: torch.Tensor, *stroke: float, brightness: float = 1.0) -> torch.Tensor:
+    """A picture that is all of one object, with a stroke in its middle."""
+    new, old = torch.tensor(stroke).view(1, 1, 3), image[..., 16:24, 16:24].mean((2, 3)).view(1, 1, 3)
+    (before, chroma), whole = split_colours(old), torch.ones_like(image[:, :1])
+    brightening = Brightening.of(before, new, brightness)
+    colours = with_room(split_colours(new)[1], brightening.new)
+    change = Recoloring(colours, chroma, torch.ones(1, 1, dtype=torch.bool), brightening)
+    return change(image, whole, [colours_beside(image, whole)])
+
+
+MIDDLE = box(16, 16, 8, 8, size=(40, 40))
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [((1.0, 0.85, 0.1), (0.8, 0.05, 0.05)), ((1.0, 1.0, 1.0), (0.1, 0.1, 0.6)), ((0.4, 0.15, 0.15), (0.5, 0.4, 0.1))],
+)
+def test_an_object_in_the_brightness_of_the_stroke_keeps_its_shading(
+    old: tuple[float, ...], new: tuple[float, ...]
+) -> None:
+    image = lit(*old)
+    edited = changed(image, *new)
+    painted = (edited * MIDDLE).sum((2, 3)) / MIDDLE.sum()
+    assert (painted - torch.tensor([new])).abs().max() < 0.06
+    before, after = luminance(image)[0, 0, 20], luminance(edited)[0, 0, 20]
+    assert after.diff().min() > 0  # lighter where it was lighter
+    dark = slice(2, 18)
+    torch.testing.assert_close((after / after[20])[dark], (before / before[20])[dark], atol=0.02, rtol=0)
+    hue = F.cosine_similarity(split_luminance(edited)[1], split_luminance(torch.tensor(new).view(1, 3, 1, 1))[1], dim=1)
+    assert hue[..., 2:38].min() > 0.99
+    assert edited.min() >= -1e-6
+    assert edited.max() <= 1 + 1e-6
+
+
+def test_brightness_goes_from_that_of_the_object_to_that_of_the_stroke() -> None:
+    image = lit(1.0, 0.85, 0.1)
+    red = paint(0.8, 0.05, 0.05, MIDDLE)
+    amounts = torch.tensor([0.0, 0.3, 0.7, 1.0])
+    edited = [recolor(image, red, MIDDLE, num_landmarks=40, brightness=float(amount)) for amount in amounts]
+    assert torch.equal(edited[0], recolor(image, red, MIDDLE, num_landmarks=40))
+    levels = torch.stack([(luminance(each) * MIDDLE).sum() / MIDDLE.sum() for each in edited])
+    torch.testing.assert_close(levels, torch.lerp(levels[0], levels[3], amounts), atol=2e-3, rtol=0)
+    batch = recolor(
+        image.expand(2, -1, -1, -1),
+        red.expand(2, -1, -1, -1),
+        MIDDLE.expand(2, -1, -1, -1),
+        num_landmarks=40,
+        brightness=amounts[1:3],
+    )
+    torch.testing.assert_close(batch, torch.cat(edited[1:3]), atol=1e-5, rtol=0)
+    with pytest.raises(ValueError, match=r"brightness must be in \[0, 1\], got 1\.5"):
+        recolor(image, red, MIDDLE, brightness=1.5)
+
+
+def test_highlights_stay_white_and_shading_is_never_flat() -> None:
+    image = lit(1.0, 0.6, 0.1)
+    image[..., 19:21, 30:34] = 0.98
+    black = changed(image, 0.0, 0.0, 0.0)
+    assert black[..., 19:21, 30:34].min() > 0.7
+    assert luminance(black)[0, 0, 10].max() < 0.1
+    assert luminance(black)[0, 0, 10].diff().min() > 0
+    white = changed(lit(0.2, 0.2, 0.2), 1.0, 1.0, 1.0)
+    assert luminance(white)[0, 0, 10].diff().min() > 0
+    assert luminance(white)[0, 0, 20, 20] > 0.85
+
+
+def test_borders_in_the_brightness_of_the_stroke_have_no_rim() -> None:
+    share = F.avg_pool2d(box(10, 10, 20, 20, size=(40, 40)), 5, 1, 2)
+    ground = torch.tensor([0.15, 0.3, 0.15]).view(1, 3, 1, 1)
+    image = share * 0.9 + (1 - share) * ground
+    edited = recolor(image, paint(0.1, 0.1, 0.6, MIDDLE), MIDDLE, num_landmarks=40, brightness=1.0)
+    wanted = share * torch.tensor([0.1, 0.1, 0.6]).view(1, 3, 1, 1) + (1 - share) * ground
+    assert (edited - wanted).abs().max() < 0.1
+    assert (luminance(edited) - luminance(wanted)).abs().max() < 0.1
+
+
+def test_strokes_of_one_hue_are_told_apart_by_their_brightness() -> None:
+    image = torch.cat([lit(0.9, 0.3, 0.3)[..., :20], lit(0.3, 0.4, 0.9)[..., 20:]], dim=3)
+    left, right = box(16, 4, 8, 8, size=(40, 40)), box(16, 28, 8, 8, size=(40, 40))
+    strokes = paint(0.1, 0.1, 0.1, left) + paint(0.8, 0.8, 0.8, right)
+    edited = recolor(image, strokes, left + right, num_landmarks=40, brightness=1.0)
+    assert luminance(edited)[0, 0, 20, 8] < 0.2
+    assert luminance(edited)[0, 0, 20, 32] > 0.7
+
+
+def test_brightness_is_differentiable() -> None:
+    image = lit(1.0, 0.85, 0.1).double().requires_grad_()
+    amount = torch.tensor(0.5, dtype=torch.float64, requires_grad=True)
+    strokes = paint(0.8, 0.05, 0.05, MIDDLE).double()
+    edited = recolor(image, strokes, MIDDLE.double(), num_landmarks=30, brightness=amount)
+    (slope,) = torch.autograd.grad(edited.sum(), amount, retain_graph=True)
+    above, below = (
+        recolor(image.detach(), strokes, MIDDLE.double(), num_landmarks=30, brightness=0.5 + step).sum()
+        for step in (1e-5, -1e-5)
+    )
+    torch.testing.assert_close(slope, (above - below) / 2e-5, rtol=1e-4, atol=1e-4)
+    assert torch.autograd.grad(edited.sum(), image)[0].isfinite().all()

@@ -94,7 +94,7 @@ def coloured(picture: Array, *painted: Array, kind: Any = None, **options: Any) 
         ({}, False),
         ({"reach": 0.5, "patch_size": 5}, True),
         ({"spatial_bandwidth": 60.0, "photometric_bandwidth": 0.2}, True),
-        ({"landmarks": "uniform"}, False),
+        ({"landmarks": "uniform", "brightness": 0.8}, False),
     ],
 )
 def test_full_passes_recolour_as_in_memory(
