@@ -24,8 +24,11 @@ class Painted(Protocol):
     def render(self, moving: int | None = None) -> Tensor:
         """The preview under the edit, (1, C, h, w) in [0, 1], quickly while a slider of a step moves."""
 
-    def mask(self) -> Tensor | None:
-        """The mask of the region, (1, 1, h, w) in [0, 1]."""
+    def mask(self, edit: str) -> Tensor | None:
+        """The mask of what the scribbles of an edit select, (1, 1, h, w) in [0, 1]."""
+
+    def ignored(self, edit: str) -> Tensor | None:
+        """Which pixels (1, 1, h, w) under these scribbles do not count."""
 
     def add_stroke(self, step: str, points: list[tuple[float, float]], radius: float, paint: str) -> None:
         """Add a stroke to a step: points (x, y) in pixels of the preview."""
@@ -38,19 +41,22 @@ class Canvas:
         brush: what draws.
         token: part of the addresses of the pictures.
         draw: is called with the step and the function that adds a complete stroke to it.
+        lay: is called when :meth:`lay_over` is to be called, in a thread, and then :meth:`show_layers`.
         show_error: is called with a sentence for the user.
 
     Attributes:
         pictures: image files, by their kind.
     """
 
-    def __init__(self, brush: Brush, token: str, draw: Draw, show_error: Callable[[str], None]) -> None:
+    def __init__(
+        self, brush: Brush, token: str, draw: Draw, lay: Callable[[], None], show_error: Callable[[str], None]
+    ) -> None:
         self.pictures: dict[str, bytes] = {}
         self.histogram = ""
         self.clipped = self.clipped_before = (0.0, 0.0)  # shares of white and of black, after and before the edit
         self._session: Painted | None = None
         self._preview_size = (1, 1)
-        self._brush, self._token, self._draw = brush, token, draw
+        self._brush, self._token, self._draw, self._lay = brush, token, draw, lay
         self._frame = 0
         self._flashes = 0
         self._mask_shown: bytes | None = None  # the mask that was shown last
@@ -76,6 +82,7 @@ class Canvas:
         with self._photo:
             ui.element("div").classes("over pieces")
             self._mask = ui.element("img").classes("over mask").props('alt="mask"')
+            self._ignored = ui.element("img").classes("over ignored").props('alt="parts of strokes that do not count"')
             self._clipped = ui.element("img").classes("over").props('alt="clipped"')
             self._before = ui.element("img").classes("over before").props('alt="before"')
             ui.element("div").classes("over before originals")
@@ -84,7 +91,7 @@ class Canvas:
         self._photo.on(
             "mouse", lambda event: self._pointer(*event.args), js_handler="(event) => page.point(event, emit)"
         )
-        for element in (self._photo, self._clipped, self._mask):
+        for element in (self._photo, self._clipped, self._mask, self._ignored):
             element.set_visibility(False)
 
     def _build_bar(self) -> None:
@@ -94,10 +101,11 @@ class Canvas:
             wipe.props('dense aria-label="Before and after"')
             wipe.on("update:model-value", js_handler="(share) => closeup.wipe(share)")
             self._show_strokes = ui.checkbox("Strokes", value=True, on_change=self.draw_strokes).props("dense")
-            self._show_mask = ui.checkbox("Mask", value=False, on_change=lambda: self.draw_mask()).props("dense")
-            self._show_mask.tooltip(
-                "Keep the mask of the region in sight; otherwise it shows for a second after a stroke"
-            )
+            self._show_mask = ui.checkbox("Mask", value=False, on_change=self._follow_view).props("dense")
+            self._show_mask.tooltip("Show what the strokes select")
+            self._is_plain = ui.checkbox("B/W", value=False, on_change=self._follow_view).props("dense")
+            self._is_plain.props('aria-label="B/W: black and white"').tooltip("Show the mask in black and white")
+            self._is_plain.set_visibility(False)
             self._show_clipped = ui.checkbox("Clipped", value=False, on_change=self._draw_clipped)
             self._show_clipped.props("dense").tooltip("Mark what has become white (red) or black (blue)")
             ui.space()
@@ -123,7 +131,11 @@ class Canvas:
 
     def switch(self, step: str) -> None:
         """Show the strokes of another step."""
+        if step != self._step:
+            self.pictures.update(mask=b"", ignored=b"")
         self._step = step
+        self._show_mask.set_enabled(step in BRUSHES and not EDITS[step].coloured)  # others select nothing
+        self._lay()
         ui.run_javascript(f"closeup.brush({'true' if step in BRUSHES else 'false'})")
         self.draw_strokes()
         self.draw_mask()
@@ -134,8 +146,36 @@ class Canvas:
         if session is None:
             return
         self.take(session.render(moving))
-        mask = session.mask()
-        self.pictures["mask"] = b"" if mask is None else drawing.mask_picture(mask)
+        self.lay_over(moving=moving is not None)
+
+    def lay_over(self, *, moving: bool = False) -> None:
+        """Compute the mask, if it may be shown, and what does not count of the strokes; may run in a thread."""
+        session, step = self._session, self._step
+        if session is None or step not in BRUSHES:
+            return
+        keep = bool(self._show_mask.value)
+        mask = None
+        if EDITS[step].regional is not None or (keep and not moving):
+            mask = session.mask(step)
+        tint = drawing.TINTS[0] if mask is None else drawing.contrasting_tint(self._edited, mask)
+        plain = keep and bool(self._is_plain.value)
+        content = b"" if mask is None else drawing.lossless(mask) if plain else drawing.mask_picture(mask, tint)
+        ignored = None if moving else session.ignored(step)
+        if step == self._step:  # another tab may have been opened meanwhile
+            self.pictures["mask"] = content
+            if not moving:
+                self.pictures["ignored"] = b"" if ignored is None else drawing.hatching(ignored)
+
+    def show_layers(self) -> None:
+        """Show what :meth:`lay_over` has computed."""
+        self.draw_strokes()
+        self.draw_mask()
+
+    def _follow_view(self) -> None:
+        """Show the mask as it is asked for."""
+        self._is_plain.set_visibility(bool(self._show_mask.value))
+        self.draw_mask()
+        self._lay()
 
     def take(self, edited: Tensor) -> None:
         """Take the edited picture (1, C, h, w), in [0, 1], that is shown next."""
@@ -151,10 +191,11 @@ class Canvas:
 
     def draw_mask(self, *, moving: bool = False) -> None:
         """Show the mask, except while a slider is moving; for a second, if it is new and not to be kept in sight."""
-        mask = self.pictures.get("mask") if EDITS[self._step].regional else None
+        mask = self.pictures.get("mask")
         new = mask != self._mask_shown
         keep = bool(self._show_mask.value)
-        if not mask or moving or not (keep or new):
+        passing = new and EDITS[self._step].regional is not None  # shows for a moment after a stroke
+        if not mask or moving or not (keep or passing):
             self._mask.set_visibility(False)
             self._mask_shown = mask if not moving else self._mask_shown
             return
@@ -186,6 +227,10 @@ class Canvas:
                 points = tuple((x / width, y / height) for x, y in self._line)
                 strokes += (Stroke(points, self._brush.radius[self._step], self._brush.paint(self._step)),)
         self._photo.set_content(drawing.strokes_svg(strokes, self._preview_size))
+        is_hatched = bool(strokes and self.pictures.get("ignored"))
+        if is_hatched:
+            self._show("ignored", self._ignored)
+        self._ignored.set_visibility(is_hatched)
 
     def _pointer(self, kind: str, x: float, y: float) -> None:
         """Begin, continue or end a stroke."""

@@ -87,11 +87,10 @@ class SaveDialog(NameDialog):
 
     def _build_options(self) -> None:
         with ui.row().classes("w-full items-center no-wrap gap-3") as self._lossy:
-            ui.label("JPEG quality").classes("text-no-wrap")
+            label = ui.label().classes("text-no-wrap")
             self._quality = SteadySlider(min=LEAST_QUALITY, max=100, step=1, value=QUALITY)
-            self._quality.props('dense label aria-label="JPEG quality"').on_reset(
-                lambda: self._quality.set_value(QUALITY)
-            )
+            label.bind_text_from(self._quality, "value", lambda value: f"JPEG quality {value:.0f}")
+            self._quality.props('dense aria-label="JPEG quality"').on_reset(lambda: self._quality.set_value(QUALITY))
         self._side = ui.number(
             "Longest side in pixels", value=self._longest, min=LEAST_SIDE, max=self._longest, precision=0
         )

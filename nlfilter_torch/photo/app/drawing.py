@@ -12,9 +12,14 @@ from torch import Tensor
 from nlfilter_torch.filtering.filters import polynomial_response
 from nlfilter_torch.photo.declared.parameters import EDITS
 from nlfilter_torch.photo.declared.strokes import Stroke
+from nlfilter_torch.photo.picture.colour import hundredths_of_lab
 
 QUALITY = 95
-TINT, OPACITY = (255, 40, 80), 120  # of the mask
+#: Colours of the mask, of which the one that differs most from the picture under it is shown.
+TINTS = ((255, 40, 80), (0, 190, 255), (255, 220, 0), (170, 80, 255))
+OPACITY = 120  # of the mask, of 255
+COMPARED = 4096  # pixels, about, with which these are compared
+HATCHING = 8  # pixels of a preview from one line to the next
 #: Colours of strokes with a meaning, by its word: green on objects, red on the background, grey on what stays as it is.
 WORDS = {
     scribble.word: "#22c55e" if scribble.role == "object" else "#ef4444"
@@ -43,12 +48,36 @@ def lossless(image: Tensor) -> bytes:
     return _encode(Image.fromarray(np.ascontiguousarray(values)), "PNG", compress_level=1)
 
 
-def mask_picture(mask: Tensor) -> bytes:
+def mask_picture(mask: Tensor, tint: tuple[int, int, int] = TINTS[0]) -> bytes:
     """A mask (1, 1, H, W) in [0, 1] as a tinted, transparent PNG."""
     alpha = (mask[0, 0] * OPACITY).round().to(torch.uint8).numpy()
     layer = np.empty((*alpha.shape, 4), np.uint8)
-    layer[..., :3], layer[..., 3] = TINT, alpha
+    layer[..., :3], layer[..., 3] = tint, alpha
     return _encode(Image.fromarray(layer), "PNG", compress_level=1)
+
+
+def contrasting_tint(image: Tensor, mask: Tensor) -> tuple[int, int, int]:
+    """The tint of :data:`TINTS` that differs most from the colours of an image (1, C, H, W) in a mask (1, 1, H, W).
+
+    >>> contrasting_tint(torch.tensor([0.9, 0.1, 0.2]).view(1, 3, 1, 1), torch.ones(1, 1, 1, 1))
+    (0, 190, 255)
+    """
+    step = max(1, mask.numel() // COMPARED)
+    colours, weights = image.expand(-1, 3, -1, -1).flatten(2)[..., ::step], mask.flatten(2)[..., ::step]
+    tints = torch.tensor(TINTS).T[None] / 255
+    distances = hundredths_of_lab(tints[..., None]) - hundredths_of_lab(colours.float().unsqueeze(2))
+    means = (distances.norm(dim=1) * weights).sum(-1)
+    return TINTS[int(means.argmax())]
+
+
+def hatching(places: Tensor) -> bytes:
+    """Black and white lines on some pixels (1, 1, H, W), as a transparent PNG."""
+    height, width = places.shape[-2:]
+    phase = (torch.arange(height).unsqueeze(1) + torch.arange(width)) % HATCHING
+    lines, values = (places[0, 0] > 0) & (phase < HATCHING // 2), torch.where(phase < HATCHING // 4, 255, 0)
+    layer = torch.where(lines, values, 0).unsqueeze(2).repeat(1, 1, 4)
+    layer[..., 3] = torch.where(lines, 255, 0)
+    return _encode(Image.fromarray(layer.to(torch.uint8).numpy()), "PNG", compress_level=1)
 
 
 def clipped_picture(image: Tensor) -> bytes:

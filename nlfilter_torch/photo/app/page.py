@@ -83,7 +83,7 @@ class Editor:
         brush = Brush()
         with ui.element("div").classes("editor"):
             with ui.element("div").classes("viewer"):
-                self._canvas = Canvas(brush, self._token, self._draw, self._tasks.show_error)
+                self._canvas = Canvas(brush, self._token, self._draw, self._lay, self._tasks.show_error)
             with ui.column().classes("panel"):
                 handle = ui.button(icon="drag_handle").props('flat dense aria-label="Show or hide the controls"')
                 handle.classes("handle").on("click", js_handler="() => page.fold()")
@@ -245,9 +245,19 @@ class Editor:
                 self._show()
                 self._draw_response()
                 self._canvas.draw_mask(moving=moving is not None)
+                self._canvas.draw_strokes()
         finally:
             self._drawing = False
         self._at_rest.drawn(self.session)
+
+    def _lay(self) -> None:
+        """Show the mask and the strokes of the open tab."""
+        if self.session.opened is not None:
+            self._tasks.start(self._lay_over())
+
+    async def _lay_over(self) -> None:
+        await self._tasks.run("Working", self._canvas.lay_over)
+        self._canvas.show_layers()
 
     def _show(self) -> None:
         """Show the picture that the canvas has taken, and its histogram."""

@@ -253,10 +253,15 @@ class Session:
         with self._drawing:
             return self.preview.render(self.recipe, moving)
 
-    def mask(self) -> Tensor | None:
-        """The mask of the region that has its own sliders; see :meth:`Preview.mask`."""
+    def mask(self, edit: str) -> Tensor | None:
+        """The mask of what the scribbles of an edit select; see :meth:`Preview.selected`."""
         with self._drawing:
-            return self.preview.mask(self.recipe.last("detail"))
+            return self.preview.selected(self.recipe, edit)
+
+    def ignored(self, edit: str) -> Tensor | None:
+        """What does not count of these scribbles; see :meth:`Preview.ignored`."""
+        with self._drawing:
+            return self.preview.ignored(self.recipe, edit)
 
     def original(self, place: Rectangle) -> Tensor:
         """A part of the photograph before the edit, (1, C, h, w) in [0, 1]; raises ValueError if none is open."""

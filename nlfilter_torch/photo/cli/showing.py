@@ -24,7 +24,7 @@ from nlfilter_torch.photo.picture.drawn import Drawn
 from nlfilter_torch.photo.picture.edit import PhotoEdit, Rows
 from nlfilter_torch.photo.picture.in_memory import InMemory, edit_image
 from nlfilter_torch.photo.selections.scribbled_colours import frame_places
-from nlfilter_torch.photo.selections.stray import strays
+from nlfilter_torch.photo.selections.stray import stray_parts
 
 Read = Callable[[slice], Tensor]  # rows of the photograph as (1, C, h, W) in [0, 1]
 MAX_PIXELS = 500_000  # largest size of the picture that shows scribbles
@@ -90,7 +90,7 @@ class Scribbled:
             mask = edit_image(selection, image, Drawn(marks))
         shown = drawn_over(image, mask, region[:, :3] if coloured else None, painted, kept)
         for drawn in (painted, kept):
-            shown = shown if drawn is None else hatched(shown, stray_parts(image, drawn))
+            shown = shown if drawn is None else hatched(shown, stray_parts(InMemory(image), drawn))
         write_photograph(Photograph(shown), target)
 
 
@@ -137,13 +137,6 @@ def drawn_over(image: Tensor, mask: Tensor, colours: Tensor | None, painted: Ten
         painted = painted.maximum(kept.ceil())
     rim = F.max_pool2d(painted, 3, stride=1, padding=1) - painted
     return torch.where(rim > 0, torch.ones_like(shown), shown)
-
-
-def stray_parts(image: Tensor, painted: Tensor) -> Tensor:
-    """The parts (1, 1, H, W) of scribbles on an image that do not count, since they are on something else."""
-    source = InMemory(image)
-    scribbles = source.scribbles(painted, None, "scribbles", needed=False)
-    return scribbles.weighted(strays(scribbles, source.size).to(image)).planes(source)
 
 
 def hatched(shown: Tensor, places: Tensor) -> Tensor:

@@ -1,14 +1,17 @@
 """The large picture with its overlays, and the brush that draws on it."""
 
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
+import torch
 from nicegui import Client
 
 from nlfilter_torch.photo.app import drawing
 from nlfilter_torch.photo.app.brush import Brush
 from nlfilter_torch.photo.app.canvas import Canvas
 from nlfilter_torch.photo.app.session import Session
+from nlfilter_torch.photo.io.photographs import Photograph, write_photograph
 from tests.problems import cat
 
 
@@ -19,11 +22,15 @@ class Page:
         self.brush = Brush()
         self.strokes = 0
         self.errors: list[str] = []
-        self.canvas = Canvas(self.brush, "token", self.draw, self.errors.append)
+        self.canvas = Canvas(self.brush, "token", self.draw, self.lay, self.errors.append)
 
     def draw(self, step: str, add: Callable[[], None]) -> None:
         add()
         self.strokes += 1
+
+    def lay(self) -> None:
+        self.canvas.lay_over()
+        self.canvas.show_layers()
 
     def open(self, session: Session) -> None:
         assert session.opened is not None
@@ -135,6 +142,45 @@ def test_the_mask_is_shown_when_it_is_new_or_kept_in_sight(opened: Page) -> None
     assert canvas._mask.visible
     canvas.switch("recolor")
     assert not canvas._mask.visible
+
+
+def test_masks_of_all_brushes_in_colour_and_in_black_and_white(opened: Page, session: Session) -> None:
+    canvas = opened.canvas
+    canvas.switch("defocus")
+    opened.paint((20.0, 20.0), (40.0, 20.0))
+    canvas.draw(None)
+    assert not canvas.pictures["mask"]  # it is computed when it is asked for
+    canvas._show_mask.set_value(True)
+    assert canvas._mask.visible
+    mask = session.mask("defocus")
+    assert mask is not None
+    tint = drawing.contrasting_tint(session.render(), mask)
+    assert canvas.pictures["mask"] == drawing.mask_picture(mask, tint)
+    canvas._is_plain.set_value(True)
+    assert canvas.pictures["mask"] == drawing.lossless(mask)
+    canvas.switch("tone")
+    assert not canvas._mask.visible
+    canvas._show_mask.set_value(False)
+    assert not canvas._is_plain.visible
+
+
+def test_parts_of_strokes_that_do_not_count_are_hatched(opened: Page, tmp_path: Path, session: Session) -> None:
+    pixels = torch.full((1, 3, 60, 90), 0.5) + torch.tensor([0.3, -0.2, -0.2]).view(1, 3, 1, 1)
+    pixels[..., 48:] = torch.tensor([0.1, 0.5, 0.2]).view(1, 3, 1, 1)
+    write_photograph(Photograph(pixels), tmp_path / "two.png")
+    session.open(tmp_path / "two.png")
+    opened.open(session)
+    canvas = opened.canvas
+    opened.paint((20.0, 30.0), (55.0, 30.0))
+    canvas.draw(None)
+    canvas.draw_strokes()
+    assert canvas._ignored.visible
+    ignored = session.ignored("detail")
+    assert ignored is not None
+    assert canvas.pictures["ignored"] == drawing.hatching(ignored)
+    assert ignored.nonzero()[:, 3].min() >= 47
+    canvas._show_strokes.set_value(False)
+    assert not canvas._ignored.visible
 
 
 def test_what_is_clipped(opened: Page, session: Session) -> None:

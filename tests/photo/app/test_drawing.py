@@ -26,6 +26,16 @@ def test_pictures() -> None:
     assert (layer[0, 0, 3], layer[-1, -1, 3]) == (0, drawing.OPACITY)
 
 
+def test_the_mask_contrasts_with_the_picture() -> None:
+    everywhere = torch.ones(1, 1, 20, 20)
+    for colour in drawing.TINTS:
+        image = torch.tensor(colour).view(1, 3, 1, 1).expand(-1, -1, 20, 20) / 255
+        assert drawing.contrasting_tint(image, everywhere) != colour
+    lines = decoded(drawing.hatching(everywhere))
+    assert {tuple(pixel) for pixel in lines.reshape(-1, 4)} == {(0, 0, 0, 0), (0, 0, 0, 255), (255, 255, 255, 255)}
+    assert not decoded(drawing.hatching(torch.zeros(1, 1, 20, 20))).any()
+
+
 def test_strokes_are_drawn_as_painted() -> None:
     svg = drawing.strokes_svg(
         [Stroke(((0.5, 0.25),), 0.1, "in"), Stroke(((0.0, 0.0), (1.0, 1.0)), 0.1, "#aabbcc")], (100, 200)

@@ -10,8 +10,10 @@ import torch
 from PIL import Image
 
 from nlfilter_torch.photo.cli import main
-from nlfilter_torch.photo.cli.showing import hatched, stray_parts
+from nlfilter_torch.photo.cli.showing import hatched
 from nlfilter_torch.photo.io.photographs import Photograph, read_photograph, write_photograph
+from nlfilter_torch.photo.picture.in_memory import InMemory
+from nlfilter_torch.photo.selections.stray import stray_parts
 from tests.problems import box, paint
 
 
@@ -83,7 +85,7 @@ def test_many_scribbles_over_unlike_things_have_one_note(
 def test_stray_parts_are_hatched() -> None:
     thing = box(10, 10, 40, 40, (60, 90))
     image = paint(0.7, 0.15, 0.1, thing) + paint(0.2, 0.5, 0.25, 1 - thing)
-    stray = stray_parts(image, box(30, 20, 5, 37, (60, 90)))
+    stray = stray_parts(InMemory(image), box(30, 20, 5, 37, (60, 90)))
     assert torch.equal(stray, box(30, 50, 5, 7, (60, 90)))
     dark = (hatched(image, stray) == 0).all(1)
     assert dark.sum() == pytest.approx(stray.sum() / 2, abs=2)
