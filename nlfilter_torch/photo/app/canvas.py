@@ -191,20 +191,25 @@ class Canvas:
 
     def draw_mask(self, *, moving: bool = False) -> None:
         """Show the mask, except while a slider is moving; for a second, if it is new and not to be kept in sight."""
-        mask = self.pictures.get("mask")
+        mask, keep = self.pictures.get("mask"), bool(self._show_mask.value)
         new = mask != self._mask_shown
-        keep = bool(self._show_mask.value)
-        passing = new and EDITS[self._step].regional is not None  # shows for a moment after a stroke
+        passing = EDITS[self._step].regional is not None  # shows for a moment after a stroke
         if not mask or moving or not (keep or passing):
-            self._mask.set_visibility(False)
+            self._hide_mask()
             self._mask_shown = mask if not moving else self._mask_shown
-            return
-        self._mask_shown = mask
-        self._flashes += 1
-        # An animation begins again if its name changes.
-        self._mask.classes(remove="flash-0 flash-1", add="" if keep else f"flash-{self._flashes % 2}")
-        self._show("mask", self._mask)
-        self._mask.set_visibility(True)
+        elif keep or new:
+            self._mask_shown = mask
+            self._flashes += 1
+            # An animation begins again if its name changes.
+            self._mask.classes(remove="flash-0 flash-1", add="" if keep else f"flash-{self._flashes % 2}")
+            self._show("mask", self._mask)
+            self._mask.set_visibility(True)
+        elif not {"flash-0", "flash-1"}.intersection(self._mask.classes):  # it was kept in sight
+            self._hide_mask()
+
+    def _hide_mask(self) -> None:
+        self._mask.classes(remove="flash-0 flash-1")
+        self._mask.set_visibility(False)
 
     def _draw_clipped(self) -> None:
         """Show what is clipped, if it is asked for."""

@@ -6,30 +6,49 @@ from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.edits.applying import edit_of, scribbles_of
 from nlfilter_torch.photo.picture.in_memory import InMemory, edit_image
 from nlfilter_torch.photo.picture.painting import TensorPainter
-from nlfilter_torch.photo.selections.stray import stray_parts
+from nlfilter_torch.photo.selections.stray_parts import stray_parts
 
 
-def selected(step: Step, image: Tensor, stride: float = 1) -> Tensor | None:
-    """The mask (1, 1, h, w) of what the scribbles of a step select; None if there are none, or it selects nothing.
+class Overlays:
+    """Caches the last result for each, since it is asked for whenever the picture is drawn."""
 
-    ``image`` (1, C, h, w) is the picture before the step, and ``stride`` its sampling step relative to the photograph.
-    """
-    if not step.painted(step.declared.words[0] if step.declared.words else ""):
-        return None
+    def __init__(self) -> None:
+        self._selected: tuple[Tensor, Step, Tensor | None] | None = None
+        self._ignored: tuple[Step, Tensor | None] | None = None
+
+    def selected(self, step: Step, image: Tensor, stride: float = 1) -> Tensor | None:
+        """The mask (1, 1, h, w) of what the scribbles of a step select; None if there are none, or all is changed.
+
+        ``image`` (1, C, h, w) is the picture before the step, and ``stride`` its sampling step relative to the
+        photograph.
+        """
+        if self._selected is None or self._selected[0] is not image or self._selected[1] != step:
+            self._selected = image, step, _selected(step, image, stride)
+        return self._selected[2]
+
+    def ignored(self, step: Step, image: Tensor) -> Tensor | None:
+        """Which pixels (1, 1, h, w) under the scribbles of a step do not count, or None."""
+        if self._ignored is None or self._ignored[0] != step:
+            self._ignored = step, _ignored(step, image)
+        return self._ignored[1]
+
+
+def _is_painted(step: Step) -> bool:
+    return bool(step.declared.words) and bool(step.painted(step.declared.words[0]))
+
+
+def _selected(step: Step, image: Tensor, stride: float) -> Tensor | None:
     size = (image.shape[-2], image.shape[-1])
     edit = edit_of(step, size, stride=stride)
-    selection = edit.selection()
+    selection = edit.selection() if _is_painted(step) else None
     if selection is None:
         return None
     return edit_image(selection, image.clamp(0, 1), edit.marks(scribbles_of(step, size, TensorPainter())))
 
 
-def ignored(step: Step, image: Tensor) -> Tensor | None:
-    """Which pixels (1, 1, h, w) under the scribbles of a step do not count, or None; arguments as above."""
-    if not step.painted(step.declared.words[0] if step.declared.words else ""):
-        return None
+def _ignored(step: Step, image: Tensor) -> Tensor | None:
     size = (image.shape[-2], image.shape[-1])
-    if edit_of(step, size).selection() is None:
+    if not _is_painted(step) or edit_of(step, size).selection() is None:
         return None
     drawn = scribbles_of(step, size, TensorPainter())
     parts = [stray_parts(InMemory(image.clamp(0, 1)), mask.ceil()) for mask in drawn.masks.values()]

@@ -24,7 +24,6 @@ from nlfilter_torch.operator.build import operator_from_points
 from nlfilter_torch.operator.features import GuideFeatures, estimate_bandwidth, reduce_channels, unit_window
 from nlfilter_torch.operator.operator import NonlocalOperator
 from nlfilter_torch.operator.options import Construction, GuideChannels
-from nlfilter_torch.photo.app.overlays import ignored, selected
 from nlfilter_torch.photo.declared.declaration import Edit
 from nlfilter_torch.photo.declared.parameters import DETAIL, MASK
 from nlfilter_torch.photo.declared.presets import Recipe
@@ -192,8 +191,6 @@ class Preview:
         self._active: tuple[tuple[int, int], Tensor] | None = None
         self._filter: tuple[Key, Callable[[Step], Tensor]] | None = None
         self._pictures: list[StepPicture] = []
-        self._selected: tuple[Tensor, Step, Tensor | None] | None = None
-        self._ignored: tuple[Step, Tensor | None] | None = None
 
     def layers(self, detail: Step) -> Layers:
         """The layers for the filter of a step; slow if its settings have changed."""
@@ -259,24 +256,7 @@ class Preview:
             self._mask = (key, self._source.all(fitted))
         return self._mask[1]
 
-    def selected(self, recipe: Recipe, edit: str) -> Tensor | None:
-        """The mask (1, 1, h, w) of what the scribbles of the last step of an edit select, or None."""
-        step = recipe.last(edit)
-        if step.declared.regional is not None:
-            return self.mask(step)
-        image = self._before(step)
-        if self._selected is None or self._selected[0] is not image or self._selected[1] != step:
-            self._selected = image, step, selected(step, image, self.stride)
-        return self._selected[2]
-
-    def ignored(self, recipe: Recipe, edit: str) -> Tensor | None:
-        """Which pixels (1, 1, h, w) under these scribbles do not count, or None."""
-        step = recipe.last(edit)
-        if self._ignored is None or self._ignored[0] != step:
-            self._ignored = step, ignored(step, self._before(step))
-        return self._ignored[1]
-
-    def _before(self, step: Step) -> Tensor:
+    def before(self, step: Step) -> Tensor:
         """The picture before a step, as it was last rendered, or the reduced photograph."""
         whole = step.mixed(opacity=1.0)
         return next((picture.before for picture in self._pictures if picture.key[-1] == whole), self.pixels)

@@ -8,6 +8,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from nlfilter_torch.photo.app.overlays import Overlays
 from nlfilter_torch.photo.app.preview import PIXELS, Preview
 from nlfilter_torch.photo.app.sidecar import Sidecar
 from nlfilter_torch.photo.declared.json_values import Value
@@ -102,6 +103,7 @@ class Session:
         self._kept = Recipe()  # what the sidecar holds
         self._drawing = threading.Lock()  # previews cache what they compute, so they draw one picture at a time
         self._fitting = threading.Lock()  # the same holds for parts at full size
+        self._overlays = Overlays()
         self._at_rest: tuple[tuple[Step, ...], Tensor] | None = None  # the last result, for other tabs
         self._pixels = pixels
         self._past: list[Recipe] = []
@@ -127,6 +129,7 @@ class Session:
         self.opened = Opened(path.resolve(), name or path.name, photograph, preview, parts, pages)
         self.recipe = self._shown = self.saved = Recipe()
         self._at_rest = None
+        self._overlays = Overlays()
         self._past, self._future = [], []
 
     def keep_in(self, sidecar: Sidecar) -> None:
@@ -254,14 +257,18 @@ class Session:
             return self.preview.render(self.recipe, moving)
 
     def mask(self, edit: str) -> Tensor | None:
-        """The mask of what the scribbles of an edit select; see :meth:`Preview.selected`."""
+        """The mask (1, 1, h, w) of what the scribbles of the last step of an edit select, or None."""
+        step, preview = self.recipe.last(edit), self.preview
         with self._drawing:
-            return self.preview.selected(self.recipe, edit)
+            if step.declared.regional is not None:
+                return preview.mask(step)
+            return self._overlays.selected(step, preview.before(step), preview.stride)
 
     def ignored(self, edit: str) -> Tensor | None:
-        """What does not count of these scribbles; see :meth:`Preview.ignored`."""
+        """Which pixels (1, 1, h, w) under these scribbles do not count, or None."""
+        step = self.recipe.last(edit)
         with self._drawing:
-            return self.preview.ignored(self.recipe, edit)
+            return self._overlays.ignored(step, self.preview.before(step))
 
     def original(self, place: Rectangle) -> Tensor:
         """A part of the photograph before the edit, (1, C, h, w) in [0, 1]; raises ValueError if none is open."""

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from nlfilter_torch.core.torch_internals import is_unreadable
-from nlfilter_torch.photo.picture.in_memory import InMemory
 from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles, blocks_at
 from nlfilter_torch.photo.selections.scribbled_colours import colours_in_lab
 
@@ -39,12 +38,6 @@ def without_strays(scribbles: Scribbles, size: tuple[int, int]) -> Scribbles:
     if not bool(stray.any()):
         return scribbles
     return scribbles.weighted(scribbles.weights.masked_fill(stray, 0.0))
-
-
-def stray_parts(source: InMemory, painted: Tensor) -> Tensor:
-    """The parts (1, 1, H, W) of scribbles (1, 1, H, W) on an image that do not count."""
-    scribbles = source.scribbles(painted, None, "scribbles", needed=False)
-    return scribbles.weighted(strays(scribbles, source.size).to(source.image)).planes(source)
 
 
 @torch.no_grad()

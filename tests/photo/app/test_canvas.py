@@ -131,8 +131,8 @@ def test_the_mask_is_shown_when_it_is_new_or_kept_in_sight(opened: Page) -> None
     canvas.draw_mask()
     assert canvas._mask.visible
     assert "flash-1" in canvas._mask.classes
-    canvas.draw_mask()  # it is not new
-    assert not canvas._mask.visible
+    canvas.draw_mask()  # it is not new, and disappears by itself
+    assert "flash-1" in canvas._mask.classes
     canvas._show_mask.set_value(True)
     assert canvas._mask.visible
     assert not {"flash-0", "flash-1"} & set(canvas._mask.classes)
@@ -140,6 +140,8 @@ def test_the_mask_is_shown_when_it_is_new_or_kept_in_sight(opened: Page) -> None
     assert not canvas._mask.visible
     canvas.draw_mask()
     assert canvas._mask.visible
+    canvas._show_mask.set_value(False)
+    assert not canvas._mask.visible
     canvas.switch("recolor")
     assert not canvas._mask.visible
 
