@@ -4,6 +4,7 @@ The filter of the second edit depends on that result. It is rebuilt in every rou
 those with the filter as it is.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -86,12 +87,17 @@ class Chain:
         """For each value, what it often is."""
         return (*self.first.usual, *self.second.usual)
 
+    @property
+    def idle(self) -> tuple[float, ...]:
+        """Values that change nothing."""
+        return (*self.first.idle, *self.second.idle)
+
     def snapped(self, state: Minimum) -> Minimum:
         """The chain at short values of the first edit, if that is better."""
         best, count = state, len(self.first.start)
         tried = {tuple(state.values[:count].tolist())}
         for digits, equal in SNAPS:
-            near = rounded(state.predicted, state, self.usual, self.ends, digits=digits, equal=equal)
+            near = rounded(state.predicted, state, self.usual, self.ends, digits=digits, equal=equal, near=math.inf)
             values = tuple(near.values[:count].tolist())
             if values not in tried and not self.is_exact(best):
                 tried.add(values)

@@ -7,7 +7,7 @@ parameters do, in milliseconds: also the means of the picture, which limits of b
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import ClassVar, cast
 
 import torch
@@ -34,6 +34,7 @@ from nlfilter_torch.photo.picture.source import luminance
 from nlfilter_torch.photo.picture.viewing import within_limits
 
 LEVELS = 255.0
+USUAL_THRESHOLD = 5.0 / LEVELS
 MOST_LEVELS = 60.0  # largest threshold of detail that is looked for
 
 
@@ -45,20 +46,39 @@ class Ingredients:
         image: (1, C, h, w).
         layers: that the edit adds, (1, K, 1, h, w).
         activity: variance of luminance around the pixels, (1, 1, h, w).
+        weights: how much the pixels count in means, (1, 1, h, w); None is 1 each.
     """
 
     image: Tensor
     layers: Tensor
     activity: Tensor
+    weights: Tensor | None = None
 
     def at(self, places: Tensor) -> "Ingredients":
-        """Those of single pixels, given by row-major indices (P,), as a picture of one row, in float64."""
+        """Those of single pixels, given by row-major indices (P,), as a picture of one row, in float64.
+
+        The pixels are weighted so that their means of what the edit may change are those of the picture.
+        """
         planes = (planes.flatten(-2)[..., None, places].double() for planes in (self.image, self.layers, self.activity))
-        return Ingredients(*planes)
+        whole, sample = self._measured(), Ingredients(*planes)
+        columns = sample._measured()
+        missing = whole.mean(1) - columns.mean(1)
+        gram = columns @ columns.mT / columns.shape[1]
+        gram = gram + 1e-9 * torch.diag(gram.diagonal()) + 1e-12 * torch.eye(len(gram), dtype=gram.dtype)
+        weights = (1 + torch.linalg.solve(gram, missing) @ columns).clamp(min=0.5, max=2.0)
+        return replace(sample, weights=(weights / weights.max()).view(1, 1, 1, -1))
+
+    def _measured(self) -> Tensor:
+        """What has the means of the picture, (S, P), in float64."""
+        grey, layers = reduce_channels(self.image, "luminance"), self.layers[0]
+        shares = self.activity / (self.activity + USUAL_THRESHOLD**2)
+        planes = [torch.ones_like(grey), grey, grey.square(), layers.transpose(0, 1), (layers * shares).transpose(0, 1)]
+        return torch.cat([part[0].flatten(1).double() for part in planes])
 
     def every(self, step: int) -> "Ingredients":
         """Those of each ``step``-th column."""
-        return Ingredients(self.image[..., ::step], self.layers[..., ::step], self.activity[..., ::step])
+        weights = None if self.weights is None else self.weights[..., ::step]
+        return Ingredients(self.image[..., ::step], self.layers[..., ::step], self.activity[..., ::step], weights)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -266,5 +286,5 @@ class LimitedAt:
 
 def _all(seen: Ingredients, change: Fitted, limits: Limits, brighter: float | Tensor) -> Tensor:
     """All pixels under a change of brightness."""
-    source = InMemory(seen.image)
+    source = InMemory(seen.image, weights=seen.weights)
     return source.all(within_limits(source, change, limits, brighter))

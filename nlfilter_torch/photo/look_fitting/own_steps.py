@@ -35,8 +35,10 @@ PROMISING = 0.3  # share that edits by the default filter explain, from which on
 
 # Two edits are fitted only if a rough model of them leaves less than this, and than this multiple of what one leaves.
 UNPROMISING, LESS = 0.15, 0.6
+MORE, RARER = 1.1, 1.01  # what two edits, and an edit without limits, leave counts for so much more
 # Steps are preferred to a look if they explain that much of what is left out, and it leaves that many times as much.
-ENOUGH, CLEARLY = 0.8, 1.25
+# Edits by other programs leave three times as much under steps as under looks. JPEG files of weak edits are half noise.
+ENOUGH, CLEARLY = 0.5, 1.2
 
 Key = tuple[str, tuple[tuple[str, Value], ...]]  # name and filter of an edit
 
@@ -129,6 +131,11 @@ class Candidate:
     fitted: float
     left_out: float
 
+    def cost(self) -> float:
+        """What is left, more of it for what is less usual: noise must not decide for two edits, or no limits."""
+        twice, free = len(self.edits) > 1, any(edit.limits == "none" for edit in self.edits)
+        return (1 - self.left_out) * (MORE if twice else 1.0) * (RARER if free else 1.0)
+
     @property
     def steps(self) -> tuple[Step, ...]:
         """The steps."""
@@ -185,7 +192,7 @@ class StepSearch:
         if all(pair.is_of_brightness() for pair in self.pairs):
             self._search()
         explained: dict[tuple[str, ...], tuple[float, float]] = {}
-        for candidate in sorted(self.candidates, key=lambda candidate: candidate.left_out):
+        for candidate in sorted(self.candidates, key=Candidate.cost, reverse=True):
             explained[tuple(edit.edit for edit in candidate.edits)] = candidate.fitted, candidate.left_out
         best = self._best()
         if best is None or best.left_out <= 0:
@@ -193,7 +200,7 @@ class StepSearch:
         return FittedSteps(best.steps, best.fitted, best.left_out, explained)
 
     def _best(self) -> Candidate | None:
-        return max(self.candidates, key=lambda candidate: candidate.left_out, default=None)
+        return min(self.candidates, key=Candidate.cost, default=None)
 
     def _edits(self, limits: Limits) -> tuple[OwnEdit, OwnEdit, OwnEdit]:
         """The edits with the default filters; the filter of the last two is the same."""
@@ -242,7 +249,7 @@ class StepSearch:
         coarse = minimize(Errors(edit, self.pairs, seen, COARSE), edit.start, edit.ends, COARSE_STEPS)
         errors = Errors(edit, self.pairs, seen)
         fine = minimize(errors, coarse.values.tolist(), edit.ends, FINE_STEPS)
-        return self._candidate((edit,), rounded(errors, fine, edit.usual, edit.ends))
+        return self._candidate((edit,), rounded(errors, fine, plain(edit.usual, edit.idle), edit.ends))
 
     def _try_chain(self) -> None:
         """Try two edits, one after the other, if they look promising before the filter of the second is computed."""
@@ -261,7 +268,7 @@ class StepSearch:
             chain, best = min((chain, best), (turned, other), key=_loss)
         if not chain.is_exact(best):
             best = chain.snapped(chain.better(best))
-        best = rounded(best.predicted, best, chain.usual, chain.ends)
+        best = rounded(best.predicted, best, plain(chain.usual, chain.idle), chain.ends)
         self.candidates.append(self._candidate((chain.first, chain.second), best))
 
     def _power(self) -> float:
@@ -276,6 +283,11 @@ class StepSearch:
         left_out = float(best.left_out(groups).square().sum())
         values = best.values.split([len(edit.start) for edit in edits])
         return Candidate(edits, values, 1 - best.loss / power, 1 - left_out / power)
+
+
+def plain(usual: Sequence[Sequence[float]], idle: Sequence[float]) -> list[tuple[float, ...]]:
+    """Values that are tried first: what they often are, and those that change nothing."""
+    return [(*values, value) for values, value in zip(usual, idle, strict=True)]
 
 
 def _loss(order: tuple[Chain, Minimum]) -> float:

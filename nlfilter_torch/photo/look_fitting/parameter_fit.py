@@ -9,10 +9,11 @@ from torch import Tensor
 STEP = 1e-4  # by which parameters are moved for derivatives
 DAMPING, SOFTER, HARDER, HARDEST = 1e-3, 0.1, 10.0, 1e6
 SETTLED = 1e-4  # relative decrease of the sum of squares below which the search ends
+NEAR = 0.02  # distance of a value from its rounding, relative or, below 1, absolute
 IDLE = 1e-9  # squared norm of the derivatives of a parameter that hardly matters, relative to the largest
 TINY = 1e-9  # damping for parameters that nearly depend on each other
 DIGITS = (1, 2, 3, 4, 6)  # after the point that are tried
-EQUAL = 0.02  # relative increase of the sum of squares that rounding the parameters may cost
+EQUAL = 0.01  # relative increase of the sum of squares that rounding the parameters may cost
 FAINT = 2e-5  # residual that counts as none
 
 Residuals = Callable[[Tensor], Tensor]  # of the parameters (p,), (R,)
@@ -85,19 +86,22 @@ def rounded(
     *,
     digits: Sequence[int] = DIGITS,
     equal: float = EQUAL,
+    near: float = NEAR,
 ) -> Minimum:
     """The minimum with values that are as short as they can be, for hardly larger residuals.
 
     One value after the other is rounded, the last one first, and those before it follow, to first order. ``usual`` are
-    tried first, then values with some ``digits`` after the point, for a relative increase of ``equal`` at most.
+    tried first, then values as ``near`` with some ``digits`` after the point, for a relative increase of ``equal``.
     """
     least, most = torch.tensor(ends, dtype=torch.float64).unbind(1)
     gram, values = best.jacobian.mT @ best.jacobian, best.values
     for i, plain in reversed([*enumerate(usual)]):
         allowed = best.loss + (1 - i / len(usual)) * (equal * best.loss + len(best.residuals) * FAINT**2)
-        for value in (*plain, *(round(float(values[i]), count) + 0.0 for count in digits)):  # no -0
+        own = float(values[i])
+        short = [round(own, count) + 0.0 for count in digits]  # no -0
+        for value in (*plain, *(value for value in short if abs(value - own) <= near * max(abs(own), 1))):
             moved = values.clone()
-            moved[:i] -= _solved(gram[:i, :i], gram[:i, i] * (value - values[i]), 0.0)
+            moved[:i] -= _solved(gram[:i, :i], gram[:i, i] * (value - own), 0.0)
             moved[i] = value
             moved = moved.clamp(least, most)
             if float(residuals(moved).square().sum()) <= allowed:
