@@ -24,6 +24,7 @@ REPORTING = ("hubble_deep_field", "immunohistochemistry", "retina", "colorwheel"
 SHAPES = ("blob", "hairs", "holes", "motion", "soft")
 SIZE = (112, 160)
 RADIUS, LENGTH = 0.014, 0.14  # of a scribble, as shares of the short side
+BAND = 0.06  # of a trimap: width on either side of its partial opacity, as a share of the short side
 COMPOSITES = 25
 FIRST_SEED = {"choosing": 0, "reporting": 10_000}
 
@@ -51,6 +52,17 @@ class Composite:
         random = np.random.default_rng(seed)
         alpha = self.alpha[0, 0].numpy()
         inside, outside = (draw_strokes(place, count, random) for place in (alpha > 0.98, alpha < 0.02))
+        return inside, outside
+
+    def trimap(self) -> tuple[Tensor, Tensor]:
+        """Masks (1, 1, H, W) of the object and of the background, but for a wide band around partial opacity."""
+        alpha = self.alpha[0, 0].numpy()
+        soft = (alpha > 0.01) & (alpha < 0.99)
+        border = cv2.morphologyEx((alpha > 0.5).astype(np.uint8), cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8)) > 0
+        radius = round(BAND * min(alpha.shape))
+        disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
+        known = cv2.dilate((soft | border).astype(np.uint8), disc) == 0
+        inside, outside = (torch.from_numpy(known & side)[None, None].float() for side in (alpha > 0.5, alpha <= 0.5))
         return inside, outside
 
 

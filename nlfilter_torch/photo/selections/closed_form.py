@@ -14,7 +14,8 @@ from nlfilter_torch.photo.selections.pyramid import doubled, halved, pyramid_lev
 
 WINDOW_RADIUS, NOISE = 2, 1e-6  # radius of the windows in which masks are linear in colour; variance of noise
 LINEAR_LEVELS, LINEAR_STEPS = 2, 24  # levels of the pyramid, steps on each
-END_MARGIN = 0.1  # mask values closer than this to 0 or 1 are set to 0 or 1
+# Mask values closer than this to 0 or 1 are set to 0 or 1: of a few scribbles, and of a trimap.
+END_MARGIN, END_MARGIN_OF_TRIMAP = 0.1, 0.05
 SLOWEST = 0.005  # smallest eigenvalue that the steps damp
 # Confidence in a rough mask of 0 or 1, and in scribbles.
 LINEAR_ROUGH_CONFIDENCE, LINEAR_SCRIBBLE_CONFIDENCE = 3e-3, 10.0
@@ -89,7 +90,9 @@ def linear_models(image: Tensor) -> list[LinearMasks]:
     return [LinearMasks.of(colours) for colours in halved(image, levels)]
 
 
-def solve_linear(models: list[LinearMasks], start: Tensor, rough: Tensor, front: Tensor, back: Tensor) -> Tensor:
+def solve_linear(
+    models: list[LinearMasks], start: Tensor, rough: Tensor, front: Tensor, back: Tensor, trimap: Tensor
+) -> Tensor:
     """Solve for the functions (B, K, C+1, H, W) of :meth:`LinearMasks.fit`.
 
     Args:
@@ -98,6 +101,7 @@ def solve_linear(models: list[LinearMasks], start: Tensor, rough: Tensor, front:
         rough: rough masks, (B, K, H, W); values near 0 or 1 have a higher confidence.
         front: weights of foreground scribbles, (B, K, H, W).
         back: weights of background scribbles, (B, K, H, W).
+        trimap: how nearly the scribbles are a trimap, (B, K) in [0, 1].
     """
     trust = LINEAR_ROUGH_CONFIDENCE * ((2 * rough - 1).square() + 0.01)
     certain = LINEAR_SCRIBBLE_CONFIDENCE * (front + back)
@@ -115,7 +119,8 @@ def solve_linear(models: list[LinearMasks], start: Tensor, rough: Tensor, front:
     assert coarser is not None  # for mypy
     functions = torch.stack([models[0].fit(mask.clamp(0.0, 1.0).double()) for mask in coarser.split(1, 1)], dim=1)
     slopes, constant = functions.tensor_split([-1], dim=2)
-    return (torch.cat([slopes, constant - END_MARGIN], dim=2) / (1 - 2 * END_MARGIN)).to(start)
+    margin = (END_MARGIN + (END_MARGIN_OF_TRIMAP - END_MARGIN) * trimap)[:, :, None, None, None]
+    return (torch.cat([slopes, constant - margin], dim=2) / (1 - 2 * margin)).to(start)
 
 
 def damped(model: LinearMasks, mask: Tensor, target: Tensor, trust: Tensor) -> Tensor:

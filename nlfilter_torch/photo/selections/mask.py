@@ -34,6 +34,7 @@ from nlfilter_torch.photo.picture.viewing import viewed_size
 from nlfilter_torch.photo.selections.closed_form import LinearMasks, linear_mask, linear_models, solve_linear
 from nlfilter_torch.photo.selections.random_walker import solve_mask
 from nlfilter_torch.photo.selections.rough_mask import RoughMasks
+from nlfilter_torch.photo.selections.scribbled_colours import trimap_share
 from nlfilter_torch.photo.selections.stray import without_strays
 
 SOLVED = 1 << 17  # pixels
@@ -382,4 +383,5 @@ def fit_borders(image: Tensor, models: list[LinearMasks], rough: Tensor, front: 
         ROUGH_CONFIDENCE + painted * SCRIBBLE_CONFIDENCE
     )
     start = solve_mask(image, target, ROUGH_CONFIDENCE + painted * SCRIBBLE_CONFIDENCE)
-    return solve_linear(models, start, rough, front, back)
+    trimap = trimap_share(torch.stack([front, back], dim=2).flatten(3))
+    return solve_linear(models, start, rough, front, back, trimap)

@@ -22,6 +22,7 @@ from nlfilter_torch.photo.picture.resizing import block_means, enlarged
 from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles, scribbled_blocks
 from nlfilter_torch.photo.picture.source import Blocks, Guide, Operator, Planes, Reduced
 from nlfilter_torch.photo.selections.scribbled_colours import (
+    by_trimap,
     colour_likelihood,
     evenness,
     frame_places,
@@ -29,6 +30,7 @@ from nlfilter_torch.photo.selections.scribbled_colours import (
     likeness,
     linked_evenly,
     outwards,
+    trimap_share,
 )
 from nlfilter_torch.photo.selections.texture import TEXTURE_MARGIN, with_texture
 
@@ -37,7 +39,9 @@ TEXTURE_WEIGHT = 1.5
 NUM_CHANNELS = 9  # channels of the guide
 SMOOTHNESS = 0.25  # of the regression
 CONTRAST = 4.0  # steepness of the curve from likelihood to rough mask
-COLOUR_SHARE = 0.65  # weight of the colours of single pixels in the rough mask; the rest is the regression
+# Weight of the colours of single pixels in the rough mask, for a few scribbles and for a trimap; the rest is the
+# regression.
+COLOUR_SHARE = (0.65, 1.0)
 # Colours count less where the regression finds no part of the region nearby: standard deviation of "nearby" as a share
 # of the short side, number of rows or columns of the grid it is averaged on, and average from which on colours count.
 AROUND_SIGMA, AROUND_GRID, ENOUGH_AROUND = 0.1, 40, 0.5
@@ -113,19 +117,22 @@ class RoughMasks:
     def mask(self, number: int, scribbles: Scribbles) -> Tensor:
         """The rough mask (B, 1, H, W) of a region with that number, from scribbles on it and on its background."""
         colours, weights = outwards(scribbles, self.picture.size)
+        planes = scribbles.planes(self.picture)
+        trimap = trimap_share(planes.flatten(2))
         unlike = 1 - likeness(colours, weights[:, :1], self.frame.colours, self.photometric_bandwidth)
-        linked = linked_evenly(self.evenness, scribbles.planes(self.picture))
+        linked = linked_evenly(self.evenness, planes)
         frame_links, grid_links = self.frame.values(linked), self.grid.values(linked)
         regression = self.regression(scribbles, unlike, frame_links, grid_links)
         likely = sharpened(regression(self.picture))
         likely_frame = torch.maximum(self.frame.values(likely * self.evenness), frame_links)
-        compared = [unlike, likely_frame, self.grid.colours, grid_links, self.photometric_bandwidth]
+        compared = [unlike, likely_frame, self.grid.colours, grid_links, self.photometric_bandwidth, trimap]
         by_colour = self.picture.kept(
             ("likelihood", number),
             [colours, weights, *compared],
             partial(colour_likelihood, self.picture.image, colours, weights, self.frame.colours, *compared),
         )
-        return likely + (by_colour - likely) * COLOUR_SHARE * (around(likely) / ENOUGH_AROUND).clamp(max=1.0)
+        share = by_trimap(COLOUR_SHARE, trimap).view(-1, 1, 1, 1)
+        return likely + (by_colour - likely) * share * (around(likely) / ENOUGH_AROUND).clamp(max=1.0)
 
     def regression(self, scribbles: Scribbles, unlike: Tensor, frame_links: Tensor, grid_links: Tensor) -> Planes:
         """Likelihood that a pixel belongs to a region: about 1 inside and about 0 outside; not clamped.

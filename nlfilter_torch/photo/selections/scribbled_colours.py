@@ -19,8 +19,11 @@ from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles
 FRAME_POINTS = 64  # approximate number of points along the upper or left border of a picture
 NUM_COMPARED = 512  # approximate number of scribbled pixels that the frame is compared with
 SIMILAR_SHARE = 0.1  # a frame point similar to this share of the scribbled pixels does not count as background
-NUM_COLOURS = 32  # approximate number of scribbled pixels on each side that the colours of all pixels are compared with
-BANDWIDTH_SHARE = 0.4  # bandwidth of that comparison as a share of the photometric bandwidth
+# Approximate number of scribbled pixels on each side that the colours of all pixels are compared with, and bandwidth of
+# that comparison as a share of the photometric bandwidth: for a few scribbles, and for a trimap.
+NUM_COLOURS = (32, 128)
+BANDWIDTH_SHARE = (0.4, 0.25)
+SPARSE, DENSE = 0.3, 0.6  # share of a picture under scribbles up to which they are a few, and from which on a trimap
 EVEN_SIGMA = 2.0  # pixels; standard deviation of the surroundings whose evenness is judged
 HALF_EVEN_DEVIATION = 0.007  # standard deviation of colours, in hundredths of Lab, that counts as half even
 UNLINKED, LINKED = 0.25, 0.5  # least evenness along a path up to which it links nothing, and from which on it does
@@ -129,6 +132,23 @@ def evenness(image: Tensor) -> Tensor:
     return 1 / (1 + variance / HALF_EVEN_DEVIATION**2)
 
 
+def trimap_share(painted: Tensor) -> Tensor:
+    """How nearly scribbles are a trimap: 0 for a few of them, 1 for most of the picture, (...).
+
+    Args:
+        painted: weights (..., 2, n), for all pixels, of the scribbles on a region and on its background. 0 is returned
+            where either side has none.
+    """
+    shares = (painted.detach() > 0).to(painted).mean(-1)
+    return ((shares.sum(-1) - SPARSE) / (DENSE - SPARSE)).clamp(0.0, 1.0) * (shares.amin(-1) > 0)
+
+
+def by_trimap(values: tuple[float, float], trimap: Tensor) -> Tensor:
+    """A setting between its values for a few scribbles and for a trimap, by :func:`trimap_share`."""
+    few, most = values
+    return few + (most - few) * trimap
+
+
 def colour_likelihood(
     image: Tensor,
     scribbled: Tensor,
@@ -139,6 +159,7 @@ def colour_likelihood(
     inner: Tensor,
     linked: Tensor,
     bandwidth: float | Tensor,
+    trimap: Tensor,
 ) -> Tensor:
     """Likelihood (B, 1, h, w), in [0, 1], that a pixel belongs to a region, by its own colour alone.
 
@@ -157,10 +178,13 @@ def colour_likelihood(
         inner: colours (B, C, m) of :func:`inner_places`.
         linked: :func:`linked_evenly` of these, (B, 1, m).
         bandwidth: photometric bandwidth of the regression.
+        trimap: :func:`trimap_share` of the scribbles, (B,). Many scribbled pixels tell colours apart that differ less.
     """
     places = hundredths_of_lab(image).flatten(2)
-    scale = BANDWIDTH_SHARE * per_image(bandwidth, image, 3)
-    samples = (every_nth(scribbled, side, NUM_COLOURS) for side in weights.split(1, dim=1))
+    dense = trimap.view(-1, 1, 1)
+    scale = by_trimap(BANDWIDTH_SHARE, dense) * per_image(bandwidth, image, 3)
+    number = by_trimap(NUM_COLOURS, dense).round().long()
+    samples = (every_nth(scribbled, side, number) for side in weights.split(1, dim=1))
     inside, outside = (density(places, colours_in_lab(sample), shares, scale) for sample, shares in samples)
     shares = unlike * torch.cat([likely.square(), (1 - likely).square()], dim=1)
     shares = shares / unlike.sum(2, keepdim=True).clamp(min=EPSILON)
@@ -186,7 +210,7 @@ def outwards(scribbles: Scribbles, size: tuple[int, int]) -> tuple[Tensor, Tenso
     return image.gather(2, order.expand_as(image)), weights.gather(2, order.expand_as(weights))
 
 
-def every_nth(colours: Tensor, weights: Tensor, number: int) -> tuple[Tensor, Tensor]:
+def every_nth(colours: Tensor, weights: Tensor, number: int | Tensor) -> tuple[Tensor, Tensor]:
     """Choose every n-th pixel of positive weight, about ``number`` in each image, independently of the other images.
 
     The order of the pixels matters: see :func:`outwards`.
@@ -194,7 +218,7 @@ def every_nth(colours: Tensor, weights: Tensor, number: int) -> tuple[Tensor, Te
     Args:
         colours: (B, C, n).
         weights: (B, 1, n).
-        number: of pixels.
+        number: of pixels, or for each image, (B, 1, 1).
 
     Returns:
         Colours (B, C, m) of the pixels that are chosen in any image; and their weights (B, 1, m), divided by their sum,

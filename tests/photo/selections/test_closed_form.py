@@ -17,7 +17,7 @@ def test_the_solve_is_that_of_the_linear_system(monkeypatch: pytest.MonkeyPatch)
     image, rough = noise(1, 3, height, width), noise(1, 1, height, width, seed=1)
     front, back = box(1, 1, 2, 2, size=(height, width)).double(), box(4, 4, 1, 2, size=(height, width)).double()
     functions = closed_form.solve_linear(
-        closed_form.linear_models(image), torch.full_like(rough, 0.5), rough, front, back
+        closed_form.linear_models(image), torch.full_like(rough, 0.5), rough, front, back, rough.new_zeros(1, 1)
     )
     pixels = image[0].flatten(1).T.numpy()
     rows, columns = np.divmod(np.arange(count), width)
@@ -49,7 +49,7 @@ def test_the_solve_is_the_same_in_float32(name: str) -> None:
     solved = []
     for dtype in (torch.float32, torch.float64):
         colours, *masks = (planes.to(dtype) for planes in (image, rough, rough, front, back))
-        functions = closed_form.solve_linear(closed_form.linear_models(colours), *masks)
+        functions = closed_form.solve_linear(closed_form.linear_models(colours), *masks, colours.new_zeros(1, 1))
         assert functions.dtype == dtype
         solved.append(closed_form.linear_mask(colours - 0.5, functions[:, 0]))
     torch.testing.assert_close(solved[0].double(), solved[1], atol=2e-3, rtol=0)

@@ -46,13 +46,22 @@ def test_colours_of_a_region_where_it_reaches_the_border_belong_to_it() -> None:
         by_regression = torch.tensor([[[1.0, likely, 0.0]]]).double()
         grid, linked = image.squeeze(2)[..., 1:2], torch.tensor([[[inside]]]).double()
         return colour_likelihood(
-            image, *outwards(scribbles, (1, 3)), frame, unlike, by_regression, grid, linked, 0.08
+            image, *outwards(scribbles, (1, 3)), frame, unlike, by_regression, grid, linked, 0.08, torch.zeros(1)
         ).flatten()
 
     assert likelihoods(0.9)[:2].min() > 0.95
     assert likelihoods(0.1)[1] < 0.05
     assert likelihoods(0.9)[2] < 0.05
     assert likelihoods(0.1, inside=1.0)[1] > 2 * likelihoods(0.1)[1]
+
+
+def test_scribbles_that_leave_little_open_are_a_trimap() -> None:
+    inside, outside = torch.zeros(3, 10, 10), torch.zeros(3, 10, 10)
+    inside[0, :2], outside[0, -1:] = 1, 1
+    inside[1, :3], outside[1, -4:] = 0.5, 1
+    inside[2] = 1  # no side to tell it from
+    shares = scribbled_colours.trimap_share(torch.stack([inside, outside], dim=1).flatten(2))
+    assert shares.tolist() == [0, 1, 0]
 
 
 @pytest.mark.parametrize("size", [(1, 1), (3, 50), (112, 160), (300, 430), (1, 200_000), (70_000, 3)])
