@@ -160,6 +160,10 @@ class Slider:
         self._following = False
         self._value.set_text(self._control.show(value))
 
+    def set_enabled(self, is_enabled: bool) -> None:
+        """Let the slider be moved, or not."""
+        self._slider.set_enabled(is_enabled)
+
     def reset(self) -> None:
         """Set the slider to its value at the start."""
         self._released(self._control.usual(self._recipe()))

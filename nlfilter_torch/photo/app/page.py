@@ -22,6 +22,7 @@ from nlfilter_torch.photo.app.brush import Brush
 from nlfilter_torch.photo.app.canvas import Canvas
 from nlfilter_torch.photo.app.closeup import Closeup
 from nlfilter_torch.photo.app.dialogs import NameDialog, Question, SaveDialog
+from nlfilter_torch.photo.app.look_tab import thumbnails
 from nlfilter_torch.photo.app.panel import Panel
 from nlfilter_torch.photo.app.session import Session
 from nlfilter_torch.photo.app.tabs import Link
@@ -87,7 +88,14 @@ class Editor:
             with ui.column().classes("panel"):
                 handle = ui.button(icon="drag_handle").props('flat dense aria-label="Show or hide the controls"')
                 handle.classes("handle").on("click", js_handler="() => page.fold()")
-                link = Link(lambda: self.session.recipe, brush, self._change, self._clear_strokes, self._replace)
+                link = Link(
+                    lambda: self.session.recipe,
+                    brush,
+                    self._change,
+                    self._clear_strokes,
+                    self._replace,
+                    self._thumbnail,
+                )
                 self._panel = Panel(link, self._canvas.switch)
         ui.keyboard(on_key=self._key)
         ui.on("closeup", lambda event: self._look(event.args))
@@ -100,6 +108,11 @@ class Editor:
         if kind == "original":
             return self._closeup.original(place)
         return self._canvas.pictures.get(kind) or self._closeup.file(kind)
+
+    def _thumbnail(self, look: str) -> str:
+        """The address of a picture of the photograph under a look, or "" if there is none."""
+        kind = f"look-{look}"
+        return f"/picture/{self._token}/{kind}?{self.session.address}" if kind in self._canvas.pictures else ""
 
     def _tell(self, script: str) -> None:
         if not self._client.is_deleted:
@@ -316,6 +329,8 @@ class Editor:
         self._closeup.open(self.session)
         with self._client:
             self._canvas.open(self.session, opened.preview.pixels, opened.photograph.size)
+        pictures = await self._tasks.run("Opening", partial(thumbnails, opened.preview.pixels))
+        self._canvas.pictures |= {f"look-{look}": content for look, content in pictures.items()}
         self.follow()
         with self._client:
             ui.navigate.history.replace(f"/?photo={quote(self.session.address)}")

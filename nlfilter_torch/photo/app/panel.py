@@ -5,12 +5,17 @@ from collections.abc import Callable
 from nicegui import ui
 
 from nlfilter_torch.photo.app.detail_tab import DetailTab
+from nlfilter_torch.photo.app.look_tab import LookTab
 from nlfilter_torch.photo.app.step_list import StepList
 from nlfilter_torch.photo.app.tabs import EditTab, Link
 from nlfilter_torch.photo.declared.parameters import DETAIL, EDITS
+from nlfilter_torch.photo.declared.shared_parameters import LOOK
 
 #: The kind of tab of each edit, in the order of the tabs.
-TABS: dict[str, type[EditTab]] = dict.fromkeys((DETAIL.name, *EDITS), EditTab) | {DETAIL.name: DetailTab}
+TABS: dict[str, type[EditTab]] = dict.fromkeys((DETAIL.name, *EDITS), EditTab) | {
+    DETAIL.name: DetailTab,
+    LOOK.name: LookTab,
+}
 CLIPPED = 0.001  # share of the picture that an edit may clip without a warning
 
 

@@ -89,7 +89,7 @@ class StepList:
             on.props(f'dense aria-label="{name}: on"').tooltip("Switch this step on or off")
             title = ui.button(name, on_click=partial(self._open_tab, step.edit)).props("flat dense no-caps align=left")
             title.classes("name").tooltip("Show its controls")
-            opacity = SteadySlider(min=0, max=100, step=1, value=100 * step.opacity)
+            opacity = SteadySlider(min=0, max=100, step=1, value=100 * step.opacity).classes("mixing")
             opacity.props(f'dense aria-label="{name}: opacity"').tooltip(
                 "Opacity: how much of this step is mixed with the picture before it"
             )

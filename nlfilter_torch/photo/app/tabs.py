@@ -24,6 +24,7 @@ class Link:
         change: is called with changes of the parameters of a step.
         clear: is called with a step whose strokes are to be removed.
         replace: is called with another edit, and the place of the step whose slider moves, or None.
+        thumbnail: returns the address of a picture of the photograph under a look, or "" if there is none.
     """
 
     recipe: Callable[[], Recipe]
@@ -31,6 +32,7 @@ class Link:
     change: Change
     clear: Callable[[str], None]
     replace: Replace
+    thumbnail: Callable[[str], str]
 
 
 class EditTab:

@@ -298,5 +298,5 @@ LOOK = Edit(
         *WITHOUT_SHADING,
     ),
     function="apply_look",
-    hint="A look found by `nlfilter-torch fit`: load its file and choose its strength.",
+    hint="Choose a look, or load one by Load edit: from nlfilter-torch fit, a .cube file or a Hald picture.",
 )

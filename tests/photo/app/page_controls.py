@@ -21,6 +21,7 @@ class Controls:
         self.brush = Brush()
         self.changes: list[tuple[str, Mapping[str, object], bool]] = []
         self.cleared: list[str] = []
+        self.thumbnails: dict[str, str] = {}
         self.replaced: list[tuple[Recipe, int | None]] = []
         self.link = Link(
             lambda: self.recipe,
@@ -28,6 +29,7 @@ class Controls:
             lambda *change: self.changes.append(change),
             self.cleared.append,
             lambda *change: self.replaced.append(change),
+            lambda look: self.thumbnails.get(look, ""),
         )
 
     def show(self, tab: EditTab, recipe: Recipe) -> None:

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from playwright.sync_api import Browser, Page
+from playwright.sync_api import Browser, Page, expect
 
 from nlfilter_torch.photo.io.photographs import Photograph, write_photograph
 from tests.browser import SCREENS, Editor, Tab, running
@@ -42,6 +42,10 @@ def test_no_serious_defect(browser: Browser, editor: Editor, width: int, height:
     page = tab.page
     tab.wait_until_ready()
     result = {"Detail": defects(page)}
+    page.get_by_role("tab", name="Look").click()
+    page.get_by_role("button", name="faded").click()
+    expect(page.get_by_role("checkbox", name="Look: on")).to_be_attached()
+    result["Look"] = defects(page)
     page.get_by_role("tab", name="Recolor").click()
     page.get_by_role("button", name="#8a46c8").first.wait_for()
     result["Recolor"] = defects(page)
