@@ -16,7 +16,7 @@ from nlfilter_torch.photo.declared.shared_parameters import KNOTS, SATURATIONS, 
 from nlfilter_torch.photo.declared.steps import Step, json_of
 from nlfilter_torch.photo.edits.applying import apply_step
 from nlfilter_torch.photo.look_fitting.alignment import inside_frame
-from nlfilter_torch.photo.look_fitting.kept_pixels import KeptPixels, is_of_colours, squares
+from nlfilter_torch.photo.look_fitting.kept_pixels import KEPT, KeptPixels, is_of_colours, squares
 from nlfilter_torch.photo.look_fitting.look_choice import (
     CHOICES,
     RIDGES,
@@ -28,7 +28,7 @@ from nlfilter_torch.photo.look_fitting.look_choice import (
     simplest,
 )
 from nlfilter_torch.photo.look_fitting.look_pixels import EditedPhotograph, PixelSample
-from nlfilter_torch.photo.look_fitting.look_sums import Layout, Parts, Sums
+from nlfilter_torch.photo.look_fitting.look_sums import MOST, Layout, Parts, Sums
 from nlfilter_torch.photo.looks.lattice import lattice_of
 from nlfilter_torch.photo.looks.look_filter import NAMES
 
@@ -182,10 +182,19 @@ class _Region:
     sliders: tuple[Tensor, Tensor] | None = (torch.zeros(1), torch.zeros(1))
     kept: KeptPixels | None = None
 
-    def add(self, number: int, pixels: PixelSample, squares: list[Sums], rounding: float, width: int) -> None:
+    def add(
+        self,
+        number: int,
+        pixels: PixelSample,
+        squares: list[Sums],
+        rounding: float,
+        width: int,
+        colours: PixelSample | None = None,
+    ) -> None:
         """Add the pixels of a pair with that number, and the sums over their squares.
 
         ``rounding`` is half the step between the values of the edited photograph, or 0, and ``width`` is its width.
+        ``colours`` are more of its pixels, without columns.
         """
         if not squares:
             return  # the region is not in this photograph
@@ -197,7 +206,7 @@ class _Region:
         else:
             self.folds[fold] = self.folds[fold] + whole
         if self.kept is not None:
-            self.kept.add(pixels, fold, width)
+            self.kept.add_pair(pixels, colours, fold, width)
         self._add_sliders(pixels, whole, rounding)
 
     def _add_sliders(self, pixels: PixelSample, sums: Sums, rounding: float) -> None:
@@ -362,8 +371,11 @@ def check_belong(before: Tensor, after: Tensor, first: str, second: str) -> None
 
 def _add(regions: list[_Region], number: int, photograph: EditedPhotograph) -> None:
     """Add the pixels of a photograph with that number to each of its regions."""
-    for region, pixels, sums in zip(regions, *_pixels_and_sums(photograph, regions[0].layout), strict=True):
-        region.add(number, pixels, sums, photograph.rounding, photograph.size[1])
+    samples, sums = _pixels_and_sums(photograph, regions[0].layout)
+    many = regions[0].kept is not None and photograph.free.shape[1] > MOST
+    colours = photograph.colours(KEPT) if many else [None] * len(regions)
+    for region, pixels, own, more in zip(regions, samples, sums, colours, strict=True):
+        region.add(number, pixels, own, photograph.rounding, photograph.size[1], more)
 
 
 def _pixels_and_sums(photograph: EditedPhotograph, layout: Layout) -> tuple[list[PixelSample], list[list[Sums]]]:

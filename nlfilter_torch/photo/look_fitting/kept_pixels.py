@@ -14,7 +14,7 @@ from nlfilter_torch.photo.look_fitting.look_choice import SHRINK, SLACK, Candida
 from nlfilter_torch.photo.look_fitting.look_pixels import PixelSample
 from nlfilter_torch.photo.look_fitting.look_sums import MOST, Layout, Parts, Sums, columns_of
 from nlfilter_torch.photo.looks.lattice import colours_of_nodes, resampled
-from nlfilter_torch.photo.looks.look_filter import tone_curve
+from nlfilter_torch.photo.looks.look_filter import pointwise, tone_curve
 
 SQUARES = 3  # a single pair is divided into so many parts along each side, which are the folds
 KEPT = 2 * MOST  # pixels of all pairs
@@ -79,7 +79,7 @@ class _FittedPixels:
 
 
 @dataclass
-class KeptPixels:
+class ThinnedPixels:
     """Pixels of all pairs, thinned so that they are never more than :data:`KEPT`.
 
     Attributes:
@@ -94,9 +94,48 @@ class KeptPixels:
         """Add the pixels of a pair in a fold, of a picture of that width."""
         square = squares(pixels.places, width)
         self.samples.append((pixels.every(self.step), fold, square[:: self.step]))
-        while sum(len(square) for _, _, square in self.samples) > KEPT:
+        while len(self) > KEPT:
             self.step *= 2
             self.samples = [(pixels.every(2), fold, square[::2]) for pixels, fold, square in self.samples]
+
+    def __len__(self) -> int:
+        """Number of pixels."""
+        return sum(len(square) for _, _, square in self.samples)
+
+    @property
+    def square(self) -> Tensor:
+        """For each pixel the number of its square, (P,)."""
+        return torch.cat([square for _, _, square in self.samples])
+
+    @property
+    def fold(self) -> Tensor:
+        """For each pixel the fold of its pair, (P,)."""
+        return torch.cat([torch.full_like(square, fold) for _, fold, square in self.samples])
+
+    def change(self, predicted: list[Tensor], folds: Tensor) -> ColourChange:
+        """The pixels, what looks make of them, (3, P) each, and what folds (P,) they are in."""
+        before, after = (
+            torch.cat([getattr(pixels, name) for pixels, _, _ in self.samples], dim=1).double()
+            for name in ("before", "after")
+        )
+        weights = torch.cat([pixels.shown for pixels, _, _ in self.samples]).double()
+        return ColourChange(before, after, predicted, weights / weights.sum(), folds)
+
+
+@dataclass
+class KeptPixels(ThinnedPixels):
+    """Pixels of all pairs that the lattice of a look is fitted to.
+
+    Attributes:
+        colours: more pixels of the same pairs, without columns, for details of the lattice; or none.
+    """
+
+    colours: ThinnedPixels = field(default_factory=ThinnedPixels)
+
+    def add_pair(self, pixels: PixelSample, colours: PixelSample | None, fold: int, width: int) -> None:
+        """Add the pixels of a pair in a fold, of a picture of that width, and if there are, more without columns."""
+        self.add(pixels, fold, width)
+        self.colours.add(pixels if colours is None else colours, fold, width)
 
     def lattice(self, bases: Sequence[Candidate], folds: Sequence[Sums], layout: Layout) -> LookWithLattice | None:
         """A look with a lattice for what it leaves; None if that explains hardly more than the first look alone.
@@ -109,9 +148,7 @@ class KeptPixels:
             layout: of the columns.
         """
         alone = len({fold for _, fold, _ in self.samples}) == 1
-        numbers = [square if alone else torch.full_like(square, fold) for _, fold, square in self.samples]
-        number = torch.cat(numbers).unique(return_inverse=True)[1]
-        group = latin(number) if alone else number
+        group = self._groups(self)
         if int(group.max()) == 0:
             return None
         groups = [latin(i) if alone else i for i in range(len(folds))]
@@ -133,20 +170,26 @@ class KeptPixels:
         """The lattice for what a look leaves of the pixels in groups (P,), to which the folds belong."""
         others = [[sums for sums, own in folds if own != left] for left in (*range(int(group.max()) + 1), -1)]
         looks = [basis.fitted_to(reduce(Sums.__add__, sums), layout) for sums in others]
-        before, after = (
-            torch.cat([getattr(pixels, name) for pixels, _, _ in self.samples], dim=1).double()
-            for name in ("before", "after")
-        )
-        weights = torch.cat([pixels.shown for pixels, _, _ in self.samples]).double()
-        colours = ColourChange(before, after, self._predicted(looks, layout), weights / weights.sum(), group)
-        return _FittedPixels(basis, looks[-1], colours, refined(colours, fit_lattice(colours)))
+        colours = self.change(self._predicted(looks, layout), group)
+        more, lattice = colours, fit_lattice(colours)
+        if is_of_colours(basis.parts) and len(self.colours) > len(self):
+            more = self.colours.change([], self._groups(self.colours))
+            more = replace(more, predicted=[coloured(more.before, look, layout) for look in (looks[0], looks[-1])])
+        return _FittedPixels(basis, looks[-1], colours, refined(more, lattice))
+
+    def _groups(self, pixels: ThinnedPixels) -> Tensor:
+        """The groups (P,) of pixels that are left out at once: those of a pair, or of squares of a single one."""
+        if len({fold for _, fold, _ in self.samples}) > 1:
+            return torch.searchsorted(self.fold.unique(), pixels.fold)
+        values = self.square.unique()
+        return latin(torch.searchsorted(values, pixels.square).clamp(max=len(values) - 1))
 
     def _agree(self, colours: ColourChange) -> bool:
         """Whether one lattice explains parts of all pictures from the rest of these.
 
         Colours of one pair that no other has say nothing when pairs are left out.
         """
-        square = latin(torch.cat([square for _, _, square in self.samples]).unique(return_inverse=True)[1])
+        square = latin(self.square.unique(return_inverse=True)[1])
         parts = replace(colours, predicted=colours.predicted[-1:] * (int(square.max()) + 2), folds=square)
         lattice = refined(parts, fit_lattice(parts))
         return 1 - lattice.without > WITHIN * (1 - lattice.left_out)
@@ -163,6 +206,14 @@ class KeptPixels:
                 change = torch.einsum("lcf,cfp->lcp", coefficients, columns)
                 parts.append(pixels.before[:, inside] + change)
         return list(torch.cat(parts, dim=2))
+
+
+def coloured(colours: Tensor, coefficients: Tensor, layout: Layout) -> Tensor:
+    """Colours (3, P) under a look with coefficients (3, F) of parts that are functions of the colour."""
+    curves, matrix, saturation = (coefficients[:, layout.place(name)] for name in COLOURS)
+    straight = torch.linspace(0, 1, layout.knots, dtype=colours.dtype)
+    identity = torch.eye(3, dtype=colours.dtype)
+    return pointwise(colours[None, :, None], straight + curves, identity + matrix, 1 + saturation[0])[0, :, 0]
 
 
 def rising(lattice: Tensor, coefficients: Tensor, layout: Layout, density: Tensor) -> Tensor:

@@ -18,9 +18,10 @@ from nlfilter_torch.photo.look_fitting.lattice_fit import (
     Problem,
     conjugate_gradients,
 )
-from nlfilter_torch.photo.looks.lattice import resampled
+from nlfilter_torch.photo.looks.lattice import lattice_change, resampled
 
 GRIDS = (17, 33)  # numbers of nodes along each axis
+AGAIN = 2  # more rounds with most nodes, as lattices take values beyond the ends of clipped ones for right
 RIDGES = (10.0, 1.0, 0.1)  # so many pixels at a node, of average weight, halve its change
 
 
@@ -31,6 +32,8 @@ def refined(pixels: ColourChange, lattice: FittedLattice) -> FittedLattice:
     """
     for nodes in GRIDS:
         lattice = _with_details(pixels, lattice, nodes)
+    for _ in range(AGAIN if bool(((pixels.after <= 0) | (pixels.after >= 1)).any()) else 0):
+        lattice = _with_details(pixels, lattice, lattice.changes.shape[1])
     return lattice
 
 
@@ -68,9 +71,9 @@ def _rest(pixels: ColourChange, lattice: FittedLattice, nodes: int) -> Problem:
 
     Of its three predictions, the first is by looks without the first fold, and the last by those of all.
     """
-    coarse = Problem.of(pixels, lattice.changes.shape[1])
+    colours = pixels.before[None, :, None]
     first, all_of = (
-        predicted + coarse.at_pixels(changes.flatten(1))
+        predicted + lattice_change(colours, changes)[0, :, 0]
         for predicted, changes in ((pixels.predicted[0], lattice.first), (pixels.predicted[-1], lattice.changes))
     )
     left = replace(pixels, predicted=[first, first, all_of], folds=pixels.folds.clamp(max=1))

@@ -151,6 +151,17 @@ class EditedPhotograph:
         inside = self.inside[places] > 0
         return [self._at(places[inside], layers[:, inside], self.inside)]
 
+    def colours(self, most: int) -> list[PixelSample]:
+        """Pixels of each region, at most so many, clipped or not, without the columns of any part."""
+        samples = []
+        for shown in self._shown():
+            places = sample(shown, most)
+            share = int((shown > 0).sum()) / max(len(places), 1)
+            before, after, free = (planes[:, places] for planes in (self.before, self.after, self.free))
+            weights = shown[places] * share
+            samples.append(PixelSample(places, before, after, {}, weights * free, weights))
+        return samples
+
     def _shown(self) -> list[Tensor]:
         """Weights of the pixels, clipped or not, (N,) for each region."""
         if self.masks is None:

@@ -110,16 +110,18 @@ class Sums:
         return 1.0 - self.left(coefficients) / max(float(self.power.sum()), 1e-30)
 
 
-def sample(weights: Tensor) -> Tensor:
+def sample(weights: Tensor, most: int | None = None) -> Tensor:
     """Indices (P,), ascending, of the pixels that sums are taken over, from weights (H, W).
 
-    They are all pixels of positive weight, or :data:`MOST` of them: one at random of each run of equal length.
+    They are all pixels of positive weight, or ``most`` of them (None: :data:`MOST`): one at random of each run of equal
+    length.
     """
+    most = MOST if most is None else most
     places = weights.flatten().nonzero().squeeze(1)
-    if len(places) <= MOST:
+    if len(places) <= most:
         return places
-    random = torch.rand(MOST, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    return places[((torch.arange(MOST) + random) * (len(places) / MOST)).long().to(places.device)]
+    random = torch.rand(most, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    return places[((torch.arange(most) + random) * (len(places) / most)).long().to(places.device)]
 
 
 def columns_of(image: Tensor, weighed: Mapping[str, Tensor], layout: Layout) -> Tensor:

@@ -8,8 +8,16 @@ from nlfilter_torch import fit_look
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.edits.applying import apply_step
-from nlfilter_torch.photo.look_fitting.kept_pixels import KEPT, KeptPixels, is_of_colours, nondecreasing
+from nlfilter_torch.photo.look_fitting.kept_pixels import (
+    COLOURS,
+    KEPT,
+    KeptPixels,
+    coloured,
+    is_of_colours,
+    nondecreasing,
+)
 from nlfilter_torch.photo.look_fitting.look_pixels import EditedPhotograph
+from nlfilter_torch.photo.look_fitting.look_sums import Layout, columns_of
 from tests.looks import CAT, CUP, FEW, SUIT, explained, in_bytes, single_look
 
 
@@ -93,6 +101,24 @@ def test_never_more_pixels_than_enough_are_kept(monkeypatch: pytest.MonkeyPatch)
         assert total == pytest.approx(8000 * (number + 1), rel=0.01)
         assert sum(len(square) for _, _, square in kept.samples) <= 15_000
     assert kept.step == 4
+
+
+def test_details_have_more_pixels_under_the_same_look() -> None:
+    photograph = EditedPhotograph(CUP[0], by_hue(CUP)[0], None, FEW, 3, None)
+    kept, layout = KeptPixels(), Layout(17, 5, 4)
+    kept.add_pair(photograph.regions()[0].every(4), photograph.colours(5000)[0], 0, photograph.size[1])
+    assert (len(kept), len(kept.colours)) == (2000, 5000)
+    weights = [sum(float(pixels.shown.sum()) for pixels, _, _ in part.samples) for part in (kept, kept.colours)]
+    assert weights[0] == pytest.approx(weights[1], rel=0.01)
+    coefficients = torch.randn(3, layout.columns, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    coefficients[:, layout.place("saturation")] = coefficients[:1, layout.place("saturation")]  # for all channels
+    others = [layout.place(name) for name in layout.lengths if name not in COLOURS]
+    for place in others:
+        coefficients[:, place] = 0
+    (pixels, _, _) = kept.samples[0]
+    change = torch.einsum("cf,cfp->cp", coefficients, columns_of(pixels.before, pixels.weighed, layout))
+    shown = coloured(pixels.before.double(), coefficients, layout)
+    torch.testing.assert_close(shown, pixels.before + change)
 
 
 @pytest.mark.parametrize("colour", [(0.5, 0.5, 0.5), (0.2, 0.6, 0.4)])
