@@ -27,8 +27,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+from torch.nn.functional import avg_pool2d
 
 from benchmarks.composites import Composite, composites, draw_strokes, setup
+from benchmarks.photographs import photograph
 from nlfilter_torch import defocus, recolor
 from nlfilter_torch.photo.edits.defocus import blur_kernel, convolve
 from nlfilter_torch.photo.edits.recolor import Recoloring, with_room
@@ -36,6 +38,7 @@ from nlfilter_torch.photo.picture.colour import hundredths_of_lab, merge_luminan
 from nlfilter_torch.photo.picture.resizing import resize
 from nlfilter_torch.photo.picture.viewing import viewed_size
 from nlfilter_torch.photo.selections.border_colours import colours_beside
+from nlfilter_torch.photo.selections.connected import EXTENTS, Extent
 
 TINTS = ((0.8, 0.2, 0.15), (0.2, 0.35, 0.8), (0.2, 0.6, 0.25), (0.85, 0.7, 0.15))
 COLOURS = ((0.1, 0.3, 0.9), (0.9, 0.5, 0.1), (0.7, 0.15, 0.7), (0.15, 0.6, 0.3))  # of the scribbles, for each tint
@@ -48,6 +51,12 @@ AREA_SIZE = 0.13  # megapixels to which photographs are reduced for smooth areas
 # smallest share of the photograph.
 SMOOTH_BLUR, SMOOTH_MARGIN, SMOOTH_CHANGE = 0.006, 0.008, 1.7
 SMOOTH_LIGHTNESS, SMOOTH_COLOUR, SMOOTH_SHARE = 30, 15, 0.1
+HATS = ((0.85, 0.1, 0.12), (0.9, 0.45, 0.3), (0.85, 0.35, 0.45), (0.75, 0.2, 0.5), (0.95, 0.65, 0.1))
+BESIDE_HAT = {  # rows and columns
+    "face": (slice(112, 205), slice(185, 262)),
+    "lips": (slice(167, 185), slice(208, 248)),
+    "suit": (slice(300, 400), slice(40, 120)),
+}
 LIMITS = {"covered": 90.0, "outside": 10.0, "outside, keep": 5.0, "border": 20.0, "kept": 85.0, "kept, two": 95.0}
 
 
@@ -78,13 +87,15 @@ def rms(difference: Tensor, where: Tensor) -> float:
     return 255 * float((difference.square().mean(1, keepdim=True) * where).sum() / where.sum()) ** 0.5
 
 
-def measure_recolor(composite: Composite, number: int, count: int, seed: int, *, keep: bool) -> dict[str, float]:
+def measure_recolor(
+    composite: Composite, number: int, count: int, seed: int, *, keep: bool, extent: Extent = "near"
+) -> dict[str, float]:
     """Measure one recolouring: shares in percent, and errors."""
     scene = tinted(composite, number)
     inside = scene.scribbles(count, seed)[0]
     colour = torch.tensor(COLOURS[number % len(COLOURS)]).view(1, 3, 1, 1)
     options = {"keep": scene.scribbles(1, seed + 1)[1]} if keep else {}
-    result = recolor(scene.image, (colour * inside).expand_as(scene.image), inside, **options)
+    result = recolor(scene.image, (colour * inside).expand_as(scene.image), inside, extent=extent, **options)
     wanted = recoloured(scene, colour, inside)
     change, ideal = result - scene.image, wanted - scene.image
     along = (change * ideal).sum(1, keepdim=True) / ideal.square().sum(1, keepdim=True).clamp(min=1e-8)
@@ -97,6 +108,31 @@ def measure_recolor(composite: Composite, number: int, count: int, seed: int, *,
         "border": rms(result - wanted, border),
         "nothing": rms(ideal, border),
     }
+
+
+def hat_scene(tint: tuple[float, float, float]) -> tuple[Tensor, Tensor]:
+    """A photograph (1, 3, 512, 512) of an astronaut in a hat of that colour with a texture, and the hat (1, 1, ...)."""
+    image, texture = photograph("astronaut"), photograph("gravel")
+    rows, columns = torch.meshgrid(torch.arange(512.0), torch.arange(512.0), indexing="ij")
+    inside = (((rows - 70) / 62) ** 2 + ((columns - 227) / 82) ** 2 < 1) & (rows < 105)
+    hat, cloth = (avg_pool2d(planes, 3, 1, 1) for planes in (inside.float()[None, None], texture))
+    shade = (0.75 + 0.5 * (cloth - cloth.mean())) * (1.1 - 0.4 * rows / 140)
+    colour = (torch.tensor(tint).view(1, 3, 1, 1) * shade).clamp(0, 1)
+    return hat * colour + (1 - hat) * image, hat
+
+
+def measure_hat(tint: tuple[float, float, float]) -> dict[str, float]:
+    """Shares in percent of a hat, and of face, lips and suit beside it, that one scribble on the hat changes."""
+    image, hat = hat_scene(tint)
+    inside = torch.zeros_like(hat)
+    inside[..., 50:70, 190:240] = 1
+    strokes = torch.tensor(COLOURS[3]).view(1, 3, 1, 1).expand_as(image)
+    shares = {}
+    for extent in EXTENTS[:2]:
+        changed = (recolor(image, strokes, inside, extent=extent) - image).abs().amax(1)[0] > CHANGED
+        parts = {"hat": hat[0, 0] > 0.98} | BESIDE_HAT
+        shares |= {f"{name}, {extent}": 100 * float(changed[part].float().mean()) for name, part in parts.items()}
+    return shares
 
 
 def measure_brightness(composite: Composite, number: int, seed: int) -> dict[str, float]:
@@ -189,7 +225,7 @@ def report(title: str, cases: list[dict[str, float]], limits: dict[str, str]) ->
         values = sorted(case[name] for case in cases)
         high = name in ("covered", "kept", "blurred")
         tenth = values[len(values) // 10] if high else values[-1 - len(values) // 10]
-        line = f"  {name:10}{statistics.mean(values):8.1f}{tenth:8.1f}"
+        line = f"  {name:12}{statistics.mean(values):8.1f}{tenth:8.1f}"
         if name in limits:
             limit = LIMITS[limits[name]]
             held = [v >= limit if high else v <= limit for v in values]
@@ -207,6 +243,9 @@ def main(arguments: list[str] | None = None) -> None:
     print(f"{chosen.count} composites of {chosen.size[0]}x{chosen.size[1]} ({chosen.kind} set)")
     single = [measure_recolor(scene, i, 1, first + 10 * i, keep=False) for i, scene in scenes]
     report("recolor, one scribble", single, {"covered": "covered", "outside": "outside", "border": "border"})
+    object_alone = [measure_recolor(scene, i, 1, first + 10 * i, keep=False, extent="object") for i, scene in scenes]
+    report("recolor, one scribble, this object", object_alone, {"covered": "covered", "outside": "outside"})
+    report("recolor, hats beside a face", [measure_hat(tint) for tint in HATS], {})
     two = [measure_recolor(scene, i, 2, first + 10 * i, keep=True) for i, scene in scenes]
     report("recolor, two and one to keep", two, {"covered": "covered", "outside": "outside, keep", "border": "border"})
     bright = [measure_brightness(scene, i, first + 10 * i) for i, scene in scenes]

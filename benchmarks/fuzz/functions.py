@@ -16,6 +16,7 @@ import nlfilter_torch as nlf
 from benchmarks.fuzz.cases import SAMPLINGS
 from benchmarks.fuzz.checks import Findings, judged
 from benchmarks.fuzz.scene import Scene
+from nlfilter_torch.photo.selections.connected import EXTENTS
 
 TOO_LARGE = 1_000_001  # as a patch size, 8 TB of weights
 Kind = Callable[[Scene], Any]
@@ -211,7 +212,9 @@ FUNCTIONS = {
         lambda operator, **options: operator.spectrum(**options), OPERATOR, {"rank": _count(1, 20)}
     ),
     "NonlocalOperator.cat": Function(
-        lambda operator, image: nlf.NonlocalOperator.cat([operator, operator])[0] @ image[:1], OPERATOR | IMAGE, {}
+        lambda operator, image: nlf.NonlocalOperator.cat([operator, operator])[: len(operator)] @ image,
+        OPERATOR | IMAGE,
+        {},
     ),
     "pad_images": Function(nlf.pad_images, {"images": lambda scene: list(scene.image(3))}, {}),
     "collate": Function(_collated, {"samples": lambda scene: [scene.operator, scene.operator]}, {}),
@@ -314,13 +317,14 @@ FUNCTIONS = {
     "region_mask": Function(
         nlf.region_mask,
         {"image": _image(1, 3), "scribbles": lambda scene: scene.mask(1)},
-        LOCAL | {"reach": _number(0, 0.99), "photometric_bandwidth": _plain(0.03, 0.5)},
+        LOCAL | {"reach": _number(0, 0.99), "extent": _one_of(*EXTENTS)} | {"photometric_bandwidth": _plain(0.03, 0.5)},
     ),
     "recolor": Function(
         nlf.recolor,
         {"image": _image(3)} | PAINTED,
         LOCAL
         | {"keep": _background, "reach": _number(0, 0.99), "brightness": _number(0, 1)}
+        | {"extent": _one_of(*EXTENTS)}
         | {"photometric_bandwidth": _plain(0.03, 0.5)},
     ),
     "colorize": Function(

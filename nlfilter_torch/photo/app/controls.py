@@ -177,3 +177,34 @@ class Slider:
 
     def _released(self, value: float) -> None:
         self._change(self._control.edit, self._control.entries(self._recipe(), value), True)
+
+
+class Choice:
+    """A choice among words on the page, which shows the current edit and calls ``change`` with changes."""
+
+    def __init__(self, edit: str, parameter: Parameter, recipe: Callable[[], Recipe], change: Change) -> None:
+        self._edit, self._parameter, self._recipe, self._change = edit, parameter, recipe, change
+        self._following = False
+        labels = dict(zip(parameter.choices, parameter.labels, strict=True))
+        self._select = ui.select(labels, value=self._chosen, label="What takes part")
+        self._select.props("dense outlined options-dense").classes("w-full q-mt-xs").tooltip(parameter.help)
+        self._select.on_value_change(lambda event: self._choose(event.value))
+
+    @property
+    def _chosen(self) -> str:
+        return str(self._recipe().last(self._edit)[self._parameter.name])
+
+    def follow(self) -> None:
+        """Show the current edit."""
+        self._following = True
+        self._select.set_value(self._chosen)
+        self._following = False
+
+    def _choose(self, value: str) -> None:
+        if not self._following:
+            self._change(self._edit, {self._parameter.name: value}, True)
+
+
+def choices(edit: str, recipe: Callable[[], Recipe], change: Change) -> list[Choice]:
+    """A control for every choice of an edit that the editor offers, built into the open element."""
+    return [Choice(edit, parameter, recipe, change) for parameter in EDITS[edit] if parameter.labels]

@@ -74,6 +74,7 @@ class DetailTab(EditTab):
     def _build_sliders(self, detail: Step) -> None:
         self._box.clear()
         sliders: list[Slider] = []
+        self._choices = []
         with self._box:
             if detail.has_region():
                 ui.label("In the region").classes("group")
@@ -81,6 +82,7 @@ class DetailTab(EditTab):
                 inside = controls.detail_sliders("inside", len(detail.sliders_inside))
                 sliders += [self._slider(control, " in the region") for control in inside]
                 sliders += [self._slider(control) for control in controls.OF_EDIT[self._edit]]
+                self._choices = controls.choices(self._edit, self._link.recipe, self._link.change)
                 ui.label("Elsewhere").classes("group")
             outside = controls.detail_sliders("alpha", len(detail["alpha"]))
             sliders += [self._slider(control) for control in outside]

@@ -243,7 +243,7 @@ class Preview:
         """The mask (1, 1, h, w) of the region, or None without strokes; only the first one is slow."""
         if not detail.has_region():
             return None
-        key = (detail.strokes, detail["reach"], detail["tolerance"], detail["landmarks"])
+        key = (detail.strokes, detail["reach"], detail["extent"], detail["tolerance"], detail["landmarks"])
         if self._mask is None or self._mask[0] != key:
             fewer = min(detail["landmarks"], MASK.defaults["num_landmarks"])
             if (detail["tolerance"], fewer) != self._compared_by:

@@ -8,7 +8,7 @@ from nicegui import ui
 
 from nlfilter_torch.photo.app import controls
 from nlfilter_torch.photo.app.brush import BRUSHES, COLOURS, RADIUS, Brush
-from nlfilter_torch.photo.app.controls import Change, Control, Slider, SteadySlider
+from nlfilter_torch.photo.app.controls import Change, Choice, Control, Slider, SteadySlider
 from nlfilter_torch.photo.app.step_list import Replace
 from nlfilter_torch.photo.declared.parameters import EDITS
 from nlfilter_torch.photo.declared.presets import Recipe
@@ -41,12 +41,15 @@ class EditTab:
     def __init__(self, edit: str, link: Link) -> None:
         self._edit, self._link = edit, link
         self._sliders: list[Slider] = []
+        self._choices: list[Choice] = []
         self._build()
 
     def follow(self) -> None:
         """Show the current edit."""
         for slider in self._sliders:
             slider.follow()
+        for choice in self._choices:
+            choice.follow()
 
     def draw_response(self, svg: str) -> None:
         """Show the response of the sliders, in a tab that has a place for it."""
@@ -57,6 +60,7 @@ class EditTab:
         if needs_strokes:
             self._build_brush()
         self._sliders += [self._slider(control) for control in controls.OF_EDIT[self._edit]]
+        self._choices += controls.choices(self._edit, self._link.recipe, self._link.change)
         if not needs_strokes:
             self._build_brush()
 

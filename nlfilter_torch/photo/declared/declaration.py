@@ -99,6 +99,7 @@ class Parameter:
         length: length of a list; 0 is any.
         panel: title of its section in the help of the command; without one it is among the edit's main options.
         per_image: whether the function also takes a tensor with one value for each image.
+        labels: what the editor calls the choices, if it offers them.
         usual: range of the command, which accepts values of :attr:`low` to :attr:`high` beyond it if the user insists.
     """
 
@@ -125,6 +126,7 @@ class Parameter:
     length: int = 0
     panel: str | None = None
     per_image: bool = False
+    labels: tuple[str, ...] = ()
     usual: tuple[float, float] | None = None
 
     @property

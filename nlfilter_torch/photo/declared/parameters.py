@@ -16,6 +16,7 @@ from nlfilter_torch.photo.declared.declaration import (
     Slider,
 )
 from nlfilter_torch.photo.declared.shared_parameters import (
+    EXTENT,
     LIMITS,
     LOOK,
     REACH,
@@ -87,6 +88,7 @@ DETAIL = Edit(
             "`luminance`: edit brightness and keep the colours. `all`: edit red, green and blue, colours too.",
         ),
         replace(REACH, slider=REACH_SLIDER),
+        EXTENT,
         replace(TOLERANCE, argument="mask_bandwidth"),
         number(
             "threshold",
@@ -252,6 +254,7 @@ RECOLOR = Edit(
             panel=FILTER_PANEL,
             per_image=True,
         ),
+        EXTENT,
         number(
             "brightness",
             0.0,
@@ -342,6 +345,7 @@ DEFOCUS = Edit(
             ("disc", "gaussian"),
             "`disc`: points of light become discs, as in a lens. `gaussian`: they become soft spots.",
         ),
+        EXTENT,
         TOLERANCE,
         *filter_parameters(share=0.3, patch_size=1)[1:],
     ),
@@ -374,6 +378,7 @@ MASK = Edit(
     """,
     (
         REACH,
+        EXTENT,
         TOLERANCE,
         *(p for p in filter_parameters(share=0.45)[1:] if p.name != "patch_size"),
     ),

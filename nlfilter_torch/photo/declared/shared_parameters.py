@@ -188,6 +188,17 @@ REACH = number(
     panel=FILTER_PANEL,
     per_image=True,
 )
+#: For all edits that select regions.
+EXTENT = Parameter(
+    "extent",
+    "choice",
+    "near",
+    "Which similar areas belong to the region: `near`, those nearby; `object`, only what is connected with a scribble; "
+    "`everywhere`, all of the picture.",
+    domain="choice",
+    choices=("near", "object", "everywhere"),
+    labels=("What is like it nearby", "This object", "Everywhere"),
+)
 REACH_SLIDER = Slider("Reach of the region", 0, 0.95, 0.05)
 
 

@@ -16,6 +16,7 @@ from nlfilter_torch.photo.declared.parameters import DEFOCUS
 from nlfilter_torch.photo.picture.drawn import Drawn, M
 from nlfilter_torch.photo.picture.in_memory import edit_image
 from nlfilter_torch.photo.picture.source import Fitted, Source
+from nlfilter_torch.photo.selections.connected import Extent
 from nlfilter_torch.photo.selections.mask import ObjectEdit, background_of, fit_regions
 
 Aperture = Literal["disc", "gaussian"]
@@ -35,6 +36,7 @@ def defocus(
     radius: float | None = None,
     aperture: Aperture = DEFOCUS.defaults["aperture"],
     reach: float | Tensor = REACH,
+    extent: Extent = DEFOCUS.defaults["extent"],
     photometric_bandwidth: float | Tensor = DEFOCUS.defaults["photometric_bandwidth"],
     spatial_bandwidth: float | Tensor | None = None,
     patch_size: int = DEFOCUS.defaults["patch_size"],
@@ -57,6 +59,7 @@ def defocus(
         aperture: ``"disc"`` turns bright dots into discs, as a lens does; ``"gaussian"`` is the paper's, with the same
             variance.
         reach: that of :func:`region_mask`; larger than there by default, so that more of the subject stays sharp.
+        extent: that of :func:`region_mask`.
         photometric_bandwidth: that of :func:`region_mask`, in hundredths of Lab.
         spatial_bandwidth: that of :func:`region_mask`, in pixels; None is 0.3 of the short side.
         patch_size: width of the compared patches.
@@ -88,6 +91,7 @@ def defocus(
         radius=radius,
         aperture=aperture,
         reach=reach,
+        extent=extent,
         photometric_bandwidth=photometric_bandwidth,
         spatial_bandwidth=spatial_bandwidth,
         patch_size=patch_size,

@@ -38,6 +38,7 @@ from nlfilter_torch.photo.picture.limits import Limits
 from nlfilter_torch.photo.picture.pixels import whole_image
 from nlfilter_torch.photo.picture.source import Fitted, Guide, Pixels, Planes, Source, luminance
 from nlfilter_torch.photo.picture.viewing import fit_change
+from nlfilter_torch.photo.selections.connected import Extent
 from nlfilter_torch.photo.selections.mask import RegionMask, Regions
 
 Channels = Literal["luminance", "all"]
@@ -53,6 +54,7 @@ def enhance(
     residual: float | Tensor | None = DETAIL.defaults["residual"],
     channels: Channels = DETAIL.defaults["channels"],
     reach: float | Tensor = DETAIL.defaults["reach"],
+    extent: Extent = DETAIL.defaults["extent"],
     mask_bandwidth: float | Tensor = DETAIL.defaults["mask_bandwidth"],
     threshold: float | Tensor = DETAIL.defaults["threshold"],
     limits: Limits = DETAIL.defaults["limits"],
@@ -81,6 +83,7 @@ def enhance(
         residual: weight of the residual of the eigenvectors, see :func:`polynomial_filter`.
         channels: ``"luminance"`` keeps the colours, ``"all"`` edits red, green and blue alike.
         reach: reach of the masks, in [0, 1); larger includes less similar pixels.
+        extent: of the masks, that of :func:`region_mask`.
         mask_bandwidth: photometric bandwidth of the masks, in hundredths of Lab.
         threshold: standard deviation of luminance around a pixel at which detail gets half the amplification of the
             sliders; where the deviation is smaller, detail gets less. 0 amplifies all detail alike.
@@ -118,6 +121,7 @@ def enhance(
         residual=residual,
         channels=channels,
         reach=reach,
+        extent=extent,
         mask_bandwidth=mask_bandwidth,
         threshold=threshold,
         limits=limits,
@@ -144,6 +148,7 @@ class Detail(FilteredEdit):
     residual: float | Tensor | None
     channels: Channels
     reach: float | Tensor
+    extent: Extent = DETAIL.defaults["extent"]
     mask_bandwidth: float | Tensor
     threshold: float | Tensor
     limits: Limits
@@ -161,6 +166,7 @@ class Detail(FilteredEdit):
         generator = self.generator
         return RegionMask(
             reach=self.reach,
+            extent=self.extent,
             photometric_bandwidth=self.mask_bandwidth,
             spatial_bandwidth=None,
             num_landmarks=min(self.num_landmarks, MASK.defaults["num_landmarks"]),

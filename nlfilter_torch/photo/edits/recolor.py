@@ -23,6 +23,7 @@ from nlfilter_torch.photo.picture.in_memory import edit_image
 from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles
 from nlfilter_torch.photo.picture.source import Fitted, Pixels, Source
 from nlfilter_torch.photo.selections.border_colours import Sides, colours_beside, refine_mask
+from nlfilter_torch.photo.selections.connected import Extent
 from nlfilter_torch.photo.selections.mask import ObjectEdit, Regions, background_of, fit_regions
 from nlfilter_torch.photo.selections.stray import without_strays
 
@@ -42,6 +43,7 @@ def recolor(
     keep: Tensor | None = None,
     brightness: float | Tensor = RECOLOR.defaults["brightness"],
     reach: float | Tensor = RECOLOR.defaults["reach"],
+    extent: Extent = RECOLOR.defaults["extent"],
     photometric_bandwidth: float | Tensor = RECOLOR.defaults["photometric_bandwidth"],
     spatial_bandwidth: float | Tensor | None = None,
     patch_size: int = RECOLOR.defaults["patch_size"],
@@ -66,6 +68,7 @@ def recolor(
             luminance of the stroke, and others theirs in proportion; highlights stay white.
         reach: in [0, 1), probability that a walk over similar pixels continues after each step; larger includes less
             similar pixels.
+        extent: that of :func:`region_mask`: what is similar nearby, the object under a stroke alone, or everywhere.
         photometric_bandwidth: in hundredths of Lab: 0.08 is 8 units.
         spatial_bandwidth: in pixels; None is 1.2 of the short side, ``math.inf`` no limit.
         patch_size: width of the compared patches.
@@ -95,6 +98,7 @@ def recolor(
     edit = Recolor(
         brightness=brightness,
         reach=reach,
+        extent=extent,
         photometric_bandwidth=photometric_bandwidth,
         spatial_bandwidth=spatial_bandwidth,
         patch_size=patch_size,

@@ -32,6 +32,7 @@ from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles, parts_in_bl
 from nlfilter_torch.photo.picture.source import Fitted, Reduced, Source
 from nlfilter_torch.photo.picture.viewing import viewed_size
 from nlfilter_torch.photo.selections.closed_form import LinearMasks, linear_mask, linear_models, solve_linear
+from nlfilter_torch.photo.selections.connected import Extent, connected
 from nlfilter_torch.photo.selections.random_walker import solve_mask
 from nlfilter_torch.photo.selections.rough_mask import RoughMasks
 from nlfilter_torch.photo.selections.scribbled_colours import trimap_share
@@ -51,6 +52,7 @@ def region_mask(
     background: Tensor | None = None,
     *,
     reach: float | Tensor = MASK.defaults["reach"],
+    extent: Extent = MASK.defaults["extent"],
     photometric_bandwidth: float | Tensor = MASK.defaults["photometric_bandwidth"],
     spatial_bandwidth: float | Tensor | None = None,
     patch_size: int = 1,
@@ -78,6 +80,8 @@ def region_mask(
             ``scribbles`` take precedence. None means no background scribbles.
         reach: in [0, 1), probability that a random walk over similar pixels continues after each step; larger values
             include less similar pixels.
+        extent: ``"near"`` selects what is similar and nearby, ``"object"`` only what is connected with a scribble of
+            it, ``"everywhere"`` what is similar at any distance.
         photometric_bandwidth: in hundredths of Lab: 0.08 is 8 units.
         spatial_bandwidth: in pixels; None is 0.45 of the short side, ``math.inf`` no limit: similar pixels anywhere.
         patch_size: width of the compared patches.
@@ -105,6 +109,7 @@ def region_mask(
     """
     edit = RegionMask(
         reach=reach,
+        extent=extent,
         photometric_bandwidth=photometric_bandwidth,
         spatial_bandwidth=spatial_bandwidth,
         patch_size=patch_size,
@@ -136,6 +141,7 @@ class RegionMask(PhotoEdit):
     landmarks: Sampling = "kmeans"
     completion: Completion = "diagonal"
     generator: torch.Generator | None = None
+    extent: Extent = MASK.defaults["extent"]
     names: tuple[str, str] = ("scribbles", "background")
 
     def fit(self, source: Source[M], drawn: Drawn[M]) -> Fitted:
@@ -178,6 +184,7 @@ class ObjectEdit(PhotoEdit):
     landmarks: Sampling = "kmeans"
     completion: Completion = "diagonal"
     generator: torch.Generator | None = None
+    extent: Extent = MASK.defaults["extent"]
 
     def selection(self) -> RegionMask:
         """The masks of the objects, without the default of the spatial bandwidth, which depends on the size."""
@@ -189,6 +196,7 @@ class ObjectEdit(PhotoEdit):
             landmarks=self.landmarks,
             completion=self.completion,
             generator=self.generator,
+            extent=self.extent,
         )
 
     def selection_in(self, size: tuple[int, int]) -> RegionMask:
@@ -261,16 +269,18 @@ def fit_regions(
     source: Source[M], inside: list[Scribbles], background: list[Scribbles], settings: RegionMask
 ) -> Regions:
     """Compute the masks of regions from scribbles on each, and on the background: none, for all, or for each."""
-    MASK.check(source.batch, reach=settings.reach)
+    MASK.check(source.batch, reach=settings.reach, extent=settings.extent)
     inside, background = ([without_strays(drawn, source.size) for drawn in side] for side in (inside, background))
     several = len(background) > 1
     scribbles = [_against(inside, k, background[k : k + 1] if several else background) for k in range(len(inside))]
     check_positive(settings.photometric_bandwidth, "photometric_bandwidth", source.batch)
     check_count(settings.num_landmarks, "num_landmarks")
     small, steps = _reduced(source, FLOATS_PER_PIXEL + settings.num_landmarks)
+    everywhere = settings.extent == "everywhere"
+    distance = math.inf if everywhere else settings.spatial_bandwidth
     options = OperatorOptions(
         photometric_bandwidth=settings.photometric_bandwidth,
-        spatial_bandwidth=_nearness(settings.spatial_bandwidth, source.batch, steps, small.size),
+        spatial_bandwidth=_nearness(distance, source.batch, steps, small.size),
         patch_size=settings.patch_size,
         num_landmarks=min(settings.num_landmarks, small.size[0] * small.size[1]),
         landmarks=settings.landmarks,
@@ -278,13 +288,16 @@ def fit_regions(
         guide_channels="all",
         generator=settings.generator,
     )
-    rough = RoughMasks.of(small, options, settings.reach)
+    rough = RoughMasks.of(small, options, settings.reach, everywhere)
     reduced = [blocks_of(drawn, small, source.size, steps) for drawn in scribbles]
     image = small.image.clamp(0.0, 1.0)  # a far brighter pixel of a float file would upset the linear functions
     masks = torch.cat([rough.mask(number, drawn) for number, drawn in enumerate(reduced)], dim=1)
     front, back = torch.stack([drawn.planes(small) for drawn in reduced], dim=2).unbind(1)
     functions = small.kept("borders", [masks, front, back], partial(_fit_borders, small, image, masks, front, back))
-    return Regions(image, steps, functions, scribbles)
+    regions = Regions(image, steps, functions, scribbles)
+    if settings.extent != "object":
+        return regions
+    return replace(regions, functions=functions * connected(regions.reduced_masks(), front).unsqueeze(2))
 
 
 def _reduced(source: Source[M], floats: int) -> tuple[Reduced, tuple[float, float]]:

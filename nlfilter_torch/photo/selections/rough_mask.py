@@ -91,6 +91,7 @@ class RoughMasks:
         grid: points inside it.
         photometric_bandwidth: of the filter.
         reach: that of :func:`region_mask`.
+        everywhere: whether single pixels count wherever they are, not only near what the regression selects.
     """
 
     picture: Reduced
@@ -99,15 +100,16 @@ class RoughMasks:
     grid: Points
     photometric_bandwidth: Tensor
     reach: float | Tensor
+    everywhere: bool = False
 
     @staticmethod
-    def of(picture: Reduced, options: OperatorOptions, reach: float | Tensor) -> "RoughMasks":
+    def of(picture: Reduced, options: OperatorOptions, reach: float | Tensor, everywhere: bool) -> "RoughMasks":
         """Prepare a picture: build its operator, with options of :func:`nonlocal_operator`, and choose the points."""
         guide = Guide(options, region_guide, TEXTURE_MARGIN, NUM_CHANNELS, spectral=True, sampled=True)
         operator = picture.operator(guide)
         frame, grid = (Points.of(picture, operator, choose(picture.size)) for choose in (frame_places, inner_places))
         bandwidth = torch.as_tensor(options.photometric_bandwidth, dtype=picture.dtype)
-        return RoughMasks(picture, operator, frame, grid, bandwidth, reach)
+        return RoughMasks(picture, operator, frame, grid, bandwidth, reach, everywhere)
 
     @cached_property
     def evenness(self) -> Tensor:
@@ -132,7 +134,8 @@ class RoughMasks:
             partial(colour_likelihood, self.picture.image, colours, weights, self.frame.colours, *compared),
         )
         share = by_trimap(COLOUR_SHARE, trimap).view(-1, 1, 1, 1)
-        return likely + (by_colour - likely) * share * (around(likely) / ENOUGH_AROUND).clamp(max=1.0)
+        nearby = 1.0 if self.everywhere else (around(likely) / ENOUGH_AROUND).clamp(max=1.0)
+        return likely + (by_colour - likely) * share * nearby
 
     def regression(self, scribbles: Scribbles, unlike: Tensor, frame_links: Tensor, grid_links: Tensor) -> Planes:
         """Likelihood that a pixel belongs to a region: about 1 inside and about 0 outside; not clamped.

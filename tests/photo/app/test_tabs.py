@@ -67,3 +67,14 @@ def test_what_the_brush_paints() -> None:
     for value in ("#abc", "red", None, "1234567"):
         brush.choose_colour(value)
     assert brush.colour == "#abcdef"
+
+
+def test_what_takes_part_is_chosen(shown: Controls) -> None:
+    tab = EditTab("recolor", shown.link)
+    (chosen,) = shown.of(ui.select)
+    assert chosen.value == "near"
+    chosen.set_value("object")
+    assert shown.changes == [("recolor", {"extent": "object"}, True)]
+    shown.show(tab, Recipe((Step("recolor", extent="everywhere"),)))
+    assert chosen.value == "everywhere"
+    assert len(shown.changes) == 1

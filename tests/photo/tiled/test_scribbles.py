@@ -92,7 +92,7 @@ def coloured(picture: Array, *painted: Array, kind: Any = None, **options: Any) 
     ("options", "kept"),
     [
         ({}, False),
-        ({"reach": 0.5, "patch_size": 5}, True),
+        ({"reach": 0.5, "patch_size": 5, "extent": "object"}, True),
         ({"spatial_bandwidth": 60.0, "photometric_bandwidth": 0.2}, True),
         ({"landmarks": "uniform", "brightness": 0.8}, False),
     ],

@@ -1,0 +1,81 @@
+"""What is connected with a scribble, and masks of it."""
+
+import pytest
+import torch
+
+from nlfilter_torch import defocus, enhance, recolor, region_mask
+from nlfilter_torch.photo.selections.connected import BORDER, connected
+from tests.problems import box, inverse, noise, oriented, paint
+
+SIZE = (48, 64)
+LEFT, RIGHT, FAR = (box(*corner, 12, 12, size=SIZE) for corner in ((18, 4), (18, 26), (18, 50)))
+STROKE = box(22, 8, 4, 4, size=SIZE)
+
+
+def scene() -> torch.Tensor:
+    """Three reddish squares with grain in a row on a bluish ground."""
+    inside = LEFT + RIGHT + FAR
+    image = 0.1 * noise(1, 3, *SIZE, dtype=torch.float32) + 0.2
+    image[:, :1] += 0.5 * inside
+    image[:, 2:] += 0.4 * (1 - inside)
+    return image
+
+
+def covered(mask: torch.Tensor, part: torch.Tensor) -> float:
+    return float((mask * part).sum() / part.sum())
+
+
+def test_only_what_is_connected_belongs_to_the_object() -> None:
+    masks = (LEFT + RIGHT).clamp(max=1) + 0.2 * box(10, 2, 30, 60, size=SIZE)
+    belongs = connected(masks.clamp(max=1), STROKE)
+    assert belongs[LEFT > 0].all()
+    assert not belongs[RIGHT > 0].any()
+    assert belongs[..., 17, 10]  # its border
+    assert not belongs[..., 17 - BORDER - 1, 10]
+    both = connected(masks.clamp(max=1), STROKE + box(20, 30, 2, 2, size=SIZE))
+    assert both[LEFT + RIGHT > 0].all()
+    touching = torch.maximum(masks, box(20, 10, 2, 20, size=SIZE)).clamp(max=1)
+    assert connected(touching, STROKE)[RIGHT > 0].all()
+    assert not connected(0 * masks, 0 * STROKE).any()
+    assert connected(0 * masks, STROKE)[STROKE > 0].all()
+    for number in range(8):
+        turned = connected(oriented(masks.clamp(max=1), number), oriented(STROKE, number))
+        assert torch.equal(inverse(turned.float(), number) > 0, belongs)
+
+
+def test_each_region_is_connected_by_itself() -> None:
+    masks = torch.cat([LEFT + FAR, RIGHT + FAR], dim=1).expand(2, -1, -1, -1)
+    strokes = torch.cat([STROKE, box(20, 30, 2, 2, size=SIZE)], dim=1).expand(2, -1, -1, -1)
+    belongs = connected(masks, strokes)
+    assert belongs[:, :1][(LEFT > 0).expand(2, -1, -1, -1)].all()
+    assert belongs[:, 1:][(RIGHT > 0).expand(2, -1, -1, -1)].all()
+    assert not belongs[(FAR > 0).expand(2, 2, -1, -1)].any()
+
+
+def test_masks_of_the_object_of_what_is_near_and_of_everything() -> None:
+    image = scene()
+    near, this, everywhere = (
+        region_mask(image, STROKE, extent=extent, num_landmarks=60) for extent in ("near", "object", "everywhere")
+    )
+    assert torch.equal(near, region_mask(image, STROKE, num_landmarks=60))
+    assert min(covered(mask, LEFT) for mask in (near, this, everywhere)) > 0.9
+    assert covered(near, RIGHT) > 0.5
+    assert covered(this, RIGHT) == covered(this, FAR) == 0
+    assert covered(everywhere, FAR) > 0.9
+    with pytest.raises(ValueError, match="extent must be one of 'near', 'object', 'everywhere', got 'here'"):
+        region_mask(image, STROKE, extent="here")  # type: ignore[arg-type]
+
+
+def test_every_edit_of_objects_stops_at_the_object() -> None:
+    image = scene()
+    painted = paint(0.1, 0.7, 0.2, STROKE)
+    sliders = torch.tensor([4.0, 4.0, 1.0])
+    sharp = defocus(image, STROKE, radius=2.0, num_landmarks=60, extent="object")
+    assert (sharp - image)[(RIGHT > 0).expand_as(image)].abs().max() > 1e-3
+    for edited in (
+        recolor(image, painted, STROKE, num_landmarks=60, extent="object"),
+        enhance(image, sliders, STROKE, num_landmarks=60, extent="object"),
+    ):
+        change = (edited - image).abs().amax(1, keepdim=True)
+        assert change[LEFT > 0].max() > 1e-3
+        assert change[RIGHT > 0].max() == 0
