@@ -75,6 +75,7 @@ def batch(
     workers: Workers = None,
     cluster: Cluster = None,
     memory: options.Memory = None,
+    quality: options.QualityOfFolder = None,
     force: options.Insist = False,
     **values: Any,
 ) -> None:
@@ -91,7 +92,7 @@ def batch(
     if not force:
         check_usual(step, typed_options(context, values))
 
-    from nlfilter_torch.photo.cli.editing import allowed_memory, check_workers
+    from nlfilter_torch.photo.cli.editing import allowed_memory, check_quality_of, check_workers
     from nlfilter_torch.photo.cli.folders import Tally, edit_folder, left_out, pictures, prepare, subfolders
     from nlfilter_torch.photo.cli.progress import steps
     from nlfilter_torch.photo.io.rows import WHOLE, free_memory
@@ -105,6 +106,9 @@ def batch(
     if preset is not None and (recipe := other_recipe(context, preset, settings)) is not None:
         settings, edit = {"recipe": recipe.to_json()}, partial(apply, preset=[str(Path(preset).absolute())])
     paths = pictures(folder)
+    if quality is not None:
+        check_quality_of(paths, quality)
+        settings, edit = {**settings, "quality": quality}, partial(_edit_at_quality, edit, quality)
     prepare(paths, target, settings)
     if others := left_out(folder):
         _tell(f"left out {others}; convert them to PNG, JPEG, TIFF, WebP or AVIF if they are photographs")
@@ -139,6 +143,13 @@ def batch(
         raise typer.Exit(INTERRUPTED)
     if tally.failures or tally.left:
         raise typer.Exit(1)
+
+
+def _edit_at_quality(edit: Callable[..., object], quality: int, source: str, target: str, **limits: Any) -> None:
+    """Edit a file, with that quality if it is a JPEG."""
+    from nlfilter_torch.photo.cli.editing import is_jpeg
+
+    edit(source, target, **limits, **({"quality": quality} if is_jpeg(target) else {}))
 
 
 def _cores() -> int:

@@ -116,10 +116,23 @@ def check_not_input(source: str, target: str, *, force: bool) -> None:
 
 def check_quality(target: str, quality: int | None) -> None:
     """Raise ValueError if a quality is set for a file that is no JPEG."""
-    if quality is not None and Path(target).suffix.lower() not in (".jpg", ".jpeg"):
+    if quality is not None and not is_jpeg(target):
         raise ValueError(
             f"--quality must be used with a JPEG file, got {quality} for {target}; name a .jpg file, or leave it out"
         )
+
+
+def check_quality_of(paths: Sequence[Path], quality: int) -> None:
+    """Raise ValueError if a quality is set for a folder of files of which none is a JPEG."""
+    if not any(is_jpeg(path) for path in paths):
+        raise ValueError(
+            f"--quality must be used with JPEG files, got {quality} for {paths[0].parent}, which has none; leave it out"
+        )
+
+
+def is_jpeg(path: str | Path) -> bool:
+    """Whether a path has the suffix of a JPEG file."""
+    return Path(path).suffix.lower() in (".jpg", ".jpeg")
 
 
 def check_written(

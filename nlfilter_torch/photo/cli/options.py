@@ -156,6 +156,16 @@ Quality = Annotated[
         rich_help_panel=FILES_PANEL,
     ),
 ]
+QualityOfFolder = Annotated[
+    int | None,
+    typer.Option(
+        min=1,
+        max=100,
+        metavar="1-100",
+        help="Quality of the JPEG files; others are not affected. Default: 95.",
+        rich_help_panel=FILES_PANEL,
+    ),
+]
 Workers = Annotated[
     int | None,
     typer.Option(

@@ -10,10 +10,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import skimage.data
 from PIL import Image
 
 from nlfilter_torch.photo.cli import main
-from nlfilter_torch.photo.cli.folders import RECORD, Tally, pictures, prepare, subfolders
+from nlfilter_torch.photo.cli.folders import RECORD, Edit, Tally, pictures, prepare, subfolders
 from nlfilter_torch.photo.declared.presets import PRESETS, Recipe
 from nlfilter_torch.photo.declared.steps import Step
 from tests.folders import fill, finished, refused
@@ -139,6 +140,42 @@ def test_settings_and_workers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     assert json.loads((tmp_path / "out" / RECORD).read_text()) == settings
     assert main(arguments) == 0
     assert (seen["workers"], seen["threads"]) == (9, 1)
+
+
+def edit_here(paths: list[Path], target: Path, edit: Edit, **_: object) -> None:
+    """Edit a folder without processes, which take seconds to start."""
+    for path in paths:
+        edit(str(path), str(target / path.name))
+
+
+def test_the_quality_of_jpeg_files(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("nlfilter_torch.photo.cli.folders.edit_folder", edit_here)
+    source, preset = tmp_path / "in", tmp_path / "look.json"
+    fill(source, 1)
+    Image.fromarray(skimage.data.chelsea()[:48, :48]).save(source / "001.jpg")
+    preset.write_text(Recipe((Step("look", matrix=(0.9, 0, 0, 0, 0.9, 0, 0, 0, 0.9)),)).to_json())
+    for name, options in (
+        ("usual", ("--preset", preset)),
+        ("small", ("--preset", preset, "--quality", 30)),
+        ("detail", ("--quality", 30, *OPTIONS)),
+    ):
+        assert main(["batch", str(source), str(tmp_path / name), *map(str, options)]) == 0
+    steps = {}
+    for name in ("usual", "small", "detail"):
+        with Image.open(tmp_path / name / "001.jpg") as picture:
+            steps[name] = sum(picture.quantization[0])
+    assert steps["small"] == steps["detail"] > 5 * steps["usual"]
+    usual, small = ((tmp_path / name / "000.png").read_bytes() for name in ("usual", "small"))
+    assert usual == small
+    assert json.loads((tmp_path / "small" / RECORD).read_text())["quality"] == 30
+    assert "contains results of other settings" in refused(capsys, source, tmp_path / "small", "--preset", preset)
+    (source / "001.jpg").unlink()
+    assert f"--quality must be used with JPEG files, got 30 for {source}, which has none; leave it out" in refused(
+        capsys, source, tmp_path / "none", "--quality", 30
+    )
+    assert "--quality" in refused(capsys, source, tmp_path / "none", "--quality", 101)
 
 
 def test_refusals(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
