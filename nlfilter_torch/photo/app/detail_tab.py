@@ -58,7 +58,7 @@ class DetailTab(EditTab):
         self._build_brush(EDITS[self._edit].hint)
 
     def _build_bandwidth(self) -> None:
-        self._automatic = ui.checkbox("Choose from the photograph what counts as detail", value=True)
+        self._automatic = ui.checkbox("What counts as detail: automatic", value=True)
         self._automatic.props("dense").classes("q-mt-xs")
         self._automatic.on_value_change(lambda event: self._set_bandwidth("auto" if event.value else BANDWIDTH))
         with ui.column().classes("control gap-0") as self._by_hand:

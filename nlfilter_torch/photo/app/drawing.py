@@ -16,7 +16,7 @@ from nlfilter_torch.photo.picture.colour import hundredths_of_lab
 
 QUALITY = 95
 #: Colours of the mask, of which the one that differs most from the picture under it is shown.
-TINTS = ((255, 40, 80), (0, 190, 255), (255, 220, 0), (170, 80, 255))
+TINTS = ((255, 40, 80), (0, 190, 255), (255, 220, 0))
 OPACITY = 120  # of the mask, of 255
 COMPARED = 4096  # pixels, about, with which these are compared
 HATCHING = 8  # pixels of a preview from one line to the next
