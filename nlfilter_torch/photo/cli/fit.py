@@ -143,14 +143,15 @@ def _fitted(
     search = None if looks_only else StepSearch(step, order)
     if search is not None and len(pairs.paths) == 1:
         images = list(search.watching(pairs))
-        own = search.fitted()
-        if own.are_nearly_all:
-            return (), own
+        if search.is_likely():
+            own = search.fitted()
+            if own.are_nearly_all:
+                return (), own
         fitted = fit_look(images, order=order, step=step)
     else:
         fitted = fit_look(iter(pairs) if search is None else search.watching(pairs), order=order, step=step)
     looks = fitted if isinstance(fitted, tuple) else (fitted,)
-    steps = None if search is None else search.fitted()
+    steps = None if search is None else search.fitted(looks[0].left_out)
     return looks, steps if steps is not None and steps.explain_more_than(looks[0].left_out) else None
 
 

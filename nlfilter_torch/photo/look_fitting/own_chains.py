@@ -99,16 +99,11 @@ class Chain:
         for digits, equal in SNAPS:
             near = rounded(state.predicted, state, self.usual, self.ends, digits=digits, equal=equal, near=math.inf)
             values = tuple(near.values[:count].tolist())
-            if values not in tried and not self.is_exact(best):
+            if values not in tried and not is_exact(best):
                 tried.add(values)
                 snapped = self._at(near.values, state.jacobian)
                 best = snapped if snapped.loss < PREFERRED * best.loss else best
         return best
-
-    @staticmethod
-    def is_exact(state: Minimum) -> bool:
-        """Whether what is left is hardly more than the rounding of files of 8 bits."""
-        return state.loss < NOISE * len(state.residuals) / (12 * 255**2)
 
     def _at(self, values: Tensor, jacobian: Tensor | None = None) -> Minimum:
         """The chain at values of the first edit, with the best values of the second near the given ones.
@@ -144,3 +139,8 @@ class Chain:
     def _seen(self, pair: ViewedPair, whole: Ingredients, values: Tensor, operator: NonlocalOperator) -> Ingredients:
         """What the second edit needs to know of the sample, after the first edit with some values."""
         return self.second.ingredients(self._between(whole, values), operator).at(pair.places)
+
+
+def is_exact(state: Minimum) -> bool:
+    """Whether what is left is hardly more than the rounding of files of 8 bits."""
+    return state.loss < NOISE * len(state.residuals) / (12 * 255**2)

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from nlfilter_torch.core.inner import EVERYWHERE, Inner
 from nlfilter_torch.filtering.filters import detail_layers
+from nlfilter_torch.operator.build import sampled_operator
 from nlfilter_torch.operator.features import reduce_channels
 from nlfilter_torch.operator.operator import NonlocalOperator
 from nlfilter_torch.photo.declared.declaration import GAINS
@@ -30,12 +31,14 @@ from nlfilter_torch.photo.picture.changes import activity, limit_by_activity
 from nlfilter_torch.photo.picture.in_memory import InMemory
 from nlfilter_torch.photo.picture.limits import Limits
 from nlfilter_torch.photo.picture.pixels import Fitted, part_of
-from nlfilter_torch.photo.picture.source import luminance
+from nlfilter_torch.photo.picture.source import luminance, seeded
 from nlfilter_torch.photo.picture.viewing import within_limits
 
 LEVELS = 255.0
 USUAL_THRESHOLD = 5.0 / LEVELS
 MOST_LEVELS = 60.0  # largest threshold of detail that is looked for
+
+Key = tuple[str, tuple[tuple[str, Value], ...]]  # name and filter of an edit
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,6 +132,11 @@ class OwnEdit(ABC):
     def edited(self, seen: Ingredients, values: Tensor) -> Tensor:
         """The edited pixels (1, C, h, w)."""
 
+    @property
+    def key(self) -> Key:
+        """What :class:`Ingredients` depend on."""
+        return self.edit, self.filter
+
     def step(self, values: Sequence[float]) -> Step:
         """The step with these values."""
         common: dict[str, Value] = {"limits": self.limits, "viewing_size": self.viewing_size, **dict(self.filter)}
@@ -138,6 +146,19 @@ class OwnEdit(ABC):
         """The filter of a picture at the viewing size."""
         edit = cast(Detail | Tone | Sharpen, edit_of(self.step(self.start), source.size))
         return source.operator(edit.guide(source.size)).operator
+
+    def roughly(self, image: Tensor, places: Tensor) -> Ingredients:
+        """:meth:`Ingredients.at` pixels (P,) that are spread evenly, with a filter that is balanced over them alone.
+
+        It takes a fifth of the time of megapixels, and layers are off by a twentieth. Not for :class:`OwnSharpen`.
+        """
+        size = (image.shape[2], image.shape[3])
+        options, grey = self.step(self.start).filter_options(size), reduce_channels(image, "luminance")
+        options["num_landmarks"] = min(options["num_landmarks"], image.shape[2] * image.shape[3])
+        operator = sampled_operator(grey, places, **options, generator=seeded())
+        pixels, variance = (planes.flatten(2)[..., None, places] for planes in (image, activity(image)))
+        layers = self.layers(pixels, operator)
+        return Ingredients(pixels.double(), layers.double(), variance.double())
 
     def ingredients(self, image: Tensor, operator: NonlocalOperator) -> Ingredients:
         """What the edit needs to know of an image (1, C, h, w), with its filter."""

@@ -4,6 +4,7 @@ A look imitates an edit; if this program made it, the steps themselves explain m
 Looked for are detail with its threshold, tone and sharpening, each with soft limits and with none, and two of them.
 """
 
+import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations
@@ -19,8 +20,8 @@ from nlfilter_torch.photo.declared.presets import PRESETS, Recipe
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.edits.applying import apply_recipe
 from nlfilter_torch.photo.look_fitting.fit_look import FILTER_NAMES, Pair, images_of
-from nlfilter_torch.photo.look_fitting.own_chains import Chain
-from nlfilter_torch.photo.look_fitting.own_edits import Ingredients, OwnDetail, OwnEdit, OwnSharpen, OwnTone
+from nlfilter_torch.photo.look_fitting.own_chains import Chain, is_exact
+from nlfilter_torch.photo.look_fitting.own_edits import Ingredients, Key, OwnDetail, OwnEdit, OwnSharpen, OwnTone
 from nlfilter_torch.photo.look_fitting.parameter_fit import Minimum, minimize, rounded
 from nlfilter_torch.photo.look_fitting.viewed_pair import ViewedPair
 from nlfilter_torch.photo.picture.in_memory import InMemory
@@ -30,6 +31,7 @@ MOST_PAIRS = 3  # that are looked at; the first ones
 COARSE = 4  # of this many pixels of the sample one is looked at first
 COARSE_STEPS, FINE_STEPS = 12, 3  # of least squares
 NEARLY_ALL = 0.99  # share from which on nothing else is looked for
+LIKELY = 0.97  # share that rough fits leave no doubt from
 PROMISING = 0.3  # share that edits by the default filter explain, from which on other filters are looked at
 
 
@@ -39,8 +41,6 @@ MORE, RARER = 1.1, 1.01  # what two edits, and an edit without limits, leave cou
 # Steps are preferred to a look if they explain that much of what is left out, and it leaves that many times as much.
 # Edits by other programs leave three times as much under steps as under looks. JPEG files of weak edits are half noise.
 ENOUGH, CLEARLY = 0.5, 1.2
-
-Key = tuple[str, tuple[tuple[str, Value], ...]]  # name and filter of an edit
 
 
 @dataclass(frozen=True)
@@ -52,12 +52,14 @@ class FittedSteps:
         fitted: share of the change of the pairs that they explain, 1 at best.
         left_out: share of the change of pairs, or of parts of a single picture, explained by steps fitted without them.
         explained: the same two for all that was tried, by the names of the edits.
+        are_exact: whether what they leave is no more than the rounding of files of 8 bits.
     """
 
     steps: tuple[Step, ...] = ()
     fitted: float = 0.0
     left_out: float = 0.0
     explained: dict[tuple[str, ...], tuple[float, float]] = field(default_factory=dict)
+    are_exact: bool = False
 
     def apply(self, image: Tensor, *, generator: torch.Generator | None = None) -> Tensor:
         """An image (B, C, H, W) in [0, 1] after the steps; values may leave [0, 1]. Differentiable in the image."""
@@ -70,7 +72,7 @@ class FittedSteps:
     @property
     def are_nearly_all(self) -> bool:
         """Whether they leave so little that a look cannot explain much more."""
-        return self.left_out >= NEARLY_ALL
+        return self.left_out >= NEARLY_ALL or self.are_exact
 
     def explain_more_than(self, share: float) -> bool:
         """Whether they explain clearly more than a look that explains a share of the change where it is left out."""
@@ -124,12 +126,19 @@ class Candidate:
         values: of each.
         fitted: share of the change that they explain.
         left_out: share explained where it was left out of the fit.
+        is_exact: whether the rest is no more than the rounding of files of 8 bits.
     """
 
     edits: tuple[OwnEdit, ...]
     values: tuple[Tensor, ...]
     fitted: float
     left_out: float
+    is_exact: bool
+
+    @property
+    def key(self) -> tuple[Key, ...]:
+        """What the filters depend on."""
+        return tuple(edit.key for edit in self.edits)
 
     def cost(self) -> float:
         """What is left, more of it for what is less usual: noise must not decide for two edits, or no limits."""
@@ -171,8 +180,11 @@ class StepSearch:
         self.filter = tuple((name, step[name]) for name in names if step[name] != step.declared[name].default)
         self.pairs: list[ViewedPair] = []
         self.candidates: list[Candidate] = []
-        self._whole: dict[Key, list[Ingredients]] = {}  # of all pixels, by edit and filter
+        self._rough: list[Candidate] = []
+        self._whole: dict[Key, list[Ingredients]] = {}  # of all pixels
         self._seen: dict[Key, list[Ingredients]] = {}  # of the samples
+        self._chain_start: tuple[float, Tensor, OwnEdit, OwnEdit] | None = None  # share, values and edits
+        self._started = self._refined = False
 
     def add(self, before: Tensor, after: Tensor) -> None:
         """Add a photograph (C, H, W) before and after the edit, unless there are enough of them."""
@@ -187,20 +199,46 @@ class StepSearch:
 
     @torch.no_grad()
     @full_precision
-    def fitted(self) -> FittedSteps:
-        """The steps that explain most."""
-        if all(pair.is_of_brightness() for pair in self.pairs):
-            self._search()
+    def promise(self) -> float:
+        """About the share of the change that steps explain, from a look at a sample of the pixels."""
+        if not self._started:
+            self._started = True
+            if all(pair.is_of_brightness() for pair in self.pairs):
+                self._look_around()
+        best = self._best()
+        single = 0.0 if best is None else best.left_out
+        return max(single, 0.0 if self._chain_start is None else self._chain_start[0])
+
+    def is_likely(self) -> bool:
+        """Whether steps seem to explain so much that no look is needed."""
+        return self.promise() >= LIKELY
+
+    @torch.no_grad()
+    @full_precision
+    def fitted(self, beat: float = -math.inf) -> FittedSteps:
+        """The steps that explain most; only roughly fitted if they hardly explain more than a share."""
+        promise = self.promise()
+        if promise > max(beat, 0.0) and not self._is_enough():
+            self._refine()
         explained: dict[tuple[str, ...], tuple[float, float]] = {}
-        for candidate in sorted(self.candidates, key=Candidate.cost, reverse=True):
+        for candidate in sorted(self._all(), key=Candidate.cost, reverse=True):
             explained[tuple(edit.edit for edit in candidate.edits)] = candidate.fitted, candidate.left_out
         best = self._best()
         if best is None or best.left_out <= 0:
             return FittedSteps(explained=explained)
-        return FittedSteps(best.steps, best.fitted, best.left_out, explained)
+        return FittedSteps(best.steps, best.fitted, best.left_out, explained, best.is_exact)
+
+    def _all(self) -> list[Candidate]:
+        """All candidates; rough ones only where there is no better one of the same edit."""
+        known = {candidate.key for candidate in self.candidates}
+        return [*self.candidates, *(candidate for candidate in self._rough if candidate.key not in known)]
 
     def _best(self) -> Candidate | None:
-        return min(self.candidates, key=Candidate.cost, default=None)
+        return min(self._all(), key=Candidate.cost, default=None)
+
+    def _is_enough(self) -> bool:
+        """Whether an edit is fitted that explains nearly all, or all but the rounding of a file of 8 bits."""
+        return any(candidate.left_out >= NEARLY_ALL or candidate.is_exact for candidate in self.candidates)
 
     def _edits(self, limits: Limits) -> tuple[OwnEdit, OwnEdit, OwnEdit]:
         """The edits with the default filters; the filter of the last two is the same."""
@@ -211,62 +249,85 @@ class StepSearch:
             OwnDetail(limits=limits, viewing_size=size, filter=self.filter, order=self.order),
         )
 
-    def _search(self) -> None:
-        """Try edits, those that take least time first, until one explains nearly all."""
+    def _look_around(self) -> None:
+        """Look at all edits, most of them roughly, those that take least time first."""
         sharpen, tone, detail = self._edits("soft")
         self._try([sharpen])
-        if self._explained() < NEARLY_ALL:
-            self._try([tone, detail])
-        if self._explained() < NEARLY_ALL:
-            self._try_chain()
-        promising = not self.filter and self._explained() > PROMISING
-        for other in filters_of_presets() if promising else []:
-            if self._explained() < NEARLY_ALL:
-                self._try([replace(detail, filter=other)])
+        if self._is_enough():
+            return
+        edits = [tone, detail]
+        self._look_at(edits)
+        best = max(candidate.left_out for candidate in self._all())
+        if PROMISING < best < LIKELY and not self.filter:
+            edits = [replace(detail, filter=other) for other in filters_of_presets()]
+            self._look_at(edits)
+        self._begin_chain()
 
-    def _explained(self) -> float:
-        best = self._best()
-        return 0.0 if best is None else best.left_out
+    def _look_at(self, edits: Sequence[OwnEdit]) -> None:
+        """Fit edits roughly, with soft limits."""
+        for edit in edits:
+            self._seen[edit.key] = [edit.roughly(pair.image, pair.places) for pair in self.pairs]
+            self._rough.append(self._fit(edit))
+
+    def _refine(self) -> None:
+        """Fit what looks best, until it explains nearly all."""
+        if self._refined:
+            return
+        self._refined = True
+        if self._chain_start is not None:
+            self._fit_chain(*self._chain_start[1:])
+        best = min(self._rough, key=Candidate.cost, default=None)
+        if best is not None and not self._is_enough() and best is self._best_single():
+            self._try(best.edits)
+
+    def _best_single(self) -> Candidate:
+        return min((candidate for candidate in self._all() if len(candidate.edits) == 1), key=Candidate.cost)
 
     def _try(self, edits: Sequence[OwnEdit]) -> None:
         """Fit edits with the same filter, with each kind of limits."""
-        keys = [(edit.edit, edit.filter) for edit in edits]
-        for key in keys:
-            self._whole[key] = []
-        for pair in self.pairs:
-            operator = edits[0].operator(InMemory(pair.image))  # one at a time is in memory
-            for key, edit in zip(keys, edits, strict=True):
-                self._whole[key].append(edit.ingredients(pair.image, operator))
-        for key, edit in zip(keys, edits, strict=True):
-            self._seen[key] = [seen.at(pair.places) for seen, pair in zip(self._whole[key], self.pairs, strict=True)]
+        self._prepare(edits)
+        for edit in edits:
+            places = zip(self._whole[edit.key], self.pairs, strict=True)
+            self._seen[edit.key] = [seen.at(pair.places) for seen, pair in places]
             self.candidates += [self._fit(replace(edit, limits=limits)) for limits in ("soft", "none")]
-            if edit.filter != self.filter and edit.filter:
-                del self._whole[key]  # not part of chains
+
+    def _prepare(self, edits: Sequence[OwnEdit]) -> None:
+        """Compute what edits with the same filter need to know of the pairs."""
+        edits = [edit for edit in edits if edit.key not in self._whole]
+        for pair in self.pairs if edits else []:
+            operator = edits[0].operator(InMemory(pair.image))  # one at a time is in memory
+            for edit in edits:
+                self._whole.setdefault(edit.key, []).append(edit.ingredients(pair.image, operator))
 
     def _fit(self, edit: OwnEdit) -> Candidate:
         """The values of an edit that suit the pairs best, from a coarse sample to a finer one."""
-        seen = self._seen[edit.edit, edit.filter]
+        seen = self._seen[edit.key]
         coarse = minimize(Errors(edit, self.pairs, seen, COARSE), edit.start, edit.ends, COARSE_STEPS)
         errors = Errors(edit, self.pairs, seen)
         fine = minimize(errors, coarse.values.tolist(), edit.ends, FINE_STEPS)
         return self._candidate((edit,), rounded(errors, fine, plain(edit.usual, edit.idle), edit.ends))
 
-    def _try_chain(self) -> None:
-        """Try two edits, one after the other, if they look promising before the filter of the second is computed."""
+    def _begin_chain(self) -> None:
+        """Look for two edits that promise more, one after the other, than one."""
         starts = []
         for one, two in combinations(self._edits("soft"), 2):
-            chain, step = self._chain(one, two), 2 * COARSE
-            start = chain.start(self._seen[one.edit, one.filter], self._seen[two.edit, two.filter], step)
-            starts.append((step * start.loss / self._power(), start.values, chain))
-        left, values, chain = min(starts, key=itemgetter(0))
-        if left > min(UNPROMISING, LESS * (1 - self._explained())):
-            return
+            step = 2 * COARSE
+            start = Chain(one, two, self.pairs, []).start(self._seen[one.key], self._seen[two.key], step)
+            starts.append((step * start.loss / self._power(), start.values, one, two))
+        left, values, one, two = min(starts, key=itemgetter(0))
+        if left < min(UNPROMISING, LESS * (1 - max(candidate.left_out for candidate in self._all()))):
+            self._chain_start = 1 - left, values, one, two
+
+    def _fit_chain(self, values: Tensor, one: OwnEdit, two: OwnEdit) -> None:
+        """Fit two edits in both orders, from values that they nearly have."""
+        self._prepare([edit for edit in (one, two) if edit.edit != "sharpen"])
+        chain, turned = (Chain(*edits, self.pairs, self._whole[edits[0].key]) for edits in ((one, two), (two, one)))
         best = chain.begin(values)
-        if not chain.is_exact(best):
-            count, turned = len(chain.first.start), self._chain(chain.second, chain.first)
+        if not is_exact(best):
+            count = len(one.start)
             other = turned.begin(torch.cat([values[count:], values[:count]]))
             chain, best = min((chain, best), (turned, other), key=_loss)
-        if not chain.is_exact(best):
+        if not is_exact(best):
             best = chain.snapped(chain.better(best))
         best = rounded(best.predicted, best, plain(chain.usual, chain.idle), chain.ends)
         self.candidates.append(self._candidate((chain.first, chain.second), best))
@@ -274,15 +335,12 @@ class StepSearch:
     def _power(self) -> float:
         return sum(float(pair.change().square().sum()) for pair in self.pairs)
 
-    def _chain(self, one: OwnEdit, two: OwnEdit) -> Chain:
-        return Chain(one, two, self.pairs, self._whole[one.edit, one.filter])
-
     def _candidate(self, edits: tuple[OwnEdit, ...], best: Minimum) -> Candidate:
         groups = torch.cat([pair.groups(len(self.pairs) == 1) for pair in self.pairs])
         power = self._power()
         left_out = float(best.left_out(groups).square().sum())
         values = best.values.split([len(edit.start) for edit in edits])
-        return Candidate(edits, values, 1 - best.loss / power, 1 - left_out / power)
+        return Candidate(edits, values, 1 - best.loss / power, 1 - left_out / power, is_exact(best))
 
 
 def plain(usual: Sequence[Sequence[float]], idle: Sequence[float]) -> list[tuple[float, ...]]:

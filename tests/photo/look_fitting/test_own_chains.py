@@ -3,7 +3,7 @@
 import torch
 
 from nlfilter_torch.photo import Recipe, apply_recipe
-from nlfilter_torch.photo.look_fitting.own_chains import Chain
+from nlfilter_torch.photo.look_fitting.own_chains import Chain, is_exact
 from nlfilter_torch.photo.look_fitting.own_edits import OwnDetail, OwnEdit, OwnSharpen, OwnTone
 from nlfilter_torch.photo.look_fitting.viewed_pair import ViewedPair
 from nlfilter_torch.photo.picture.in_memory import InMemory
@@ -25,9 +25,9 @@ def test_the_right_values_leave_what_rounding_to_8_bits_does() -> None:
     both = chain(TONE, DETAIL, values)
     state = both.better(both.begin(torch.tensor((1.29, 1.05, *values[2:]), dtype=torch.float64)))
     best = both.snapped(state)
-    assert both.is_exact(best)
+    assert is_exact(best)
     assert torch.allclose(best.values, torch.tensor(values, dtype=torch.float64), atol=0.03)
-    assert not both.is_exact(state) or state is best
+    assert not is_exact(state) or state is best
 
 
 def test_a_start_is_near_the_values() -> None:
