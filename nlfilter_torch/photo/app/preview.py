@@ -149,17 +149,22 @@ class StepPicture:
         before: the picture before the step.
         after: the picture after it.
         fitted: the step as fitted to the picture before, or None to add the change that it made to other pictures.
+        coloured: whether the colours after the step do not depend on those before it.
     """
 
     key: tuple[Step, ...]
     before: Tensor
     after: Tensor
     fitted: Fitted | None
+    coloured: bool = False
 
     def of(self, image: Tensor) -> Tensor:
         """Apply the step to another picture of the same size without fitting it again, which is approximate."""
         if image.shape != self.before.shape:
             return image
+        if self.coloured:
+            luminances = [reduce_channels(picture, "luminance") for picture in (image, self.before)]
+            return self.after + (luminances[0] - luminances[1])
         if self.fitted is None:
             return image + (self.after - self.before)
         return InMemory(image.clamp(0, 1)).all(self.fitted)
@@ -296,9 +301,11 @@ class Preview:
             return StepPicture(key, image, self._source.all(self._blend(step)), None)
         edit = self._filter_of(step, image, before, keep=keep)
         after = edit(step)
-        # Edits of objects are more exact as fitted, others by the change that they made.
-        fitted = edit.fitted if isinstance(edit, PreparedStep) and step.declared.requires_strokes else None
-        return StepPicture(key, image, after, fitted)
+        # Edits of objects are more exact as fitted, others by their change. Colorize, as fitted, would hold its filter.
+        coloured = step.declared.coloured
+        is_kept = step.declared.requires_strokes and not coloured
+        fitted = edit.fitted if isinstance(edit, PreparedStep) and is_kept else None
+        return StepPicture(key, image, after, fitted, coloured)
 
     def _is_of_layers(self, step: Step) -> bool:
         """Whether a step only weighs layers of luminance, which are cached; such edits take regions, too."""

@@ -1,11 +1,14 @@
 """The editor's preview: it shows what is saved, and does not recompute what has not changed."""
 
+import gc
+
 import pytest
 import torch
 import torch.nn.functional as F
 
 from nlfilter_torch import estimate_bandwidth, nonlocal_operator, polynomial_filter, region_mask
 from nlfilter_torch.operator.features import reduce_channels
+from nlfilter_torch.operator.operator import NonlocalOperator
 from nlfilter_torch.photo.app.preview import PIXELS, Preview, reduce, sampled_operator
 from nlfilter_torch.photo.app.session import Session
 from nlfilter_torch.photo.declared.parameters import EDITS
@@ -90,7 +93,7 @@ PAIRS = {
 }
 
 
-LATER = (Step("tone", contrast=1.4, **FEW), Step("sharpen", **FEW), PAIRS["recolor"][0])
+LATER = (Step("tone", contrast=1.4, **FEW), PAIRS["colorize"][0], PAIRS["recolor"][0])
 
 
 def test_later_steps_stay_while_a_slider_moves(session: Session, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -106,6 +109,16 @@ def test_later_steps_stay_while_a_slider_moves(session: Session, monkeypatch: py
     wanted = Preview(cat()).render(session.recipe)
     assert rms(moving, wanted) < 0.5 * rms(Preview(cat()).render(Recipe(session.recipe.steps[:1])), wanted)
     assert difference(session.render(), wanted) < 0.1
+
+
+def test_pictures_of_steps_hold_no_filters(session: Session) -> None:
+    """Filters need a hundred times the memory of a picture, so only that of the step at work is held."""
+    for name in ("recolor", "colorize", "defocus"):
+        session.load(Recipe((PAIRS[name][0],)))
+        session.render()
+        session.preview._filter = None
+        gc.collect()
+        assert not [held for held in gc.get_objects() if type(held) is NonlocalOperator]
 
 
 def test_a_step_that_begins_to_move_leaves_later_ones(session: Session) -> None:
