@@ -10,6 +10,7 @@ Extent = Literal["near", "object", "everywhere"]
 EXTENTS: tuple[Extent, ...] = get_args(Extent)
 INSIDE = 0.5  # mask from which on a pixel is inside an object, in which pixels are connected
 BORDER = 8  # width in pixels of a soft border, which belongs to the nearest object
+SMALL = 0.03  # of the pixels of the object; smaller pieces within its border, such as hair, belong to it
 
 
 @torch.no_grad()
@@ -24,21 +25,22 @@ def connected(masks: Tensor, scribbles: Tensor) -> Tensor:
     """
     painted = scribbles > 0
     inside = (masks >= INSIDE) | painted
-    own = torch.stack([_reached(*planes) for planes in zip(inside.flatten(0, 1), painted.flatten(0, 1), strict=True)])
-    own = own.view_as(inside).to(masks)
-    others = inside.to(masks) - own
+    parts = [_parts(*planes) for planes in zip(inside.flatten(0, 1), painted.flatten(0, 1), strict=True)]
+    own, others = (torch.stack(planes).view_as(inside).to(masks) for planes in zip(*parts, strict=True))
     for _ in range(BORDER):
         wider = torch.where(others > 0, 0.0, _widened(own))
         others, own = torch.where(wider > 0, 0.0, _widened(others)), wider
     return own > 0
 
 
-def _reached(inside: Tensor, painted: Tensor) -> Tensor:
-    """The connected components (H, W) that hold a painted pixel."""
+def _parts(inside: Tensor, painted: Tensor) -> tuple[Tensor, Tensor]:
+    """The connected components (H, W) that hold a painted pixel, and other ones that are not small beside them."""
     from skimage.measure import label
 
     numbers = torch.from_numpy(label(inside.cpu().numpy(), connectivity=1)).to(inside.device)
-    return torch.isin(numbers, numbers[painted].unique()) & inside
+    own = torch.isin(numbers, numbers[painted].unique()) & inside
+    large = numbers.flatten().bincount() >= SMALL * own.sum()
+    return own, inside & ~own & large[numbers]
 
 
 def _widened(planes: Tensor) -> Tensor:

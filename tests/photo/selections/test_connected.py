@@ -26,7 +26,7 @@ def covered(mask: torch.Tensor, part: torch.Tensor) -> float:
 
 
 def test_only_what_is_connected_belongs_to_the_object() -> None:
-    masks = (LEFT + RIGHT).clamp(max=1) + 0.2 * box(10, 2, 30, 60, size=SIZE)
+    masks = (LEFT + RIGHT).clamp(max=1) + 0.1 * box(10, 2, 30, 60, size=SIZE)
     belongs = connected(masks.clamp(max=1), STROKE)
     assert belongs[LEFT > 0].all()
     assert not belongs[RIGHT > 0].any()
@@ -34,6 +34,8 @@ def test_only_what_is_connected_belongs_to_the_object() -> None:
     assert not belongs[..., 17 - BORDER - 1, 10]
     both = connected(masks.clamp(max=1), STROKE + box(20, 30, 2, 2, size=SIZE))
     assert both[LEFT + RIGHT > 0].all()
+    fragment = box(15, 10, 1, 2, size=SIZE)  # such as hair beside it
+    assert connected(torch.maximum(masks, fragment).clamp(max=1), STROKE)[fragment > 0].all()
     touching = torch.maximum(masks, box(20, 10, 2, 20, size=SIZE)).clamp(max=1)
     assert connected(touching, STROKE)[RIGHT > 0].all()
     assert not connected(0 * masks, 0 * STROKE).any()
