@@ -346,6 +346,7 @@ DEFOCUS = Edit(
             "`disc`: points of light become discs, as in a lens. `gaussian`: they become soft spots.",
         ),
         EXTENT,
+        REACH,
         TOLERANCE,
         *filter_parameters(share=0.3, patch_size=1)[1:],
     ),
@@ -380,7 +381,7 @@ MASK = Edit(
         REACH,
         EXTENT,
         TOLERANCE,
-        *(p for p in filter_parameters(share=0.45)[1:] if p.name != "patch_size"),
+        *(p for p in filter_parameters(share=0.3)[1:] if p.name != "patch_size"),
     ),
     function="region_mask",
     scribbles=(

@@ -180,7 +180,7 @@ TOLERANCE = number(
 #: For all edits that select regions.
 REACH = number(
     "reach",
-    0.6,
+    0.65,
     "How far a region spreads to less similar areas. 0 stays close, 0.95 goes far.",
     (0, 0.999),
     domain="below 1",

@@ -22,8 +22,8 @@ from nlfilter_torch.photo.selections.mask import ObjectEdit, background_of, fit_
 Aperture = Literal["disc", "gaussian"]
 
 # A mask below BLURRED counts as background, above SHARP as subject. A blurred part of the subject is more disturbing
-# than a sharp part of the background, so uncertain pixels stay sharp and the reach is larger than for other regions.
-BLURRED, SHARP, REACH = 0.15, 0.4, 0.72
+# than a sharp part of the background, so uncertain pixels stay sharp.
+BLURRED, SHARP = 0.15, 0.4
 SUBJECT_WEIGHT = 1e-5  # weight of the subject in the blur of the background
 ROWS, FAST = 192, 64  # rows of a Fourier transform, about; its sizes are multiples of this, which makes it fast
 
@@ -35,7 +35,7 @@ def defocus(
     background: Tensor | None = None,
     radius: float | None = None,
     aperture: Aperture = DEFOCUS.defaults["aperture"],
-    reach: float | Tensor = REACH,
+    reach: float | Tensor = DEFOCUS.defaults["reach"],
     extent: Extent = DEFOCUS.defaults["extent"],
     photometric_bandwidth: float | Tensor = DEFOCUS.defaults["photometric_bandwidth"],
     spatial_bandwidth: float | Tensor | None = None,
@@ -58,7 +58,7 @@ def defocus(
         radius: radius of the strongest blur, in pixels, at most half the short side; None is 2.5 % of the short side.
         aperture: ``"disc"`` turns bright dots into discs, as a lens does; ``"gaussian"`` is the paper's, with the same
             variance.
-        reach: that of :func:`region_mask`; larger than there by default, so that more of the subject stays sharp.
+        reach: that of :func:`region_mask`.
         extent: that of :func:`region_mask`.
         photometric_bandwidth: that of :func:`region_mask`, in hundredths of Lab.
         spatial_bandwidth: that of :func:`region_mask`, in pixels; None is 0.3 of the short side.
@@ -112,7 +112,6 @@ class Defocus(ObjectEdit):
     relative: ClassVar[bool] = True
     radius: float | None
     aperture: Aperture
-    reach: float | Tensor = REACH
 
     def fit(self, source: Source[M], drawn: Drawn[M]) -> Fitted:
         """Fit the mask of the subject."""

@@ -83,7 +83,7 @@ def region_mask(
         extent: ``"near"`` selects what is similar and nearby, ``"object"`` only what is connected with a scribble of
             it, ``"everywhere"`` what is similar at any distance.
         photometric_bandwidth: in hundredths of Lab: 0.08 is 8 units.
-        spatial_bandwidth: in pixels; None is 0.45 of the short side, ``math.inf`` no limit: similar pixels anywhere.
+        spatial_bandwidth: in pixels; None is 0.3 of the short side, ``math.inf`` no limit: similar pixels anywhere.
         patch_size: width of the compared patches.
         num_landmarks: M of the operator.
         landmarks: how the landmarks are chosen, see :func:`nonlocal_operator`.

@@ -57,9 +57,10 @@ def test_each_region_is_connected_by_itself() -> None:
 def test_masks_of_the_object_of_what_is_near_and_of_everything() -> None:
     image = scene()
     near, this, everywhere = (
-        region_mask(image, STROKE, extent=extent, num_landmarks=60) for extent in ("near", "object", "everywhere")
+        region_mask(image, STROKE, extent=extent, spatial_bandwidth=24.0, num_landmarks=60)
+        for extent in ("near", "object", "everywhere")
     )
-    assert torch.equal(near, region_mask(image, STROKE, num_landmarks=60))
+    assert torch.equal(near, region_mask(image, STROKE, spatial_bandwidth=24.0, num_landmarks=60))
     assert min(covered(mask, LEFT) for mask in (near, this, everywhere)) > 0.9
     assert covered(near, RIGHT) > 0.5
     assert covered(this, RIGHT) == covered(this, FAR) == 0
