@@ -5,7 +5,7 @@ those with the filter as it is.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -24,10 +24,16 @@ STEPS = 12  # of the search for a start
 COARSE, INNER_STEPS = 4, 6  # of the search for the values of the second edit: every so many pixels, and steps
 # The filter of the second edit jumps a little with the result of the first, as its landmarks do, and only the right
 # values give the right filter. People choose short numbers: they are tried if the errors do not forbid them.
-# Digits after the point of the values that are tried, and the relative increase of the sum of squares, to first order,
-# that they may cost; and what they must leave to be preferred, as the jumps make small differences by chance.
-SNAPS: tuple[tuple[tuple[int, ...], float], ...] = (((0, 1), 1.5), ((1,), 0.5), ((2,), 0.3))
+# Grids of the values that are tried, and the relative increase of the sum of squares, to first order, that they may
+# cost; and what they must leave to be preferred, as the jumps make small differences by chance.
+SNAPS: tuple[tuple[tuple[float, ...], float], ...] = (
+    ((1.0, 0.5, 0.1), 1.5),
+    ((0.5, 0.1), 0.5),
+    ((0.1,), 0.5),
+    ((0.05, 0.01), 0.3),
+)
 PREFERRED = 0.8
+KNOWN = 2.5  # multiple of the sum of squares that values of a preset may leave, to first order, to be tried
 NOISE = 1.2  # multiple of the error of rounding to 8 bits that counts as exact
 
 
@@ -74,7 +80,10 @@ class Chain:
 
     def begin(self, values: Tensor) -> Minimum:
         """The chain near a start (p,), after a step of Gauss and Newton."""
-        return self.better(self._at(values))
+        least = torch.tensor(self.ends, dtype=torch.float64)[:, 0]
+        # A threshold of 0 has no derivative.
+        usual = torch.tensor([values[0] if values else 0.0 for values in self.usual], dtype=torch.float64)
+        return self.better(self._at(torch.where(values == least, usual, values)))
 
     def better(self, state: Minimum) -> Minimum:
         """The chain after a step, if that is better."""
@@ -96,14 +105,22 @@ class Chain:
         """The chain at short values of the first edit, if that is better."""
         best, count = state, len(self.first.start)
         tried = {tuple(state.values[:count].tolist())}
-        for digits, equal in SNAPS:
-            near = rounded(state.predicted, state, self.usual, self.ends, digits=digits, equal=equal, near=math.inf)
-            values = tuple(near.values[:count].tolist())
-            if values not in tried and not is_exact(best):
-                tried.add(values)
-                snapped = self._at(near.values, state.jacobian)
+        for values in self._short(state):
+            first = tuple(values[:count].tolist())
+            if first not in tried and not is_exact(best):
+                tried.add(first)
+                snapped = self._at(values, state.jacobian)
                 best = snapped if snapped.loss < PREFERRED * best.loss else best
         return best
+
+    def _short(self, state: Minimum) -> Iterator[Tensor]:
+        """Short values near those of the chain."""
+        for known in self.first.known:
+            values = state.following(torch.tensor(known, dtype=torch.float64))
+            if float(state.predicted(values).square().sum()) < KNOWN * state.loss:
+                yield values
+        for grids, equal in SNAPS:
+            yield rounded(state.predicted, state, self.usual, self.ends, grids=grids, equal=equal, near=math.inf).values
 
     def _at(self, values: Tensor, jacobian: Tensor | None = None) -> Minimum:
         """The chain at values of the first edit, with the best values of the second near the given ones.

@@ -20,6 +20,7 @@ from nlfilter_torch.operator.features import reduce_channels
 from nlfilter_torch.operator.operator import NonlocalOperator
 from nlfilter_torch.photo.declared.declaration import GAINS
 from nlfilter_torch.photo.declared.json_values import Value
+from nlfilter_torch.photo.declared.presets import PRESETS
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.edits.applying import edit_of
 from nlfilter_torch.photo.edits.detail import Detail, DetailChange
@@ -133,6 +134,11 @@ class OwnEdit(ABC):
         """The edited pixels (1, C, h, w)."""
 
     @property
+    def known(self) -> tuple[tuple[float, ...], ...]:
+        """Values of presets."""
+        return ()
+
+    @property
     def key(self) -> Key:
         """What :class:`Ingredients` depend on."""
         return self.edit, self.filter
@@ -192,6 +198,13 @@ class OwnDetail(OwnEdit):
     def usual(self) -> tuple[tuple[float, ...], ...]:
         """The last slider is 1, and the threshold that of the default."""
         return (*((),) * self.order, (1.0,), (5.0, 0.0))
+
+    @property
+    def known(self) -> tuple[tuple[float, ...], ...]:
+        """Sliders of presets with the default filter, and the default threshold."""
+        steps = [recipe.steps[0] for recipe in PRESETS.values()]
+        plain = [step["alpha"] for step in steps if [name for name, _ in step.values if name != "alpha"] == []]
+        return tuple((*alpha, 5.0) for alpha in plain if len(alpha) == self.order + 1)
 
     def parameters(self, values: Sequence[float]) -> dict[str, Value]:
         """Sliders and threshold."""

@@ -12,7 +12,7 @@ SETTLED = 1e-4  # relative decrease of the sum of squares below which the search
 NEAR = 0.02  # distance of a value from its rounding, relative or, below 1, absolute
 IDLE = 1e-9  # squared norm of the derivatives of a parameter that hardly matters, relative to the largest
 TINY = 1e-9  # damping for parameters that nearly depend on each other
-DIGITS = (1, 2, 3, 4, 6)  # after the point that are tried
+GRIDS = (1e-1, 1e-2, 1e-3, 1e-4, 1e-6)  # whose multiples are tried
 EQUAL = 0.01  # relative increase of the sum of squares that rounding the parameters may cost
 FAINT = 2e-5  # residual that counts as none
 
@@ -41,6 +41,13 @@ class Minimum:
     def predicted(self, values: Tensor) -> Tensor:
         """Residuals (R,) at other values, to first order."""
         return self.residuals + self.jacobian @ (values - self.values)
+
+    def following(self, first: Tensor) -> Tensor:
+        """Values (p,) that start with given ones (q,), and the best others for these, to first order."""
+        count, gram = len(first), self.jacobian.mT @ self.jacobian
+        change = first - self.values[:count]
+        others = _solved(gram[count:, count:], gram[count:, :count] @ change, TINY)
+        return torch.cat([first, self.values[count:] - others])
 
     def left_out(self, groups: Tensor) -> Tensor:
         """Residuals (R,) of each group, by their numbers (R,), under parameters fitted to the others.
@@ -84,21 +91,21 @@ def rounded(
     usual: Sequence[Sequence[float]],
     ends: Sequence[tuple[float, float]],
     *,
-    digits: Sequence[int] = DIGITS,
+    grids: Sequence[float] = GRIDS,
     equal: float = EQUAL,
     near: float = NEAR,
 ) -> Minimum:
     """The minimum with values that are as short as they can be, for hardly larger residuals.
 
     One value after the other is rounded, the last one first, and those before it follow, to first order. ``usual`` are
-    tried first, then values as ``near`` with some ``digits`` after the point, for a relative increase of ``equal``.
+    tried first, then multiples of some ``grids`` as ``near``, for a relative increase of ``equal``.
     """
     least, most = torch.tensor(ends, dtype=torch.float64).unbind(1)
     gram, values = best.jacobian.mT @ best.jacobian, best.values
     for i, plain in reversed([*enumerate(usual)]):
         allowed = best.loss + (1 - i / len(usual)) * (equal * best.loss + len(best.residuals) * FAINT**2)
         own = float(values[i])
-        short = [round(own, count) + 0.0 for count in digits]  # no -0
+        short = [round(round(own / grid) * grid, 6) + 0.0 for grid in grids]  # no -0
         for value in (*plain, *(value for value in short if abs(value - own) <= near * max(abs(own), 1))):
             moved = values.clone()
             moved[:i] -= _solved(gram[:i, :i], gram[:i, i] * (value - own), 0.0)

@@ -30,6 +30,14 @@ def test_edits_of_samples_are_those_of_the_picture(edit: OwnEdit, values: tuple[
     assert torch.equal(seen.at(places).every(4).image, seen.at(places[::4]).image)
 
 
+def test_rough_layers_are_nearly_those_of_the_picture() -> None:
+    edit, places = OwnDetail(filter=FEW), torch.arange(0, 8000, 4)
+    exact = edit.ingredients(CAT, edit.operator(InMemory(CAT))).at(places).layers
+    rough = edit.roughly(CAT, places).layers
+    assert float((rough - exact).square().sum() / exact[:, :-1].square().sum()) < 0.04
+    assert (2.2, 2.2, 2.2, 1.0, 5.0) in edit.known
+
+
 @pytest.mark.parametrize("edit", [OwnDetail(filter=FEW), OwnTone(filter=FEW), OwnSharpen()])
 def test_idle_values_change_nothing(edit: OwnEdit) -> None:
     seen = edit.ingredients(CAT, edit.operator(InMemory(CAT)))

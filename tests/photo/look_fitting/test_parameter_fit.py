@@ -28,6 +28,16 @@ def test_the_minimum_is_found_and_rounded() -> None:
     assert short.loss <= 1.02 * best.loss
 
 
+def test_other_values_follow_the_first_ones() -> None:
+    target = noisy()
+    best = minimize(lambda values: decay(values) - target, (1.0, 3.0), ENDS, 20)
+    values = best.following(torch.tensor([2.02], dtype=torch.float64))
+    again = minimize(lambda rate: decay(torch.cat([values[:1], rate])) - target, (0.5,), ENDS[1:], 20)
+    assert values[0] == 2.02
+    assert float(values[1]) == pytest.approx(float(again.values[0]), abs=1e-3)
+    assert float(best.predicted(values).square().sum()) == pytest.approx(again.loss, rel=1e-2)
+
+
 def test_values_stay_within_their_ends() -> None:
     target = decay(torch.tensor([2.0, -0.5]))
     best = minimize(lambda values: decay(values) - target, (1.0, 3.0), ENDS, 20)
