@@ -103,7 +103,7 @@ def fit_look(
     chosen by cross-validation over the pairs. A single pair is divided into ninths, which say little about other
     pictures; the look is then kept closer to the identity, the less of the edit it explains. A lattice is fitted to
     what the best look leaves, and added if it explains clearly more of what is left out; colours that no pair has do
-    not depend on it.
+    not depend on it, but for what a few parameters say of their hues.
 
     Args:
         pairs: photographs before and after the edit, two tensors (B, C, H, W) in [0, 1] of the same shape, C = 1 or 3;

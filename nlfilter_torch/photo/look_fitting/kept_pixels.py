@@ -8,6 +8,7 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
+from nlfilter_torch.photo.look_fitting.hue_fit import changed, fit_hues
 from nlfilter_torch.photo.look_fitting.lattice_details import refined
 from nlfilter_torch.photo.look_fitting.lattice_fit import ColourChange, FittedLattice, fit_lattice
 from nlfilter_torch.photo.look_fitting.look_choice import SHRINK, SLACK, Candidate
@@ -170,12 +171,18 @@ class KeptPixels(ThinnedPixels):
         """The lattice for what a look leaves of the pixels in groups (P,), to which the folds belong."""
         others = [[sums for sums, own in folds if own != left] for left in (*range(int(group.max()) + 1), -1)]
         looks = [basis.fitted_to(reduce(Sums.__add__, sums), layout) for sums in others]
-        colours = self.change(self._predicted(looks, layout), group)
-        more, lattice = colours, fit_lattice(colours)
+        plain = self.change(self._predicted(looks, layout), group)
+        hues = fit_hues(plain)
+        colours = more = changed(plain, hues)
+        lattice = fit_lattice(colours)
         if is_of_colours(basis.parts) and len(self.colours) > len(self):
             more = self.colours.change([], self._groups(self.colours))
             more = replace(more, predicted=[coloured(more.before, look, layout) for look in (looks[0], looks[-1])])
-        return _FittedPixels(basis, looks[-1], colours, refined(more, lattice))
+            more = changed(more, [hues[0], hues[-1]])
+        lattice = refined(more, lattice)
+        if bool(hues[-1].any()):
+            lattice = replace(lattice.with_more(hues[-1]), without=plain.explained())
+        return _FittedPixels(basis, looks[-1], plain, lattice)
 
     def _groups(self, pixels: ThinnedPixels) -> Tensor:
         """The groups (P,) of pixels that are left out at once: those of a pair, or of squares of a single one."""

@@ -8,7 +8,7 @@ along each axis.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Protocol
 
@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.core.kernels.lattice import corners
+from nlfilter_torch.photo.looks.lattice import resampled
 
 SMOOTH = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6)  # strengths of the penalty on second derivatives
 RIDGE = 1e-3  # of the changes where there are no pixels, see :meth:`Penalised.ridge`
@@ -54,6 +55,12 @@ class ColourChange:
         beyond = ((self.after >= 1) & (result > 1)) | ((self.after <= 0) & (result < 0))
         return torch.where(beyond, 0.0, self.after - result)
 
+    def explained(self) -> float:
+        """Share of the change that the looks explain of the folds that they were fitted without."""
+        folds = range(len(self.predicted) - 1)
+        left = sum(self.energy(self.left(0.0, fold), fold) for fold in folds)
+        return 1 - left / max(self.energy(self.after - self.before), 1e-30)
+
     def energy(self, rest: Tensor, fold: int | None = None) -> float:
         """Weighted sum of squares of values (3, P), of all or of a fold."""
         weights = self.weights if fold is None else self.weights * (self.folds == fold)
@@ -79,6 +86,16 @@ class FittedLattice:
     without: float
     density: Tensor
     first: Tensor
+
+    def with_more(self, changes: Tensor) -> "FittedLattice":
+        """The lattice and another one (3, m, m, m) of what comes before it, with as many nodes as the larger one."""
+        nodes = max(self.changes.shape[1], changes.shape[1])
+        density = self.density.view(1, *self.changes.shape[1:]).expand(3, -1, -1, -1)
+        return replace(
+            self,
+            changes=resampled(self.changes, nodes) + resampled(changes, nodes),
+            density=resampled(density, nodes)[0].flatten(),
+        )
 
 
 def fit_lattice(pixels: ColourChange) -> FittedLattice:

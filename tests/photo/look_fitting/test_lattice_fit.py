@@ -74,3 +74,23 @@ def test_nothing_is_left_of_clipped_values_beyond_the_end() -> None:
     predicted = torch.tensor([[1.2, 0.9, -0.1, 1.2]], dtype=torch.float64).expand(3, -1)
     change = ColourChange(before, after, [predicted], torch.ones(4, dtype=torch.float64), torch.zeros(4).long())
     torch.testing.assert_close(change.left(0.0, 0)[0], torch.tensor([0.0, 0.1, 0.0, -0.3], dtype=torch.float64))
+
+
+def test_another_lattice_is_added_on_the_finer_grid() -> None:
+    sample = pixels(3000, 0.7)
+    lattice = fit_lattice(sample)
+    nodes, (hue, colours) = lattice.changes.shape[1], (colours_of_nodes(n) for n in (5, 33))
+    assert lattice.with_more(hue).changes.shape[1] == nodes
+    finer = lattice.with_more(colours)
+    assert finer.density.shape == (33**3,)
+    places = sample.before[None, :, None]
+    torch.testing.assert_close(
+        lattice_change(places, finer.changes), lattice_change(places, lattice.changes) + sample.before[None, :, None]
+    )
+
+
+def test_the_share_that_looks_explain_of_folds_that_they_were_fitted_without() -> None:
+    sample = pixels(900, 0.7)
+    assert sample.explained() == pytest.approx(0)
+    perfect = ColourChange(sample.before, sample.after, [sample.after] * 4, sample.weights, sample.folds)
+    assert perfect.explained() == 1
