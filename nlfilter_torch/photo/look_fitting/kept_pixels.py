@@ -22,8 +22,9 @@ KEPT = 2 * MOST  # pixels of all pairs
 COLOURS = ("curves", "matrix", "saturation")  # parts that are functions of the colour
 # A lattice is chosen if a look without it leaves more than SLACK times what it leaves, plus CLEAR. Where an edit may
 # depend on the surroundings of pixels, since more than SURROUNDINGS is left, lattices gain a little on the picture and
-# lose as much on others; there it is CLEARLY times as much, or WITHIN times if parts of all pictures are left out.
-CLEARLY, CLEAR, SURROUNDINGS, WITHIN = 1.75, 1e-4, 0.004, 2.5
+# lose as much on others; there it is CLEARLY times as much. For several pairs, whose colours differ, it is FAIRLY times
+# as much, and WITHIN times if parts of all of them are left out.
+CLEARLY, FAIRLY, WITHIN, CLEAR, SURROUNDINGS = 1.75, 1.6, 2.5, 1e-4, 0.004
 NEAR = 3  # steps between nodes that colours may be away from greys to change with them
 BATCH = 1 << 14  # pixels whose columns are in memory at once
 _Number = TypeVar("_Number", int, Tensor)
@@ -158,7 +159,8 @@ class KeptPixels(ThinnedPixels):
         left, without = 1 - best.lattice.left_out, 1 - fits[0].lattice.without
         if SLACK * left + CLEAR >= without:
             return None
-        if CLEARLY * left + CLEAR >= without and left > SURROUNDINGS and (alone or not self._agree(best.colours)):
+        often = CLEARLY if alone else FAIRLY
+        if left > SURROUNDINGS and (often * left + CLEAR >= without or not (alone or self._agree(best.colours))):
             return None
         changes = rising(best.lattice.changes, best.coefficients, layout, best.lattice.density)
         strength = 1 - SHRINK * min(max(left, 0.0), 1.0) if alone else 1.0
