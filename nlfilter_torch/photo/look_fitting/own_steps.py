@@ -32,6 +32,7 @@ COARSE = 4  # of this many pixels of the sample one is looked at first
 COARSE_STEPS, FINE_STEPS = 12, 3  # of least squares
 NEARLY_ALL = 0.99  # share from which on nothing else is looked for
 LIKELY = 0.97  # share that rough fits leave no doubt from
+CLOSE = 0.9  # share of a rough fit of one edit from which on it is fitted before two are
 PROMISING = 0.3  # share that edits by the default filter explain, from which on other filters are looked at
 
 
@@ -274,10 +275,15 @@ class StepSearch:
         if self._refined:
             return
         self._refined = True
-        if self._chain_start is not None:
-            self._fit_chain(*self._chain_start[1:])
-        best = min(self._rough, key=Candidate.cost, default=None)
-        if best is not None and not self._is_enough() and best is self._best_single():
+        best = self._best_single()
+        # Rough layers leave a little that two edits seem to explain.
+        if best in self._rough and best.left_out >= CLOSE:
+            self._try(best.edits)
+        start, single = self._chain_start, self._best_single()
+        if start is not None and not self._is_enough() and 1 - start[0] < LESS * (1 - single.left_out):
+            self._fit_chain(*start[1:])
+        best = self._best_single()
+        if best in self._rough and not self._is_enough():
             self._try(best.edits)
 
     def _best_single(self) -> Candidate:
