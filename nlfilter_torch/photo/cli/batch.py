@@ -21,6 +21,7 @@ from nlfilter_torch.photo.cli.edits import (
     with_options,
 )
 from nlfilter_torch.photo.cli.interrupts import INTERRUPTED
+from nlfilter_torch.photo.declared.looks import LOOKS
 from nlfilter_torch.photo.declared.parameters import EDITS
 from nlfilter_torch.photo.declared.presets import PRESETS
 
@@ -58,8 +59,8 @@ Cluster = Annotated[
 Preset = Annotated[
     str | None,
     preset_option(
-        f"One of {', '.join(PRESETS)}, or a file of any edits, such as `nlfilter-torch fit` and the editor make. "
-        "Options on the command line override a detail preset; other presets accept none.",
+        f"One of {', '.join((*PRESETS, *LOOKS))}, or a file of any edits, such as `nlfilter-torch fit` and the editor "
+        "make. Options on the command line override a detail preset; other presets accept none.",
         plain=False,
     ),
 ]

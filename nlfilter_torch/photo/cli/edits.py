@@ -10,6 +10,7 @@ import typer
 from nlfilter_torch.photo.cli import options
 from nlfilter_torch.photo.declared.declaration import FILTER_PANEL, UNITS, Edit, Kind, Parameter, ScribbleKind
 from nlfilter_torch.photo.declared.json_values import Value
+from nlfilter_torch.photo.declared.looks import LOOKS
 from nlfilter_torch.photo.declared.parameters import DETAIL, EDITS
 from nlfilter_torch.photo.declared.presets import PRESETS, Recipe, find_recipe
 from nlfilter_torch.photo.declared.steps import Step
@@ -75,8 +76,8 @@ def preset_option(help: str, *, plain: bool = True) -> object:
 PresetName = Annotated[
     str | None,
     preset_option(
-        f"One of {', '.join(PRESETS)} (see `nlfilter-torch presets`), or a file written by `nlfilter-torch fit`. It "
-        "replaces the defaults of the other options; options on the command line override it."
+        f"One of {', '.join((*PRESETS, *LOOKS))} (see `nlfilter-torch presets`), or a file written by `nlfilter-torch "
+        "fit`. It replaces the defaults of the other options; options on the command line override it."
     ),
 ]
 #: The option ``--region`` for each kind of scribbles on an object.

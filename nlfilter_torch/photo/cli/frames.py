@@ -18,6 +18,7 @@ from nlfilter_torch.photo.cli.edits import (
     with_options,
 )
 from nlfilter_torch.photo.declared.json_values import Value
+from nlfilter_torch.photo.declared.looks import LOOKS
 from nlfilter_torch.photo.declared.parameters import EDITS
 from nlfilter_torch.photo.declared.presets import PRESETS, Recipe
 
@@ -63,8 +64,9 @@ EditName = Annotated[
 Preset = Annotated[
     str | None,
     preset_option(
-        f"One of {', '.join(PRESETS)}, or a file of any edits without scribbles, as written by `nlfilter-torch fit` or "
-        "the editor. Options on the command line override a detail preset; other presets accept none.",
+        f"One of {', '.join((*PRESETS, *LOOKS))}, or a file of any edits without scribbles, as written by "
+        "`nlfilter-torch fit` or the editor. Options on the command line override a detail preset; other presets "
+        "accept none.",
         plain=False,
     ),
 ]

@@ -4,6 +4,7 @@ from typing import Annotated
 
 import typer
 
+from nlfilter_torch.photo.declared.looks import CHARACTERS
 from nlfilter_torch.photo.declared.presets import PRESETS, PURPOSES, find_recipe
 
 Name = Annotated[
@@ -29,4 +30,9 @@ def presets(name: Name = None) -> None:
         sliders = ", ".join(f"{value:g}" for value in step["alpha"])
         bandwidth = step["bandwidth"] if isinstance(step["bandwidth"], str) else f"{step['bandwidth']:g}"
         table.add_row(title, sliders, bandwidth, PURPOSES[title])
-    Console().print(table)
+    console = Console()
+    console.print(table)
+    looks = Table("look", "what it does")
+    for title, character in CHARACTERS.items():
+        looks.add_row(title, character)
+    console.print(looks)

@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING
 
 from nlfilter_torch.photo.declared.colour_tables import step_of_cube, step_of_hald
 from nlfilter_torch.photo.declared.json_values import Value, parse_json, shown
+from nlfilter_torch.photo.declared.looks import LOOKS
 from nlfilter_torch.photo.declared.parameters import EDITS
 from nlfilter_torch.photo.declared.steps import VERSION, Step, acting_steps, json_of
 
@@ -223,7 +224,7 @@ PURPOSES: dict[str, str] = {
 
 
 def find_recipe(name: str) -> Recipe:
-    """Return the preset of that name (``soft-skin`` is ``soft skin``), or read the file at that path.
+    """Return the preset or look of that name (``soft-skin`` is ``soft skin``), or read the file at that path.
 
     It holds a recipe, or is a colour table of another program: a ``.cube`` file, or a Hald as a PNG or TIFF file.
 
@@ -237,10 +238,12 @@ def find_recipe(name: str) -> Recipe:
     spoken = name.lower().replace("-", " ").replace("_", " ")
     if spoken in PRESETS:
         return PRESETS[spoken]
+    if spoken in LOOKS:
+        return Recipe((LOOKS[spoken],))
     path = Path(name)
     if not path.is_file():
         raise ValueError(
-            f"{name} is neither a file nor one of the presets {', '.join(PRESETS)}; "
+            f"{name} is neither a file nor one of the presets {', '.join((*PRESETS, *LOOKS))}; "
             "create a file with nlfilter-torch fit"
         )
     return Recipe.from_file(path.read_bytes(), name)

@@ -91,12 +91,14 @@ class OwnEdit(ABC):
 
     Attributes:
         edit: its name.
+        has_layers: whether its filter gives layers of detail, which others with the same parameters share.
         limits: of brightness.
         filter: parameters of its filter that are not the defaults.
         viewing_size: of the step.
     """
 
     edit: ClassVar[str]
+    has_layers: ClassVar[bool] = True
     limits: Limits = "soft"
     filter: tuple[tuple[str, Value], ...] = ()
     viewing_size: float = 1.5
@@ -268,6 +270,7 @@ class OwnSharpen(OwnEdit):
     """The amount of sharpening."""
 
     edit: ClassVar[str] = "sharpen"
+    has_layers: ClassVar[bool] = False
 
     @property
     def start(self) -> tuple[float, ...]:

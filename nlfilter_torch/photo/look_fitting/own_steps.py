@@ -34,8 +34,6 @@ NEARLY_ALL = 0.99  # share from which on nothing else is looked for
 LIKELY = 0.97  # share that rough fits leave no doubt from
 CLOSE = 0.9  # share of a rough fit of one edit from which on it is fitted before two are
 PROMISING = 0.3  # share that edits by the default filter explain, from which on other filters are looked at
-
-
 # Two edits are fitted only if a rough model of them leaves less than this, and than this multiple of what one leaves.
 UNPROMISING, LESS = 0.15, 0.6
 MORE, RARER = 1.1, 1.01  # what two edits, and an edit without limits, leave counts for so much more
@@ -326,7 +324,7 @@ class StepSearch:
 
     def _fit_chain(self, values: Tensor, one: OwnEdit, two: OwnEdit) -> None:
         """Fit two edits in both orders, from values that they nearly have."""
-        self._prepare([edit for edit in (one, two) if edit.edit != "sharpen"])
+        self._prepare([edit for edit in (one, two) if edit.has_layers])
         chain, turned = (Chain(*edits, self.pairs, self._whole[edits[0].key]) for edits in ((one, two), (two, one)))
         best = chain.begin(values)
         if not is_exact(best):

@@ -8,6 +8,7 @@ import skimage.data
 import torch
 
 from nlfilter_torch.photo.cli import main
+from nlfilter_torch.photo.declared.looks import CHARACTERS, LOOKS
 from nlfilter_torch.photo.declared.presets import PRESETS, PURPOSES, Recipe, find_recipe
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.edits.applying import apply_recipe
@@ -193,3 +194,10 @@ def step_file(edit: str, entries: str) -> str:
 def test_files_that_hold_no_edit(text: str, sentence: str) -> None:
     with pytest.raises(ValueError, match=sentence):
         Recipe.from_json(text, "edit.json")
+
+
+def test_looks_are_presets() -> None:
+    assert list(LOOKS) == list(CHARACTERS)
+    assert not LOOKS.keys() & PRESETS.keys()
+    for name, look in LOOKS.items():
+        assert find_recipe(name.upper()) == Recipe((look,))
