@@ -240,7 +240,9 @@ FUNCTIONS = {
     "estimate_bandwidth": Function(nlf.estimate_bandwidth, {"guide": _image(1, 3, 2)}, GUIDED | {"weights": _weights}),
     "estimate_noise": Function(nlf.estimate_noise, IMAGE, {}),
     "noise_profile": Function(lambda image: nlf.noise_profile(image).levels, IMAGE, {}),
-    "profile_of_difference": Function(lambda image: nlf.profile_of_difference(image, 0.5 * image).levels, IMAGE, {}),
+    "profile_of_difference": Function(
+        lambda noisy, clean: nlf.profile_of_difference(noisy, clean).levels, {"noisy": _image(3), "clean": _image(3)}, {}
+    ),
     "diffusion_map": Function(nlf.diffusion_map, SPECTRUM | TIME, {}),
     "diffusion_mask": Function(nlf.diffusion_mask, SPECTRUM | REGION, TIME | WIDTH | NEGATIVE),
     "segment_mask": Function(nlf.segment_mask, SPECTRUM | REGIONS, TIME | {"temperature": _number(0, 8)}),
