@@ -56,7 +56,7 @@ def measure(composite: Composite, count: int, seed: int) -> dict[str, Score]:
     return {"alone": score(region_mask(composite.image, inside), composite.alpha), **scores}
 
 
-def of_trimaps(chosen: Iterable[Composite]) -> None:
+def report_trimaps(chosen: Iterable[Composite]) -> None:
     """Print the mean and largest squared error of every method in the unknown bands of trimaps."""
     errors: dict[str, list[float]] = {name: [] for name in METHODS}
     for composite in chosen:
@@ -68,8 +68,8 @@ def of_trimaps(chosen: Iterable[Composite]) -> None:
             mask = method(composite.image, inside, outside)
             errors[name].append(float((mask - composite.alpha)[unknown].square().mean()))
     print(f"\n{len(errors[OURS])} wide trimaps, squared error where they are unknown\n{'':14}{'mean':>8}{'most':>8}")
-    for name, each in errors.items():
-        print(f"{name:14}{statistics.mean(each):8.4f}{max(each):8.4f}")
+    for name, values in errors.items():
+        print(f"{name:14}{statistics.mean(values):8.4f}{max(values):8.4f}")
 
 
 def report(cases: dict[str, dict[str, Score]]) -> bool:
@@ -142,7 +142,7 @@ def main(arguments: list[str] | None = None) -> None:
     if not chosen.quick:
         print(f"best in both means, and {WON:.0%} against each: {'holds' if holds else 'FALLS SHORT'}")
     larger = (TRIMAP_SCALE * chosen.size[0], TRIMAP_SCALE * chosen.size[1])
-    of_trimaps(composites(chosen.count, chosen.first, chosen.images, larger))
+    report_trimaps(composites(chosen.count, chosen.first, chosen.images, larger))
     speed(64 if chosen.quick else MEGAPIXEL)
 
 

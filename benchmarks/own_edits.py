@@ -71,7 +71,7 @@ class Found:
         of_file: after the steps.
         of_edit: share of the edit itself.
         error: largest of a slider; None if the edits are not the right ones.
-        look: share explained by a look where it was left out, or nan.
+        look: share explained by a look where it was left out; None if no look was fitted.
         seconds: of the processor.
     """
 
@@ -79,7 +79,7 @@ class Found:
     of_file: float
     of_edit: float
     error: float | None
-    look: float
+    look: float | None
     seconds: float
 
 
@@ -96,7 +96,7 @@ def error_of(steps: FittedSteps, recipe: Recipe) -> float | None:
     errors = [0.0]
     for step, right in zip(steps.steps, recipe.steps, strict=True):
         for name in SLIDERS[step.edit]:
-            values, wanted = (torch.tensor(one[name]).flatten() for one in (step, right))
+            values, wanted = (torch.tensor(chosen[name]).flatten() for chosen in (step, right))
             errors.append(float(((values - wanted).abs() / wanted.abs().clamp(min=1)).max()))
     return max(errors)
 
@@ -109,7 +109,7 @@ def find(before: Tensor, recipe: Recipe, file: Callable[[Tensor], Tensor], *, lo
     steps = fit_steps([(before, after)])
     seconds = time.process_time() - started
     result = steps.apply(before)
-    explained = torch.nan
+    explained = None
     if look:
         fitted = fit_look([(before, after)])
         assert isinstance(fitted, FittedLook)
@@ -127,7 +127,8 @@ def report(name: str, cases: list[Found]) -> None:
     errors = [case.error for case in cases if case.error is not None]
     worst = f"{100 * max(errors):8.1f}" if errors else f"{'':8}"
     missed = f"{len(cases) - len(errors)} other steps" if len(errors) < len(cases) else ""
-    look = f"{100 * statistics.mean(case.look for case in cases):9.1f}" if cases[0].look == cases[0].look else ""
+    looks = [case.look for case in cases if case.look is not None]
+    look = f"{100 * statistics.mean(looks):9.1f}" if looks else ""
     seconds = statistics.mean(case.seconds for case in cases)
     print(
         f"{name:34}" + "".join(f"{v:9.2f}" for v in (*means, lowest)) + f"{worst}{seconds:7.1f}{look} {missed}",

@@ -12,10 +12,14 @@ With the brightness of the strokes, the object's texture in the new colour is kn
 with one scribble, and "nothing" that of the object as it was. Where the painted texture leaves [0, 1], it is clipped in
 the expected result.
 
+Hats are painted with one scribble on the photograph of an astronaut, whose face, lips and suit have similar colours:
+shares of the hat and of each of these that change, if what is similar nearby takes part, and if this object alone does.
+
 Blotches are measured in smooth areas of the photographs themselves, such as skies: connected areas without borders, of
 about one colour, in which one scribble is drawn. "Covered" is as above, "spread" the standard deviation of the new
 colour over the area (a* and b* of CIE Lab), "even" what it would be if the whole area were recoloured, and "before"
 that of the old colour.
+
 ``--set choosing`` takes the photographs and seeds that the defaults were chosen on.
 """
 
@@ -38,7 +42,7 @@ from nlfilter_torch.photo.picture.colour import hundredths_of_lab, merge_luminan
 from nlfilter_torch.photo.picture.resizing import resize
 from nlfilter_torch.photo.picture.viewing import viewed_size
 from nlfilter_torch.photo.selections.border_colours import colours_beside
-from nlfilter_torch.photo.selections.connected import EXTENTS, Extent
+from nlfilter_torch.photo.selections.connected import Extent
 
 TINTS = ((0.8, 0.2, 0.15), (0.2, 0.35, 0.8), (0.2, 0.6, 0.25), (0.85, 0.7, 0.15))
 COLOURS = ((0.1, 0.3, 0.9), (0.9, 0.5, 0.1), (0.7, 0.15, 0.7), (0.15, 0.6, 0.3))  # of the scribbles, for each tint
@@ -52,6 +56,7 @@ AREA_SIZE = 0.13  # megapixels to which photographs are reduced for smooth areas
 SMOOTH_BLUR, SMOOTH_MARGIN, SMOOTH_CHANGE = 0.006, 0.008, 1.7
 SMOOTH_LIGHTNESS, SMOOTH_COLOUR, SMOOTH_SHARE = 30, 15, 0.1
 HATS = ((0.85, 0.1, 0.12), (0.9, 0.45, 0.3), (0.85, 0.35, 0.45), (0.75, 0.2, 0.5), (0.95, 0.65, 0.1))
+HAT_EXTENTS: tuple[Extent, ...] = ("near", "object")
 BESIDE_HAT = {  # rows and columns
     "face": (slice(112, 205), slice(185, 262)),
     "lips": (slice(167, 185), slice(208, 248)),
@@ -128,7 +133,7 @@ def measure_hat(tint: tuple[float, float, float]) -> dict[str, float]:
     inside[..., 50:70, 190:240] = 1
     strokes = torch.tensor(COLOURS[3]).view(1, 3, 1, 1).expand_as(image)
     shares = {}
-    for extent in EXTENTS[:2]:
+    for extent in HAT_EXTENTS:
         changed = (recolor(image, strokes, inside, extent=extent) - image).abs().amax(1)[0] > CHANGED
         parts = {"hat": hat[0, 0] > 0.98} | BESIDE_HAT
         shares |= {f"{name}, {extent}": 100 * float(changed[part].float().mean()) for name, part in parts.items()}

@@ -10,6 +10,7 @@ the number of lattices, their nodes and the steps were chosen on a fifth photogr
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 import torch.nn.functional as F
@@ -22,7 +23,7 @@ from nlfilter_torch import Look
 TRAINED = ("astronaut", "coffee", "rocket", "hubble_deep_field")
 REPORTED = ("motorcycle", "immunohistochemistry", "retina", "colorwheel")
 SIDE, CROP, TEST_CROP = 128, 48, 96  # pixels of photographs, and of their parts in training and in the figures
-EACH, TESTS = 4, 16  # parts of each photograph in a batch, and in the figures
+TRAINED_PARTS, TESTED_PARTS = 4, 16  # parts of each photograph in a batch, and in the figures
 STEPS, QUICK_STEPS = 800, 10
 RATE = 0.005
 KNOTS, LATTICES, NODES = 17, 6, 9
@@ -114,7 +115,7 @@ def trained(network: StyleNetwork, steps: int) -> StyleNetwork:
     optimizer = torch.optim.Adam(network.parameters(), lr=RATE)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps)
     for _ in range(steps):
-        before = crops.batch(EACH, CROP)
+        before = crops.batch(TRAINED_PARTS, CROP)
         loss = (network(before) - style(before)).square().mean()
         optimizer.zero_grad()
         loss.backward()
@@ -132,25 +133,27 @@ def decibels(result: Tensor, expected: Tensor) -> float:
 def measure(quick: bool) -> Iterator[Figure]:
     """PSNR on photographs not trained on, of networks with curves, curves and a matrix, lattices, and both."""
     networks = {
-        "curves alone": {"curves": True},
-        "curves and a matrix": {"curves": True, "matrix": True},
-        f"weights of {LATTICES} lattices": {"lattices": LATTICES},
-        f"curves and weights of {LATTICES} lattices": {"curves": True, "lattices": LATTICES},
+        "curves alone": partial(StyleNetwork, curves=True),
+        "curves and a matrix": partial(StyleNetwork, curves=True, matrix=True),
+        f"weights of {LATTICES} lattices": partial(StyleNetwork, lattices=LATTICES),
+        f"curves and weights of {LATTICES} lattices": partial(StyleNetwork, curves=True, lattices=LATTICES),
     }
-    batches = {name: Crops([reduced_to(photograph(name), SIDE)], seed=6).batch(TESTS, TEST_CROP) for name in REPORTED}
+    batches = {
+        name: Crops([reduced_to(photograph(name), SIDE)], seed=6).batch(TESTED_PARTS, TEST_CROP) for name in REPORTED
+    }
     for name, batch in batches.items():
         yield Figure(f"unedited, {name}", decibels(batch, style(batch)), unit="dB")
     means = []
-    for called, outputs in networks.items():
+    for kind, build in networks.items():
         with torch.random.fork_rng():
             torch.manual_seed(0)
-            network = StyleNetwork(**outputs)
+            network = build()
         network = trained(network, QUICK_STEPS if quick else STEPS)
         with torch.no_grad():
             values = [decibels(network(batch), style(batch)) for batch in batches.values()]
         for name, value in zip(batches, values, strict=True):
-            yield Figure(f"{called}, {name}", value, unit="dB")
+            yield Figure(f"{kind}, {name}", value, unit="dB")
         means.append(sum(values) / len(values))
         # Lattices must pay for their size on photographs that they were not fitted to.
-        limit = None if len(means) < 3 or quick else means[0]
-        yield Figure(f"{called}, mean", means[-1], limit, "dB", at_most=False)
+        limit = means[0] if "lattices" in kind and not quick else None
+        yield Figure(f"{kind}, mean", means[-1], limit, "dB", at_most=False)

@@ -2,12 +2,11 @@
 
 import math
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from nlfilter_torch.operator.features import reduce_channels
-from nlfilter_torch.photo.look_fitting.scaled_crop import scaled_crop
+from nlfilter_torch.photo.look_fitting.scaled_crop import best_match, correlation_of, reduced, scaled_crop
 from nlfilter_torch.photo.picture.resizing import resize
 
 SAME_SHAPE = 0.02  # largest difference of log aspect ratios at which an edited picture counts as resized
@@ -52,7 +51,7 @@ def _aligned_of_same_size(
     if min(edges) > 0:
         inside, covered = _inside(after, edges), _inside(before, edges)
         enlarged = resize(inside, (height, width)).clamp(0, 1)
-        if _correlation(_grey(before), _grey(enlarged)) > _correlation(_grey(covered), _grey(inside)):
+        if correlation_of(_grey(before), _grey(enlarged)) > correlation_of(_grey(covered), _grey(inside)):
             return before, enlarged, f"{framed}; the picture in it is enlarged to {width}x{height}"
     down, right = (0, 0) if framed else _shift(before, after)
     if (down, right) == (0, 0):
@@ -69,7 +68,7 @@ def _aligned_of_other_size(before: Tensor, after: Tensor, name: str, edited: str
     (row, column), likeness = (0, 0), -1.0
     if other[0] <= height and other[1] <= width:
         (row, column), likeness = _place(before, after)
-    whole = -1.0 if resized is None else _correlation(_grey(before), _grey(resized))
+    whole = -1.0 if resized is None else correlation_of(_grey(before), _grey(resized))
     if (
         likeness < SURE
         and (scaled := _scaled_crop(before, after, max(whole, likeness, RESIZED_CORRELATION))) is not None
@@ -102,7 +101,7 @@ def _scaled_crop(before: Tensor, after: Tensor, likeness: float) -> tuple[tuple[
     top, left, height, width = place
     part = before[..., top : top + height, left : left + width]
     resized = resize(after, (height, width)).clamp(0, 1)
-    return ((top, left), part, resized) if _correlation(_grey(part), _grey(resized)) > likeness + BETTER else None
+    return ((top, left), part, resized) if correlation_of(_grey(part), _grey(resized)) > likeness + BETTER else None
 
 
 def frame(before: Tensor, after: Tensor) -> tuple[int, int, int, int]:
@@ -154,12 +153,6 @@ def _grey(image: Tensor) -> Tensor:
     return reduce_channels(image, "luminance").mean((0, 1)).double()
 
 
-def _correlation(first: Tensor, second: Tensor) -> float:
-    pair = torch.stack([first.flatten(), second.flatten()])
-    correlation = float(pair.corrcoef()[0, 1])
-    return correlation if math.isfinite(correlation) else 0.0  # it is not for pictures of one brightness
-
-
 def _shift(before: Tensor, after: Tensor) -> tuple[int, int]:
     """Estimate the shift (down, right) of a picture in pixels; 0 unless undoing it increases the correlation."""
     from skimage.registration import phase_cross_correlation
@@ -172,8 +165,8 @@ def _shift(before: Tensor, after: Tensor) -> tuple[int, int]:
     limit = MAX_SHIFT * min(first.shape)
     if (down, right) == (0, 0) or max(abs(down), abs(right)) > limit:
         return 0, 0
-    likeness = _correlation(*_overlap(first, second, down, right))
-    return (down, right) if likeness > _correlation(first, second) + 0.01 else (0, 0)
+    likeness = correlation_of(*_overlap(first, second, down, right))
+    return (down, right) if likeness > correlation_of(first, second) + 0.01 else (0, 0)
 
 
 def _overlap(first: Tensor, second: Tensor, down: int, right: int) -> tuple[Tensor, Tensor]:
@@ -193,32 +186,15 @@ def _place(before: Tensor, after: Tensor) -> tuple[tuple[int, int], float]:
     """
     whole, part = _grey(before), _grey(after)
     scale = max(1.0, min(whole.shape) / SEARCH_SIDE)
-    small, piece = (_reduced(grey, scale) for grey in (whole, part))
+    small, piece = (reduced(grey, 1 / scale) for grey in (whole, part))
     if min(piece.shape) < 4 or float(piece.std()) == 0:
         return (0, 0), -1.0
-    (row, column), correlation = _best_match(small, piece[: small.shape[0], : small.shape[1]])
+    (row, column), correlation = best_match(small, piece[: small.shape[0], : small.shape[1]])
     if scale == 1:
         return (row, column), correlation
     margin = math.ceil(2 * scale)
     top = min(max(0, round(row * scale) - margin), whole.shape[0] - part.shape[0])
     left = min(max(0, round(column * scale) - margin), whole.shape[1] - part.shape[1])
     near = whole[top : top + part.shape[0] + 2 * margin, left : left + part.shape[1] + 2 * margin]
-    (down, right), correlation = _best_match(near, part)
+    (down, right), correlation = best_match(near, part)
     return (top + down, left + right), correlation
-
-
-def _reduced(grey: Tensor, scale: float) -> Tensor:
-    """Reduce luminance (H, W) by a factor."""
-    if scale == 1:
-        return grey
-    size = (max(1, round(grey.shape[0] / scale)), max(1, round(grey.shape[1] / scale)))
-    return resize(grey[None, None], size)[0, 0]
-
-
-def _best_match(whole: Tensor, part: Tensor) -> tuple[tuple[int, int], float]:
-    """Position (row, column) of the part in the whole, (H, W) each, and the correlation there."""
-    from skimage.feature import match_template
-
-    correlations = match_template(whole.numpy(), part.numpy())
-    row, column = np.unravel_index(int(correlations.argmax()), correlations.shape)
-    return (int(row), int(column)), float(correlations.max())

@@ -28,7 +28,7 @@ from nlfilter_torch.photo.look_fitting.look_choice import (
     simplest,
 )
 from nlfilter_torch.photo.look_fitting.look_pixels import EditedPhotograph, PixelSample
-from nlfilter_torch.photo.look_fitting.look_sums import MOST, Layout, Parts, Sums
+from nlfilter_torch.photo.look_fitting.look_sums import MOST, SHADES, Layout, Parts, Sums, means_of_shades
 from nlfilter_torch.photo.looks.lattice import lattice_of
 from nlfilter_torch.photo.looks.look_filter import NAMES
 
@@ -39,7 +39,6 @@ STIFF, STIFF_ALONE = 3e-3, 1e-2  # smallest ridge of tone curves and saturation,
 SLIDERS_ONLY = 0.98  # share of the change from which on an edit counts as one by sliders alone
 LIKELY = 0.95  # share that the layers of a sample of the pixels explain of such an edit
 ALIKE = 0.5  # least correlation of the luminance of a photograph with that of its edit
-SHADES = 256
 KINDS_OF_CURVES = {"tone": "curves"}  # a tone curve for all channels is a part of this name
 
 
@@ -242,9 +241,9 @@ class _Region:
                 bases += [simplest(plain)] if plain else []
             more = self.kept.lattice(bases, groups, self.layout)
             if more is not None:
-                parts = (*more.parts, "lattice")
+                basis = more.basis
+                parts = (*basis.parts, "lattice")
                 explained[parts] = more.fitted, more.left_out
-                basis = next(look for look in bases if look.parts == more.parts)
                 changed = self._step(replace(basis, parts=parts, coefficients=more.coefficients), step, more.lattice)
                 added = self._added(basis)
                 added["lattice"] = more.fitted - basis.fitted, more.left_out - basis.left_out
@@ -358,10 +357,7 @@ def check_belong(before: Tensor, after: Tensor, first: str, second: str) -> None
     grey, edited = (reduce_channels(image[None], "luminance")[0, 0, shown].double() for image in (before, after))
     if min(float(grey.std(correction=0)), float(edited.std(correction=0))) < 1 / 255:
         return  # nothing to compare
-    shades = (grey.clamp(0, 1) * (SHADES - 1)).round().long()
-    counts = torch.zeros(SHADES, dtype=torch.float64).index_add(0, shades, torch.ones_like(grey)).clamp(min=1)
-    means = torch.zeros(SHADES, dtype=torch.float64).index_add(0, shades, edited) / counts
-    shared = float(((means[shades] - edited.mean()).square().mean() / edited.var(correction=0)).sqrt())
+    shared = float(((means_of_shades(grey, edited) - edited.mean()).square().mean() / edited.var(correction=0)).sqrt())
     if len(grey) >= 4 * SHADES and shared < ALIKE:
         raise ValueError(
             f"{second} must be an edit of {first}, but their brightness agrees only to {100 * shared:.0f} % "

@@ -18,7 +18,7 @@ HUES = 6  # hats, at red, yellow, green, cyan, blue and magenta
 NODES = 17  # of the grid that the changes are sampled on
 RIDGES = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5)  # relative to the squares of the columns
 ENOUGH = 1 << 14  # pixels that the parameters are fitted to
-PRIOR = 1e-4  # weight of evenly distributed colours that stay as they are, so that hues that few pixels have do
+PRIOR = 1e-4  # weight of evenly distributed colours that stay as they are, and keep hues of few pixels as they are
 TINY = 1e-9
 
 
@@ -73,7 +73,7 @@ def fit_hues(pixels: ColourChange) -> list[Tensor]:
     sums = [_sums(few, columns, even, fold, fold) for fold in range(number)]
     best, least = None, LOOSER * sum(few.energy(few.left(0.0, fold), fold) for fold in range(number))
     for ridge in RIDGES:
-        solved = [each.solve(ridge) for each in sums]
+        solved = [others.solve(ridge) for others in sums]
         left = sum(few.energy(few.left(_change(columns, x), i), i) for i, x in enumerate(solved))
         if left < least:
             best, least = (ridge, solved), left
@@ -88,8 +88,8 @@ def changed(pixels: ColourChange, lattices: list[Tensor]) -> ColourChange:
     """The pixels, whose looks are followed by lattices (3, n, n, n)."""
     colours = pixels.before[None, :, None]
     predicted = [
-        each + lattice_change(colours, lattice)[0, :, 0]
-        for each, lattice in zip(pixels.predicted, lattices, strict=True)
+        result + lattice_change(colours, lattice)[0, :, 0]
+        for result, lattice in zip(pixels.predicted, lattices, strict=True)
     ]
     return replace(pixels, predicted=predicted)
 
@@ -109,5 +109,5 @@ def _thinned(pixels: ColourChange) -> ColourChange:
     """Some of the pixels, evenly."""
     step = 1 + (len(pixels.weights) - 1) // ENOUGH
     before, after = pixels.before[:, ::step], pixels.after[:, ::step]
-    predicted = [each[:, ::step] for each in pixels.predicted]
+    predicted = [result[:, ::step] for result in pixels.predicted]
     return ColourChange(before, after, predicted, pixels.weights[::step], pixels.folds[::step])

@@ -56,14 +56,14 @@ class LookWithLattice:
     """A look with a lattice, and the shares of the change that it explains.
 
     Attributes:
-        parts: of the look beside the lattice.
-        coefficients: (3, F) of the columns.
+        basis: the look beside the lattice.
+        coefficients: (3, F) of its columns, fitted to all pixels, and weakened if there is a single pair.
         lattice: changes (3, n, n, n).
         fitted: share of the pixels that it was fitted to.
         left_out: share of those that were left out.
     """
 
-    parts: Parts
+    basis: Candidate
     coefficients: Tensor
     lattice: Tensor
     fitted: float
@@ -165,11 +165,11 @@ class KeptPixels(ThinnedPixels):
         changes = rising(best.lattice.changes, best.coefficients, layout, best.lattice.density)
         strength = 1 - SHRINK * min(max(left, 0.0), 1.0) if alone else 1.0
         shares = best.lattice.fitted, best.lattice.left_out
-        return LookWithLattice(best.basis.parts, strength * best.coefficients, strength * changes, *shares)
+        return LookWithLattice(best.basis, strength * best.coefficients, strength * changes, *shares)
 
     def _fitted(
         self, basis: Candidate, folds: Sequence[tuple[Sums, int]], group: Tensor, layout: Layout
-    ) -> "_FittedPixels":
+    ) -> _FittedPixels:
         """The lattice for what a look leaves of the pixels in groups (P,), to which the folds belong."""
         others = [[sums for sums, own in folds if own != left] for left in (*range(int(group.max()) + 1), -1)]
         looks = [basis.fitted_to(reduce(Sums.__add__, sums), layout) for sums in others]

@@ -21,7 +21,7 @@ from nlfilter_torch.photo.look_fitting.lattice_fit import (
 from nlfilter_torch.photo.looks.lattice import lattice_change, resampled
 
 GRIDS = (17, 33)  # numbers of nodes along each axis
-AGAIN = 2  # more rounds with most nodes, as lattices take values beyond the ends of clipped ones for right
+AGAIN = 2  # more rounds on the finest grid where values are clipped: each sees anew which results are beyond the ends
 RIDGES = (10.0, 1.0, 0.1)  # so many pixels at a node, of average weight, halve its change
 
 

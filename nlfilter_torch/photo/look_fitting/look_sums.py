@@ -17,6 +17,7 @@ from nlfilter_torch.photo.looks.look_filter import BLURS, below_largest, saturat
 
 Parts = tuple[str, ...]  # of a look; ``tone`` is one curve for all channels, ``curves`` one for each
 MOST = 1 << 16  # pixels of a pair that sums are taken over
+SHADES = 256  # of grey, for :func:`means_of_shades`
 
 
 @dataclass(frozen=True)
@@ -122,6 +123,13 @@ def sample(weights: Tensor, most: int | None = None) -> Tensor:
         return places
     random = torch.rand(most, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     return places[((torch.arange(most) + random) * (len(places) / most)).long().to(places.device)]
+
+
+def means_of_shades(grey: Tensor, values: Tensor) -> Tensor:
+    """For each pixel, the mean (P,) of the values (P,) of all pixels whose luminance (P,) is of the same shade."""
+    shades = (grey.clamp(0, 1) * (SHADES - 1)).round().long()
+    counts = torch.zeros(SHADES).to(values).index_add(0, shades, torch.ones_like(values)).clamp(min=1)
+    return (torch.zeros(SHADES).to(values).index_add(0, shades, values) / counts)[shades]
 
 
 def columns_of(image: Tensor, weighed: Mapping[str, Tensor], layout: Layout) -> Tensor:

@@ -71,9 +71,9 @@ class Chain:
 
         def errors(values: Tensor) -> Tensor:
             parts = []
-            for pair, one, two in zip(self.pairs, *seen, strict=True):
-                between = self.first.edited(one, values[:count]).clamp(0, 1)
-                parts.append(pair.errors(self.second.edited(replace(two, image=between), values[count:]), step))
+            for pair, seen_first, seen_second in zip(self.pairs, *seen, strict=True):
+                between = self.first.edited(seen_first, values[:count]).clamp(0, 1)
+                parts.append(pair.errors(self.second.edited(replace(seen_second, image=between), values[count:]), step))
             return torch.cat(parts)
 
         return minimize(errors, (*self.first.start, *self.second.start), self.ends, STEPS)

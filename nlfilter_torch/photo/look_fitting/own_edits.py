@@ -7,7 +7,7 @@ parameters do, in milliseconds: also the means of the picture, which limits of b
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import ClassVar, cast
 
 import torch
@@ -36,7 +36,8 @@ from nlfilter_torch.photo.picture.source import luminance, seeded
 from nlfilter_torch.photo.picture.viewing import within_limits
 
 LEVELS = 255.0
-USUAL_THRESHOLD = 5.0 / LEVELS
+USUAL_THRESHOLD: float = Step("detail")["threshold"]  # in levels
+USUAL_AMOUNT: float = Step("sharpen")["amount"]
 MOST_LEVELS = 60.0  # largest threshold of detail that is looked for
 
 Key = tuple[str, tuple[tuple[str, Value], ...]]  # name and filter of an edit
@@ -75,7 +76,7 @@ class Ingredients:
     def _measured(self) -> Tensor:
         """What has the means of the picture, (S, P), in float64."""
         grey, layers = reduce_channels(self.image, "luminance"), self.layers[0]
-        shares = self.activity / (self.activity + USUAL_THRESHOLD**2)
+        shares = self.activity / (self.activity + (USUAL_THRESHOLD / LEVELS) ** 2)
         planes = [torch.ones_like(grey), grey, grey.square(), layers.transpose(0, 1), (layers * shares).transpose(0, 1)]
         return torch.cat([part[0].flatten(1).double() for part in planes])
 
@@ -101,7 +102,7 @@ class OwnEdit(ABC):
     has_layers: ClassVar[bool] = True
     limits: Limits = "soft"
     filter: tuple[tuple[str, Value], ...] = ()
-    viewing_size: float = 1.5
+    viewing_size: float = Step("detail")["viewing_size"]
 
     @property
     @abstractmethod
@@ -179,34 +180,33 @@ class OwnDetail(OwnEdit):
 
     edit: ClassVar[str] = "detail"
     order: int = 3
-    alpha: tuple[float, ...] = field(default=())
 
     @property
     def start(self) -> tuple[float, ...]:
         """Sliders, and the threshold in levels."""
-        return (*(self.alpha or (1.5,) * self.order + (1.0,)), 5.0)
+        return (*(1.5,) * self.order, 1.0, USUAL_THRESHOLD)
 
     @property
     def ends(self) -> tuple[tuple[float, float], ...]:
-        """Those of sliders and of a threshold."""
-        return (*[(float(GAINS[0]), float(GAINS[1]))] * (self.order + 1), (0.0, MOST_LEVELS))
+        """Range of sliders, and of the threshold."""
+        return (*(GAINS,) * (self.order + 1), (0.0, MOST_LEVELS))
 
     @property
     def idle(self) -> tuple[float, ...]:
         """Sliders of 1; the default threshold."""
-        return (*(1.0,) * (self.order + 1), 5.0)
+        return (*(1.0,) * (self.order + 1), USUAL_THRESHOLD)
 
     @property
     def usual(self) -> tuple[tuple[float, ...], ...]:
-        """The last slider is 1, and the threshold that of the default."""
-        return (*((),) * self.order, (1.0,), (5.0, 0.0))
+        """The last slider is 1; the threshold is the default or 0."""
+        return (*((),) * self.order, (1.0,), (USUAL_THRESHOLD, 0.0))
 
     @property
     def known(self) -> tuple[tuple[float, ...], ...]:
         """Sliders of presets with the default filter, and the default threshold."""
         steps = [recipe.steps[0] for recipe in PRESETS.values()]
-        plain = [step["alpha"] for step in steps if [name for name, _ in step.values if name != "alpha"] == []]
-        return tuple((*alpha, 5.0) for alpha in plain if len(alpha) == self.order + 1)
+        plain = [step["alpha"] for step in steps if {name for name, _ in step.values} <= {"alpha"}]
+        return tuple((*alpha, USUAL_THRESHOLD) for alpha in plain if len(alpha) == self.order + 1)
 
     def parameters(self, values: Sequence[float]) -> dict[str, Value]:
         """Sliders and threshold."""
@@ -237,7 +237,7 @@ class OwnTone(OwnEdit):
 
     @property
     def ends(self) -> tuple[tuple[float, float], ...]:
-        """Those of gains."""
+        """Range of gains."""
         return (GAINS, GAINS)
 
     @property
@@ -279,7 +279,7 @@ class OwnSharpen(OwnEdit):
 
     @property
     def ends(self) -> tuple[tuple[float, float], ...]:
-        """Those of gains."""
+        """Range of gains."""
         return (GAINS,)
 
     @property
@@ -290,7 +290,7 @@ class OwnSharpen(OwnEdit):
     @property
     def usual(self) -> tuple[tuple[float, ...], ...]:
         """The default amount."""
-        return ((4.0,),)
+        return ((USUAL_AMOUNT,),)
 
     def parameters(self, values: Sequence[float]) -> dict[str, Value]:
         """The amount."""

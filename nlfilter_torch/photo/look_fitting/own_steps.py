@@ -314,21 +314,22 @@ class StepSearch:
     def _begin_chain(self) -> None:
         """Look for two edits that promise more, one after the other, than one."""
         starts = []
-        for one, two in combinations(self._edits("soft"), 2):
+        for first, second in combinations(self._edits("soft"), 2):
             step = 2 * COARSE
-            start = Chain(one, two, self.pairs, []).start(self._seen[one.key], self._seen[two.key], step)
-            starts.append((step * start.loss / self._power(), start.values, one, two))
-        left, values, one, two = min(starts, key=itemgetter(0))
+            start = Chain(first, second, self.pairs, []).start(self._seen[first.key], self._seen[second.key], step)
+            starts.append((step * start.loss / self._power(), start.values, first, second))
+        left, values, first, second = min(starts, key=itemgetter(0))
         if left < min(UNPROMISING, LESS * (1 - max(candidate.left_out for candidate in self._all()))):
-            self._chain_start = 1 - left, values, one, two
+            self._chain_start = 1 - left, values, first, second
 
-    def _fit_chain(self, values: Tensor, one: OwnEdit, two: OwnEdit) -> None:
+    def _fit_chain(self, values: Tensor, first: OwnEdit, second: OwnEdit) -> None:
         """Fit two edits in both orders, from values that they nearly have."""
-        self._prepare([edit for edit in (one, two) if edit.has_layers])
-        chain, turned = (Chain(*edits, self.pairs, self._whole[edits[0].key]) for edits in ((one, two), (two, one)))
+        self._prepare([edit for edit in (first, second) if edit.has_layers])
+        orders = ((first, second), (second, first))
+        chain, turned = (Chain(*edits, self.pairs, self._whole[edits[0].key]) for edits in orders)
         best = chain.begin(values)
         if not is_exact(best):
-            count = len(one.start)
+            count = len(first.start)
             other = turned.begin(torch.cat([values[count:], values[:count]]))
             chain, best = min((chain, best), (turned, other), key=_loss)
         if not is_exact(best):

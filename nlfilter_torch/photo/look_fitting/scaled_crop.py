@@ -47,19 +47,17 @@ def _whole_pixels(middle: float, length: float, limit: int) -> tuple[int, int]:
 
 def _first_place(whole: Tensor, part: Tensor, largest: float) -> tuple[float, float, float] | None:
     """Middle (row, column) of the part and the pixels of the whole in one of its own, by trying sizes."""
-    from skimage.feature import match_template
-
     scale = min(1.0, FIRST_SIDE / min(whole.shape))
-    small = _reduced(whole, scale)
+    small = reduced(whole, scale)
     best, place = -math.inf, None
     for number in range(STEPS):
         pixel = largest * math.exp(-STEP * number)
-        piece = _reduced(part, scale * pixel)[: small.shape[0], : small.shape[1]]
+        piece = reduced(part, scale * pixel)[: small.shape[0], : small.shape[1]]
         if min(piece.shape) < LEAST_SIDE or float(piece.std()) < LEAST_CONTRAST:
             break
-        correlations = match_template(small.numpy(), piece.numpy())
-        if correlations.max() > best:
-            best, (row, column) = correlations.max(), divmod(int(correlations.argmax()), correlations.shape[1])
+        (row, column), likeness = best_match(small, piece)
+        if likeness > best:
+            best = likeness
             place = ((row + piece.shape[0] / 2) / scale, (column + piece.shape[1] / 2) / scale, pixel)
     return place
 
@@ -68,7 +66,7 @@ def _refined(
     whole: Tensor, part: Tensor, place: tuple[float, float, float], scale: float
 ) -> tuple[float, float, float]:
     """A place whose correlation is largest in pictures reduced by a factor, by a search along the three axes."""
-    comparison = Comparison(_reduced(whole, scale), _reduced(part, scale * place[2]), place, scale)
+    comparison = Comparison(reduced(whole, scale), reduced(part, scale * place[2]), place, scale)
     moves: tuple[float, ...] = (0.0, 0.0, 0.0)
     best, step = comparison.correlation(moves), FIRST_MOVE
     while step > LAST_MOVE:
@@ -114,7 +112,7 @@ class Comparison:
         row, column, pixel = self.place_after(moves)
         step = pixel / self.place[2]
         shown = _sampled(self.whole, self.scale * row, self.scale * column, step, self.part.shape)
-        return float(torch.stack([shown.flatten(), self.part.flatten()]).corrcoef()[0, 1].nan_to_num())
+        return correlation_of(shown, self.part)
 
 
 def _sampled(whole: Tensor, row: float, column: float, step: float, shape: torch.Size) -> Tensor:
@@ -127,7 +125,21 @@ def _sampled(whole: Tensor, row: float, column: float, step: float, shape: torch
     return F.grid_sample(whole[None, None], grid[None], padding_mode="border", align_corners=False)[0, 0]
 
 
-def _reduced(grey: Tensor, scale: float) -> Tensor:
+def best_match(whole: Tensor, part: Tensor) -> tuple[tuple[int, int], float]:
+    """Position (row, column) of the part in the whole, (H, W) each, and the correlation there."""
+    from skimage.feature import match_template
+
+    correlations = match_template(whole.numpy(), part.numpy())
+    place = int(correlations.argmax())
+    return divmod(place, correlations.shape[1]), float(correlations.flat[place])
+
+
+def correlation_of(first: Tensor, second: Tensor) -> float:
+    """Correlation of two pictures of the same shape; 0 if one of them is of one brightness."""
+    return float(torch.stack([first.flatten(), second.flatten()]).corrcoef()[0, 1].nan_to_num())
+
+
+def reduced(grey: Tensor, scale: float) -> Tensor:
     """Resize luminance (H, W) by a factor."""
     size = (max(1, round(grey.shape[0] * scale)), max(1, round(grey.shape[1] * scale)))
     return grey if size == tuple(grey.shape) else resize(grey[None, None], size)[0, 0]

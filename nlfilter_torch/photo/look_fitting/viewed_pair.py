@@ -6,8 +6,8 @@ from torch import Tensor
 from nlfilter_torch.core.precision import working_dtype
 from nlfilter_torch.operator.features import reduce_channels
 from nlfilter_torch.photo.look_fitting.alignment import inside_frame
-from nlfilter_torch.photo.look_fitting.kept_pixels import squares
-from nlfilter_torch.photo.look_fitting.look_sums import sample
+from nlfilter_torch.photo.look_fitting.kept_pixels import latin, squares
+from nlfilter_torch.photo.look_fitting.look_sums import means_of_shades, sample
 from nlfilter_torch.photo.picture.in_memory import InMemory
 from nlfilter_torch.photo.picture.resizing import resize
 from nlfilter_torch.photo.picture.seen import range_of
@@ -16,7 +16,6 @@ from nlfilter_torch.photo.picture.viewing import viewed_size
 # An edit of brightness moves colours along grey, and their chroma in proportion. Shares of a change that must be so,
 # and along grey; noise of compression is not.
 ALONG_BOTH, ALONG_GREY = 0.6, 0.5
-SHADES = 256
 CURVE = 0.996  # share that a function of brightness explains from which on an edit counts as a tone curve
 
 
@@ -71,7 +70,7 @@ class ViewedPair:
 
     def groups(self, alone: bool) -> Tensor:
         """What is left out together, (C P,): the pair or, if it is the only one, a third of its squares."""
-        group = (self.squares + self.squares // 3) % 3 if alone else torch.full_like(self.squares, self.number)
+        group = latin(self.squares) if alone else torch.full_like(self.squares, self.number)
         return group.repeat(self.before.shape[1])
 
     def is_of_brightness(self) -> bool:
@@ -96,7 +95,4 @@ class ViewedPair:
 def _explained_by_curve(before: Tensor, change: Tensor) -> float:
     """Share of the change of luminance (C, P) that a function of luminance explains."""
     grey, moved = (reduce_channels(planes[None, :, None], "luminance")[0, 0, 0] for planes in (before, change))
-    shades = (grey.clamp(0, 1) * (SHADES - 1)).round().long()
-    counts = torch.zeros(SHADES, dtype=grey.dtype).index_add(0, shades, torch.ones_like(grey)).clamp(min=1)
-    means = torch.zeros(SHADES, dtype=grey.dtype).index_add(0, shades, moved) / counts
-    return 1 - float((moved - means[shades]).square().sum() / moved.square().sum().clamp(min=1e-30))
+    return 1 - float((moved - means_of_shades(grey, moved)).square().sum() / moved.square().sum().clamp(min=1e-30))

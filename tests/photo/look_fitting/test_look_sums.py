@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from nlfilter_torch.photo.look_fitting.look_sums import Layout, Sums, columns_of, sample, sums_of
+from nlfilter_torch.photo.look_fitting.look_sums import Layout, Sums, columns_of, means_of_shades, sample, sums_of
 from nlfilter_torch.photo.looks.look_filter import pointwise
 from tests.looks import BENT, CAT, SEPIA, VIVID
 
@@ -19,6 +19,12 @@ def test_sums_of_samples_are_those_of_all_pixels() -> None:
     assert torch.equal(places, places.sort().values)
     assert float(whole.flatten()[places].mean()) == pytest.approx(float(whole[:, 50:].mean()), abs=2e-3)
     assert torch.equal(sample(whole[:50]), whole[:50].flatten().nonzero().squeeze(1))
+
+
+def test_means_are_those_of_pixels_of_the_same_shade() -> None:
+    grey = torch.tensor([0.2, 0.8, 0.2, 1.3, 1.0], dtype=torch.float64)
+    values = torch.tensor([1.0, 5.0, 2.0, 3.0, 4.0], dtype=torch.float64)
+    assert means_of_shades(grey, values).tolist() == [1.5, 5.0, 1.5, 3.5, 3.5]
 
 
 def test_columns_and_parameters_are_the_change_of_a_look() -> None:

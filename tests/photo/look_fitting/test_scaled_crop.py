@@ -32,4 +32,7 @@ def test_pictures_without_anything_to_compare() -> None:
     assert scaled_crop(GREY, torch.full((30, 40), 0.5, dtype=torch.float64)) is None
     assert scaled_crop(GREY[:1, :1], GREY[:1, :1]) is None
     place = scaled_crop(torch.zeros(40, 50, dtype=torch.float64), CUP.mean((0, 1)).double()[:20, :25])
-    assert place is None or all(isinstance(number, int) for number in place)
+    assert place is not None
+    top, left, height, width = place
+    assert 0 <= top < top + height <= 40
+    assert 0 <= left < left + width <= 50
