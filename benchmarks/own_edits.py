@@ -140,7 +140,7 @@ def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--pictures", type=Path, help="folder of photographs, in place of scikit-image's")
-    parser.add_argument("--most", type=int, default=3, help="photographs")
+    parser.add_argument("--most", type=int, default=3, help="largest number of photographs")
     parser.add_argument("--side", type=int, default=256, help="pixels of the short side")
     parser.add_argument("--edits", nargs="+", default=list(EDITS), choices=EDITS, metavar="NAME", help="all by default")
     parser.add_argument("--formats", nargs="+", default=list(FORMATS), choices=FORMATS, help="all by default")

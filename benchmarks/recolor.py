@@ -12,8 +12,8 @@ With the brightness of the strokes, the object's texture in the new colour is kn
 with one scribble, and "nothing" that of the object as it was. Where the painted texture leaves [0, 1], it is clipped in
 the expected result.
 
-Hats are painted with one scribble on the photograph of an astronaut, whose face, lips and suit have similar colours:
-shares of the hat and of each of these that change, if what is similar nearby takes part, and if this object alone does.
+Hats of several colours are put on the photograph of an astronaut and recoloured with one scribble. Printed are the
+shares of the hat, and of face, lips and suit beside it, that change, with each of two extents.
 
 Blotches are measured in smooth areas of the photographs themselves, such as skies: connected areas without borders, of
 about one colour, in which one scribble is drawn. "Covered" is as above, "spread" the standard deviation of the new

@@ -241,7 +241,9 @@ FUNCTIONS = {
     "estimate_noise": Function(nlf.estimate_noise, IMAGE, {}),
     "noise_profile": Function(lambda image: nlf.noise_profile(image).levels, IMAGE, {}),
     "profile_of_difference": Function(
-        lambda noisy, clean: nlf.profile_of_difference(noisy, clean).levels, {"noisy": _image(3), "clean": _image(3)}, {}
+        lambda noisy, clean: nlf.profile_of_difference(noisy, clean).levels,
+        {"noisy": _image(3), "clean": _image(3)},
+        {},
     ),
     "diffusion_map": Function(nlf.diffusion_map, SPECTRUM | TIME, {}),
     "diffusion_mask": Function(nlf.diffusion_mask, SPECTRUM | REGION, TIME | WIDTH | NEGATIVE),
@@ -319,15 +321,24 @@ FUNCTIONS = {
     "region_mask": Function(
         nlf.region_mask,
         {"image": _image(1, 3), "scribbles": lambda scene: scene.mask(1)},
-        LOCAL | {"reach": _number(0, 0.99), "extent": _one_of(*EXTENTS)} | {"photometric_bandwidth": _plain(0.03, 0.5)},
+        LOCAL
+        | {
+            "reach": _number(0, 0.99),
+            "extent": _one_of(*EXTENTS),
+            "photometric_bandwidth": _plain(0.03, 0.5),
+        },
     ),
     "recolor": Function(
         nlf.recolor,
         {"image": _image(3)} | PAINTED,
         LOCAL
-        | {"keep": _background, "reach": _number(0, 0.99), "brightness": _number(0, 1)}
-        | {"extent": _one_of(*EXTENTS)}
-        | {"photometric_bandwidth": _plain(0.03, 0.5)},
+        | {
+            "keep": _background,
+            "reach": _number(0, 0.99),
+            "brightness": _number(0, 1),
+            "extent": _one_of(*EXTENTS),
+            "photometric_bandwidth": _plain(0.03, 0.5),
+        },
     ),
     "colorize": Function(
         nlf.colorize,

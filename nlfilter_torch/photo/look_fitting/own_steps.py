@@ -28,15 +28,15 @@ from nlfilter_torch.photo.picture.in_memory import InMemory
 from nlfilter_torch.photo.picture.limits import Limits
 
 MOST_PAIRS = 3  # that are looked at; the first ones
-COARSE = 4  # of this many pixels of the sample one is looked at first
+COARSE = 4  # the first fits look at one of so many pixels of the sample
 COARSE_STEPS, FINE_STEPS = 12, 3  # of least squares
 NEARLY_ALL = 0.99  # share from which on nothing else is looked for
-LIKELY = 0.97  # share that rough fits leave no doubt from
+LIKELY = 0.97  # share explained by a rough fit from which on steps are fitted before a look, with no other filters
 CLOSE = 0.9  # share of a rough fit of one edit from which on it is fitted before two are
 PROMISING = 0.3  # share that edits by the default filter explain, from which on other filters are looked at
 # Two edits are fitted only if a rough model of them leaves less than this, and than this multiple of what one leaves.
 UNPROMISING, LESS = 0.15, 0.6
-MORE, RARER = 1.1, 1.01  # what two edits, and an edit without limits, leave counts for so much more
+MORE, RARER = 1.1, 1.01  # what is left counts so many times as much for two edits, and for edits without limits
 # Steps are preferred to a look if they explain that much of what is left out, and it leaves that many times as much.
 # Edits by other programs leave three times as much under steps as under looks. JPEG files of weak edits are half noise.
 ENOUGH, CLEARLY = 0.5, 1.2
@@ -146,7 +146,7 @@ class Candidate:
 
     @property
     def steps(self) -> tuple[Step, ...]:
-        """The steps."""
+        """The edits as steps with these values."""
         return tuple(edit.step(values.tolist()) for edit, values in zip(self.edits, self.values, strict=True))
 
 
