@@ -35,17 +35,21 @@ def _bytes(image: Tensor) -> Tensor:
     return (image[0] * 255).round_().to(torch.uint8)
 
 
+def _grey_or_rgb(image: Tensor) -> Image.Image:
+    """An image (1, 1 or 3, H, W) in [0, 1] for Pillow."""
+    values = _bytes(image)
+    planes = values[0] if len(values) == 1 else values.permute(1, 2, 0)
+    return Image.fromarray(np.ascontiguousarray(planes.numpy()))
+
+
 def picture(image: Tensor) -> bytes:
     """An image (1, 1 or 3, H, W) in [0, 1] as a JPEG."""
-    values = _bytes(image).permute(1, 2, 0).numpy()
-    return _encode(Image.fromarray(np.ascontiguousarray(values.squeeze())), "JPEG", quality=QUALITY, subsampling=0)
+    return _encode(_grey_or_rgb(image), "JPEG", quality=QUALITY, subsampling=0)
 
 
 def lossless(image: Tensor) -> bytes:
     """An image (1, 1 or 3, H, W) in [0, 1] as a PNG."""
-    values = _bytes(image).permute(1, 2, 0).numpy()
-    values = values[..., 0] if values.shape[2] == 1 else values
-    return _encode(Image.fromarray(np.ascontiguousarray(values)), "PNG", compress_level=1)
+    return _encode(_grey_or_rgb(image), "PNG", compress_level=1)
 
 
 def mask_picture(mask: Tensor, tint: tuple[int, int, int] = TINTS[0]) -> bytes:

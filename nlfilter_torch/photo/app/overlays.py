@@ -10,11 +10,11 @@ from nlfilter_torch.photo.selections.stray_parts import stray_parts
 
 
 class Overlays:
-    """Caches the last result for each, since it is asked for whenever the picture is drawn."""
+    """Both overlays of a picture; each result is kept, since it is asked for whenever the picture is drawn."""
 
     def __init__(self) -> None:
         self._selected: tuple[Tensor, Step, Tensor | None] | None = None
-        self._ignored: tuple[Step, Tensor | None] | None = None
+        self._ignored: tuple[Tensor, Step, Tensor | None] | None = None
 
     def selected(self, step: Step, image: Tensor, stride: float = 1) -> Tensor | None:
         """The mask (1, 1, h, w) of what the scribbles of a step select; None if there are none, or all is changed.
@@ -28,9 +28,9 @@ class Overlays:
 
     def ignored(self, step: Step, image: Tensor) -> Tensor | None:
         """Which pixels (1, 1, h, w) under the scribbles of a step do not count, or None."""
-        if self._ignored is None or self._ignored[0] != step:
-            self._ignored = step, _ignored(step, image)
-        return self._ignored[1]
+        if self._ignored is None or self._ignored[0] is not image or self._ignored[1] != step:
+            self._ignored = image, step, _ignored(step, image)
+        return self._ignored[2]
 
 
 def _is_painted(step: Step) -> bool:

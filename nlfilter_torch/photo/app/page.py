@@ -68,6 +68,7 @@ class Editor:
         self.session = photographs.new()
         self._told: str | None = None  # the last trouble of the session that was shown
         self._token = secrets.token_urlsafe(16)
+        self._openings = 0  # photographs that were opened, so that browsers do not show thumbnails of another
         self._wanted: list[int | None] = []  # at most one picture to draw next: the place of a step that moves, or None
         self._drawing = False
 
@@ -112,7 +113,7 @@ class Editor:
     def _thumbnail(self, look: str) -> str:
         """The address of a picture of the photograph under a look, or "" if there is none."""
         kind = f"look-{look}"
-        return f"/picture/{self._token}/{kind}?{self.session.address}" if kind in self._canvas.pictures else ""
+        return f"/picture/{self._token}/{kind}?{self._openings}" if kind in self._canvas.pictures else ""
 
     def _tell(self, script: str) -> None:
         if not self._client.is_deleted:
@@ -324,12 +325,15 @@ class Editor:
         opened = self.session.opened
         if opened is None or self._client.is_deleted:
             return
+        self._openings += 1
         self._title.set_text(opened.name)
         self._tasks.clear_error()
         self._closeup.open(self.session)
         with self._client:
             self._canvas.open(self.session, opened.preview.pixels, opened.photograph.size)
         pictures = await self._tasks.run("Opening", partial(thumbnails, opened.preview.pixels))
+        if self.session.opened is not opened or self._client.is_deleted:  # meanwhile
+            return
         self._canvas.pictures |= {f"look-{look}": content for look, content in pictures.items()}
         self.follow()
         with self._client:

@@ -381,6 +381,7 @@ class Session:
         """
         target, opened = self.check_photograph(name), self._opened_to("save")
         recipe, photograph = self.recipe, opened.photograph
+        size = reduced_size(photograph, options.side)
         pixels = self._edited_at_once(recipe, report)
         if pixels is None:
             rows = photograph.pixels[0].permute(1, 2, 0).numpy()
@@ -389,7 +390,7 @@ class Session:
             for part, values in edit_rows(self._passes(photograph, report), rows, recipe.steps, opened.name):
                 pixels[0, :, part] = torch.from_numpy(values).permute(2, 0, 1)
         report("Writing", 0, 1)
-        write_photograph(reduced(photograph.with_pixels(pixels), options.side), target, quality=options.quality)
+        write_photograph(resized(photograph.with_pixels(pixels), size), target, quality=options.quality)
         self.saved = recipe
         return target
 
@@ -413,19 +414,25 @@ class Session:
         self.load(Recipe.from_file(content, name))
 
 
-def reduced(photograph: Photograph, side: int | None) -> Photograph:
-    """A photograph whose longest side has at most that many pixels.
+def reduced_size(photograph: Photograph, side: int | None) -> tuple[int, int]:
+    """(height, width) of a photograph whose longest side is to have at most ``side`` pixels.
 
     Raises:
-        ValueError: if some of its pixels hold no data, which have no place in another size.
+        ValueError: if it is smaller than now, and some pixels hold no data, which have no place in another size.
     """
     height, width = photograph.size
     if side is None or side >= max(height, width):
-        return photograph
+        return height, width
     if photograph.hidden is not None:
         raise ValueError("a photograph with pixels without data must be saved in its own size; leave the size as it is")
     scale = side / max(height, width)
-    size = (max(1, round(height * scale)), max(1, round(width * scale)))
+    return max(1, round(height * scale)), max(1, round(width * scale))
+
+
+def resized(photograph: Photograph, size: tuple[int, int]) -> Photograph:
+    """A photograph at another size (height, width)."""
+    if size == photograph.size:
+        return photograph
     pixels = resize(photograph.pixels.clamp(0, 1) if photograph.depth.startswith("uint") else photograph.pixels, size)
     alpha = None if photograph.alpha is None else resize(photograph.alpha, size).clamp(0, 1)
     return replace(photograph, pixels=pixels, alpha=alpha, exif=read_upright(photograph.exif, size=size[::-1]).block)

@@ -10,6 +10,12 @@ from nlfilter_torch.photo.app.controls import SteadySlider
 from nlfilter_torch.photo.declared.presets import Recipe
 
 Replace = Callable[[Recipe, int | None], None]  # a new edit, and the place of the step whose slider moves, or None
+#: What the buttons of a step do.
+TIPS = {
+    "up": "Apply this step earlier",
+    "down": "Apply this step later",
+    "remove": "Remove this step; Undo brings it back",
+}
 
 
 def listed(recipe: Recipe) -> tuple[tuple[int, str], ...]:
@@ -107,9 +113,8 @@ class StepList:
 
     @staticmethod
     def _button(name: str, action: str, icon: str, enabled: bool, act: Callable[[], None]) -> None:
-        tip = "Remove this step; Undo brings it back" if action == "remove" else f"Apply this step {_WHEN[action]}"
         button = ui.button(icon=icon, on_click=act).props(f'flat dense size=sm aria-label="{name}: {action}"')
-        button.tooltip(tip).set_enabled(enabled)
+        button.tooltip(TIPS[action]).set_enabled(enabled)
 
     def _switch(self, place: int, on: bool) -> None:
         if not self._following:
@@ -119,10 +124,10 @@ class StepList:
     def _mix(self, place: int, percent: float | None, moving: int | None) -> None:
         if not self._following and percent is not None:
             recipe = self._recipe()
-            self._rows_at(place).value.set_text(f"{percent:.0f} %")
+            self._row_at(place).value.set_text(f"{percent:.0f} %")
             self._replace(recipe.replaced(place, recipe.steps[place].mixed(opacity=percent / 100)), moving)
 
-    def _rows_at(self, place: int) -> Row:
+    def _row_at(self, place: int) -> Row:
         return next(row for row in self._rows if row.place == place)
 
     def _move(self, place: int, to: int) -> None:
@@ -130,6 +135,3 @@ class StepList:
 
     def _remove(self, place: int) -> None:
         self._replace(self._recipe().replaced(place), None)
-
-
-_WHEN = {"up": "earlier", "down": "later"}

@@ -286,16 +286,18 @@ class Recoloring:
                 share = torch.lerp(share, masks[:, k : k + 1] * self.valid[:, k, None, None, None], sides.trust)
             share = sides.refine(compared, share)
             # Colour of the object's part of a mixed pixel; inside the object, that of the pixel.
-            thing = torch.addcmul(compared, 1 - share, sides.across)
-            light, thing_chroma = (None, thing) if self.brightening is None else split_luminance(thing.clamp(0.0, 1.0))
-            relative = self.relative(k, thing_chroma, light)
+            object_colour = torch.addcmul(compared, 1 - share, sides.across)
+            object_luminance, object_chroma = None, object_colour
+            if self.brightening is not None:
+                object_luminance, object_chroma = split_luminance(object_colour.clamp(0.0, 1.0))
+            relative = self.relative(k, object_chroma, object_luminance)
             factor = share * relative.clamp(0.0, 1.5)
-            if self.brightening is not None and light is not None:
-                new = self.brightening(k, light, relative)
-                brightness = torch.addcmul(brightness, share, new - light)
+            if self.brightening is not None and object_luminance is not None:
+                new = self.brightening(k, object_luminance, relative)
+                brightness = torch.addcmul(brightness, share, new - object_luminance)
                 factor = factor * in_gamut(new, relative.clamp(0.0, 1.5) * self.colours[:, k, :, None, None])
             changed = torch.addcmul(changed, factor, self.colours[:, k, :, None, None])
-            changed = torch.addcmul(changed, share, thing_chroma, value=-1)
+            changed = torch.addcmul(changed, share, object_chroma, value=-1)
             total = total + share
         untouched = (total == 0).expand_as(pixels)
         return torch.where(untouched, pixels, merge_luminance(brightness.clamp(0.0, 1.0), changed))
