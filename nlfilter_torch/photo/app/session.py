@@ -423,16 +423,17 @@ def reduced_size(photograph: Photograph, side: int | None) -> tuple[int, int]:
     height, width = photograph.size
     if side is None or side >= max(height, width):
         return height, width
-    if photograph.hidden is not None:
+    if photograph.hidden is not None and photograph.hidden.nodata is not None:
         raise ValueError("a photograph with pixels without data must be saved in its own size; leave the size as it is")
     scale = side / max(height, width)
     return max(1, round(height * scale)), max(1, round(width * scale))
 
 
 def resized(photograph: Photograph, size: tuple[int, int]) -> Photograph:
-    """A photograph at another size (height, width)."""
+    """A photograph at another size (height, width); hidden pixels have colours of pixels nearby."""
     if size == photograph.size:
         return photograph
     pixels = resize(photograph.pixels.clamp(0, 1) if photograph.depth.startswith("uint") else photograph.pixels, size)
     alpha = None if photograph.alpha is None else resize(photograph.alpha, size).clamp(0, 1)
-    return replace(photograph, pixels=pixels, alpha=alpha, exif=read_upright(photograph.exif, size=size[::-1]).block)
+    exif = read_upright(photograph.exif, size=size[::-1]).block
+    return replace(photograph, pixels=pixels, alpha=alpha, exif=exif, hidden=None)

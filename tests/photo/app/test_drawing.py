@@ -24,6 +24,7 @@ def test_pictures() -> None:
     layer = decoded(drawing.mask_picture(mask))
     assert layer.shape == (100, 150, 4)
     assert (layer[0, 0, 3], layer[-1, -1, 3]) == (0, drawing.OPACITY)
+    assert decoded(drawing.picture(torch.rand(1, 3, 1, 40))).shape == (1, 40, 3)
 
 
 def test_the_mask_contrasts_with_the_picture() -> None:

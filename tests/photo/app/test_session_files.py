@@ -4,16 +4,17 @@ import io
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import psutil
 import pytest
 from PIL import Image
 
 from nlfilter_torch.__main__ import main
 from nlfilter_torch.operator.features import reduce_channels
-from nlfilter_torch.photo.app.session import FileOptions, Session
+from nlfilter_torch.photo.app.session import FileOptions, Session, reduced_size
 from nlfilter_torch.photo.declared.presets import find_recipe
 from nlfilter_torch.photo.edits.applying import apply_recipe
-from nlfilter_torch.photo.io.photographs import Photograph, read_photograph, write_photograph
+from nlfilter_torch.photo.io.photographs import HiddenPixels, Photograph, read_photograph, write_photograph
 from nlfilter_torch.photo.picture.resizing import resize
 from tests.problems import LINE, cat, difference
 
@@ -50,11 +51,16 @@ def test_a_size_and_a_quality(session: Session, photo: Path) -> None:
     assert whole.size == (100, 150)
     half = read_photograph(session.save("d.png", options=FileOptions(side=75)))
     assert difference(half.pixels, resize(whole.pixels, (50, 75)).clamp(0, 1)) <= 1.5
-    write_photograph(replace(whole, alpha=whole.pixels[:, :1]), photo.with_name("alpha.png"))
+    alpha = whole.pixels[:, :1].clone()
+    alpha[..., :40] = 0
+    write_photograph(replace(whole, alpha=alpha), photo.with_name("alpha.png"))
     session.open(photo.with_name("alpha.png"))
     halves = read_photograph(session.save("e.png", options=FileOptions(side=75)))
     assert halves.alpha is not None
     assert halves.alpha.shape == (1, 1, 50, 75)
+    hidden = HiddenPixels(np.zeros((100, 150), bool), np.zeros((0, 3), np.uint8), nodata=0)
+    with pytest.raises(ValueError, match="pixels without data must be saved in its own size"):
+        reduced_size(replace(whole, hidden=hidden), 75)
 
 
 def test_sliders_alone_are_a_preset_of_detail(session: Session, photo: Path) -> None:
