@@ -157,14 +157,18 @@ class Canvas:
         mask = None
         if EDITS[step].regional is not None or (keep and not moving):
             mask = session.mask(step)
-        tint = drawing.TINTS[0] if mask is None else drawing.contrasting_tint(self._edited, mask)
-        plain = keep and bool(self._is_plain.value)
-        content = b"" if mask is None else drawing.lossless(mask) if plain else drawing.mask_picture(mask, tint)
+        content = b"" if mask is None else self._mask_file(mask)
         ignored = None if moving else session.ignored(step)
         if step == self._step:  # another tab may have been opened meanwhile
             self.pictures["mask"] = content
             if not moving:
                 self.pictures["ignored"] = b"" if ignored is None else drawing.hatching(ignored)
+
+    def _mask_file(self, mask: Tensor) -> bytes:
+        """A mask as it is to be shown: in a colour, or in black and white."""
+        if self._show_mask.value and self._is_plain.value:
+            return drawing.lossless(mask)
+        return drawing.mask_picture(mask, drawing.contrasting_tint(self._edited, mask))
 
     def show_layers(self) -> None:
         """Show what :meth:`lay_over` has computed."""

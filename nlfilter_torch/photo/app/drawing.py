@@ -52,7 +52,7 @@ def lossless(image: Tensor) -> bytes:
     return _encode(_grey_or_rgb(image), "PNG", compress_level=1)
 
 
-def mask_picture(mask: Tensor, tint: tuple[int, int, int] = TINTS[0]) -> bytes:
+def mask_picture(mask: Tensor, tint: tuple[int, int, int]) -> bytes:
     """A mask (1, 1, H, W) in [0, 1] as a tinted, transparent PNG."""
     alpha = (mask[0, 0] * OPACITY).round().to(torch.uint8).numpy()
     layer = np.empty((*alpha.shape, 4), np.uint8)

@@ -66,4 +66,7 @@ class LookTab(EditTab):
         super()._build()
 
     def _choose(self, name: str) -> None:
-        self._link.change(self._edit, entries_of(LOOKS[name]), True)
+        entries = entries_of(LOOKS[name])
+        if self._link.recipe().last(self._edit)[AMOUNT] == 0:
+            entries[AMOUNT] = 1.0  # a look that is chosen is to be seen
+        self._link.change(self._edit, entries, True)

@@ -65,8 +65,8 @@ def preset_option(help: str, *, plain: bool = True) -> object:
             context.default_map = {entry: option_value(step.declared[entry], value) for entry, value in step.values}
         elif plain and name is not None and preset_step(find_recipe(name), DETAIL) is None:
             raise ValueError(
-                f"--preset must hold a look or a single detail step, without strokes and at full opacity, got {name}; "
-                "use nlfilter-torch apply, which accepts any edit"
+                "--preset must hold a look or a single detail step, without strokes, switched on and at full opacity, "
+                f"got {name}; use nlfilter-torch apply, which accepts any edit"
             )
         return name
 

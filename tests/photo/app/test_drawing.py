@@ -21,7 +21,7 @@ def test_pictures() -> None:
     assert (decoded_picture - image).square().mean().sqrt() * 255 < 3
     assert decoded(drawing.picture(image[:, :1])).shape == (100, 150)
     mask = torch.linspace(0, 1, 15000).view(1, 1, 100, 150)
-    layer = decoded(drawing.mask_picture(mask))
+    layer = decoded(drawing.mask_picture(mask, drawing.TINTS[0]))
     assert layer.shape == (100, 150, 4)
     assert (layer[0, 0, 3], layer[-1, -1, 3]) == (0, drawing.OPACITY)
     assert decoded(drawing.picture(torch.rand(1, 3, 1, 40))).shape == (1, 40, 3)

@@ -38,6 +38,9 @@ def test_a_look_is_chosen(client: Client) -> None:
     shown.show(tab, Recipe((LOOKS["faded"].changed(amount=0.4),)))
     assert [n for n, button in buttons(shown).items() if button.props["aria-pressed"] == "true"] == ["faded"]
     assert shown.of(ui.slider)[0].enabled
+    shown.show(tab, Recipe((LOOKS["faded"].changed(amount=0.0),)))
+    shown.click("warm")
+    assert shown.changes.pop()[1] == {**entries_of(LOOKS["warm"]), "amount": 1.0}
 
 
 def test_pictures_show_the_looks() -> None:

@@ -78,6 +78,7 @@ ALPHA = (3.0, 1.0, 1.0, 1.0)
 def test_a_photograph_is_opened(opened: Page, photo: Path, scripts: list[str]) -> None:
     editor = opened.editor
     assert editor._title.text == "cat.png"
+    assert editor._thumbnail("warm").endswith("/look-warm?1")
     assert editor.session.opened is not None
     assert opened.picture("before") == opened.picture("after") == drawing.picture(cat())
     assert not opened.picture("mask")
