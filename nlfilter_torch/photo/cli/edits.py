@@ -21,11 +21,16 @@ DETAIL_OPTIONS = tuple(p.name for p in EDITS["detail"] if p.is_option and p.name
 NUMBERS: dict[Kind, type[float]] = {"number": float, "count": int, "odd": int}
 
 
+def _only_step(recipe: Recipe) -> Step | None:
+    """The only step of a recipe, if it is switched on and at full opacity, since commands have no options for these."""
+    step = recipe.steps[0] if len(recipe.steps) == 1 else None
+    return step if step is not None and step.on and step.opacity == 1 else None
+
+
 def plain_step(recipe: Recipe) -> Step | None:
     """The only step of a recipe, if options of a command that takes presets can express it."""
-    step = recipe.steps[0] if len(recipe.steps) == 1 else None
-    is_plain = step is not None and step.declared.presets and not step.strokes and step.on and step.opacity == 1
-    return step if is_plain else None
+    step = _only_step(recipe)
+    return step if step is not None and step.declared.presets and not step.strokes else None
 
 
 def typed_options(context: typer.Context, names: Iterable[str]) -> list[str]:
@@ -49,8 +54,8 @@ def other_recipe(context: typer.Context, preset: str, names: Iterable[str]) -> R
 
 def preset_step(recipe: Recipe, edit: Edit) -> Step | None:
     """The only step of a recipe, if the command of an edit takes it as it is."""
-    step = recipe.steps[0] if len(recipe.steps) == 1 else None
-    return step if step is not None and step.edit in edit.presets and step.on else None
+    step = _only_step(recipe)
+    return step if step is not None and step.edit in edit.presets else None
 
 
 def preset_option(help: str, *, plain: bool = True) -> object:

@@ -108,6 +108,7 @@ def test_preset_keeps_every_entry() -> None:
         ("[1, 2]", "look.json is not a preset: it must hold a list of steps"),
         ('{"bandwidth": 3}', "look.json is not a preset: it must hold a list of steps"),
         ('{"version": 1, "steps": [{"edit": "tone"}]}', "--preset must hold a look or a single detail step, without"),
+        ('{"version": 1, "steps": [{"edit": "look", "opacity": 0.5}]}', "switched on and at full opacity, got"),
         ('{"alpha": [2, 1]}', "look.json is not a preset: it must hold a list of steps"),
         (
             detail_file('"alpha": [1]'),
