@@ -23,7 +23,7 @@ from nlfilter_torch.photo.cli.edits import (
 from nlfilter_torch.photo.cli.interrupts import INTERRUPTED
 from nlfilter_torch.photo.declared.looks import LOOKS
 from nlfilter_torch.photo.declared.parameters import EDITS
-from nlfilter_torch.photo.declared.presets import PRESETS
+from nlfilter_torch.photo.declared.presets import PRESETS, named_recipe
 
 if TYPE_CHECKING:
     from nlfilter_torch.photo.cli.folders import Tally
@@ -105,7 +105,7 @@ def batch(
     settings = {**values, "seed": seed}
     edit: Callable[..., object] = partial(edit_photograph, EDITS["detail"], **settings)
     if preset is not None and (recipe := other_recipe(context, preset, settings)) is not None:
-        settings, edit = {"recipe": recipe.to_json()}, partial(apply, preset=[str(Path(preset).absolute())])
+        settings, edit = {"recipe": recipe.to_json()}, partial(apply, preset=[_absolute(preset)])
     paths = pictures(folder)
     if quality is not None:
         check_quality_of(paths, quality)
@@ -144,6 +144,11 @@ def batch(
         raise typer.Exit(INTERRUPTED)
     if tally.failures or tally.left:
         raise typer.Exit(1)
+
+
+def _absolute(preset: str) -> str:
+    """A preset's name, or the absolute path of its file, since workers may run in other folders."""
+    return preset if named_recipe(preset) is not None else str(Path(preset).absolute())
 
 
 def _edit_at_quality(edit: Callable[..., object], quality: int, source: str, target: str, **limits: Any) -> None:

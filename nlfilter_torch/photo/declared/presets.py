@@ -223,6 +223,14 @@ PURPOSES: dict[str, str] = {
 }
 
 
+def named_recipe(name: str) -> Recipe | None:
+    """Return the preset or look of that name, or None."""
+    spoken = name.lower().replace("-", " ").replace("_", " ")
+    if spoken in LOOKS:
+        return Recipe((LOOKS[spoken],))
+    return PRESETS.get(spoken)
+
+
 def find_recipe(name: str) -> Recipe:
     """Return the preset or look of that name (``soft-skin`` is ``soft skin``), or read the file at that path.
 
@@ -235,11 +243,9 @@ def find_recipe(name: str) -> Recipe:
         >>> find_recipe("soft-skin").steps[0]["alpha"]
         (0.1, 0.4, 1.0, 1.0)
     """
-    spoken = name.lower().replace("-", " ").replace("_", " ")
-    if spoken in PRESETS:
-        return PRESETS[spoken]
-    if spoken in LOOKS:
-        return Recipe((LOOKS[spoken],))
+    named = named_recipe(name)
+    if named is not None:
+        return named
     path = Path(name)
     if not path.is_file():
         raise ValueError(

@@ -160,6 +160,7 @@ def test_the_quality_of_jpeg_files(
         ("usual", ("--preset", preset)),
         ("small", ("--preset", preset, "--quality", 30)),
         ("detail", ("--quality", 30, *OPTIONS)),
+        ("named", ("--preset", "Faded")),
     ):
         assert main(["batch", str(source), str(tmp_path / name), *map(str, options)]) == 0
     steps = {}
