@@ -82,7 +82,8 @@ PresetName = Annotated[
     str | None,
     preset_option(
         f"One of {', '.join((*PRESETS, *LOOKS))} (see `nlfilter-torch presets`), or a file written by `nlfilter-torch "
-        "fit`. It replaces the defaults of the other options; options on the command line override it."
+        "fit`. It replaces the defaults of the other options; options on the command line override it, unless it is a "
+        "look."
     ),
 ]
 #: The option ``--region`` for each kind of scribbles on an object.

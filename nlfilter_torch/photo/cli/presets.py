@@ -1,4 +1,4 @@
-"""``nlfilter-torch presets``: list the named presets."""
+"""``nlfilter-torch presets``: list the named presets and looks."""
 
 from typing import Annotated
 
@@ -9,12 +9,14 @@ from nlfilter_torch.photo.declared.presets import PRESETS, PURPOSES, find_recipe
 
 Name = Annotated[
     str | None,
-    typer.Argument(metavar="NAME", help="Print this preset as JSON, to be edited and passed to `detail --preset`."),
+    typer.Argument(
+        metavar="NAME", help="Print this preset or look as JSON, to be edited and passed to `detail --preset`."
+    ),
 ]
 
 
 def presets(name: Name = None) -> None:
-    """List the presets for `nlfilter-torch detail --preset NAME`, or print one of them as a file.
+    """List the presets and looks for `nlfilter-torch detail --preset NAME`, or print one of them as a file.
 
     To start one of your own: `nlfilter-torch presets crisp > mine.json`
     """
