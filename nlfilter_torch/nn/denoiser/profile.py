@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from nlfilter_torch.core.checks import check_image, check_same_size
-from nlfilter_torch.core.precision import full_precision, per_image, working_dtype
+from nlfilter_torch.core.precision import full_precision, per_image, squarable, working_dtype
 from nlfilter_torch.nn.denoiser.colours import split_colours
 
 KNOTS = 6  # brightnesses at which levels are known: 0, 0.2, ... 1
@@ -137,7 +137,7 @@ def profile_of_difference(noisy: Tensor, clean: Tensor) -> NoiseProfile:
     check_same_size(clean, (noisy.shape[-2], noisy.shape[-1]), "clean", "noisy")
     dtype = working_dtype(noisy)
     picture = clean.to(dtype)
-    planes = _planes_of(noisy.to(dtype) - picture)
+    planes = _planes_of(squarable(noisy.to(dtype) - picture))
     light = picture.mean(1, keepdim=True).clamp(0, 1)
     levels = [_levels(planes, light, scale) for scale in NoiseProfile.SCALES]
     return NoiseProfile(torch.stack(levels, dim=1), light.mean((1, 2, 3)))

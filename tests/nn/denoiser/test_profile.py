@@ -94,3 +94,12 @@ def test_small_pictures(size: tuple[int, int], channels: int) -> None:
 def test_images_of_different_sizes_are_refused() -> None:
     with pytest.raises(ValueError, match="clean must have the height and width of the noisy, 4x4, got 4x5; resize"):
         profile_of_difference(torch.rand(1, 3, 4, 4), torch.rand(1, 3, 4, 5))
+
+
+def test_levels_are_finite_beside_a_pixel_of_1e20() -> None:
+    clean = grey(0.5)
+    noisy = clean.clone()
+    noisy[..., 3, 5] = 1e20
+    profile = profile_of_difference(noisy, clean)
+    assert profile.levels.isfinite().all()
+    assert profile.level > 1e3
