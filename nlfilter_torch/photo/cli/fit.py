@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from nlfilter_torch.photo.cli import options
-from nlfilter_torch.photo.cli.edits import step_of, with_options
+from nlfilter_torch.photo.cli.edits import options_of, step_of, with_options
 from nlfilter_torch.photo.cli.fit_tables import Cube, Hald, Tables
 from nlfilter_torch.photo.declared.json_values import Value
 from nlfilter_torch.photo.declared.parameters import EDITS
@@ -350,7 +350,7 @@ def _report_steps(own: "FittedSteps", looks: "Sequence[FittedLook]", share: floa
     for name, (fitted, left_out) in rows.items():
         typer.echo(f"{name:40}{100 * fitted:7.1f} %{100 * left_out:8.1f} %")
     for number, step in enumerate(own.steps, 1):
-        typer.echo(f"step {number}: {step.edit} {step.as_options()}")
+        typer.echo(f"step {number}: {step.edit} {options_of(step)}")
     others = "parts of the picture left out of the fit" if alone else "other photographs"
     typer.echo(f"explained: {100 * share:.1f} % of the change, {100 * own.left_out:.1f} % in {others}")
     typer.echo(f"preset: {path}")

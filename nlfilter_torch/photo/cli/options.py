@@ -146,26 +146,15 @@ Insist = Annotated[
         rich_help_panel=FILES_PANEL,
     ),
 ]
-Quality = Annotated[
-    int | None,
-    typer.Option(
-        min=1,
-        max=100,
-        metavar="1-100",
-        help="Quality of a JPEG file. Default: 95.",
-        rich_help_panel=FILES_PANEL,
-    ),
-]
-QualityOfFolder = Annotated[
-    int | None,
-    typer.Option(
-        min=1,
-        max=100,
-        metavar="1-100",
-        help="Quality of the JPEG files; others are not affected. Default: 95.",
-        rich_help_panel=FILES_PANEL,
-    ),
-]
+
+
+def quality(help: str) -> object:
+    """The option ``--quality``."""
+    return typer.Option(min=1, max=100, metavar="1-100", help=f"{help} Default: 95.", rich_help_panel=FILES_PANEL)
+
+
+Quality = Annotated[int | None, quality("Quality of a JPEG file.")]
+QualityOfFolder = Annotated[int | None, quality("Quality of the JPEG files; others are not affected.")]
 Workers = Annotated[
     int | None,
     typer.Option(

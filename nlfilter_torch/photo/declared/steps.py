@@ -166,25 +166,6 @@ class Step:
         lines = ",\n".join(f'{indent}  "{name}": {value}' for name, value in entries)
         return f"{indent}{{\n{lines}\n{indent}}}"
 
-    def as_options(self) -> str:
-        """Options of the command of the edit that differ from the defaults, without those of strokes.
-
-        >>> Step("detail", alpha=(2.0, 1.0), threshold=0.0).as_options()
-        '--alpha 2,1 --threshold 0'
-        """
-        values = {p.name: self[p.name] for p in self.declared if p.is_option and self[p.name] != p.default}
-        if not values:
-            return "with its defaults"
-        texts = {
-            name: ",".join(f"{number:g}" for number in value)
-            if isinstance(value, tuple)
-            else f"{value:g}"
-            if isinstance(value, int | float)
-            else str(value)
-            for name, value in values.items()
-        }
-        return " ".join(f"--{name.replace('_', '-')} {text}" for name, text in texts.items())
-
     @staticmethod
     def from_entries(edit: str, entries: dict[str, object], place: str) -> "Step":
         """Create a step from parsed JSON.

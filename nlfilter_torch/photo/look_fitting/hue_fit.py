@@ -5,14 +5,14 @@ the light: products of six hats on the circle of hues with few functions. They a
 other parts of a look leave, and sampled on the grid of a lattice, to which they are added. Greys stay as they are.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from nlfilter_torch.operator.features import reduce_channels
 from nlfilter_torch.photo.look_fitting.lattice_fit import LOOSER, ColourChange
-from nlfilter_torch.photo.looks.lattice import colours_of_nodes, lattice_change
+from nlfilter_torch.photo.looks.lattice import colours_of_nodes
 
 HUES = 6  # hats, at red, yellow, green, cyan, blue and magenta
 NODES = 17  # of the grid that the changes are sampled on
@@ -82,16 +82,6 @@ def fit_hues(pixels: ColourChange) -> list[Tensor]:
     ridge, solved = best
     solved.append(_sums(few, columns, even, number).solve(ridge))
     return [_change(nodes, parameters).view(3, NODES, NODES, NODES) for parameters in solved]
-
-
-def changed(pixels: ColourChange, lattices: list[Tensor]) -> ColourChange:
-    """The pixels, whose looks are followed by lattices (3, n, n, n)."""
-    colours = pixels.before[None, :, None]
-    predicted = [
-        result + lattice_change(colours, lattice)[0, :, 0]
-        for result, lattice in zip(pixels.predicted, lattices, strict=True)
-    ]
-    return replace(pixels, predicted=predicted)
 
 
 def _change(columns: Tensor, parameters: Tensor) -> Tensor:

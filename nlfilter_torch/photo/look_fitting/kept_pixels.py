@@ -8,7 +8,7 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
-from nlfilter_torch.photo.look_fitting.hue_fit import changed, fit_hues
+from nlfilter_torch.photo.look_fitting.hue_fit import fit_hues
 from nlfilter_torch.photo.look_fitting.lattice_details import refined
 from nlfilter_torch.photo.look_fitting.lattice_fit import ColourChange, FittedLattice, fit_lattice
 from nlfilter_torch.photo.look_fitting.look_choice import SHRINK, SLACK, Candidate
@@ -175,12 +175,12 @@ class KeptPixels(ThinnedPixels):
         looks = [basis.fitted_to(reduce(Sums.__add__, sums), layout) for sums in others]
         plain = self.change(self._predicted(looks, layout), group)
         hues = fit_hues(plain)
-        colours = more = changed(plain, hues)
+        colours = more = plain.followed_by(hues)
         lattice = fit_lattice(colours)
         if is_of_colours(basis.parts) and len(self.colours) > len(self):
             more = self.colours.change([], self._groups(self.colours))
             more = replace(more, predicted=[coloured(more.before, look, layout) for look in (looks[0], looks[-1])])
-            more = changed(more, [hues[0], hues[-1]])
+            more = more.followed_by([hues[0], hues[-1]])
         lattice = refined(more, lattice)
         if bool(hues[-1].any()):
             lattice = replace(lattice.with_more(hues[-1]), without=plain.explained())

@@ -18,7 +18,7 @@ from nlfilter_torch.photo.look_fitting.lattice_fit import (
     Problem,
     conjugate_gradients,
 )
-from nlfilter_torch.photo.looks.lattice import lattice_change, resampled
+from nlfilter_torch.photo.looks.lattice import resampled
 
 GRIDS = (17, 33)  # numbers of nodes along each axis
 AGAIN = 2  # more rounds on the finest grid where values are clipped: each sees anew which results are beyond the ends
@@ -71,13 +71,9 @@ def _rest(pixels: ColourChange, lattice: FittedLattice, nodes: int) -> Problem:
 
     Of its three predictions, the first is by looks without the first fold, and the last by those of all.
     """
-    colours = pixels.before[None, :, None]
-    first, all_of = (
-        predicted + lattice_change(colours, changes)[0, :, 0]
-        for predicted, changes in ((pixels.predicted[0], lattice.first), (pixels.predicted[-1], lattice.changes))
-    )
-    left = replace(pixels, predicted=[first, first, all_of], folds=pixels.folds.clamp(max=1))
-    return Problem.of(left, nodes)
+    ends = replace(pixels, predicted=[pixels.predicted[0], pixels.predicted[-1]])
+    first, all_of = ends.followed_by([lattice.first, lattice.changes]).predicted
+    return Problem.of(replace(pixels, predicted=[first, first, all_of], folds=pixels.folds.clamp(max=1)), nodes)
 
 
 @dataclass(frozen=True)

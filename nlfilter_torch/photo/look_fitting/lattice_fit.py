@@ -8,6 +8,7 @@ along each axis.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Protocol
@@ -16,7 +17,7 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.core.kernels.lattice import corners
-from nlfilter_torch.photo.looks.lattice import resampled
+from nlfilter_torch.photo.looks.lattice import lattice_change, resampled
 
 SMOOTH = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6)  # strengths of the penalty on second derivatives
 RIDGE = 1e-3  # of the changes where there are no pixels, see :meth:`Penalised.ridge`
@@ -60,6 +61,15 @@ class ColourChange:
         folds = range(len(self.predicted) - 1)
         left = sum(self.energy(self.left(0.0, fold), fold) for fold in folds)
         return 1 - left / max(self.energy(self.after - self.before), 1e-30)
+
+    def followed_by(self, lattices: Sequence[Tensor]) -> "ColourChange":
+        """The pixels, each of whose looks is followed by a lattice (3, n, n, n)."""
+        colours = self.before[None, :, None]
+        predicted = [
+            result + lattice_change(colours, lattice)[0, :, 0]
+            for result, lattice in zip(self.predicted, lattices, strict=True)
+        ]
+        return replace(self, predicted=predicted)
 
     def energy(self, rest: Tensor, fold: int | None = None) -> float:
         """Weighted sum of squares of values (3, P), of all or of a fold."""

@@ -11,11 +11,12 @@ from torch import Tensor
 
 from nlfilter_torch.photo.picture.colour import dot
 from nlfilter_torch.photo.selections.pyramid import doubled, halved, pyramid_levels
+from nlfilter_torch.photo.selections.trimap import by_trimap
 
 WINDOW_RADIUS, NOISE = 2, 1e-6  # radius of the windows in which masks are linear in colour; variance of noise
 LINEAR_LEVELS, LINEAR_STEPS = 2, 24  # levels of the pyramid, steps on each
 # Mask values closer than this to 0 or 1 are set to 0 or 1: of a few scribbles, and of a trimap.
-END_MARGIN, END_MARGIN_OF_TRIMAP = 0.1, 0.05
+END_MARGIN = (0.1, 0.05)
 SLOWEST = 0.005  # smallest eigenvalue that the steps damp
 # Confidence in a rough mask of 0 or 1, and in scribbles.
 LINEAR_ROUGH_CONFIDENCE, LINEAR_SCRIBBLE_CONFIDENCE = 3e-3, 10.0
@@ -119,7 +120,7 @@ def solve_linear(
     assert coarser is not None  # for mypy
     functions = torch.stack([models[0].fit(mask.clamp(0.0, 1.0).double()) for mask in coarser.split(1, 1)], dim=1)
     slopes, constant = functions.tensor_split([-1], dim=2)
-    margin = (END_MARGIN + (END_MARGIN_OF_TRIMAP - END_MARGIN) * trimap)[:, :, None, None, None]
+    margin = by_trimap(END_MARGIN, trimap)[:, :, None, None, None]
     return (torch.cat([slopes, constant - margin], dim=2) / (1 - 2 * margin)).to(start)
 
 

@@ -35,8 +35,8 @@ from nlfilter_torch.photo.selections.closed_form import LinearMasks, linear_mask
 from nlfilter_torch.photo.selections.connected import Extent, connected
 from nlfilter_torch.photo.selections.random_walker import solve_mask
 from nlfilter_torch.photo.selections.rough_mask import RoughMasks
-from nlfilter_torch.photo.selections.scribbled_colours import trimap_share
 from nlfilter_torch.photo.selections.stray import without_strays
+from nlfilter_torch.photo.selections.trimap import trimap_share
 
 SOLVED = 1 << 17  # pixels
 VIEWED = VIEWING_SIZE.default_number  # megapixels; larger pictures are first reduced to this size

@@ -22,7 +22,6 @@ from nlfilter_torch.photo.picture.resizing import block_means, enlarged
 from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles, scribbled_blocks
 from nlfilter_torch.photo.picture.source import Blocks, Guide, Operator, Planes, Reduced
 from nlfilter_torch.photo.selections.scribbled_colours import (
-    by_trimap,
     colour_likelihood,
     evenness,
     frame_places,
@@ -30,9 +29,9 @@ from nlfilter_torch.photo.selections.scribbled_colours import (
     likeness,
     linked_evenly,
     outwards,
-    trimap_share,
 )
 from nlfilter_torch.photo.selections.texture import TEXTURE_MARGIN, with_texture
+from nlfilter_torch.photo.selections.trimap import by_trimap, trimap_share
 
 CHROMA_WEIGHT = 0.7  # weight of hue and saturation; that of lightness is LIGHTNESS
 TEXTURE_WEIGHT = 1.5

@@ -15,6 +15,7 @@ from nlfilter_torch.core.precision import per_image
 from nlfilter_torch.operator.features import blur
 from nlfilter_torch.photo.picture.colour import hundredths_of_lab
 from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles
+from nlfilter_torch.photo.selections.trimap import by_trimap
 
 FRAME_POINTS = 64  # approximate number of points along the upper or left border of a picture
 NUM_COMPARED = 512  # approximate number of scribbled pixels that the frame is compared with
@@ -23,7 +24,6 @@ SIMILAR_SHARE = 0.1  # a frame point similar to this share of the scribbled pixe
 # that comparison as a share of the photometric bandwidth: for a few scribbles, and for a trimap.
 NUM_COLOURS = (32, 128)
 BANDWIDTH_SHARE = (0.4, 0.25)
-SPARSE, DENSE = 0.3, 0.6  # share of a picture under scribbles up to which they are a few, and from which on a trimap
 EVEN_SIGMA = 2.0  # pixels; standard deviation of the surroundings whose evenness is judged
 HALF_EVEN_DEVIATION = 0.007  # standard deviation of colours, in hundredths of Lab, that counts as half even
 UNLINKED, LINKED = 0.25, 0.5  # least evenness along a path up to which it links nothing, and from which on it does
@@ -130,23 +130,6 @@ def evenness(image: Tensor) -> Tensor:
     mean, squares = blur(torch.cat([colours, colours.square()], dim=1), EVEN_SIGMA).chunk(2, dim=1)
     variance = (squares - mean.square()).clamp(min=0.0).mean(1, keepdim=True)
     return 1 / (1 + variance / HALF_EVEN_DEVIATION**2)
-
-
-def trimap_share(painted: Tensor) -> Tensor:
-    """How nearly scribbles are a trimap: 0 for a few of them, 1 for most of the picture, (...).
-
-    Args:
-        painted: weights (..., 2, n), for all pixels, of the scribbles on a region and on its background. 0 is returned
-            where either side has none.
-    """
-    shares = (painted.detach() > 0).to(painted).mean(-1)
-    return ((shares.sum(-1) - SPARSE) / (DENSE - SPARSE)).clamp(0.0, 1.0) * (shares.amin(-1) > 0)
-
-
-def by_trimap(values: tuple[float, float], trimap: Tensor) -> Tensor:
-    """A setting between its values for a few scribbles and for a trimap, by :func:`trimap_share`."""
-    few, most = values
-    return few + (most - few) * trimap
 
 
 def colour_likelihood(

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from nlfilter_torch.photo.look_fitting.hue_fit import changed, fit_hues, hue_columns
+from nlfilter_torch.photo.look_fitting.hue_fit import fit_hues, hue_columns
 from nlfilter_torch.photo.look_fitting.lattice_fit import ColourChange
 from nlfilter_torch.photo.looks.lattice import lattice_change
 
@@ -33,7 +33,7 @@ def test_edits_by_hue_carry_over_to_colours_that_no_pixel_has() -> None:
     sample = pixels(before, greener(before))
     lattices = fit_hues(sample)
     assert len(lattices) == 4
-    assert 1 - changed(sample, lattices).explained() < 0.1
+    assert 1 - sample.followed_by(lattices).explained() < 0.1
     unseen = colours(500, 0.1, 0.9, seed=1)
     shown = unseen + lattice_change(unseen[None, :, None], lattices[-1])[0, :, 0]
     wanted = greener(unseen)

@@ -37,7 +37,8 @@ def test_the_solve_is_that_of_the_linear_system(monkeypatch: pytest.MonkeyPatch)
     target = trust * rough.numpy().ravel() + closed_form.LINEAR_SCRIBBLE_CONFIDENCE * front.numpy().ravel()
     expected = np.linalg.solve(np.diag(1 + trust + certain) - smooth, target)
     solved = closed_form.linear_mask(image - 0.5, functions[:, 0])
-    stretched = (smooth @ expected.clip(0, 1) - closed_form.END_MARGIN) / (1 - 2 * closed_form.END_MARGIN)
+    margin = closed_form.END_MARGIN[0]
+    stretched = (smooth @ expected.clip(0, 1) - margin) / (1 - 2 * margin)
     np.testing.assert_allclose(solved.flatten(), stretched, atol=1e-5)
 
 

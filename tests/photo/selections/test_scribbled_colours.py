@@ -55,15 +55,6 @@ def test_colours_of_a_region_where_it_reaches_the_border_belong_to_it() -> None:
     assert likelihoods(0.1, inside=1.0)[1] > 2 * likelihoods(0.1)[1]
 
 
-def test_scribbles_that_leave_little_open_are_a_trimap() -> None:
-    inside, outside = torch.zeros(3, 10, 10), torch.zeros(3, 10, 10)
-    inside[0, :2], outside[0, -1:] = 1, 1
-    inside[1, :3], outside[1, -4:] = 0.5, 1
-    inside[2] = 1  # no side to tell it from
-    shares = scribbled_colours.trimap_share(torch.stack([inside, outside], dim=1).flatten(2))
-    assert shares.tolist() == [0, 1, 0]
-
-
 @pytest.mark.parametrize("size", [(1, 1), (3, 50), (112, 160), (300, 430), (1, 200_000), (70_000, 3)])
 def test_points_inside_are_few_and_spread_evenly(size: tuple[int, int]) -> None:
     places = scribbled_colours.inner_places(size)
