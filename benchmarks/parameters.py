@@ -109,7 +109,7 @@ def declares(node: ast.AST, name: str) -> bool:
     """Whether a node is ``Parameter("name", ...)``, or a call of a function that creates a parameter."""
     return (
         isinstance(node, ast.Call)
-        and named(node.func) in ("Parameter", "_curve", "number", "gain", "sliders", "choice")
+        and named(node.func) in ("Parameter", "_curve", "number", "gain", "sliders", "choice", "part")
         and isinstance(node.args[0], ast.Constant)
         and node.args[0].value == name
     )

@@ -30,7 +30,13 @@ from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.declared.shared_parameters import VIEWING_SIZE
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.edits.applying import PreparedStep, edit_of, filter_key, over, scribbles_of
-from nlfilter_torch.photo.picture.changes import activity, change_of_mean, limit_by_activity, split_sliders
+from nlfilter_torch.photo.picture.changes import (
+    activity,
+    change_in_parts,
+    change_of_mean,
+    limit_by_activity,
+    split_sliders,
+)
 from nlfilter_torch.photo.picture.in_memory import InMemory, fit_edit
 from nlfilter_torch.photo.picture.painting import TensorPainter
 from nlfilter_torch.photo.picture.pixels import Fitted, Pixels, Planes, part_of
@@ -68,7 +74,10 @@ def sampled_operator(
 
 
 class AtKnots:
-    """An edit of an image that is computed only at the knots of a slider, and interpolated linearly between them."""
+    """An edit of an image that is computed only at the knots of a slider, and interpolated linearly between them.
+
+    It is computed as a whole, and its parts are weighed afterwards.
+    """
 
     def __init__(self, name: str, knots: tuple[float, ...], edit: Callable[[Step], Tensor], image: Tensor) -> None:
         self._name, self._knots, self._edit, self._image = name, knots, edit, image
@@ -76,6 +85,14 @@ class AtKnots:
 
     def __call__(self, step: Step) -> Tensor:
         """The edited image."""
+        shares = {name: step[name] for name in step.declared.parts}
+        if all(share == 1 for share in shares.values()):
+            return self._whole(step)
+        whole = step.changed(strokes=None, **dict.fromkeys(shares, 1.0))
+        return change_in_parts(self._image, self._whole(whole), **shares)
+
+    def _whole(self, step: Step) -> Tensor:
+        """The image under the step, of which all parts count fully."""
         value, knots = step[self._name], self._knots
         if value in knots or value > knots[-1]:
             return self._computed(step)

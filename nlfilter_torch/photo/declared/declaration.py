@@ -101,6 +101,7 @@ class Parameter:
         per_image: whether the function also takes a tensor with one value for each image.
         labels: what the editor calls the choices, if it offers them.
         usual: range of the command, which accepts values of :attr:`low` to :attr:`high` beyond it if the user insists.
+        part: whether it is the share, from 0 to 1, of a part of what the edit changes, without which nothing changes.
     """
 
     name: str
@@ -128,6 +129,7 @@ class Parameter:
     per_image: bool = False
     labels: tuple[str, ...] = ()
     usual: tuple[float, float] | None = None
+    part: bool = False
 
     @property
     def keyword(self) -> str:
@@ -370,6 +372,11 @@ class Edit:
         """Check arguments of the function, in the order given; see :meth:`Parameter.check_argument`."""
         for name, value in arguments.items():
             self[name].check_argument(value, batch)
+
+    @cached_property
+    def parts(self) -> tuple[str, ...]:
+        """Names of the parameters that are shares of parts of the change; if all of them are 0, nothing changes."""
+        return tuple(p.name for p in self if p.part)
 
     @property
     def words(self) -> tuple[str, ...]:

@@ -28,6 +28,7 @@ from nlfilter_torch.photo.declared.shared_parameters import (
     filter_parameters,
     gain,
     number,
+    part,
     sliders,
 )
 
@@ -189,6 +190,8 @@ DENOISE = Edit(
     Example: `nlfilter-torch denoise in.jpg out.jpg`
 
     Gently: `nlfilter-torch denoise in.jpg out.jpg --strength 0.6`
+
+    Coloured noise only, and keep the grain: `nlfilter-torch denoise in.jpg out.jpg --brightness 0`
     """,
     (
         number(
@@ -201,6 +204,16 @@ DENOISE = Edit(
             idle=0.0,
             slider=Slider("Strength", 0, 2, 0.05, knots=(0, 0.5, 1, 2)),
             per_image=True,
+        ),
+        part(
+            "brightness",
+            "Share of the noise in brightness that is removed: 1 is all, 0 leaves brightness unchanged.",
+            "In brightness",
+        ),
+        part(
+            "colour",
+            "Share of the noise in colour that is removed: 1 is all, 0 leaves the colours unchanged.",
+            "In colour",
         ),
         number(
             "noise_level",

@@ -44,6 +44,7 @@ class Further(Presentation, total=False):
     is_argument: bool
     length: int
     per_image: bool
+    part: bool
 
 
 ALIKE = "How much two places may differ and still count as similar"
@@ -73,6 +74,12 @@ def sliders(
 def choice(name: str, choices: tuple[str, ...], help: str) -> Parameter:
     """Declare a choice among words, the first by default."""
     return Parameter(name, "choice", choices[0], help, domain="choice", choices=choices)
+
+
+def part(name: str, help: str, label: str) -> Parameter:
+    """Declare the share of a part of what an edit changes, all of it by default, with a slider."""
+    slider = Slider(label, 0, 1, 0.05)
+    return number(name, 1.0, help, (0, 1), domain="share", metavar="0...1", slider=slider, per_image=True, part=True)
 
 
 def filter_parameters(

@@ -118,6 +118,8 @@ class Step:
         """Whether the step has any effect when it is switched on."""
         if self.declared.requires_strokes:
             return bool(self.painted(self.declared.words[0]))
+        if self.declared.parts and not any(self[name] for name in self.declared.parts):
+            return False
         acting = [p for p in self.declared if p.idle is not ...]
         return any(not p.is_idle(self[p.name]) for p in acting) or (
             self.has_region() and any(slider != 1 for slider in self.sliders_inside)

@@ -3,6 +3,7 @@
 Paper: Sec. III, Fig. 6(c), (d); Sec. V.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import ClassVar, Literal, Self
@@ -26,6 +27,7 @@ from nlfilter_torch.photo.declared.parameters import DENOISE
 from nlfilter_torch.photo.edits.hot_pixels import HotPixels, hot_pixels_of
 from nlfilter_torch.photo.edits.noise import noise_of, profile_of
 from nlfilter_torch.photo.edits.synthesis import remainder
+from nlfilter_torch.photo.picture.changes import change_in_parts
 from nlfilter_torch.photo.picture.drawn import Drawn, M
 from nlfilter_torch.photo.picture.edit import FilteredEdit
 from nlfilter_torch.photo.picture.in_memory import edit_image
@@ -52,6 +54,8 @@ def denoise(
     *,
     noise_level: float | Tensor | NoiseProfile | None = DENOISE.defaults["noise_level"],
     strength: float | Tensor = DENOISE.defaults["strength"],
+    brightness: float | Tensor = DENOISE.defaults["brightness"],
+    colour: float | Tensor = DENOISE.defaults["colour"],
     method: Method = DENOISE.defaults["method"],
     photometric_bandwidth: float | Tensor | None = None,
     spatial_bandwidth: float | Tensor | None = None,
@@ -76,6 +80,10 @@ def denoise(
             by :func:`noise_profile`, since the noise of cameras is not white, for the rule as white noise.
         strength: factor of the noise level, a number or a tensor of shape () or (B,): 0 changes nothing, more than 1
             smooths more. For the network, more than 100/255 counts as 100/255 of noise.
+        brightness: share of the change of luminance that is made, from 0 to 1, a number or a tensor of shape () or
+            (B,): 0 leaves luminance, and with it the grain, unchanged. Of images other than RGB it is the share of the
+            whole change. Hot pixels count as noise.
+        colour: the same for chroma, the difference between RGB and luminance.
         method: ``"network"`` or ``"rule"``. All further arguments are for the rule.
         photometric_bandwidth: h_y; None is the noise level.
         spatial_bandwidth: h_x in pixels; None is 0.2 of the short side.
@@ -103,6 +111,8 @@ def denoise(
     edit = Denoise(
         noise_level=noise_level,
         strength=strength,
+        brightness=brightness,
+        colour=colour,
         method=method,
         photometric_bandwidth=photometric_bandwidth,
         spatial_bandwidth=spatial_bandwidth,
@@ -129,6 +139,8 @@ class Denoise(FilteredEdit):
     noise_level: float | Tensor | Noise | NoiseProfile | None
     strength: float | Tensor
     method: Method
+    brightness: float | Tensor = DENOISE.defaults["brightness"]
+    colour: float | Tensor = DENOISE.defaults["colour"]
     guide_channels: GuideChannels = "all"
     working: WorkingRange | None = None
     hot_pixels: HotPixels | None = None
@@ -140,7 +152,16 @@ class Denoise(FilteredEdit):
 
     def fit(self, source: Source[M], drawn: Drawn[M]) -> Fitted:
         """Fit the network, or the sliders of the rule."""
-        DENOISE.check(source.batch, strength=self.strength, method=self.method)
+        DENOISE.check(source.batch, strength=self.strength, brightness=self.brightness, colour=self.colour)
+        DENOISE.check(method=self.method)
+        fitted = self._fit(source)
+        if _are(1, self.brightness, self.colour):
+            return fitted
+        in_parts = partial(change_in_parts, brightness=self.brightness, colour=self.colour)
+        repaired = None if fitted.repaired is None else partial(_repaired_in_parts, fitted.repaired, in_parts)
+        return replace(fitted.then(in_parts), repaired=repaired)
+
+    def _fit(self, source: Source[M]) -> Fitted:
         check_count(self.num_landmarks, "num_landmarks")
         is_map = is_noise_map(self.noise_level, source.size)
         if not isinstance(self.noise_level, (Noise, NoiseProfile)) and not is_map:
@@ -194,7 +215,7 @@ class Denoise(FilteredEdit):
 
     def _hot_pixels_of(self, source: Source[M]) -> HotPixels | None:
         """The hot pixels of a picture; None if nothing is to be changed, or for the rule."""
-        idle = any(not isinstance(value, Tensor) and value == 0 for value in (self.noise_level, self.strength))
+        idle = _are(0, self.noise_level) or _are(0, self.strength) or _are(0, self.brightness, self.colour)
         return None if idle or self.method != "network" else hot_pixels_of(source)
 
     def _estimated(self, source: Source[M], hot_pixels: HotPixels | None) -> Noise | NoiseProfile:
@@ -237,6 +258,21 @@ class Denoise(FilteredEdit):
         if weak and estimated and 0 < float(self.strength) < 2:  # a clean photograph has nothing more to lose
             remedy = "; --strength 2 removes more" if level >= VISIBLE_LEVELS else ", as is the noise"
         return f"{text}; {changed}{weak}{remedy}"
+
+
+def _are(number: float, *values: object) -> bool:
+    """Whether all values are that number, and no tensors."""
+    return all(not isinstance(value, Tensor) and value == number for value in values)
+
+
+def _repaired_in_parts(
+    repaired: Callable[[Tensor, Tensor], Tensor],
+    in_parts: Callable[[Tensor, Tensor], Tensor],
+    image: Tensor,
+    span: Tensor,
+) -> Tensor:
+    """Images whose defects are replaced in part, see :attr:`Fitted.repaired`."""
+    return in_parts(image, repaired(image, span))
 
 
 def _in_range(level: object, working: WorkingRange) -> float | Tensor | Noise | NoiseProfile | None:

@@ -32,6 +32,19 @@ def activity(image: Tensor) -> Tensor:
     return (square - mean.square()).clamp(min=0)
 
 
+def change_in_parts(image: Tensor, edited: Tensor, *, brightness: float | Tensor, colour: float | Tensor) -> Tensor:
+    """The image with shares of the change of its luminance and of its chroma, numbers or tensors of shape () or (B,).
+
+    Images (B, C, H, W) other than RGB have no chroma.
+    """
+    change = edited - image
+    first = per_image(brightness, change, 4)
+    if image.shape[1] != 3:
+        return image + first * change
+    luminance = reduce_channels(change, "luminance")
+    return image + first * luminance + per_image(colour, change, 4) * (change - luminance)
+
+
 def sum_of(changes: Tensor) -> Tensor:
     """Sum of added detail and the rest of the change, which are concatenated to (B, 2 C, H, W)."""
     added, rest = changes.chunk(2, dim=1)

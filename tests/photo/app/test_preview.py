@@ -191,6 +191,14 @@ def test_slow_edits_are_computed_at_knots_only(session: Session, monkeypatch: py
         session.set("denoise", strength=strength)
         assert difference(session.render(), expected[strength]) < 1e-3
     assert events == ["filter", *["edit"] * 4]
+    session.set("denoise", strength=1.0)
+    session.render()
+    del events[:]
+    for shares in ({"brightness": 0.0}, {"brightness": 0.4, "colour": 0.7}, {"colour": 0.0}):
+        session.set("denoise", **shares)
+        step = session.recipe.steps[0]
+        assert difference(session.render(), apply_step(step, image).clamp(0, 1)) < 1e-3
+    assert events == []
 
 
 def test_another_tolerance_or_picture_needs_another_filter(session: Session, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -215,7 +215,7 @@ def test_the_scale_of_floats_is_noted(
         ("sharpen", "in.tif", ()),
         ("sharpen", "grey.tif", ("--guide-blur", "0")),
         ("tone", "in.tif", ("--clarity", "1.5")),
-        ("denoise", "in.tif", ("--method", "rule", "--patch-size", "3", "--noise-level", "6")),
+        ("denoise", "in.tif", ("--method", "rule", "--colour", "0.4", "--noise-level", "6")),
         ("denoise", "grey.tif", ("--method", "rule", "--noise-level", "5")),
         ("abstract", "in.tif", ("--edges", "1", "--tones", "8")),
         ("abstract", "grey.tif", ()),

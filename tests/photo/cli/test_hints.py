@@ -21,6 +21,8 @@ DETAIL = ["--alpha", "--bandwidth", "--region", "--force", "--quality"]
             ["detail", "a.png", "b.png", "--sigma", "20"],
             "No such option: --sigma; here it is --bandwidth or --tolerance",
         ),
+        (["denoise", "a.png", "b.png", "--luminance", "0"], "No such option: --luminance; here it is --brightness"),
+        (["denoise", "a.png", "b.png", "--color", "0"], "No such option: --color; here it is --colour"),
         (["defocus", "a.png", "b.png", "--blur", "5"], "No such option: --blur; here it is --radius"),
         (
             ["recolor", "a.png", "b.png", "--color", "red"],

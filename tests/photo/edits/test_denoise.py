@@ -1,9 +1,14 @@
 """Denoising: photographs come closer to the originals, and noise is estimated."""
 
+from typing import Literal
+
 import pytest
 import torch
 
 from nlfilter_torch import NoiseProfile, denoise, estimate_noise
+from nlfilter_torch.photo.declared.steps import Step
+from nlfilter_torch.photo.edits.applying import apply_step
+from nlfilter_torch.photo.picture.colour import split_luminance
 from tests.problems import colour
 
 
@@ -52,3 +57,44 @@ def test_noise_may_be_told_as_a_profile() -> None:
     assert torch.equal(denoise(noisy, noise_level=white.scaled(0.0)), noisy)
     with pytest.raises(ValueError, match="noise_level must be the profile of 1 or 1 images, got 2; select"):
         denoise(noisy, noise_level=NoiseProfile.white(torch.tensor([0.05, 0.1])))
+
+
+@pytest.mark.parametrize("method", ["network", "rule"])
+@pytest.mark.parametrize("scale", [1.0, 1 / 64], ids=["usual", "faint"])
+def test_brightness_and_colour_have_strengths_of_their_own(method: Literal["network", "rule"], scale: float) -> None:
+    draw = torch.Generator().manual_seed(0)
+    noisy = colour("chelsea", 40, 56) + 0.08 * torch.randn(1, 3, 40, 56, generator=draw)
+    noisy[..., 20, 30] = torch.tensor([3.0, 0.0, 0.0])  # a hot pixel
+    noisy = noisy * scale
+    whole = denoise(noisy, method=method, num_landmarks=40)
+    before, after = split_luminance(noisy), split_luminance(whole)
+    assert min(float((a - b).abs().mean()) for a, b in zip(before, after, strict=True)) > 0.01 * scale
+    grain, still = (
+        split_luminance(denoise(noisy, method=method, num_landmarks=40, brightness=brightness, colour=1 - brightness))
+        for brightness in (0.0, 1.0)
+    )
+    torch.testing.assert_close(grain[0], before[0], atol=1e-6, rtol=0)
+    torch.testing.assert_close(still[1], before[1], atol=1e-6, rtol=0)
+    assert torch.equal(denoise(noisy, method=method, num_landmarks=40, brightness=0.0, colour=0.0), noisy)
+    assert torch.equal(denoise(noisy, method=method, num_landmarks=40, brightness=1, colour=1.0), whole)
+    if scale == 1:
+        torch.testing.assert_close((grain[1], still[0]), (after[1], after[0]), atol=1e-6, rtol=0)
+        half = denoise(noisy, method=method, num_landmarks=40, brightness=0.5, colour=torch.tensor([0.5]))
+        torch.testing.assert_close(half, (noisy + whole) / 2, atol=1e-6, rtol=0)
+
+
+def test_shares_of_noise_in_steps_and_for_each_image() -> None:
+    noisy = colour("rocket", 32, 40) + 0.06 * torch.randn(2, 3, 32, 40, generator=torch.Generator().manual_seed(0))
+    both = denoise(noisy, noise_level=0.06, brightness=torch.tensor([0.0, 1.0]))
+    alone = denoise(noisy[:1], noise_level=0.06, brightness=0.0)
+    torch.testing.assert_close(both[:1], alone, atol=1e-6, rtol=0)
+    torch.testing.assert_close(both[1:], denoise(noisy[1:], noise_level=0.06), atol=1e-6, rtol=0)
+    step = Step("denoise", noise_level=0.06 * 255, brightness=0.0)
+    torch.testing.assert_close(apply_step(step, noisy[:1]), alone, atol=1e-6, rtol=0)
+    assert step.changes()
+    assert not step.changed(colour=0.0).changes()
+    grey = noisy[:, :1]
+    assert torch.equal(denoise(grey, brightness=0.0), grey)
+    torch.testing.assert_close(denoise(grey, colour=0.3), denoise(grey), atol=1e-6, rtol=0)
+    with pytest.raises(ValueError, match="brightness must be in"):
+        denoise(noisy, brightness=1.5)
