@@ -1,14 +1,16 @@
-"""Strokes with strays beside clean ones: ``python -m benchmarks.scribbles [--quick] [--set choosing]``.
+"""Strokes with strays beside clean ones: ``python -m benchmarks.scribbles [--quick] [--photographs FOLDER]``.
 
 Recolouring by one natural stroke, a bent line, of which a fifth lies on something else, against the same stroke without
 that part. On composites (:mod:`benchmarks.composites`) the covered share of the object and the changed share of the
-background are known. On free photographs of scikit-image the strokes are stored in ``scribbles.json`` as lists of
-points, the last of them on something else, and the result of the clean stroke is the reference: "covered" is the share
-of what it changes that is changed, "outside" the share of the rest that is.
+background are known. On 30 free photographs, seven of scikit-image and the others of Debian's packages, the strokes are
+stored in ``scribbles.json`` as lists of points, the last of them on something else, and the result of the clean stroke
+is the reference: "covered" is the share of what it changes that is changed, "outside" the share of the rest that is.
+FOLDER is that of :mod:`benchmarks.denoiser_training.free_photographs`; without it only scikit-image's are measured.
 
 Limit: each mean differs by at most 2 points with and without strays. ``--plain`` counts strays like the rest of a
-stroke. ``--out FOLDER`` writes the photographs with stroke, and both results. ``--set choosing`` takes the composites
-on which the constants were chosen.
+stroke. ``--out FOLDER`` writes the photographs with stroke, what is ignored of it, and both results. ``--each`` lists
+the photographs with their packages. ``--set choosing`` takes the photographs and composites on which the constants
+were chosen.
 """
 
 import argparse
@@ -17,8 +19,9 @@ import sys
 from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
-from statistics import mean
+from statistics import mean, median
 from unittest import mock
 
 import cv2
@@ -27,18 +30,22 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from benchmarks.composites import FIRST_SEED, RADIUS, SIZE, composites, sources
+from benchmarks.composites import CHOOSING, FIRST_SEED, RADIUS, REPORTING, SIZE, composites, sources
+from benchmarks.denoiser_training.free_photographs import photographs
 from benchmarks.photographs import photograph, reduced_to
 from benchmarks.recolor import CHANGED, COLOURS, recoloured, tinted
 from benchmarks.training.figures import Figure, table
 from nlfilter_torch import recolor
-from nlfilter_torch.photo.io.photographs import Photograph, write_photograph
+from nlfilter_torch.photo.io.photographs import Photograph, read_photograph, write_photograph
+from nlfilter_torch.photo.picture.in_memory import InMemory
+from nlfilter_torch.photo.selections.stray_parts import stray_parts
 
 STRAY = 0.2  # of a stroke
 LENGTH, BEND, POINTS, TRIES = 0.35, 0.4, 40, 400  # of the strokes on composites; length as a share of the short side
 COUNT, FIRST = 25, 20_000  # composites, and what is added to the seeds of their set
 SIDE = 240  # short side of photographs
 LIMIT = 2.0  # points
+IGNORED = torch.tensor((1.0, 0.0, 1.0))  # colour of the parts of strokes that do not count
 STORED = Path(__file__).with_suffix(".json")
 
 Mask = NDArray[np.bool_]
@@ -50,6 +57,7 @@ class Job:
 
     Attributes:
         name: of the picture and what is recoloured.
+        package: of the picture.
         image: (1, 3, H, W).
         colour: of the stroke, (1, 3, 1, 1).
         clean: the stroke without its stray part, (1, 1, H, W).
@@ -57,6 +65,7 @@ class Job:
     """
 
     name: str
+    package: str
     image: Tensor
     colour: Tensor
     clean: Tensor
@@ -107,7 +116,7 @@ def on_composites(count: int, first: int, images: dict[str, Tensor]) -> Iterator
         points = leaving(alpha > 0.98, alpha < 0.02, np.random.default_rng(first + number))
         whole = line(points, SIZE, max(1, round(2 * RADIUS * min(SIZE))))
         colour = torch.tensor(COLOURS[number % len(COLOURS)]).view(1, 3, 1, 1)
-        job = Job(scene.name, scene.image, colour, as_mask(whole & (alpha > 0.5)), as_mask(whole))
+        job = Job(scene.name, "", scene.image, colour, as_mask(whole & (alpha > 0.5)), as_mask(whole))
         ideal = recoloured(scene, colour, job.clean) - scene.image
         visible = (scene.alpha > 0.98) & (ideal.abs().amax(1, keepdim=True) > CHANGED)
         shares = list[float]()
@@ -120,17 +129,31 @@ def on_composites(count: int, first: int, images: dict[str, Tensor]) -> Iterator
         yield shares
 
 
-def jobs() -> Iterator[Job]:
-    """The recolourings of photographs that are stored."""
+def sources_of_photographs() -> dict[str, tuple[str, str]]:
+    """Set, choosing or reporting, and package of every free photograph, by name."""
+    listed = {entry.name: (entry.set, entry.package) for entry in photographs()}
+    names = {"choosing": CHOOSING, "reporting": REPORTING}
+    return listed | {name: (kind, "scikit-image") for kind, shipped in names.items() for name in shipped}
+
+
+def jobs(kind: str, folder: Path | None = None) -> Iterator[Job]:
+    """The recolourings that are stored for photographs of a set, of which a folder holds those of Debian's packages."""
+    listed = sources_of_photographs()
     for entry in json.loads(STORED.read_text(encoding="utf-8")):
-        image = reduced_to(photograph(entry["photograph"])[:, :3], SIDE)
+        name = entry["photograph"]
+        own, package = listed[name]
+        shipped = package == "scikit-image"
+        if own != kind or (folder is None and not shipped):
+            continue
+        picture = photograph(name) if shipped else read_photograph((folder or Path()) / own / f"{name}.png").pixels
+        image = reduced_to(picture[:, :3], SIDE)
         size = (image.shape[-2], image.shape[-1])
         points = np.array(entry["points"], dtype=np.float64)[:, ::-1] * size  # of columns and rows, from 0 to 1
         width = max(1, round(2 * RADIUS * min(size)))
         clean = line(points[: -entry["stray"]], size, width)
         whole = line(points, size, width)
         colour = torch.tensor(entry["colour"]).view(1, 3, 1, 1)
-        yield Job(f"{entry['photograph']}: {entry['what']}", image, colour, as_mask(clean), as_mask(whole))
+        yield Job(f"{name}: {entry['what']}", package, image, colour, as_mask(clean), as_mask(whole))
 
 
 def on_photograph(job: Job, out: Path | None) -> list[float]:
@@ -139,6 +162,7 @@ def on_photograph(job: Job, out: Path | None) -> list[float]:
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
         seen = torch.lerp(job.image, job.colour.expand_as(job.image), job.whole)
+        seen = torch.where(stray_parts(InMemory(job.image), job.whole) > 0, IGNORED.view(1, 3, 1, 1), seen)
         name = job.name.replace(": ", "-").replace(" ", "-")
         write_photograph(Photograph(torch.cat([seen, *results], dim=3).clamp(0, 1)), out / f"{name}.png")
     before, after = ((result - job.image).abs().amax(1, keepdim=True) > 5 * CHANGED for result in results)
@@ -154,8 +178,10 @@ def main(arguments: list[str] | None = None) -> int:
     """Measure, print a table, and return 1 if a figure falls short of its limit."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.scribbles", description=__doc__)
     parser.add_argument("--quick", action="store_true", help="one composite and photograph, to see that it runs")
-    parser.add_argument("--set", choices=tuple(FIRST_SEED), default="reporting", help="photographs of the composites")
+    parser.add_argument("--set", choices=tuple(FIRST_SEED), default="reporting", help="of photographs and composites")
     parser.add_argument("--plain", action="store_true", help="strays count like the rest of a stroke")
+    parser.add_argument("--photographs", type=Path, help="folder of free photographs of Debian's packages")
+    parser.add_argument("--each", action="store_true", help="list the photographs")
     parser.add_argument("--out", type=Path, help="folder for pictures")
     options = parser.parse_args(arguments)
     with ExitStack() as stack:
@@ -165,7 +191,11 @@ def main(arguments: list[str] | None = None) -> int:
         number = 1 if options.quick else COUNT
         rows = list(on_composites(number, first, sources(None, options.set)))
         covered, outside, covered_stray, outside_stray = (mean(column) for column in zip(*rows, strict=True))
-        shares = [on_photograph(job, options.out) for job in list(jobs())[: 1 if options.quick else None]]
+        shares = list[list[float]]()
+        for job in islice(jobs(options.set, options.photographs), 1 if options.quick else None):
+            shares.append(on_photograph(job, options.out))
+            if options.each:
+                print(f"{job.name:60}{job.package:18}covered{shares[-1][0]:6.1f} %   outside{shares[-1][1]:6.1f} %")
     figures = [
         Figure("composites: covered by clean strokes", covered, unit="%"),
         Figure("composites: outside of clean strokes", outside, unit="%"),
@@ -173,7 +203,9 @@ def main(arguments: list[str] | None = None) -> int:
         Figure("composites: more outside with strays", outside_stray - outside, LIMIT, "points"),
         Figure("photographs: not covered with strays, mean", 100 - mean(row[0] for row in shares), LIMIT, "points"),
         Figure("photographs: outside with strays, mean", mean(row[1] for row in shares), LIMIT, "points"),
+        Figure("photographs: outside with strays, median", median(row[1] for row in shares), unit="points"),
         Figure("photographs: outside with strays, worst", max(row[1] for row in shares), unit="points"),
+        Figure("photographs: strokes", len(shares)),
     ]
     print(table(figures))
     return int(not options.quick and any(not each.holds for each in figures))
