@@ -1,0 +1,205 @@
+"""Forty jobs of a retoucher on free photographs, and how many results are kept: ``python -m benchmarks.keepers``.
+
+Recolouring by the first strokes that come to mind, masks, defocus, presets, colours for grey photographs, noise and
+abstraction. The strokes of ``keepers.json`` were drawn once, with the editor's brush, and never adapted to results.
+For every job a picture ``OUT/NUMBER-PHOTOGRAPH-EDIT.png`` is written: the photograph, with strokes, and the result (of
+a mask, the object on grey); ``OUT/all.png`` shows the results together. A person looks at each result in full size
+and says in ``keepers.json`` whether it would be kept and published as it is ("keeper"), or "why" not; this command
+counts these judgements.
+
+``--pictures`` is the folder of :mod:`benchmarks.denoiser_training.free_photographs`; without it only scikit-image's
+photographs are edited. Jobs on photographs of the choosing set may guide changes of the edits, those on the reporting
+set are counted only.
+"""
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from benchmarks.composites import CHOOSING
+from benchmarks.denoiser_training.free_photographs import photographs
+from benchmarks.figures.scenes import luminance, scribbled
+from benchmarks.photographs import photograph, reduced_to
+from nlfilter_torch import region_mask
+from nlfilter_torch.photo.app.brush import RADIUS
+from nlfilter_torch.photo.declared.parameters import EDITS, MASK
+from nlfilter_torch.photo.declared.presets import Recipe, find_recipe
+from nlfilter_torch.photo.declared.steps import Step
+from nlfilter_torch.photo.declared.strokes import Stroke
+from nlfilter_torch.photo.edits.applying import apply_recipe
+from nlfilter_torch.photo.io.photographs import Photograph, read_photograph, write_photograph
+from nlfilter_torch.photo.picture.painting import colour_of, mask_of
+from nlfilter_torch.photo.picture.resizing import resize
+
+STORED = Path(__file__).with_suffix(".json")
+SIDE = 600  # short side of photographs, at most
+GREY = 0.6  # behind an object that is cut out
+TILE, ACROSS = (200, 300), 5  # of the contact sheet
+SET_OF = {entry.name: entry.set for entry in photographs()}
+PAINTS = {"in": "#ffd91a", "out": "#e02020", "keep": "#20d0e0"}
+AIM = 0.85  # share of the results to keep
+KINDS = {"recolor": "recolouring", "mask": "masks and defocus", "defocus": "masks and defocus"}
+
+
+@dataclass(frozen=True)
+class Job:
+    """An edit of a photograph.
+
+    Attributes:
+        number: from 1.
+        photograph: its name.
+        what: is done.
+        edit: its name, "mask" or "preset".
+        recipe: the edit; empty for a mask.
+        strokes: drawn with the editor's brush.
+        noise: standard deviation in grey levels of the noise that is added to the photograph.
+        keeper: whether the result is kept; None if nobody has looked at it.
+        why: what is wrong with it, if it is not kept.
+    """
+
+    number: int
+    photograph: str
+    what: str
+    edit: str
+    recipe: Recipe
+    strokes: tuple[Stroke, ...]
+    noise: float
+    keeper: bool | None
+    why: str
+
+    @staticmethod
+    def of(number: int, entry: dict[str, Any]) -> "Job":
+        """The job of an entry of the file."""
+        edit, what = entry["edit"], entry["what"]
+        drawn = [{"radius": RADIUS} | stroke for stroke in entry.get("strokes", ())]
+        words = MASK.words if edit == "mask" else EDITS[edit].words if edit in EDITS else ()
+        strokes = tuple(Stroke.from_entries(stroke, words, what) for stroke in drawn)
+        recipe = find_recipe(entry["preset"]) if edit == "preset" else Recipe()
+        if edit in EDITS:
+            entries = entry.get("parameters", {}) | ({"strokes": drawn} if drawn else {})
+            recipe = Recipe((Step.from_entries(edit, entries, what),))
+        rest = entry.get("noise", 0.0), entry.get("keeper"), entry.get("why", "")
+        return Job(number, entry["photograph"], what, edit, recipe, strokes, *rest)
+
+    @property
+    def name(self) -> str:
+        """Name of its file."""
+        return f"{self.number:02d}-{self.photograph}-{self.edit}"
+
+    @property
+    def set(self) -> str:
+        """The set of its photograph: choosing or reporting."""
+        return "choosing" if self.photograph in CHOOSING else SET_OF[self.photograph]
+
+    def before(self, folder: Path | None) -> Tensor:
+        """The photograph before the edit, (1, 3, H, W), or grey, (1, 1, H, W)."""
+        if self.photograph in CHOOSING:
+            image = photograph(self.photograph)[:, :3]
+        else:
+            image = read_photograph((folder or Path()) / self.set / f"{self.photograph}.png").pixels[:, :3].float()
+        image = reduced_to(image, SIDE)
+        if self.noise:
+            noise = torch.randn(image.shape, generator=torch.Generator().manual_seed(self.number))
+            image = (image + noise * self.noise / 255).clamp(0, 1)
+        return luminance(image) if self.edit == "colorize" else image
+
+    def after(self, image: Tensor) -> Tensor:
+        """The result for a photograph; of a mask, the object on grey."""
+        if self.edit != "mask":
+            return apply_recipe(self.recipe, image).clamp(0, 1)
+        mask = region_mask(image, mask_of(self.strokes, (image.shape[-2], image.shape[-1])))
+        return torch.lerp(torch.full_like(image, GREY), image, mask)
+
+    def marked(self, image: Tensor) -> Tensor:
+        """The photograph with its strokes."""
+        image = image.expand(-1, 3, -1, -1)
+        for stroke in self.strokes:
+            mask = mask_of([stroke], (image.shape[-2], image.shape[-1]))
+            colour = colour_of(PAINTS.get(stroke.paint, stroke.paint)).view(1, 3, 1, 1)
+            image = scribbled(image, colour.expand_as(image), mask)
+        return image
+
+
+def jobs(file: Path = STORED) -> list[Job]:
+    """The jobs that are stored."""
+    return [Job.of(number, entry) for number, entry in enumerate(json.loads(file.read_text(encoding="utf-8")), 1)]
+
+
+def panels(job: Job, folder: Path | None) -> Tensor:
+    """The photograph, with strokes, and the result, side by side."""
+    image = job.before(folder)
+    views = [view.expand(-1, 3, -1, -1) for view in (image, job.marked(image), job.after(image))]
+    return torch.cat(views if job.strokes else views[::2], dim=3)
+
+
+def in_tile(picture: Tensor) -> Tensor:
+    """A picture (1, 3, H, W), reduced and with a white border, in a tile of the contact sheet."""
+    height, width = picture.shape[-2:]
+    scale = min(TILE[0] / height, TILE[1] / width)
+    size = (round(height * scale), round(width * scale))
+    return F.pad(resize(picture, size), (0, TILE[1] - size[1], 0, TILE[0] - size[0]), value=1.0)
+
+
+def contact_sheet(pictures: Sequence[Tensor]) -> Tensor:
+    """All pictures in rows."""
+    tiles = [in_tile(picture) for picture in pictures]
+    tiles += [torch.ones_like(tiles[0])] * (-len(tiles) % ACROSS)
+    rows = [torch.cat(tiles[first : first + ACROSS], dim=3) for first in range(0, len(tiles), ACROSS)]
+    return torch.cat(rows, dim=2)
+
+
+def counted(listed: Sequence[Job]) -> str:
+    """A table of the judgements, by set and kind of edit."""
+    lines = []
+    for name in ("choosing", "reporting"):
+        for kind in ("recolouring", "masks and defocus", "other edits"):
+            own = [job for job in listed if job.set == name and KINDS.get(job.edit, "other edits") == kind]
+            lines.append(f"{name:12}{kind:20}{sum(job.keeper is True for job in own):4} of {len(own)}")
+        own = [job for job in listed if job.set == name]
+        lines.append(f"{name:12}{'all':20}{sum(job.keeper is True for job in own):4} of {len(own)}")
+    kept = sum(job.keeper is True for job in listed)
+    verdict = "holds" if kept >= AIM * len(listed) else "FALLS SHORT"
+    lines += ["", f"kept {kept} of {len(listed)}, at least {AIM:.0%}: {verdict}", ""]
+    lines += [f"{job.name}: {job.why or 'not judged'}" for job in listed if not job.keeper]
+    return "\n".join(lines)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Write the pictures, print how many are kept, and return 1 if these are too few."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.keepers", description=__doc__)
+    parser.add_argument("--pictures", type=Path, help="folder of free photographs; default: only scikit-image's")
+    parser.add_argument("--out", type=Path, default=Path("out/keepers"), help="folder for the results")
+    parser.add_argument("--only", type=int, nargs="+", help="numbers of jobs")
+    parser.add_argument("--set", choices=("choosing", "reporting"), help="jobs of one set only")
+    parser.add_argument("--count", action="store_true", help="only count the judgements")
+    options = parser.parse_args(arguments)
+    listed = jobs()
+    chosen = [
+        job
+        for job in listed
+        if (options.pictures is not None or job.photograph in CHOOSING)
+        and job.number in (options.only or range(1, len(listed) + 1))
+        and options.set in (None, job.set)
+    ]
+    results = []
+    for job in [] if options.count else chosen:
+        picture = panels(job, options.pictures)
+        options.out.mkdir(parents=True, exist_ok=True)
+        write_photograph(Photograph(picture), options.out / f"{job.name}.png")
+        results.append(picture[..., -picture.shape[-1] // (3 if job.strokes else 2) :])
+    if results:
+        write_photograph(Photograph(contact_sheet(results)), options.out / "all.png")
+    print(counted(listed))
+    return int(sum(job.keeper is True for job in listed) < AIM * len(listed))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

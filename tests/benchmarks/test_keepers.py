@@ -1,0 +1,69 @@
+"""Jobs of a retoucher: what is stored, a result of each kind, and the count of judgements."""
+
+from collections import Counter
+
+import pytest
+import torch
+
+from benchmarks.composites import CHOOSING
+from benchmarks.keepers import Job, contact_sheet, counted, jobs, main
+
+RECOLOURED = {
+    "photograph": "coffee",
+    "what": "the cup blue",
+    "edit": "recolor",
+    "strokes": [{"paint": "#0040c0", "points": [[0.2, 0.5], [0.3, 0.8]]}],
+}
+
+
+def test_stored_jobs_are_forty_with_a_judgement_and_a_photograph_of_one_set():
+    listed = jobs()
+    assert len(listed) == 40
+    assert len({job.name for job in listed}) == 40
+    assert Counter(job.edit == "recolor" for job in listed)[True] == 20
+    for job in listed:
+        assert job.set in ("choosing", "reporting")
+        assert job.keeper is not None
+        assert bool(job.why) != job.keeper
+        if job.edit in ("recolor", "mask", "defocus", "colorize"):
+            assert job.strokes
+
+
+def test_edits_change_a_photograph_and_the_mask_cuts_its_object_out():
+    image = torch.rand(1, 3, 24, 32, generator=torch.Generator().manual_seed(0)) * 0.2
+    image[:, 0, 8:16, 10:22] += 0.6
+    middle = [{"paint": "in", "points": [[0.45, 0.5], [0.55, 0.5]]}]
+    cut = Job.of(1, {"photograph": "coffee", "what": "a square", "edit": "mask", "strokes": middle}).after(image)
+    torch.testing.assert_close(cut[..., 11:13, 13:19], image[..., 11:13, 13:19], atol=0.05, rtol=0)
+    torch.testing.assert_close(cut[..., :4, :], torch.full_like(cut[..., :4, :], 0.6), atol=0.05, rtol=0)
+    preset = Job.of(2, {"photograph": "coffee", "what": "clear", "edit": "preset", "preset": "clear"})
+    assert not torch.equal(preset.after(image), image)
+    recoloured = Job.of(3, RECOLOURED | {"strokes": [middle[0] | {"paint": "#0040c0"}]})
+    assert (recoloured.after(image) - image)[:, 2, 10:14, 12:20].mean() > 0.1
+    assert torch.equal(recoloured.marked(image)[..., :4, :], image[..., :4, :])
+
+
+def test_parameters_of_a_job_are_those_of_its_edit():
+    assert Job.of(1, RECOLOURED | {"parameters": {"extent": "object"}}).recipe.steps[0]["extent"] == "object"
+    with pytest.raises(ValueError, match="shrink"):
+        Job.of(1, RECOLOURED | {"parameters": {"shrink": 1}})
+
+
+def test_count_names_what_is_not_kept(capsys):
+    kept, lost = Job.of(1, RECOLOURED | {"keeper": True}), Job.of(2, RECOLOURED | {"keeper": False, "why": "a rim"})
+    assert "kept 1 of 2, at least 85%: FALLS SHORT" in counted([kept, lost])
+    assert "02-coffee-recolor: a rim" in counted([kept, lost])
+    assert "kept 1 of 1, at least 85%: holds" in counted([kept])
+    assert main(["--count"]) in (0, 1)
+    assert "of 40" in capsys.readouterr().out
+
+
+def test_contact_sheet_has_a_tile_for_every_result():
+    sheet = contact_sheet([torch.zeros(1, 3, 30, 40), torch.zeros(1, 3, 60, 20)])
+    assert sheet.shape == (1, 3, 200, 1500)
+    assert sheet[..., :200, 400:].mean() > 0.8
+
+
+def test_photographs_of_scikit_image_need_no_folder():
+    job = next(job for job in jobs() if job.photograph in CHOOSING)
+    assert job.before(None).shape[1] == 3
