@@ -12,6 +12,7 @@ from pathlib import Path
 
 import nlfilter_torch
 from nlfilter_torch.photo.declared.declaration import UNITS, Edit, Parameter
+from nlfilter_torch.photo.declared.development import DEVELOP
 from nlfilter_torch.photo.declared.parameters import EDITS
 from nlfilter_torch.photo.declared.shared_parameters import FILTER
 
@@ -34,7 +35,7 @@ of CIE Lab by 100, and hundredths of the short side are pixels. This page is mad
 
 def page() -> str:
     """The text of the page."""
-    return HEAD + "".join(f"\n## {edit.name}\n\n{table(edit)}" for edit in EDITS.values())
+    return HEAD + "".join(f"\n## {edit.name}\n\n{table(edit)}" for edit in (DEVELOP, *EDITS.values()))
 
 
 def table(edit: Edit) -> str:

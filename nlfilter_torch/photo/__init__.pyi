@@ -1,3 +1,4 @@
+from .declared.development import Development as Development
 from .declared.presets import PRESETS as PRESETS
 from .declared.presets import Recipe as Recipe
 from .declared.presets import find_recipe as find_recipe

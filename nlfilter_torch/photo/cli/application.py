@@ -15,6 +15,7 @@ from nlfilter_torch.core.instruction_sets import NAMES, level, load_library
 from nlfilter_torch.photo.cli.apply import apply
 from nlfilter_torch.photo.cli.batch import batch
 from nlfilter_torch.photo.cli.demo import demo
+from nlfilter_torch.photo.cli.develop import develop
 from nlfilter_torch.photo.cli.edits import command
 from nlfilter_torch.photo.cli.fit import fit
 from nlfilter_torch.photo.cli.frames import frames
@@ -87,6 +88,7 @@ def assembled(others: Iterable[Callable[..., None]]) -> typer.Typer:
     whole.callback()(_common)
     for verb in others:
         whole.command(cls=Verb)(verb)
+    whole.command(cls=Verb)(develop)
     for edit in EDITS.values():
         whole.command(name=edit.name, cls=Verb)(command(edit))
     for verb in (mask, apply, fit, presets, batch, frames, inspect, demo):

@@ -32,7 +32,7 @@ def apply(
     workers: options.Workers = None,
     cluster: options.Cluster = None,
 ) -> None:
-    """Apply an edit saved in the browser to a photograph, including its sliders and strokes.
+    """Apply an edit saved in the browser to a photograph, including its sliders, strokes and crop.
 
     Photographs larger than memory are edited in tiles.
 
@@ -46,6 +46,12 @@ def apply(
         raise ValueError(
             f"--mask must come once for each --preset, got {len(masks)} for {len(recipes)}; "
             "say where each of them holds, or give one preset alone"
+        )
+    developed = next((name for recipe, name in zip(recipes, preset, strict=True) if not recipe.develop.is_idle), None)
+    if masks and developed is not None:
+        raise ValueError(
+            f"--mask must come with edits that do not develop the photograph, got {developed}; develop it first, by "
+            "nlfilter-torch develop"
         )
 
     from nlfilter_torch.photo.cli import editing, showing

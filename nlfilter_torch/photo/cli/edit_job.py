@@ -16,6 +16,7 @@ from nlfilter_torch.photo.cli.changes import ChangeMeter, squared_difference, wr
 from nlfilter_torch.photo.cli.editing import Job, pixels_of, rows_of
 from nlfilter_torch.photo.cli.scribbles import Open, Overlay, ScribbleOptions, at_once, of_edit
 from nlfilter_torch.photo.cli.showing import Scribbled
+from nlfilter_torch.photo.declared.development import AS_IT_IS, Development
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.edits.applying import edit_of
 from nlfilter_torch.photo.io.photographs import Photograph
@@ -67,6 +68,15 @@ class EditJob:
     def coloured(self) -> bool:
         """Whether the edit adds colours to a grey photograph."""
         return self.step.declared.coloured
+
+    @property
+    def develop(self) -> Development:
+        """Nothing comes before the edit."""
+        return AS_IT_IS
+
+    def on_developed(self, size: tuple[int, int]) -> "EditJob":
+        """The same edit."""
+        return self
 
     def edited(self, photograph: Photograph) -> Tensor:
         """The edited pixels of a photograph in memory, (1, C, H, W)."""

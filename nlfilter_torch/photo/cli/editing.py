@@ -14,7 +14,9 @@ from torch import Tensor
 from nlfilter_torch.photo.cli import options
 from nlfilter_torch.photo.cli.changes import MAP_DEPTH
 from nlfilter_torch.photo.cli.progress import stages, steps
+from nlfilter_torch.photo.declared.development import Development
 from nlfilter_torch.photo.declared.steps import Step, working_bytes
+from nlfilter_torch.photo.io.developed import develop_photograph
 from nlfilter_torch.photo.io.photographs import (
     Photograph,
     TooLarge,
@@ -233,6 +235,12 @@ def rows_of(photograph: Photograph, name: str) -> Rows:
     return Rows(name, photograph.size, pixels.shape[1], lambda rows: pixels[..., rows, :])
 
 
+def note_grey(develop: Development, name: str, channels: int) -> None:
+    """Print a note if a photograph with that number of channels has no colours to balance."""
+    if develop.balances and channels < 3:
+        options.note(f"{name} is grey: temperature and tint change nothing")
+
+
 class FileEdit(Protocol):
     """An edit of a photograph in a file, in memory or by rows."""
 
@@ -244,8 +252,15 @@ class FileEdit(Protocol):
     def coloured(self) -> bool:
         """Whether the edit adds colours to a grey photograph."""
 
+    @property
+    def develop(self) -> Development:
+        """What comes before the edit."""
+
+    def on_developed(self, size: tuple[int, int]) -> "FileEdit":
+        """The edit for a photograph, once (H, W), that is developed already."""
+
     def edited(self, photograph: Photograph) -> Tensor:
-        """New pixels (1, C, H, W) of a photograph in memory."""
+        """New pixels (1, C, H, W) of a photograph in memory that is developed already."""
 
     def tiling(self, job: Job) -> AbstractContextManager[Tiling]:
         """The edited rows of a photograph that does not fit in memory, which are computed within the block."""
@@ -284,10 +299,12 @@ def edit_file(
         begin("Reading")
         photograph = read_if_it_fits(source, target, edit.bytes_per_pixel, memory)
         if photograph is not None:
+            size, photograph = photograph.size, develop_photograph(photograph, edit.develop)
             output = photograph if kind is None else replace(photograph, depth=kind)
             check_output(target, output)
+            note_grey(edit.develop, source, photograph.pixels.shape[1])
             begin("Editing")
-            output = output.with_pixels(edit.edited(photograph))
+            output = output.with_pixels(edit.on_developed(size).edited(photograph))
             begin("Writing")
             write_photograph(output, target, quality=quality)
             return
@@ -295,7 +312,9 @@ def edit_file(
         picture = stack.enter_context(open_picture(Path(source), allowed))
         own_depth = check_depth(source, picture.rows.dtype)  # refuses other dtypes whatever the output is
         stored = kind or own_depth
-        written = picture.in_colour() if edit.coloured else picture
+        note_grey(edit.develop, source, picture.shape[2])
+        part = picture.of_part(edit.develop.frame(picture.shape[:2]).size)
+        written = part.in_colour() if edit.coloured else part
         check_place(Path(target), stored, written, allowed)
         processes = processes_for(workers, cluster, stack)
         report = stack.enter_context(stages())

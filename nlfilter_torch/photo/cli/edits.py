@@ -22,8 +22,8 @@ NUMBERS: dict[Kind, type[float]] = {"number": float, "count": int, "odd": int}
 
 
 def _only_step(recipe: Recipe) -> Step | None:
-    """The only step of a recipe, if it is switched on and at full opacity, since commands have no options for these."""
-    step = recipe.steps[0] if len(recipe.steps) == 1 else None
+    """The only step of a recipe that holds nothing else, if it is on and opaque, which commands have no options for."""
+    step = recipe.steps[0] if len(recipe.steps) == 1 and recipe.develop.is_idle else None
     return step if step is not None and step.on and step.opacity == 1 else None
 
 
@@ -203,6 +203,18 @@ def with_options(*names: str, more: Iterable[Edit] = ()) -> Callable[[Command], 
                     added[parameter.name] = _declared(parameter, f"Options of {edit.name}")
         signature = inspect.Signature([*own, *added.values()])
         return with_signature(function, signature)
+
+    return decorate
+
+
+def with_declared(edit: Edit) -> Callable[[Command], Command]:
+    """Replace the ``**values`` of a command by the options of an edit, and its help by that of the edit."""
+
+    def decorate(function: Command) -> Command:
+        parameters = inspect.signature(function, eval_str=True).parameters.values()
+        source, target, *own = (p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in parameters)
+        function.__doc__ = edit.help
+        return with_signature(function, inspect.Signature([source, target, *map(_declared, edit), *own[:-1]]))
 
     return decorate
 

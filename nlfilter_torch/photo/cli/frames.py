@@ -99,7 +99,9 @@ def frames(
     Another edit: `nlfilter-torch frames film.mp4 edited.mp4 --edit denoise --noise-level 8`
     """
     recipe = chosen_recipe(context, edit, preset, values)
-    if not force:
+    if not recipe.develop.is_idle:
+        raise ValueError(f"--preset must not develop the photographs of a film, got {preset}; remove its entry develop")
+    if not force and recipe.steps:
         check_usual(recipe.steps[0], typed_options(context, values))
 
     from nlfilter_torch.photo.cli.editing import allowed_memory

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from nlfilter_torch.photo.declared.declaration import FILTER_PANEL, GAINS, MAX_SLIDERS, UNITS, Parameter
+from nlfilter_torch.photo.declared.development import Crop, check_value
 
 if TYPE_CHECKING:
     from nlfilter_torch.photo.io.photographs import Depth
@@ -52,6 +53,21 @@ def parse_sliders(text: str, option: str) -> tuple[float, ...]:
             f"{option} must be numbers from {GAINS[0]:.0f} to {GAINS[1]:.0f}, such as 3,3,4,1.05, got {text!r}"
         )
     return tuple(numbers)
+
+
+def parse_crop(text: str) -> Crop:
+    """Parse the edges of a crop, separated by commas.
+
+    >>> parse_crop("0.1, 0,1,0.9")
+    (0.1, 0.0, 1.0, 0.9)
+    """
+    try:
+        edges = [float(part) for part in text.split(",")]
+    except ValueError:
+        edges = []
+    check_value("crop", edges or text, dashes="--")
+    left, top, right, bottom = edges
+    return left, top, right, bottom
 
 
 def parse_number(text: str, parameter: Parameter) -> float | str:

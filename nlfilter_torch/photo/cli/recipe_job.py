@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -10,15 +10,16 @@ from torch import Tensor
 
 from nlfilter_torch.photo.cli import editing, options
 from nlfilter_torch.photo.cli.editing import Job, pixels_of, rows_of
+from nlfilter_torch.photo.declared.development import Development
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.edits.applying import apply_recipe, edit_of
 from nlfilter_torch.photo.io.photographs import Photograph
-from nlfilter_torch.photo.io.rows import StoredPicture
 from nlfilter_torch.photo.picture.changes import blend_edited
 from nlfilter_torch.photo.picture.edit import Rows
-from nlfilter_torch.photo.tiled.pictures import Picture
+from nlfilter_torch.photo.tiled.developed import developed_rows
+from nlfilter_torch.photo.tiled.pictures import Picture, RowSource
 from nlfilter_torch.photo.tiled.recipe import edit_regions, edit_tiling
-from nlfilter_torch.photo.tiled.tiles import Tiling
+from nlfilter_torch.photo.tiled.tiles import Passes, Tiling
 
 
 @dataclass(frozen=True)
@@ -49,8 +50,17 @@ class RecipeJob:
         """Whether a recipe adds colours to a grey photograph."""
         return any(recipe.gives_colour for recipe in self.recipes)
 
+    @property
+    def develop(self) -> Development:
+        """How the photograph is developed, which no recipe for a region does."""
+        return self.recipes[0].develop
+
+    def on_developed(self, size: tuple[int, int]) -> "RecipeJob":
+        """The recipes for a photograph, once (H, W), that is developed already."""
+        return replace(self, recipes=[recipe.on_developed(size) for recipe in self.recipes])
+
     def edited(self, photograph: Photograph) -> Tensor:
-        """The edited pixels of a photograph in memory, (1, C, H, W)."""
+        """The edited pixels of a developed photograph in memory, (1, C, H, W)."""
         self._tell(rows_of(photograph, self.source))
         weights = photograph.weights
         pixels = [apply_recipe(recipe, photograph.pixels, weights=weights) for recipe in self.recipes]
@@ -58,13 +68,22 @@ class RecipeJob:
             return pixels[0]
         return blend_edited(photograph.pixels, pixels, editing.read_masks(self.masks, self.source, photograph.size))
 
-    def tiling(self, job: Job) -> AbstractContextManager[Tiling]:
+    @contextmanager
+    def tiling(self, job: Job) -> Iterator[Tiling]:
         """The edited rows of a photograph that does not fit in memory."""
-        passes, source = job.passes(self.full, Path(self.target).parent), job.picture.marked
-        picture = Picture(source, self.source)
-        self._tell(Rows(self.source, job.size, picture.colours, partial(pixels_of, picture)))
-        if not self.masks:
-            return unmarked(edit_tiling(passes, source, self.recipes[0].steps, self.source), job.picture)
+        passes, picture = job.passes(self.full, Path(self.target).parent), job.picture
+        with developed_rows(self.develop, passes, picture.marked, self.source, picture.nodata) as source:
+            read = Picture(source, self.source)
+            self._tell(Rows(self.source, read.size, read.colours, partial(pixels_of, read)))
+            if self.masks:
+                whole = self._in_regions(passes, source, job)
+            else:
+                whole = edit_tiling(passes, source, self.on_developed(job.size).recipes[0].steps, self.source)
+            with whole as tiling:
+                yield picture.unmarked(tiling)
+
+    def _in_regions(self, passes: Passes, source: RowSource, job: Job) -> AbstractContextManager[Tiling]:
+        """The rows with a recipe for each mask."""
         masks = [job.open(path) for path in self.masks]
         for path, mask in zip(self.masks, masks, strict=True):
             if tuple(mask.shape[:2]) != job.size:
@@ -73,18 +92,10 @@ class RecipeJob:
                     f"{mask.shape[1]}x{mask.shape[0]}; resize it"
                 )
         edits = [recipe.steps for recipe in self.recipes]
-        tiling = edit_regions(passes, source, edits, [mask.rows for mask in masks], self.source)
-        return unmarked(tiling, job.picture)
+        return edit_regions(passes, source, edits, [mask.rows for mask in masks], self.source)
 
     def _tell(self, rows: Rows) -> None:
         """Print the notes of all steps, without repeating any."""
         steps = [step for recipe in self.recipes for step in recipe.acting]
         for note in dict.fromkeys(note for step in steps for note in edit_of(step, rows.size).notes(rows)):
             options.note(note)
-
-
-@contextmanager
-def unmarked(whole: AbstractContextManager[Tiling], picture: StoredPicture) -> Iterator[Tiling]:
-    """Edited rows of :attr:`StoredPicture.marked` without its channel of pixels without data."""
-    with whole as tiling:
-        yield picture.unmarked(tiling)

@@ -156,7 +156,7 @@ def tell_selected(mask: Tensor, background: list[str] | None) -> None:
 
 def note_idle(recipe: Recipe, name: str, what: str = "the photograph is written") -> None:
     """Print a note if an edit changes nothing; ``what`` says what is done all the same."""
-    if not recipe.acting:
+    if not recipe.changes:
         note(f"{name} holds no step that changes anything: {what} without an edit")
 
 

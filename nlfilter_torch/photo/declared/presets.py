@@ -4,6 +4,7 @@ The editor saves, and ``nlfilter-torch apply`` and ``batch`` read::
 
     {
       "version": 1,
+      "develop": {"exposure": 0.5, "straighten": 1.5},
       "steps": [
         {"edit": "denoise"},
         {"edit": "detail", "alpha": [2.0, 2.0, 2.0, 1.0]}
@@ -12,15 +13,17 @@ The editor saves, and ``nlfilter-torch apply`` and ``batch`` read::
 
 Omitted entries have the defaults of the command of that name. A step may also have ``"on": false``, which switches it
 off, and ``"opacity"`` from 0 to 1, which mixes its result with the picture before it. Coordinates of strokes are
-relative to the picture, so that an edit made on a preview applies to the photograph. Does not import torch.
+relative to the picture as it is before it is developed, so that an edit made on a preview applies to the photograph,
+and strokes stay in place when the crop changes. Does not import torch.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from nlfilter_torch.photo.declared.colour_tables import step_of_cube, step_of_hald
+from nlfilter_torch.photo.declared.development import AS_IT_IS, Development
 from nlfilter_torch.photo.declared.json_values import Value, parse_json, shown
 from nlfilter_torch.photo.declared.looks import LOOKS
 from nlfilter_torch.photo.declared.parameters import EDITS
@@ -33,6 +36,7 @@ ORDER = tuple(EDITS)  # order in which the editor adds steps
 PICTURES = (b"\x89PNG", b"II*\0", b"MM\0*", b"\xff\xd8\xff")  # how files of pictures start
 OTHER_PICTURES = (b"BM", b"RIFF", b"GIF8", b"P6", b"\0\0\0")  # of kinds that are not read here
 MARKS = ((b"\xff\xfe", "utf-16"), (b"\xfe\xff", "utf-16"), (b"", "utf-8-sig"))  # how files of text start
+DEVELOPING_BYTES = 32  # per pixel: two copies in colour with transparency
 REMEDY = "save one in the editor"
 
 
@@ -42,9 +46,12 @@ class Recipe:
 
     Attributes:
         steps: each applied to the result of the one before; of any kind, in any order, and any number of times.
+        develop: exposure, white balance, straightening and crop, which come before all steps. Strokes are in
+            coordinates of the picture before that.
     """
 
     steps: tuple[Step, ...] = ()
+    develop: Development = AS_IT_IS
 
     @property
     def acting(self) -> tuple[Step, ...]:
@@ -52,9 +59,27 @@ class Recipe:
         return acting_steps(self.steps)
 
     @property
+    def changes(self) -> bool:
+        """Whether the recipe has any effect."""
+        return bool(self.acting) or not self.develop.is_idle
+
+    @property
+    def effect(self) -> tuple[Development, tuple[Step, ...]]:
+        """All that the result depends on; recipes of the same effect give the same picture."""
+        return self.develop, self.acting
+
+    def on_developed(self, size: tuple[int, int]) -> "Recipe":
+        """The steps for the picture (H, W) that has been developed: their strokes are mapped to what it shows."""
+        frame = self.develop.frame(size)
+        if frame.is_whole:
+            return Recipe(self.steps)
+        steps = (step.changed(strokes=tuple(map(frame.stroke_inward, step.strokes))) for step in self.steps)
+        return Recipe(tuple(steps))
+
+    @property
     def drawn(self) -> "Recipe":
         """The recipe without the steps that would have no effect if they were on, and have no strokes."""
-        return Recipe(tuple(step for step in self.steps if step.would_change() or step.strokes))
+        return self._of(*(step for step in self.steps if step.would_change() or step.strokes))
 
     def last(self, edit: str) -> Step:
         """Return the last step of an edit, or one that changes nothing if there is none."""
@@ -67,7 +92,7 @@ class Recipe:
             return self.replaced(place, step)
         rank = ORDER.index(step.edit)
         place = max((i + 1 for i, other in enumerate(self.steps) if ORDER.index(other.edit) < rank), default=0)
-        return Recipe((*self.steps[:place], step, *self.steps[place:]))
+        return self._of(*self.steps[:place], step, *self.steps[place:])
 
     def place_of(self, edit: str) -> int | None:
         """The place of the last step of an edit, or None."""
@@ -75,7 +100,7 @@ class Recipe:
 
     def replaced(self, place: int, *steps: Step) -> "Recipe":
         """Replace the step at a place by others, or by none."""
-        return Recipe((*self.steps[:place], *steps, *self.steps[place + 1 :]))
+        return self._of(*self.steps[:place], *steps, *self.steps[place + 1 :])
 
     def moved(self, place: int, to: int) -> "Recipe":
         """Move the step at a place to another.
@@ -84,12 +109,17 @@ class Recipe:
         ['sharpen', 'denoise', 'tone']
         """
         others = [*self.steps[:place], *self.steps[place + 1 :]]
-        return Recipe((*others[:to], self.steps[place], *others[to:]))
+        return self._of(*others[:to], self.steps[place], *others[to:])
+
+    def _of(self, *steps: Step) -> "Recipe":
+        """A recipe of other steps, developed alike."""
+        return replace(self, steps=steps)
 
     @property
     def bytes_per_pixel(self) -> int:
         """Memory in bytes per pixel of the step that needs most."""
-        return max((step.bytes_per_pixel() for step in self.acting), default=0)
+        developing = 0 if self.develop.is_idle else DEVELOPING_BYTES
+        return max((step.bytes_per_pixel() for step in self.acting), default=0) + developing
 
     @property
     def gives_colour(self) -> bool:
@@ -120,7 +150,9 @@ class Recipe:
             }
             <BLANKLINE>
         """
-        return json_of(self.steps if complete else self.drawn.steps if drawn else self.acting, complete=complete)
+        steps = self.steps if complete else self.drawn.steps if drawn else self.acting
+        develop = "" if self.develop.is_idle else self.develop.to_json("  ", complete=complete)
+        return json_of(steps, develop, complete=complete)
 
     @staticmethod
     def from_json(text: str | bytes, name: str, remedy: str = REMEDY) -> "Recipe":
@@ -133,7 +165,8 @@ class Recipe:
         entries = parse_json(text, name, remedy)
         if not isinstance(entries, dict) or "steps" not in entries:
             raise ValueError(f"{name} is not a preset: it must hold a list of steps; {remedy}")
-        return Recipe(tuple(_read_steps(entries, name)))
+        steps = tuple(_read_steps(entries, name))
+        return Recipe(steps, Development.from_entries(entries.get("develop", {}), name))
 
     @staticmethod
     @lru_cache(maxsize=4)  # a command asks for the file of an option more than once
@@ -170,9 +203,11 @@ def _decoded(content: bytes, name: str) -> "Values":
 
 def _read_steps(entries: dict[str, object], name: str) -> list[Step]:
     """Parse the steps of a file."""
-    unknown = entries.keys() - {"version", "steps"}
+    unknown = entries.keys() - {"version", "develop", "steps"}
     if unknown:
-        raise ValueError(f"{name} must have no entries other than version and steps, got {min(unknown)}; remove it")
+        raise ValueError(
+            f"{name} must have no entries other than version, develop and steps, got {min(unknown)}; remove it"
+        )
     if entries.get("version") != VERSION:
         raise ValueError(
             f"version in {name} must be {VERSION}, got {shown(entries.get('version'))}; "

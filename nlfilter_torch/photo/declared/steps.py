@@ -208,11 +208,15 @@ def acting_steps(steps: Iterable[Step]) -> tuple[Step, ...]:
     return tuple(step for step in steps if step.changes())
 
 
-def json_of(steps: Iterable[Step], *, complete: bool = False) -> str:
-    """Format steps as JSON, see :meth:`~nlfilter_torch.photo.declared.presets.Recipe.to_json`."""
+def json_of(steps: Iterable[Step], develop: str = "", *, complete: bool = False) -> str:
+    """Format steps as JSON, see :meth:`~nlfilter_torch.photo.declared.presets.Recipe.to_json`.
+
+    ``develop`` is the object of that entry, or nothing.
+    """
     text = ",\n".join(step.to_json("    ", complete=complete) for step in steps)
     listed = f"[\n{text}\n  ]" if text else "[]"
-    return f'{{\n  "version": {VERSION},\n  "steps": {listed}\n}}\n'
+    before = f'  "develop": {develop},\n' if develop else ""
+    return f'{{\n  "version": {VERSION},\n{before}  "steps": {listed}\n}}\n'
 
 
 def working_bytes(landmarks: int, patch_size: int, *, factors: int = 1) -> int:

@@ -20,6 +20,7 @@ from nlfilter_torch.photo.edits.look import LookEdit
 from nlfilter_torch.photo.edits.recolor import Recolor
 from nlfilter_torch.photo.edits.sharpen import Sharpen
 from nlfilter_torch.photo.edits.tone import Tone
+from nlfilter_torch.photo.picture.developing import develop_image, develop_planes
 from nlfilter_torch.photo.picture.drawn import Drawn, M, Painter
 from nlfilter_torch.photo.picture.edit import PhotoEdit
 from nlfilter_torch.photo.picture.in_memory import InMemory, fit_edit
@@ -172,7 +173,7 @@ def apply_recipe(
     """Edit a photograph as ``nlfilter-torch apply`` does.
 
     Args:
-        recipe: the steps to apply.
+        recipe: the steps to apply, after the image is developed.
         image: (B, C, H, W) in [0, 1], C = 1 or 3.
         report: called before each step with how many are done, and of how many.
         weights: how much pixels count, (B or 1, 1, H, W) from 0 to 1, such as :attr:`Photograph.weights`; None is 1
@@ -180,8 +181,9 @@ def apply_recipe(
         generator: source of randomness for the landmarks; None draws the same for every step and call.
 
     Returns:
-        (B, C, H, W), with C = 3 if a step added colour; the image itself if no step has an effect. Values may leave
-        [0, 1]; between steps they are limited to it, or to the range of the image if that is larger.
+        (B, C, H, W), with C = 3 if a step added colour, and smaller if the recipe crops or straightens; the image
+        itself if nothing has an effect. Values may leave [0, 1]; between steps they are limited to it, or to the range
+        of the image if that is larger.
         Differentiable in the image.
 
     Raises:
@@ -194,6 +196,15 @@ def apply_recipe(
         >>> apply_recipe(recipe, image).shape, apply_recipe(Recipe(), image) is image
         (torch.Size([1, 3, 24, 24]), True)
     """
+    if not recipe.develop.is_idle:
+        check_photograph(image, "image")
+        size = image.shape[-2], image.shape[-1]
+        image, recipe, frame = (
+            develop_image(image, recipe.develop),
+            recipe.on_developed(size),
+            recipe.develop.frame(size),
+        )
+        weights = None if weights is None else develop_planes(weights, frame).clamp(0, 1)
     result, steps = image, recipe.acting
     for done, step in enumerate(steps):
         if report is not None:

@@ -110,6 +110,15 @@ def read_upright(block: bytes | None, orientation: int | None = None, size: tupl
     return Upright(orientation, None if only else PREFIX + bytes(tables.data), tuple(left_out))
 
 
+def of_part(block: bytes | None, size: tuple[int, int]) -> bytes | None:
+    """The upright block of a part (width, height) of a picture, without the place of the subject."""
+    tables = parsed(block)
+    if tables is None:
+        return None
+    _drop(tables, AREAS)
+    return read_upright(PREFIX + bytes(tables.data), size=size).block
+
+
 def _turn_areas(tables: Block, orientation: int) -> bool:
     """Turn the places of the subject with the picture, whose stored size the block says; False if that fails."""
     fields = {field.code: field for field in tables.walk()}

@@ -22,6 +22,7 @@ import psutil
 
 from nlfilter_torch.photo.io import jpeg, png, tiff
 from nlfilter_torch.photo.io.decoded import NO_METADATA, Channels, Metadata, bands, decoding
+from nlfilter_torch.photo.io.exif import of_part
 from nlfilter_torch.photo.io.extras import note_left_out
 from nlfilter_torch.photo.io.photographs import (
     TooLarge,
@@ -96,6 +97,13 @@ class StoredPicture:
         shape = (height, width, 3 + self.alpha)
         rows = np.broadcast_to(np.zeros((), self.rows.dtype), shape)
         return replace(self, rows=rows, metadata=replace(self.metadata, icc=None))
+
+    def of_part(self, size: tuple[int, int]) -> "StoredPicture":
+        """Return shape and metadata of a part (H, W), without pixels."""
+        if size == self.shape[:2]:
+            return self
+        rows = np.broadcast_to(np.zeros((), self.rows.dtype), (*size, *self.rows.shape[2:]))
+        return replace(self, rows=rows, metadata=replace(self.metadata, exif=of_part(self.metadata.exif, size[::-1])))
 
 
 def is_zarr(path: Path) -> bool:

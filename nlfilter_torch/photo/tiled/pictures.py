@@ -93,6 +93,16 @@ class FileRows:
             data = self.stream.read((stop - start) * length)
         return np.frombuffer(data, self.dtype).reshape(-1, *self.shape[1:])
 
+    def part(self, rows: range, columns: range) -> Stored:
+        """Some rows and columns (h, w, S) of (H, W, S), without reading the others."""
+        pixel = math.prod(self.shape[2:]) * self.dtype.itemsize
+        data = bytearray()
+        with self.lock:
+            for row in rows:
+                self.stream.seek((row * self.shape[1] + columns.start) * pixel)
+                data += self.stream.read(len(columns) * pixel)
+        return np.frombuffer(data, self.dtype).reshape(len(rows), len(columns), *self.shape[2:])
+
 
 @dataclass(frozen=True)
 class NodataRows:

@@ -4,7 +4,6 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -15,7 +14,7 @@ from nlfilter_torch.photo.picture.changes import blend_edited
 from nlfilter_torch.photo.tiled.pictures import Picture, Rows, RowSource, Tile, mask_of
 from nlfilter_torch.photo.tiled.scribbles import RowPainter
 from nlfilter_torch.photo.tiled.source import Tiled
-from nlfilter_torch.photo.tiled.tiles import TILE_PIXELS, Passes, TileEdit, Tiling
+from nlfilter_torch.photo.tiled.tiles import Passes, Tiling, between_steps, inner, tile_by_tile
 
 
 def edit_rows(passes: Passes, source: RowSource, steps: Sequence[Step], name: str) -> Rows:
@@ -66,11 +65,6 @@ def edit_regions(
         yield tile_by_tile(passes, Picture(source, name), blend)
 
 
-def between_steps(passes: Passes, source: RowSource) -> Passes:
-    """Tiling options for the rows between two steps: floats, which hold all values of the source."""
-    return replace(passes, kind="float64" if source.dtype == np.float64 else "float32")
-
-
 @dataclass(frozen=True)
 class Blend:
     """A blend of edited pictures, each in the region of its mask."""
@@ -94,16 +88,6 @@ def step_tiling(step: Step, passes: Passes, source: RowSource, name: str) -> Ite
         fitted = fit_step(step, tiled, scribbles_of(step, tiled.size, RowPainter()))
     with tiled.tiling(fitted) as tiling:
         yield tiling
-
-
-def tile_by_tile(passes: Passes, picture: Picture, edit: TileEdit) -> Tiling:
-    """The rows of an edit that computes each pixel from the same pixel of the picture."""
-    return Tiling(passes, picture, edit, 0, passes.tile_rows or max(1, TILE_PIXELS // picture.size[1]))
-
-
-def inner(tile: Tile) -> Tensor:
-    """The pixels of a tile."""
-    return tile.inner
 
 
 def clipped(tiling: Tiling, limits: tuple[float, float]) -> Tiling:

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from tempfile import TemporaryFile, gettempdir
 from typing import Literal, Protocol
@@ -204,7 +204,7 @@ class Processes(Protocol):
 
 
 @contextmanager
-def intermediate(rows: Rows, size: tuple[int, int], folder: Path | None) -> Iterator[RowSource]:
+def intermediate(rows: Rows, size: tuple[int, int], folder: Path | None) -> Iterator[FileRows]:
     """Write rows (h, W, S) of a picture (H, W) between two steps to a temporary file, and yield that as a source.
 
     Without a folder for the file, it is in the system's folder for temporary files.
@@ -225,6 +225,21 @@ def intermediate(rows: Rows, size: tuple[int, int], folder: Path | None) -> Iter
                 raise OSError(error.errno, reason, str(folder or gettempdir())) from error
         file.flush()
         yield FileRows(file, shape, kind)
+
+
+def between_steps(passes: Passes, source: RowSource) -> Passes:
+    """Tiling options for the rows between two steps: floats, which hold all values of the source."""
+    return replace(passes, kind="float64" if source.dtype == np.float64 else "float32")
+
+
+def tile_by_tile(passes: Passes, picture: Picture, edit: TileEdit) -> Tiling:
+    """The rows of an edit that computes each pixel from the same pixel of the picture."""
+    return Tiling(passes, picture, edit, 0, passes.tile_rows or max(1, TILE_PIXELS // picture.size[1]))
+
+
+def inner(tile: Tile) -> Tensor:
+    """The pixels of a tile."""
+    return tile.inner
 
 
 def factor_bytes(pixels: int, num_landmarks: int) -> int:

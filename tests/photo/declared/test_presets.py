@@ -160,7 +160,7 @@ def step_file(edit: str, entries: str) -> str:
             "version in edit.json must be 1, got 2; update nlfilter-torch to read newer files",
         ),
         ('{"version": 1, "steps": {}}', "steps in edit.json must be a list"),
-        ('{"version": 1, "steps": [], "detail": {}}', "no entries other than version and steps, got detail"),
+        ('{"version": 1, "steps": [], "detail": {}}', "no entries other than version, develop and steps, got detail"),
         ('{"version": 1, "steps": [{}]}', "step 1 in edit.json must have an entry edit, one of denoise, detail"),
         ('{"version": 1, "steps": [{"edit": ["tone"]}]}', "step 1 in edit.json must have an entry edit"),
         (

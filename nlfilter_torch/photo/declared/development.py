@@ -1,0 +1,306 @@
+"""How a photograph is developed before the steps of an edit: exposure, white balance, straightening and crop.
+
+A recipe holds it once, beside its steps. The strokes of all steps are stored in coordinates of the original picture,
+and :class:`Frame` is the one place that maps them to the developed picture and back. Does not import torch.
+"""
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+from nlfilter_torch.photo.declared.declaration import Edit, Parameter, Slider
+from nlfilter_torch.photo.declared.json_values import is_within, shown
+from nlfilter_torch.photo.declared.strokes import Stroke
+
+Crop = tuple[float, float, float, float]
+WHOLE: Crop = (0.0, 0.0, 1.0, 1.0)
+
+#: Declared as an edit is, though it is no step: it comes first, and once.
+DEVELOP = Edit(
+    "develop",
+    """Develop a photograph: exposure and white balance in linear light, then straighten and crop.
+
+    Example: `nlfilter-torch develop in.jpg out.jpg --exposure 0.5 --temperature 0.1 --straighten 1.5`
+
+    Cut a tenth off at the left and at the bottom: `nlfilter-torch develop in.jpg out.jpg --crop 0.1,0,1,0.9`
+    """,
+    (
+        Parameter(
+            "exposure",
+            "number",
+            0.0,
+            "Brightness in stops: 1 doubles the light, -1 halves it, 0 leaves it.",
+            -5,
+            5,
+            idle=0.0,
+            metavar="STOPS",
+            slider=Slider("Exposure", -3, 3, 0.05),
+        ),
+        Parameter(
+            "temperature",
+            "number",
+            0.0,
+            "White balance from blue, -1, to amber, 1: a cold photograph becomes warmer above 0. Grey photographs stay "
+            "grey.",
+            -1,
+            1,
+            idle=0.0,
+            slider=Slider("Temperature", -1, 1, 0.01),
+        ),
+        Parameter(
+            "tint",
+            "number",
+            0.0,
+            "White balance from green, -1, to magenta, 1: a greenish photograph becomes neutral above 0.",
+            -1,
+            1,
+            idle=0.0,
+            slider=Slider("Tint", -1, 1, 0.01),
+        ),
+        Parameter(
+            "straighten",
+            "number",
+            0.0,
+            "Degrees by which the photograph is turned, clockwise above 0, counter-clockwise below. Corners that get "
+            "empty are cut off, at the same proportions.",
+            -45,
+            45,
+            idle=0.0,
+            metavar="DEGREES",
+            slider=Slider("Straighten", -15, 15, 0.1),
+        ),
+        Parameter(
+            "crop",
+            "sliders",
+            WHOLE,
+            "What is kept of the straightened photograph: left, top, right and bottom edge, as shares of its width and "
+            "height from 0 to 1. It shrinks about its middle if it has empty corners.",
+            0,
+            1,
+            idle=WHOLE,
+            length=4,
+            metavar="L,T,R,B",
+        ),
+    ),
+    hint="Comes before all steps. Strokes stay where they are on the photograph.",
+)
+
+
+def check_value(name: str, value: object, place: str = "", dashes: str = "") -> None:
+    """Raise ValueError unless a value is valid.
+
+    In the message, ``place`` says where it stands, and ``dashes`` come before the name of an option.
+    """
+    called = f"{dashes}{name}{place}"
+    if name == "crop":
+        edges = value if isinstance(value, list | tuple) and len(value) == 4 else ()
+        numbers = [edge for edge in edges if is_within(edge, 0, 1)]
+        if len(numbers) != 4 or not (numbers[0] < numbers[2] and numbers[1] < numbers[3]):
+            raise ValueError(
+                f"{called} must be the left, top, right and bottom edge as shares from 0 to 1, left below right and "
+                f"top below bottom, got {shown(list(value) if isinstance(value, tuple) else value)}; correct it"
+            )
+    elif not DEVELOP[name].is_valid(value):
+        raise ValueError(f"{called} must be {DEVELOP[name].wanted}, got {shown(value)}; correct it")
+
+
+@dataclass(frozen=True)
+class Development:
+    """Exposure, white balance, straightening and crop of a photograph; by default nothing changes.
+
+    Attributes:
+        exposure: stops, -5 to 5; 1 doubles the light.
+        temperature: -1 (blue) to 1 (amber).
+        tint: -1 (green) to 1 (magenta).
+        straighten: degrees, -45 to 45, by which the picture is turned clockwise about its middle.
+        crop: left, top, right and bottom edge as shares of the turned picture, which keeps its size. A crop with empty
+            corners is shrunk about its middle until it has none.
+
+    Raises:
+        ValueError: if a value is out of range.
+
+    Example:
+        >>> Development(straighten=10.0).frame((100, 150)).size
+        (80, 120)
+    """
+
+    exposure: float = DEVELOP["exposure"].default_number
+    temperature: float = DEVELOP["temperature"].default_number
+    tint: float = DEVELOP["tint"].default_number
+    straighten: float = DEVELOP["straighten"].default_number
+    crop: Crop = WHOLE
+
+    def __post_init__(self) -> None:
+        """Check all values."""
+        for name, value in vars(self).items():
+            check_value(name, value)
+
+    @property
+    def is_idle(self) -> bool:
+        """Whether nothing changes."""
+        return self == AS_IT_IS
+
+    @property
+    def balances(self) -> bool:
+        """Whether the white balance changes."""
+        return bool(self.temperature or self.tint)
+
+    @property
+    def changes_tones(self) -> bool:
+        """Whether exposure or white balance change."""
+        return bool(self.exposure) or self.balances
+
+    @property
+    def geometry(self) -> "Development":
+        """Straightening and crop alone."""
+        return Development(straighten=self.straighten, crop=self.crop)
+
+    def frame(self, size: tuple[int, int]) -> "Frame":
+        """Where the developed picture lies in a picture (H, W).
+
+        Raises:
+            ValueError: if the middle of the crop is outside the turned picture.
+        """
+        height, width = size
+        left, top, right, bottom = self.crop
+        if self.straighten == 0:
+            first = min(round(left * width), width - 1), min(round(top * height), height - 1)
+            last = max(round(right * width), first[0] + 1), max(round(bottom * height), first[1] + 1)
+            return Frame(size, 0.0, first[1], first[0], last[1] - first[1], last[0] - first[0])
+        angle = math.radians(self.straighten)
+        middle = (left + right - 1) / 2 * width, (top + bottom - 1) / 2 * height  # from that of the picture
+        half = (right - left) / 2 * width, (bottom - top) / 2 * height
+        share = min(1.0, *(_reach(middle, (x * half[0], y * half[1]), angle, size) for x in (-1, 1) for y in (-1, 1)))
+        if share <= 0:
+            raise ValueError(
+                f"crop must have its middle within the photograph turned by {self.straighten:g} degrees, got "
+                f"{', '.join(f'{edge:g}' for edge in self.crop)}; move it inwards"
+            )
+        columns, rows = (_inside(m + n / 2, share * h) for m, n, h in zip(middle, (width, height), half, strict=True))
+        return Frame(size, angle, rows.start, columns.start, len(rows), len(columns))
+
+    def to_json(self, indent: str = "", *, complete: bool = False) -> str:
+        """Format it as a JSON object, without defaults unless ``complete``."""
+        entries = {n: v for n, v in vars(self).items() if complete or v != getattr(AS_IT_IS, n)}
+        lines = ",\n".join(f'{indent}  "{name}": {json.dumps(value)}' for name, value in entries.items())
+        return f"{{\n{lines}\n{indent}}}"
+
+    @staticmethod
+    def from_entries(entries: object, place: str) -> "Development":
+        """Create it from parsed JSON; ``place`` is the file's name in errors.
+
+        Raises:
+            ValueError: if an entry is unknown or invalid.
+        """
+        if not isinstance(entries, Mapping):
+            raise ValueError(f"develop in {place} must be an object, got {shown(entries)}; correct it")
+        names = [parameter.name for parameter in DEVELOP]
+        for name, value in entries.items():
+            if name not in names:
+                raise ValueError(
+                    f"develop in {place} must have no entries other than {', '.join(names)}, got {name}; remove it"
+                )
+            check_value(name, value, f" of develop in {place}")
+        numbers = {name: float(value) for name, value in entries.items() if name != "crop"}
+        left, top, right, bottom = map(float, entries.get("crop", WHOLE))
+        return Development(**numbers, crop=(left, top, right, bottom))
+
+
+AS_IT_IS = Development()
+
+
+@dataclass(frozen=True)
+class Frame:
+    """Where a developed picture lies in its original: a rectangle of the original turned about its middle.
+
+    Attributes:
+        original: (H, W) of the original.
+        angle: of the turn, clockwise, in radians.
+        top: first row of the rectangle, in pixels.
+        left: its first column.
+        height: its height.
+        width: its width.
+    """
+
+    original: tuple[int, int]
+    angle: float
+    top: int
+    left: int
+    height: int
+    width: int
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(h, w) of the developed picture."""
+        return self.height, self.width
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether it is the original itself."""
+        return self.angle == 0 and self.size == self.original
+
+    @property
+    def scale(self) -> float:
+        """What the radius of a brush, a share of the short side, is multiplied by in the developed picture."""
+        return min(self.original) / min(self.size)
+
+    def inward(self, x: float, y: float) -> tuple[float, float]:
+        """Where a point of the original is in the developed picture, both as shares of width and height.
+
+        >>> Development(crop=(0.5, 0.0, 1.0, 1.0)).frame((10, 20)).inward(0.75, 0.5)
+        (0.5, 0.5)
+        """
+        if self.is_whole:
+            return x, y
+        height, width = self.original
+        column, row = turned((x - 0.5) * width, (y - 0.5) * height, self.angle)
+        return (column + width / 2 - self.left) / self.width, (row + height / 2 - self.top) / self.height
+
+    def outward(self, x: float, y: float) -> tuple[float, float]:
+        """Where a point of the developed picture is in the original, the inverse of :meth:`inward`."""
+        if self.is_whole:
+            return x, y
+        height, width = self.original
+        column, row = self.left + x * self.width - width / 2, self.top + y * self.height - height / 2
+        column, row = turned(column, row, -self.angle)
+        return column / width + 0.5, row / height + 0.5
+
+    def stroke_inward(self, stroke: Stroke) -> Stroke:
+        """A stroke in coordinates of the original, in those of the developed picture."""
+        if self.is_whole:
+            return stroke
+        points = tuple(self.inward(*point) for point in stroke.points)
+        return replace(stroke, points=points, radius=stroke.radius * self.scale)
+
+    def stroke_outward(self, stroke: Stroke) -> Stroke:
+        """A stroke in coordinates of the developed picture, in those of the original."""
+        if self.is_whole:
+            return stroke
+        points = tuple(self.outward(*point) for point in stroke.points)
+        return replace(stroke, points=points, radius=stroke.radius / self.scale)
+
+
+def turned(x: float, y: float, angle: float) -> tuple[float, float]:
+    """A point, y downwards, turned clockwise about the origin by an angle in radians."""
+    return x * math.cos(angle) - y * math.sin(angle), x * math.sin(angle) + y * math.cos(angle)
+
+
+def _reach(middle: tuple[float, float], corner: tuple[float, float], angle: float, size: tuple[int, int]) -> float:
+    """The share of the way from the middle of a crop to its corner that is within the turned picture (H, W).
+
+    Both are (x, y), ``middle`` from that of the picture and ``corner`` from that of the crop. Not positive if the
+    middle is outside.
+    """
+    starts, ways = turned(*middle, -angle), turned(*corner, -angle)
+    shares = []
+    for start, way, length in zip(starts, ways, (size[1], size[0]), strict=True):
+        room = length / 2 - (start if way > 0 else -start)
+        shares.append(room / abs(way) if way else math.copysign(math.inf, length / 2 - abs(start)))
+    return min(shares)
+
+
+def _inside(middle: float, half: float) -> range:
+    """The whole pixels between the ends of an interval, or that in its middle if there are none."""
+    pixels = range(math.ceil(middle - half - 1e-9), math.floor(middle + half + 1e-9))
+    return pixels if len(pixels) else range(math.floor(middle), math.floor(middle) + 1)

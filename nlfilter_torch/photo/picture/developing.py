@@ -1,0 +1,175 @@
+"""Developing a picture: exposure and white balance in linear light, straightening and crop.
+
+Geometry comes first, then light. A picture is turned in blocks of fixed places, so that one that is read in parts
+becomes the same, bit for bit, as one in memory.
+"""
+
+import math
+from collections.abc import Callable, Iterator
+from functools import partial
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from nlfilter_torch.photo.declared.development import Development, Frame, turned
+from nlfilter_torch.photo.picture.colour import in_even_parts
+
+BLOCK = 256  # side in pixels of the squares that are turned at once
+MARGIN = 2  # pixels around a point that bicubic interpolation reads
+BLUE_TO_AMBER = 0.75  # stops that temperature 1 adds to red and takes from blue
+GREEN_TO_MAGENTA = 0.5  # stops that tint 1 takes from green
+LUMINANCE = (0.2126, 0.7152, 0.0722)  # weights of red, green and blue in linear light
+
+ReadPart = Callable[[range, range], Tensor]  # returns rows and columns (B, C, h, w) of a picture
+
+
+def develop_image(image: Tensor, development: Development) -> Tensor:
+    """Develop a picture.
+
+    A picture with values outside [0, 1] keeps all values; in others they are limited to [0, 1].
+
+    Args:
+        image: (B, C, H, W), C = 1 or 3, with the tone curve of sRGB. White balance leaves grey pictures as they are.
+        development: how.
+
+    Returns:
+        (B, C, h, w); the image itself if nothing changes. Differentiable.
+
+    Raises:
+        ValueError: if the middle of the crop is outside the turned picture.
+
+    Example:
+        >>> grey = torch.full((1, 1, 4, 6), 0.5)
+        >>> brighter = develop_image(grey, Development(exposure=1.0, crop=(0.5, 0.0, 1.0, 1.0)))
+        >>> brighter.shape, round(float(brighter.mean()), 3)
+        (torch.Size([1, 1, 4, 3]), 0.686)
+    """
+    if development.is_idle:
+        return image
+    least, most = limits_of(image)
+    framed = develop_planes(image, development.frame((image.shape[-2], image.shape[-1])))
+    return in_light(framed.clamp(least, most), development, (least, most))
+
+
+def limits_of(image: Tensor) -> tuple[Tensor, Tensor]:
+    """The range (B, 1, 1, 1) of an image (B, C, H, W), enlarged to hold 0 and 1."""
+    values = image.detach()
+    least, most = values.amin((1, 2, 3), keepdim=True), values.amax((1, 2, 3), keepdim=True)
+    return least.clamp(max=0), most.clamp(min=1)
+
+
+def develop_planes(planes: Tensor, frame: Frame) -> Tensor:
+    """Straighten and crop planes (B, C, H, W); values may leave their range where they are turned."""
+    rows, columns = range(frame.top, frame.top + frame.height), range(frame.left, frame.left + frame.width)
+    if frame.angle == 0:
+        return part_of_planes(planes, rows, columns)
+    bands = (list(parts) for _, parts in turned_bands(partial(part_of_planes, planes), frame))
+    return torch.cat([torch.cat(parts, dim=3) for parts in bands], dim=2)
+
+
+def part_of_planes(planes: Tensor, rows: range, columns: range) -> Tensor:
+    """A part of planes (B, C, H, W)."""
+    return planes[..., rows.start : rows.stop, columns.start : columns.stop]
+
+
+def turned_bands(read: ReadPart, frame: Frame) -> Iterator[tuple[range, Iterator[Tensor]]]:
+    """Yield rows of a developed picture, a few at a time, and their parts (B, C, h, w) from left to right."""
+    for top in range(0, frame.height, BLOCK):
+        rows = range(top, min(top + BLOCK, frame.height))
+        lefts = range(0, frame.width, BLOCK)
+        yield rows, (turned_part(read, frame, rows, range(c, min(c + BLOCK, frame.width))) for c in lefts)
+
+
+def turned_part(read: ReadPart, frame: Frame, rows: range, columns: range) -> Tensor:
+    """A part (B, C, h, w) of a developed picture that is turned, by bicubic interpolation.
+
+    Pixels beyond the border of the picture have the colours of those at the border.
+    """
+    from kornia.geometry import warp_affine  # kornia takes half a second to import
+
+    height, width = frame.original
+    corners = [_source_of(frame, x, y) for x in (columns.start, columns.stop - 1) for y in (rows.start, rows.stop - 1)]
+    across, down = (
+        range(math.floor(min(v)) - MARGIN, math.ceil(max(v)) + MARGIN + 1) for v in zip(*corners, strict=True)
+    )
+    inner_columns, inner_rows = _within(across, width), _within(down, height)
+    pads = _pads(across, inner_columns) + _pads(down, inner_rows)
+    source = F.pad(read(inner_rows, inner_columns), pads, mode="replicate")
+    # Where the first pixel of the part read is in the part returned, both counted from the middles of pixels.
+    x, y = turned(across.start + 0.5 - width / 2, down.start + 0.5 - height / 2, frame.angle)
+    x, y = x + width / 2 - frame.left - columns.start - 0.5, y + height / 2 - frame.top - rows.start - 0.5
+    cosine, sine = math.cos(frame.angle), math.sin(frame.angle)
+    matrix = source.new_tensor([[[cosine, -sine, x], [sine, cosine, y]]]).expand(len(source), -1, -1)
+    size = (len(rows), len(columns))
+    return warp_affine(source, matrix, size, mode="bicubic", padding_mode="border", align_corners=True)
+
+
+def finished(planes: Tensor, colours: int, limits: tuple[float, float], nodata: float | None = None) -> Tensor:
+    """Planes (1, S, h, w) that were turned, within their ranges.
+
+    Args:
+        planes: colours, and one of transparency if there are more.
+        colours: 1 or 3.
+        limits: of the colours.
+        nodata: the value of pixels without data, which the last plane then marks by 0, or None.
+    """
+    image, opacity = planes[:, :colours].clamp(*limits), planes[:, colours:].clamp(0, 1)
+    if nodata is None:
+        return torch.cat([image, opacity], dim=1)
+    opacity = opacity.round()
+    return torch.cat([torch.where(opacity > 0, image, nodata), opacity], dim=1)
+
+
+def _source_of(frame: Frame, column: int, row: int) -> tuple[float, float]:
+    """The column and row of the original, counted from the middles of pixels, that a pixel is taken from."""
+    height, width = frame.original
+    x, y = turned(frame.left + column + 0.5 - width / 2, frame.top + row + 0.5 - height / 2, -frame.angle)
+    return x + width / 2 - 0.5, y + height / 2 - 0.5
+
+
+def _within(places: range, length: int) -> range:
+    """The places on an axis of that length, at least one of them."""
+    first = min(max(places.start, 0), length - 1)
+    return range(first, max(min(places.stop, length), first + 1))
+
+
+def _pads(places: range, inner: range) -> list[int]:
+    """How many places there are before and after those of ``inner``."""
+    return [max(inner.start - places.start, 0), max(places.stop - inner.stop, 0)]
+
+
+def in_light(image: Tensor, development: Development, limits: tuple[Tensor, Tensor]) -> Tensor:
+    """Change exposure and white balance of an image (B, C, H, W) in linear light.
+
+    ``limits`` are those of the picture before, see :func:`limits_of`; beyond [0, 1] they are not kept.
+    """
+    if not development.changes_tones:
+        return image
+    colours = image.expand(-1, 3, -1, -1) if image.shape[1] == 1 else image
+    gains = gains_of(development, coloured=image.shape[1] == 3)
+    edited = in_even_parts(partial(_times, gains=image.new_tensor(gains).view(1, 3, 1, 1)), colours)[
+        :, : image.shape[1]
+    ]
+    is_wide = (limits[0] < 0) | (limits[1] > 1)
+    return torch.where(is_wide, edited, edited.clamp(0, 1))
+
+
+def _times(image: Tensor, gains: Tensor) -> Tensor:
+    """Multiply the linear light of an image (B, 3, H, W)."""
+    from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb  # kornia takes half a second to import
+
+    return linear_rgb_to_rgb(rgb_to_linear_rgb(image) * gains)
+
+
+def gains_of(development: Development, *, coloured: bool = True) -> list[float]:
+    """What red, green and blue are multiplied by in linear light; white balance keeps the luminance of grey.
+
+    >>> gains_of(Development(exposure=1.0)), gains_of(Development(tint=1.0), coloured=False)
+    ([2.0, 2.0, 2.0], [1.0, 1.0, 1.0])
+    """
+    warmer, redder = (development.temperature, development.tint) if coloured else (0.0, 0.0)
+    gains = [2.0 ** (BLUE_TO_AMBER * warmer), 2.0 ** (-GREEN_TO_MAGENTA * redder), 2.0 ** (-BLUE_TO_AMBER * warmer)]
+    luminance = sum(weight * gain for weight, gain in zip(LUMINANCE, gains, strict=True))
+    light = 2.0**development.exposure
+    return [light * gain / luminance if coloured else light for gain in gains]

@@ -1,0 +1,135 @@
+"""``nlfilter-torch develop``, and files of edits that develop, in memory and in tiles."""
+
+from pathlib import Path
+
+import imagecodecs
+import numpy as np
+import pytest
+import tifffile
+from numpy.typing import NDArray
+from PIL import Image
+
+from nlfilter_torch.photo.cli import editing, main
+from nlfilter_torch.photo.declared.development import Development
+from nlfilter_torch.photo.declared.presets import Recipe
+from nlfilter_torch.photo.declared.steps import Step
+from nlfilter_torch.photo.declared.strokes import Stroke
+from tests.problems import colour
+
+SIZE = (300, 420)  # more than a block that is turned at once
+ALL = ["--exposure", "0.5", "--temperature", "0.2", "--straighten", "3", "--crop", "0.05,0,1,0.9"]
+
+
+def written(path: Path, kind: str) -> Path:
+    """A photograph as a TIFF: of 8 bits, with transparency, without data in places, or of floats beyond white."""
+    picture = colour("chelsea", *SIZE)[0].permute(1, 2, 0).numpy()
+    if kind == "floats":
+        tifffile.imwrite(path, 3 * picture - 0.2, photometric="rgb")
+        return path
+    stored = np.rint(254 * picture + 1).astype(np.uint8)
+    tags = None
+    if kind == "transparent":
+        alpha = np.full((*SIZE, 1), 255, np.uint8)
+        alpha[60:180, 90:220], alpha[:, 250:280] = 0, 128
+        stored = np.concatenate([stored, alpha], axis=2)
+    if kind == "nodata":
+        stored[60:180, 90:220] = 0
+        tags = [(42113, "s", 0, "0", True)]
+    tifffile.imwrite(path, stored, photometric="rgb", extratags=tags, metadata=None)
+    return path
+
+
+def by_both(monkeypatch: pytest.MonkeyPatch, source: Path, *arguments: str) -> list[NDArray[np.generic]]:
+    """The pixels that a command writes, in memory and in tiles."""
+    target = source.with_name("out.tif")
+    pictures = []
+    for _ in range(2):
+        assert main([arguments[0], str(source), str(target), *arguments[1:]]) == 0
+        pictures.append(tifffile.imread(target))
+        monkeypatch.setattr(editing, "read_if_it_fits", lambda *_: None)
+    return pictures
+
+
+@pytest.mark.parametrize("kind", ["plain", "transparent", "nodata", "floats"])
+@pytest.mark.parametrize("arguments", [ALL, ["--crop", "0.2,0.1,0.7,1"], ["--exposure", "-1", "--tint", "0.3"]])
+def test_tiles_give_the_same(kind: str, arguments: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    source = written(tmp_path / "in.tif", kind)
+    whole, tiled = by_both(monkeypatch, source, "develop", *arguments)
+    assert whole.dtype == tiled.dtype == tifffile.imread(source).dtype
+    assert whole.shape == tiled.shape
+    seen = whole[..., -1:] > 0 if kind == "transparent" else True
+    assert np.array_equal(whole * seen, tiled * seen)
+    if arguments[0] == "--crop":
+        assert np.array_equal(whole, tifffile.imread(source)[30:, 84:294])
+    if kind == "nodata":
+        hidden = (whole == 0).all(2)
+        assert 0.05 < hidden.mean() < 0.3
+        assert whole[~hidden].min() > 0  # no pixel has the colour of those without data mixed in
+    if kind == "transparent":
+        assert (whole[..., 3] == 0).any()
+        assert (whole[..., 3] == 128).any()
+
+
+def test_strokes_stay_where_they_are(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a stroke selects in the whole photograph, it selects in the developed one."""
+    picture = np.full((*SIZE, 3), 60, np.uint8)
+    picture[100:140, 200:260] = (200, 40, 40)
+    tifffile.imwrite(tmp_path / "in.tif", picture, photometric="rgb")
+    stroke = Stroke(((215 / 420, 120 / 300), (245 / 420, 120 / 300)), 0.02, "#2040e0")
+    recipe = Recipe((Step("recolor", (stroke,)),), Development(straighten=5.0, crop=(0.3, 0.0, 1.0, 1.0)))
+    (tmp_path / "edit.json").write_text(recipe.to_json())
+    whole, tiled = by_both(monkeypatch, tmp_path / "in.tif", "apply", "--preset", str(tmp_path / "edit.json"))
+    assert np.abs(whole.astype(int) - tiled).max() <= 1
+    assert whole.shape[:2] == recipe.develop.frame(SIZE).size
+    blue = whole[..., 2].astype(int) > whole[..., 0] + 40
+    assert blue.sum() == pytest.approx(40 * 60, rel=0.1)
+
+
+def test_the_file_keeps_its_depth_and_its_exif_tells_its_size(tmp_path: Path, tiled: bool) -> None:
+    exif = Image.Exif()
+    exif[271] = "Maker"
+    exif.get_ifd(34665).update({40962: 30, 40963: 20, 37396: (15, 10)})  # size, and the place of the subject
+    Image.fromarray(np.zeros((20, 30, 3), np.uint8)).save(tmp_path / "in.jpg", exif=exif)
+    assert main(["develop", str(tmp_path / "in.jpg"), str(tmp_path / "out.jpg"), "--crop", "0,0,0.5,0.5"]) == 0
+    with Image.open(tmp_path / "out.jpg") as after:
+        assert after.size == (15, 10)
+        assert after.getexif()[271] == "Maker"
+        assert dict(after.getexif().get_ifd(34665)) == {40962: 15, 40963: 10}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["--crop", "1,2"], "--crop must be the left, top, right and bottom edge as shares from 0 to 1"),
+        (["--crop", "a,b"], 'got "a,b"; correct it'),
+        (["--exposure", "9"], "--exposure"),
+        (["--straighten", "45", "--crop", "0,0,0.1,0.1"], "crop must have its middle within the photograph turned"),
+        (["--workers", "2"], "--workers takes zarr arrays"),
+    ],
+)
+def test_bad_options(arguments: list[str], sentence: str, photo: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["develop", str(photo), str(photo.with_name("out.png")), *arguments]) == 2
+    assert sentence in capsys.readouterr().err
+    assert not photo.with_name("out.png").exists()
+
+
+def test_notes(tmp_path: Path, tiled: bool, capsys: pytest.CaptureFixture[str]) -> None:
+    source, target = tmp_path / "in.png", tmp_path / "out.png"
+    source.write_bytes(imagecodecs.png_encode(np.full((20, 30), 90, np.uint8)))
+    assert main(["develop", str(source), str(target), "--temperature", "0.5"]) == 0
+    assert "in.png is grey: temperature and tint change nothing" in capsys.readouterr().err
+    assert (imagecodecs.png_decode(target.read_bytes()) == 90).all()
+    assert main(["develop", str(source), str(target)]) == 0
+    assert "no option changes anything" in capsys.readouterr().err
+
+
+def test_regions_and_films_are_not_developed(photo: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    edit = photo.with_name("edit.json")
+    edit.write_text(Recipe((), Development(exposure=1.0)).to_json())
+    out = str(photo.with_name("out.png"))
+    assert main(["apply", str(photo), out, "--preset", str(edit), "--mask", str(photo)]) == 2
+    assert "--mask must come with edits that do not develop the photograph, got" in capsys.readouterr().err
+    assert main(["frames", str(photo.parent), str(photo.with_name("f")), "--preset", str(edit)]) == 2
+    assert "--preset must not develop the photographs of a film" in capsys.readouterr().err
+    assert main(["detail", str(photo), out, "--preset", str(edit)]) == 2
+    assert "use nlfilter-torch apply" in capsys.readouterr().err

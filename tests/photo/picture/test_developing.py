@@ -1,0 +1,109 @@
+"""Exposure and white balance against plain arithmetic; turning against kornia at once; ranges and gradients."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from kornia.geometry import rotate
+from torch.autograd import gradcheck
+
+from nlfilter_torch.photo.declared.development import Development
+from nlfilter_torch.photo.declared.presets import Recipe
+from nlfilter_torch.photo.declared.steps import Step
+from nlfilter_torch.photo.declared.strokes import Stroke
+from nlfilter_torch.photo.edits.applying import apply_recipe
+from nlfilter_torch.photo.picture.developing import develop_image, gains_of
+from tests.problems import colour
+
+
+def linear(values: np.ndarray) -> np.ndarray:
+    """The light of values of sRGB."""
+    return np.where(values > 0.04045, ((values + 0.055) / 1.055) ** 2.4, values / 12.92)
+
+
+def encoded(light: np.ndarray) -> np.ndarray:
+    return np.where(light > 0.0031308, 1.055 * light ** (1 / 2.4) - 0.055, 12.92 * light)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_exposure_and_white_balance_are_factors_of_light(dtype: torch.dtype) -> None:
+    image = colour("chelsea", 40, 60).to(dtype)
+    development = Development(exposure=-0.7, temperature=0.4, tint=-0.3)
+    gains = np.array([2 ** (0.75 * 0.4), 2 ** (0.5 * 0.3), 2 ** (-0.75 * 0.4)])
+    gains *= 2**-0.7 / (gains @ [0.2126, 0.7152, 0.0722])
+    assert gains_of(development) == pytest.approx(gains)
+    wanted = encoded(linear(image.double().numpy()) * gains[:, None, None]).clip(0, 1)
+    assert np.abs(develop_image(image, development).numpy() - wanted).max() < 2e-6
+
+
+def test_white_balance_keeps_the_luminance_of_grey_and_grey_pictures() -> None:
+    development = Development(temperature=0.8, tint=0.5)
+    warm = linear(develop_image(torch.full((1, 3, 2, 2), 0.3), development).double().numpy())
+    assert np.dot([0.2126, 0.7152, 0.0722], warm[0, :, 0, 0]) == pytest.approx(float(linear(np.array(0.3))), abs=1e-6)
+    assert warm[0, 0, 0, 0] > warm[0, 1, 0, 0] > warm[0, 2, 0, 0]  # amber
+    grey = torch.rand(1, 1, 3, 4, generator=torch.Generator().manual_seed(0))
+    assert torch.allclose(develop_image(grey, development), grey, atol=1e-6)
+
+
+def test_values_above_white_are_not_lost() -> None:
+    wide = torch.tensor([0.0, 0.2, 0.9, 5.0]).view(1, 1, 1, 4)
+    darker = develop_image(wide, Development(exposure=-3.0))
+    assert darker[0, 0, 0, 3] > 1.5  # and not the value of white
+    assert torch.allclose(develop_image(darker, Development(exposure=3.0)), wide, atol=1e-5)
+    assert develop_image(wide[..., :3], Development(exposure=3.0)).max() == 1
+    both = torch.cat([wide, wide.clamp(0, 1)])  # one picture of a batch does not change the other
+    assert torch.equal(develop_image(both, Development(exposure=1.0))[1], develop_image(both[1:], Development(1.0))[0])
+
+
+def test_turned_as_kornia_does_at_once() -> None:
+    image = colour("astronaut", 300, 420)
+    frame = Development(straighten=7.0).frame((300, 420))
+    whole = rotate(image.double(), torch.tensor([-7.0]).double(), mode="bicubic", padding_mode="border")
+    wanted = whole[..., frame.top : frame.top + frame.height, frame.left : frame.left + frame.width].clamp(0, 1)
+    edited = develop_image(image, Development(straighten=7.0))
+    assert edited.shape[-2:] == frame.size
+    assert (edited - wanted).abs().max() < 1e-3
+
+
+def test_a_point_is_where_its_stroke_is() -> None:
+    """The middle of a bright spot, before and after, in pixels of the developed picture."""
+    y, x = torch.meshgrid(torch.arange(200.0), torch.arange(300.0), indexing="ij")
+    spot = torch.exp(-((x + 0.5 - 120) ** 2 + (y + 0.5 - 80) ** 2) / 50)[None, None]
+    development = Development(straighten=-12.0, crop=(0.1, 0.2, 0.8, 0.9))
+    turned, frame = develop_image(spot, development), development.frame((200, 300))
+    rows, columns = (torch.arange(n) + 0.5 for n in frame.size)
+    middle = [float((turned.sum(axis) * places).sum() / turned.sum()) for axis, places in ((2, columns), (3, rows))]
+    share = frame.inward(120 / 300, 80 / 200)
+    assert middle == pytest.approx([share[0] * frame.width, share[1] * frame.height], abs=0.05)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 7), (2, 3), (5, 1)])
+@pytest.mark.parametrize("degrees", [-45.0, 3.0])
+def test_tiny_pictures(size: tuple[int, int], degrees: float) -> None:
+    edited = develop_image(torch.full((2, 3, *size), 0.4), Development(straighten=degrees, exposure=1.0))
+    assert torch.allclose(edited, edited[:1, :1, :1, :1].expand_as(edited), atol=1e-6)
+    assert math.prod(edited.shape[-2:]) >= 1
+
+
+def test_what_changes_nothing_returns_the_image() -> None:
+    image = torch.rand(1, 3, 4, 5)
+    assert develop_image(image, Development()) is image
+    assert torch.equal(develop_image(image, Development(crop=(0.2, 0.0, 1.0, 0.5))), image[..., :2, 1:])
+
+
+def test_gradients() -> None:
+    image = torch.rand(1, 3, 5, 6, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    for development in (Development(-0.5, 0.3, 0.1), Development(straighten=5.0)):
+        assert gradcheck(lambda values, d=development: develop_image(values, d), (0.1 + 0.5 * image).requires_grad_())
+
+
+def test_a_recipe_develops_first() -> None:
+    image = colour("chelsea", 60, 80)
+    development = Development(exposure=0.3, straighten=4.0, crop=(0.0, 0.0, 0.8, 1.0))
+    stroke = Stroke(((0.3, 0.4), (0.4, 0.4)), 0.05, "in")
+    steps = (Step("detail", (stroke,), inside=(2.0, 1.0), alpha=(1.0, 1.0), landmarks=30), Step("tone"))
+    recipe = Recipe(steps, development)
+    edited = apply_recipe(recipe, image)
+    wanted = apply_recipe(recipe.on_developed((60, 80)), develop_image(image, development))
+    assert torch.allclose(edited, wanted, atol=1e-6)
