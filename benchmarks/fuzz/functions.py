@@ -16,7 +16,7 @@ import nlfilter_torch as nlf
 from benchmarks.fuzz.cases import SAMPLINGS
 from benchmarks.fuzz.checks import Findings, judged
 from benchmarks.fuzz.scene import Scene
-from nlfilter_torch.photo.selections.connected import EXTENTS
+from nlfilter_torch.photo.declared.shared_parameters import EXTENT
 
 TOO_LARGE = 1_000_001  # as a patch size, 8 TB of weights
 Kind = Callable[[Scene], Any]
@@ -92,6 +92,8 @@ SPECTRUM: dict[str, Kind] = {"spectrum": lambda scene: scene.spectrum}
 REGION: dict[str, Kind] = {"region": lambda scene: scene.mask(scene.regions)}
 REGIONS: dict[str, Kind] = {"regions": REGION["region"]}
 NEGATIVE: dict[str, Kind] = {"negative": lambda scene: scene.mask(1)}
+REMOVED: dict[str, Kind] = {"removed": NEGATIVE["negative"]}
+BY_HAND = {"added": NEGATIVE["negative"]} | REMOVED
 IMAGE = {"image": _image(1, 3, 2)}
 PAINTED: dict[str, Kind] = {"strokes": _image(3), "stroke_mask": lambda scene: scene.mask(1)}
 ALPHA: dict[str, Kind] = {"alpha": _alpha}
@@ -284,7 +286,10 @@ FUNCTIONS = {
     "enhance with regions": Function(
         nlf.enhance,
         {"image": _image(1, 3)} | REGIONS | ROWS,
-        RESIDUAL | FILTER | {"reach": _plain(0.1, 0.9), "mask_bandwidth": _plain(0.03, 0.5)},
+        RESIDUAL
+        | FILTER
+        | {"added": REGION["region"], "reach": _plain(0.1, 0.9), "mask_bandwidth": _plain(0.03, 0.5)}
+        | REMOVED,
     ),
     "sharpen": Function(
         nlf.sharpen, {"image": _image(1, 3)}, FILTER | {"amount": _number(0, 8), "guide_blur": _short_side(0.5)}
@@ -317,6 +322,7 @@ FUNCTIONS = {
         nlf.defocus,
         {"image": _image(1, 3), "focus_region": lambda scene: scene.mask(1)},
         LOCAL
+        | BY_HAND
         | {"radius": _short_side(0.5), "aperture": _one_of("disc", "gaussian")}
         | {"photometric_bandwidth": _plain(0.03, 0.5)},
     ),
@@ -324,9 +330,10 @@ FUNCTIONS = {
         nlf.region_mask,
         {"image": _image(1, 3), "scribbles": lambda scene: scene.mask(1)},
         LOCAL
+        | BY_HAND
         | {
             "reach": _number(0, 0.99),
-            "extent": _one_of(*EXTENTS),
+            "extent": _one_of(*EXTENT.choices),
             "photometric_bandwidth": _plain(0.03, 0.5),
         },
     ),
@@ -334,11 +341,13 @@ FUNCTIONS = {
         nlf.recolor,
         {"image": _image(3)} | PAINTED,
         LOCAL
+        | REMOVED
         | {
+            "added": lambda scene: torch.cat([PAINTED["strokes"](scene), scene.mask(1)], dim=1),
             "keep": _background,
             "reach": _number(0, 0.99),
             "brightness": _number(0, 1),
-            "extent": _one_of(*EXTENTS),
+            "extent": _one_of(*EXTENT.choices),
             "photometric_bandwidth": _plain(0.03, 0.5),
         },
     ),

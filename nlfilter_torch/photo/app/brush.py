@@ -19,7 +19,7 @@ class Brush:
     """The settings of the brush, for each step.
 
     Attributes:
-        word: meaning of the strokes; ``colour`` stands for :attr:`colour`.
+        word: meaning of the strokes; ``colour`` in it stands for :attr:`colour`.
         radius: as a share of the short side.
         colour: for all steps that take one.
         shown: what is called with the colour when it changes: the fields that show it.
@@ -32,7 +32,7 @@ class Brush:
 
     def paint(self, step: str) -> str:
         """The meaning or colour of a stroke for a step."""
-        return self.colour if self.word[step] == "colour" else self.word[step]
+        return self.word[step].replace("colour", self.colour)
 
     def choose_colour(self, value: object) -> None:
         """Set the colour, if the value is one, such as ``#2f6fde``; what is typed may be incomplete."""

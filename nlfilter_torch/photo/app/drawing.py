@@ -10,6 +10,7 @@ from PIL import Image
 from torch import Tensor
 
 from nlfilter_torch.filtering.filters import polynomial_response
+from nlfilter_torch.photo.declared.declaration import ScribbleRole
 from nlfilter_torch.photo.declared.parameters import EDITS
 from nlfilter_torch.photo.declared.strokes import Stroke
 from nlfilter_torch.photo.picture.colour import hundredths_of_lab
@@ -20,12 +21,17 @@ TINTS = ((255, 40, 80), (0, 190, 255), (255, 220, 0))
 OPACITY = 120  # of the mask, of 255
 COMPARED = 4096  # pixels, about, with which these are compared
 HATCHING = 8  # pixels of a preview from one line to the next
-#: Colours of strokes with a meaning, by its word: green on objects, red on the background, grey on what stays as it is.
-WORDS = {
-    scribble.word: "#22c55e" if scribble.role == "object" else "#ef4444"
-    for edit in EDITS.values()
-    for scribble in edit.scribbles
-} | {"keep": "#9ca3af"}
+#: Colours of strokes by their roles.
+ROLES: dict[ScribbleRole, str] = {
+    "object": "#22c55e",
+    "background": "#ef4444",
+    "added": "#38bdf8",
+    "removed": "#a855f7",
+}
+#: Colours of strokes with a meaning, by its word; grey is what stays as it is.
+WORDS = {scribble.word: ROLES[scribble.role] for edit in EDITS.values() for scribble in edit.scribbles} | {
+    "keep": "#9ca3af"
+}
 WHITE_TINT, BLACK_TINT = (255, 60, 60, 255), (60, 120, 255, 255)  # where a picture is clipped
 BINS = 64  # of a histogram
 
@@ -137,7 +143,7 @@ def strokes_svg(strokes: Iterable[Stroke], size: tuple[int, int]) -> str:
     for stroke in strokes:
         points = stroke.points if len(stroke.points) > 1 else stroke.points * 2  # a dot is a line of no length
         line = "L".join(f"{x * width:.1f} {y * height:.1f}" for x, y in points)
-        colour, thickness = WORDS.get(stroke.paint, stroke.paint), 2 * stroke.radius * min(size)
+        colour, thickness = stroke.colour or WORDS[stroke.paint], 2 * stroke.radius * min(size)
         paths.append(f'<path d="M{line}" stroke="{colour}" stroke-width="{thickness:.1f}" class="stroke" />')
     return "".join(paths)
 

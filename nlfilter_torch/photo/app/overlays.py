@@ -4,6 +4,7 @@ from torch import Tensor
 
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.edits.applying import edit_of, scribbles_of
+from nlfilter_torch.photo.picture.drawn import Drawn
 from nlfilter_torch.photo.picture.in_memory import InMemory, edit_image
 from nlfilter_torch.photo.picture.painting import TensorPainter
 from nlfilter_torch.photo.selections.stray_parts import stray_parts
@@ -33,24 +34,23 @@ class Overlays:
         return self._ignored[2]
 
 
-def _is_painted(step: Step) -> bool:
-    return bool(step.declared.words) and bool(step.painted(step.declared.words[0]))
-
-
 def _selected(step: Step, image: Tensor, stride: float) -> Tensor | None:
     size = (image.shape[-2], image.shape[-1])
     edit = edit_of(step, size, stride=stride)
-    selection = edit.selection() if _is_painted(step) else None
+    selection = edit.selection() if step.marks_object() else None
     if selection is None:
         return None
-    return edit_image(selection, image.clamp(0, 1), edit.marks(scribbles_of(step, size, TensorPainter())))
+    marks = edit.marks(scribbles_of(step, size, TensorPainter())).masks
+    # The last plane of what has colours is its mask.
+    return edit_image(selection, image.clamp(0, 1), Drawn({name: mask[:, -1:] for name, mask in marks.items()}))
 
 
 def _ignored(step: Step, image: Tensor) -> Tensor | None:
     size = (image.shape[-2], image.shape[-1])
-    if not _is_painted(step) or edit_of(step, size).selection() is None:
+    if not step.painted_as("object") or edit_of(step, size).selection() is None:
         return None
-    drawn = scribbles_of(step, size, TensorPainter())
-    parts = [stray_parts(InMemory(image.clamp(0, 1)), mask.ceil()) for mask in drawn.masks.values()]
+    drawn = scribbles_of(step, size, TensorPainter()).masks
+    names = [scribble.argument for scribble in step.declared.with_role("object", "background")]
+    parts = [stray_parts(InMemory(image.clamp(0, 1)), drawn[name].ceil()) for name in names if name in drawn]
     stray: Tensor = sum(parts[1:], parts[0])
     return stray.clamp(max=1) if bool(stray.any()) else None

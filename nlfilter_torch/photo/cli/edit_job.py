@@ -62,7 +62,7 @@ class EditJob:
     def bytes_per_pixel(self) -> int:
         """Memory that the edit needs per pixel of an image."""
         regional = self.step.declared.regional is not None
-        return self.step.bytes_per_pixel(masked=regional and self.scribbles.marks_objects)
+        return self.step.bytes_per_pixel(masked=regional and self.scribbles.marks_objects(self.step.declared))
 
     @property
     def coloured(self) -> bool:

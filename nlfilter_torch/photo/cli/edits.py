@@ -86,6 +86,12 @@ PresetName = Annotated[
         "look."
     ),
 ]
+#: The placeholder of a rectangle for each kind of scribbles.
+METAVARS: dict[ScribbleKind, str] = {
+    "colours": "X,Y,W,H:COLOUR",
+    "mask": "X,Y,W,H",
+    "sliders": "X,Y,W,H[:SLIDERS]",
+}
 #: The option ``--region`` for each kind of scribbles on an object.
 REGIONS: dict[ScribbleKind, object] = {
     "colours": options.ColourRegions,
@@ -101,9 +107,9 @@ def scribble_options(edit: Edit) -> dict[str, object]:
     for kind in kinds:
         annotations |= {"strokes": options.StrokesFile} if kind == "colours" else {}
         annotations["region"] = REGIONS[kind]
-    for scribble in edit.backgrounds:
+    for scribble in edit.with_options:
         name = scribble.option.removeprefix("--")
-        annotations[name] = options.rectangles(scribble.option, "X,Y,W,H", scribble.option_help)
+        annotations[name] = options.rectangles(scribble.option, METAVARS[scribble.kind], scribble.option_help)
     if any(kind != "colours" for kind in kinds):
         annotations["mask"] = options.MaskFile
     if edit.scribbles:
@@ -279,8 +285,8 @@ def edit_photograph(
 ) -> None:
     """Apply an edit to a file.
 
-    ``values`` are those of its parameters and of its options for the background, and ``typed`` holds the names of the
-    options that the user typed.
+    ``values`` are those of its parameters and of its further options for scribbles, and ``typed`` holds the names of
+    the options that the user typed.
     """
     step = step_of(edit, {name: value for name, value in values.items() if not isinstance(value, list)})
     look = None if preset is None else preset_step(find_recipe(preset), edit)
@@ -298,10 +304,10 @@ def edit_photograph(
     from nlfilter_torch.photo.cli.edit_job import EditJob
     from nlfilter_torch.photo.cli.scribbles import ScribbleOptions
 
-    backgrounds = [(s.option, values.get(s.option.removeprefix("--"))) for s in edit.backgrounds]
-    rectangles = {option: texts for option, texts in backgrounds if isinstance(texts, list)}
+    others = [(s.option, values.get(s.option.removeprefix("--"))) for s in edit.with_options]
+    rectangles = {option: texts for option, texts in others if isinstance(texts, list)}
     drawn = ScribbleOptions(region, strokes, mask, rectangles)
-    note_useless(step, typed, marked=drawn.marks_objects)
+    note_useless(step, typed, marked=drawn.marks_objects(edit))
     editing.check_written(source, target, show=show, map=map, mask=mask, strokes=strokes, preset=preset)
     job = EditJob(step, source, target, drawn, show, map, depth, seed, memory, full)
     editing.edit_file(

@@ -33,6 +33,8 @@ def mask(
     *,
     region: list[str] | None = None,
     background: list[str] | None = None,
+    add: list[str] | None = None,
+    remove: list[str] | None = None,
     mask: Path | None = None,
     show: Path | None = None,
     depth: options.FileDepth | None = None,
@@ -48,8 +50,8 @@ def mask(
     from nlfilter_torch.photo.cli.mask_job import MaskJob
     from nlfilter_torch.photo.cli.scribbles import ScribbleOptions
 
-    scribbles = ScribbleOptions(region, None, mask, {"--background": background})
-    if not scribbles.marks_objects:
+    scribbles = ScribbleOptions(region, None, mask, {"--background": background, "--add": add, "--remove": remove})
+    if not scribbles.marks_objects(MASK):
         raise ValueError(MASK.scribbles[0].advice)
     editing.check_apart("OUT", target, photograph=source, mask=mask)
     editing.check_apart("--show", show, photograph=source, output=target, mask=mask)

@@ -167,6 +167,6 @@ class MaskJob:
         """Fit the mask, and print how much is selected."""
         working, edit = range_of(source), self._edit_at(source.size)
         seen = source if working is None else Seen(source, working)
-        regions = edit.select(seen, drawn.masks["scribbles"], drawn.masks.get("background"))
-        tell_selected(regions.reduced_masks(), self.scribbles.backgrounds["--background"])
+        regions = edit.select(seen, drawn)
+        tell_selected(regions.selected(), self.scribbles.rectangles["--background"])
         return Fitted(regions.masks) if working is None else of_picture(Fitted(regions.masks), working)

@@ -3,7 +3,7 @@
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import ClassVar, Self
 
@@ -14,7 +14,7 @@ from PIL import ImageColor
 from torch import Tensor
 
 from nlfilter_torch.photo.cli.options import parse_sliders
-from nlfilter_torch.photo.declared.declaration import Edit
+from nlfilter_torch.photo.declared.declaration import Edit, Scribble, ScribbleRole
 from nlfilter_torch.photo.io.photographs import check_depth
 from nlfilter_torch.photo.io.rows import StoredPicture
 from nlfilter_torch.photo.picture.drawn import Drawn
@@ -93,6 +93,9 @@ def _pixels(text: str, length: int) -> float:
     return value
 
 
+Mark = tuple[Rectangle, slice, list[float]]  # with the channels that a rectangle sets, and their values
+
+
 @dataclass(frozen=True)
 class Overlay(ABC):
     """Scribbles or masks over a photograph, as rows (h, W, S): a picture of its size, and rectangles on top.
@@ -105,7 +108,7 @@ class Overlay(ABC):
 
     shape: tuple[int, int, int]
     picture: Picture | None
-    rectangles: list[tuple[Rectangle, slice, list[float]]]
+    rectangles: list[Mark]
     dtype = np.dtype(np.float32)
     marked: ClassVar[int]  # channel that is above 0 where something is marked
     empty: ClassVar[str]  # end of the error for a picture in which nothing is marked
@@ -188,18 +191,21 @@ class ScribbleOptions:
         region: rectangles on the objects.
         strokes: a picture of coloured scribbles.
         mask: a picture of the objects.
-        backgrounds: rectangles on the background, by their options.
+        rectangles: further ones, by their options.
     """
 
     region: list[str] | None = None
     strokes: Path | None = None
     mask: Path | None = None
-    backgrounds: Mapping[str, list[str] | None] = field(default_factory=dict)
+    rectangles: Mapping[str, list[str] | None] = field(default_factory=dict)
 
-    @property
-    def marks_objects(self) -> bool:
-        """Whether an object is marked."""
-        return bool(self.region) or self.mask is not None or self.strokes is not None
+    def of(self, edit: Edit, *roles: ScribbleRole) -> list[str]:
+        """The rectangles of an edit's scribbles that have one of these roles and options of their own."""
+        return [text for scribble in edit.with_role(*roles) for text in self.rectangles.get(scribble.option) or []]
+
+    def marks_objects(self, edit: Edit) -> bool:
+        """Whether an object is marked, or its mask painted."""
+        return bool(self.region or self.of(edit, "added")) or self.mask is not None or self.strokes is not None
 
     @property
     def called(self) -> str:
@@ -214,24 +220,26 @@ def of_edit(
 
     ``alpha`` are the sliders of regions without their own, if the edit takes regions that have sliders.
     """
-    masks: dict[str, Overlay] = {}
-    colours, sliders = None, None
+    masks: dict[str, Overlay | None] = {}
+    colours, sliders = None, SliderRegions(size, alpha or ())
+    is_added = bool(options.of(edit, "added"))
     for scribble in edit.scribbles:
-        region: Overlay | None = None
-        if scribble.kind == "colours":
-            colours = _strokes(size, options.strokes, options.region, read)
-        elif scribble.role == "background":
-            texts = options.backgrounds.get(scribble.option)
-            region = selection(size, None, texts, scribble.option, read)
-        elif alpha is not None and scribble.kind == "sliders":
-            if options.marks_objects:
-                region, sliders = _slider_regions(size, options.mask, options.region, torch.tensor(alpha), read)
+        is_object = scribble.role == "object"
+        texts = options.region if is_object else options.rectangles.get(scribble.option)
+        option, path = scribble.option or "--region", options.mask if is_object else None
+        if scribble.kind == "colours" and is_object:
+            needed = scribble.needed and not is_added
+            colours = _strokes(size, options.strokes, texts, option, read, needed=needed)
+        elif scribble.kind == "colours":
+            masks[scribble.argument] = _strokes(size, None, texts, option, read, needed=False)
+        elif scribble.kind == "sliders":
+            sliders.add(scribble.argument, texts, option, _picture(size, path, read))
         else:
-            region = selection(size, options.mask, options.region, "--region", read)
-            if region is None and scribble.needed:
+            masks[scribble.argument] = selection(size, path, texts, option, read)
+            if is_object and scribble.needed and not is_added and masks[scribble.argument] is None:
                 raise ValueError(scribble.advice)
-        masks |= {} if region is None else {scribble.argument: region}
-    return Drawn(masks, colours, sliders)
+    drawn = Drawn.of(masks | sliders.masks(), colours)
+    return replace(drawn, sliders=sliders.rows)
 
 
 def at_once(edit: Edit, drawn: Drawn[Overlay]) -> Drawn[Tensor]:
@@ -239,40 +247,45 @@ def at_once(edit: Edit, drawn: Drawn[Overlay]) -> Drawn[Tensor]:
     masks, colours = {name: overlay.at_once() for name, overlay in drawn.masks.items()}, None
     if drawn.colours is not None:
         colours, mask = drawn.colours.at_once().split([3, 1], dim=1)
-        masks |= {scribble.argument: mask for scribble in edit.scribbles if scribble.kind == "colours"}
+        masks |= {scribble.argument: mask for scribble in edit.with_role("object") if scribble.kind == "colours"}
     return Drawn(masks, colours, drawn.sliders)
 
 
-def overlays(edit: Edit, drawn: Drawn[Overlay]) -> Iterator[tuple[str, Overlay]]:
+def overlays(edit: Edit, drawn: Drawn[Overlay]) -> Iterator[tuple[Scribble, str, Overlay]]:
     """Yield the scribbles of an edit, with the option that they come from."""
-    if drawn.colours is not None:
-        yield "--region", drawn.colours
     for scribble in edit.scribbles:
+        option = scribble.option or "--region"
+        if scribble.kind == "colours" and scribble.role == "object" and drawn.colours is not None:
+            yield scribble, option, drawn.colours
         if scribble.argument in drawn.masks:
-            yield scribble.option or "--region", drawn.masks[scribble.argument]
+            yield scribble, option, drawn.masks[scribble.argument]
 
 
-def _strokes(size: Size, path: Path | None, regions: list[str] | None, read: Open) -> Strokes:
-    """Read coloured scribbles from ``--strokes`` and ``--region``."""
-    if path is None and not regions:
-        raise ValueError("give --strokes FILE or --region X,Y,W,H:COLOUR, such as --region 40,60,20,20:red")
+def _strokes(
+    size: Size, path: Path | None, texts: list[str] | None, option: str, read: Open, *, needed: bool
+) -> Strokes | None:
+    """Read coloured scribbles from ``--strokes`` and an option for rectangles; None if there are none."""
+    if path is None and not texts:
+        if needed:
+            raise ValueError("give --strokes FILE or --region X,Y,W,H:COLOUR, such as --region 40,60,20,20:red")
+        return None
     rectangles = []
-    for text in regions or []:
-        rectangle = Rectangle.parse(text, "--region", size)
+    for text in texts or []:
+        rectangle = Rectangle.parse(text, option, size)
         if rectangle.note is None:
-            raise ValueError(f"--region must end in a colour, such as {text}:red, got {text!r}")
+            raise ValueError(f"{option} must end in a colour, such as {text}:red, got {text!r}")
         try:
             *colour, opacity = (*ImageColor.getrgb(rectangle.note), 255)[:4]
             if max(*colour, opacity) > 255:
                 raise ValueError(rectangle.note)
         except ValueError:
             raise ValueError(
-                "--region must end in a colour, such as red, #c04020 or rgb(192,64,32), "
+                f"{option} must end in a colour, such as red, #c04020 or rgb(192,64,32), "
                 f"got {rectangle.note!r} in {text!r}"
             ) from None
         if opacity < 255:
             raise ValueError(
-                f"--region must end in an opaque colour, got {rectangle.note!r} in {text!r}; leave out its last part"
+                f"{option} must end in an opaque colour, got {rectangle.note!r} in {text!r}; leave out its last part"
             )
         rectangles.append((rectangle, slice(None), [*(torch.tensor(colour) / 255).tolist(), 1.0]))
     return Strokes((*size, 4), _picture(size, path, read, transparent=True), rectangles).checked()
@@ -291,27 +304,49 @@ def selection(size: Size, path: Path | None, texts: list[str] | None, option: st
     return Regions((*size, 1), _picture(size, path, read), rectangles).checked()
 
 
-def _slider_regions(
-    size: Size, path: Path | None, texts: list[str] | None, alpha: Tensor, read: Open
-) -> tuple[Regions, Tensor]:
-    """Read K regions and their sliders (K, k+1) from ``--mask`` and ``--region``, or one of them.
+@dataclass
+class SliderRegions:
+    """K regions of a photograph of a size that have sliders.
 
-    The mask, and rectangles without their own sliders, have the sliders ``alpha`` (k+1,). All that has the same sliders
-    is one region, as in the editor and in other commands, so that the time does not grow with the number of rectangles.
+    A mask, and rectangles without their own sliders, have the sliders ``alpha``. All that has the same sliders is one
+    region, as in the editor and in other commands, so that the time does not grow with the number of rectangles.
     """
-    rectangles, sliders = [], [] if path is None else [alpha]
-    for text in texts or []:
-        rectangle = Rectangle.parse(text, "--region", size)
-        own = alpha if rectangle.note is None else torch.tensor(parse_sliders(rectangle.note, "--region"))
-        if len(own) != len(alpha):
-            raise ValueError(
-                f"--region must have as many sliders as --alpha, {len(alpha)}, got {len(own)} in {text!r}; "
-                "add or drop some"
-            )
-        number = next((k for k, others in enumerate(sliders) if torch.equal(others, own)), len(sliders))
-        rectangles.append((rectangle, slice(number, number + 1), [1.0]))
-        sliders += [own] if number == len(sliders) else []
-    return Regions((*size, len(sliders)), _picture(size, path, read), rectangles).checked(), torch.stack(sliders)
+
+    size: Size
+    alpha: tuple[float, ...]
+    _sliders: list[tuple[float, ...]] = field(default_factory=list)
+    _marks: dict[str, tuple[Picture | None, list[Mark]]] = field(default_factory=dict)
+
+    def add(self, argument: str, texts: list[str] | None, option: str, picture: Picture | None) -> None:
+        """Read rectangles of an option, and a mask; ``argument`` is that of the edit's function."""
+        if picture is None and not texts:
+            return
+        if picture is not None:
+            self._sliders.append(self.alpha)
+        rectangles = []
+        for text in texts or []:
+            rectangle = Rectangle.parse(text, option, self.size)
+            own = self.alpha if rectangle.note is None else parse_sliders(rectangle.note, option)
+            if len(own) != len(self.alpha):
+                raise ValueError(
+                    f"{option} must have as many sliders as --alpha, {len(self.alpha)}, got {len(own)} in {text!r}; "
+                    "add or drop some"
+                )
+            if own not in self._sliders:
+                self._sliders.append(own)
+            number = self._sliders.index(own)
+            rectangles.append((rectangle, slice(number, number + 1), [1.0]))
+        self._marks[argument] = picture, rectangles
+
+    @property
+    def rows(self) -> Tensor | None:
+        """The sliders (K, k+1) of the regions; None if there are none."""
+        return torch.tensor(self._sliders) if self._sliders else None
+
+    def masks(self) -> dict[str, Regions]:
+        """What was read, by the arguments of the edit's function."""
+        shape = (*self.size, len(self._sliders))
+        return {name: Regions(shape, *marks).checked() for name, marks in self._marks.items()}
 
 
 def _picture(size: Size, path: Path | None, read: Open, *, transparent: bool = False) -> Picture | None:

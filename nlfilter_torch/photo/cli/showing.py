@@ -21,7 +21,7 @@ from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.io.photographs import Photograph, write_photograph
 from nlfilter_torch.photo.picture.colour import hundredths_of_lab
 from nlfilter_torch.photo.picture.drawn import Drawn
-from nlfilter_torch.photo.picture.edit import PhotoEdit, Rows
+from nlfilter_torch.photo.picture.edit import MARKS, PhotoEdit, Rows
 from nlfilter_torch.photo.picture.in_memory import InMemory, edit_image
 from nlfilter_torch.photo.selections.scribbled_colours import frame_places
 from nlfilter_torch.photo.selections.stray_parts import stray_parts
@@ -52,12 +52,14 @@ class Scribbled:
 
     def check(self) -> None:
         """Raise ValueError if there are no scribbles to show."""
-        if not dict(overlays(self.edit, self.drawn)):
+        if not list(overlays(self.edit, self.drawn)):
             raise ValueError("--show needs scribbles; give --region X,Y,W,H, or omit --show")
 
     def tell_colours(self) -> None:
         """Print the colour under each rectangle, and a note on standard error if some cover very different colours."""
-        for option, overlay in overlays(self.edit, self.drawn):
+        for scribble, option, overlay in overlays(self.edit, self.drawn):
+            if scribble.role in ("added", "removed"):  # these may cover anything
+                continue
             shares = dict[str, float]()
             for rectangle, _, _ in overlay.rectangles:
                 pixels = self.rows.read(rectangle.rows)[..., rectangle.columns].float().clamp(0, 1).flatten(2)
@@ -72,26 +74,36 @@ class Scribbled:
             target: an image file.
             edit_at: the edit with settings for a reduced size and its sampling step in pixels.
         """
-        planes = dict(overlays(self.edit, self.drawn))
         size = self.rows.size
         stride = math.ceil(math.sqrt(max(1.0, size[0] * size[1] / MAX_PIXELS)))
         image = _reduced(self.rows.read, size, stride, F.avg_pool2d).float().clamp(0, 1).expand(-1, 3, -1, -1)
-        region = _planes(planes.pop("--region"), size, stride)
-        kept = next((_planes(overlay, size, stride) for overlay in planes.values()), None)
-        coloured = self.drawn.colours is not None
-        painted = region[:, 3:].ceil() if coloured else region.amax(1, keepdim=True).ceil()
-        if kept is not None:
-            kept = kept * (1 - painted)  # the scribbles on the object take precedence
-            kept = kept if bool(kept.any()) else None
+        marks, colours = self._marks(stride)
+        painted, kept = marks.get("scribbles", torch.zeros_like(image[:, :1])), marks.get("background")
         selection = edit_at((image.shape[-2], image.shape[-1]), stride).selection()
-        mask = torch.ones_like(painted)  # all pixels are changed
+        mask = torch.ones_like(image[:, :1])  # all pixels are changed
         if selection is not None:
-            marks = {"scribbles": painted} | ({} if kept is None else {"background": kept})
             mask = edit_image(selection, image, Drawn(marks))
-        shown = drawn_over(image, mask, region[:, :3] if coloured else None, painted, kept)
-        for drawn in (painted, kept):
+        shown = drawn_over(image, mask, colours, painted, kept)
+        for drawn in (marks.get("scribbles"), kept):
             shown = shown if drawn is None else hatched(shown, stray_parts(InMemory(image), drawn))
         write_photograph(Photograph(shown), target)
+
+    def _marks(self, stride: int) -> tuple[dict[str, Tensor], Tensor | None]:
+        """The scribbles at a reduced size, under the names that the edit of their mask takes, and their colours."""
+        marks, colours = dict[str, Tensor](), None
+        for scribble, _, overlay in overlays(self.edit, self.drawn):
+            planes = _planes(overlay, self.rows.size, stride)
+            if scribble.kind == "colours":
+                colours = planes[:, :3] if scribble.role == "object" else colours
+                planes = planes[:, 3:]
+            marks[MARKS[scribble.role]] = planes.amax(1, keepdim=True)
+        if "scribbles" in marks:
+            marks["scribbles"] = marks["scribbles"].ceil()
+            if "background" in marks:  # the scribbles on the object take precedence
+                marks["background"] = marks["background"] * (1 - marks["scribbles"])
+        if "background" in marks and not bool(marks["background"].any()):
+            del marks["background"]
+        return marks, colours
 
 
 def tell_colour(place: str, pixels: Tensor) -> float:

@@ -275,7 +275,7 @@ def nodes_of(count: int) -> int | None:
 
 
 ScribbleKind = Literal["colours", "mask", "sliders"]
-ScribbleRole = Literal["object", "background"]
+ScribbleRole = Literal["object", "background", "added", "removed"]
 
 
 @dataclass(frozen=True)
@@ -287,15 +287,16 @@ class Scribble:
 
     Attributes:
         argument: name of the mask among the arguments of the edit's function.
-        word: meaning of a stroke in files; ``colour`` stands for any colour.
+        word: meaning of a stroke in files; ``colour`` in it stands for any colour.
         label: text of the brush in the editor.
         kind: ``"colours"`` are scribbles whose colours count, ``"mask"`` is a single mask, and ``"sliders"`` are masks
             of several regions that have sliders of their own.
         role: ``"object"`` marks what the edit changes, or keeps sharp; ``"background"`` marks what it leaves out.
-            Scribbles on the object cover those on the background.
-        needed: whether the edit has no effect without them.
-        option: for the background, the option of the command that takes a rectangle; without one, the command does not
-            offer these scribbles.
+            Scribbles on the object cover those on the background. ``"added"`` and ``"removed"`` are what a brush and
+            an eraser paint on the mask that is computed from these, the later over the earlier.
+        needed: whether the edit has no effect without them, or without what is added.
+        option: except for the object, the option of the command that takes a rectangle; without one, the command does
+            not offer these scribbles.
         option_help: description of that option.
         advice: for objects that are needed, the error of the command if there are none.
     """
@@ -389,9 +390,13 @@ class Edit:
         return any(scribble.needed for scribble in self.scribbles)
 
     @property
-    def backgrounds(self) -> tuple[Scribble, ...]:
-        """The scribbles on the background that the command offers."""
+    def with_options(self) -> tuple[Scribble, ...]:
+        """The scribbles for which the command has options of their own."""
         return tuple(scribble for scribble in self.scribbles if scribble.option)
+
+    def with_role(self, *roles: ScribbleRole) -> tuple[Scribble, ...]:
+        """The scribbles that have one of these roles."""
+        return tuple(scribble for scribble in self.scribbles if scribble.role in roles)
 
     @property
     def regional(self) -> Scribble | None:

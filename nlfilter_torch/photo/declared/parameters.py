@@ -34,6 +34,22 @@ from nlfilter_torch.photo.declared.shared_parameters import (
 
 CRISP = (2.2, 2.2, 2.2, 1.0)
 BACKGROUND_HELP = "A rectangle of the background, where too much is selected. May be repeated."
+ADD = Scribble(
+    "added",
+    "add",
+    "Brush",
+    role="added",
+    option="--add",
+    option_help="A rectangle that is selected as it is, as by a brush, on top of what is found. May be repeated.",
+)
+REMOVE = Scribble(
+    "removed",
+    "remove",
+    "Eraser",
+    role="removed",
+    option="--remove",
+    option_help="A rectangle that is not selected, as by an eraser, whatever is found or added. May be repeated.",
+)
 
 DETAIL = Edit(
     "detail",
@@ -111,6 +127,8 @@ DETAIL = Edit(
     scribbles=(
         Scribble("regions", "in", "Edit this", "sliders"),
         Scribble("negative", "out", "Not this", role="background"),
+        replace(ADD, kind="sliders"),
+        REMOVE,
     ),
     presets=("look",),
 )
@@ -293,6 +311,8 @@ RECOLOR = Edit(
             option="--keep",
             option_help="A rectangle; everything that resembles it stays unchanged. May be repeated.",
         ),
+        replace(ADD, word="add colour", kind="colours"),
+        REMOVE,
     ),
 )
 
@@ -375,6 +395,8 @@ DEFOCUS = Edit(
         Scribble(
             "background", "out", "Blur this", role="background", option="--background", option_help=BACKGROUND_HELP
         ),
+        ADD,
+        REMOVE,
     ),
 )
 
@@ -408,6 +430,8 @@ MASK = Edit(
         Scribble(
             "background", "out", "Not this", role="background", option="--background", option_help=BACKGROUND_HELP
         ),
+        ADD,
+        REMOVE,
     ),
 )
 

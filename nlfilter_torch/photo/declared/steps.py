@@ -10,7 +10,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from nlfilter_torch.photo.declared.declaration import Arguments, Edit
+from nlfilter_torch.photo.declared.declaration import Arguments, Edit, ScribbleRole
 from nlfilter_torch.photo.declared.json_values import Value, is_within, plain, shown
 from nlfilter_torch.photo.declared.parameters import EDITS
 from nlfilter_torch.photo.declared.shared_parameters import FILTER
@@ -91,9 +91,17 @@ class Step:
         """Declaration of the edit."""
         return EDITS[self.edit]
 
-    def painted(self, word: str) -> tuple["Stroke", ...]:
-        """Return the strokes whose paint is the given word; for ``colour``, those with any colour."""
-        return tuple(s for s in self.strokes if s.paint == word or (word == "colour" and s.paint.startswith("#")))
+    def painted(self, *words: str) -> tuple["Stroke", ...]:
+        """Return the strokes that have the meaning of one of these words, in which ``colour`` is any colour."""
+        return tuple(stroke for stroke in self.strokes if any(map(stroke.means, words)))
+
+    def painted_as(self, *roles: ScribbleRole) -> tuple["Stroke", ...]:
+        """Return the strokes of scribbles that have one of these roles."""
+        return self.painted(*(scribble.word for scribble in self.declared.with_role(*roles)))
+
+    def marks_object(self) -> bool:
+        """Whether a stroke marks an object, or adds to its mask."""
+        return bool(self.painted_as("object", "added"))
 
     @property
     def sliders_inside(self) -> tuple[float, ...]:
@@ -103,8 +111,7 @@ class Step:
 
     def has_region(self) -> bool:
         """Whether a region has sliders of its own."""
-        regional = self.declared.regional
-        return regional is not None and bool(self.painted(regional.word))
+        return self.declared.regional is not None and self.marks_object()
 
     def is_drawn(self) -> bool:
         """Whether the edit uses strokes: it requires them, or a region has sliders of its own."""
@@ -117,7 +124,7 @@ class Step:
     def would_change(self) -> bool:
         """Whether the step has any effect when it is switched on."""
         if self.declared.requires_strokes:
-            return bool(self.painted(self.declared.words[0]))
+            return self.marks_object()
         if self.declared.parts and not any(self[name] for name in self.declared.parts):
             return False
         acting = [p for p in self.declared if p.idle is not ...]

@@ -12,7 +12,7 @@ from typing import TypeGuard
 
 from nlfilter_torch.photo.declared.json_values import is_within, shown
 
-COLOUR = re.compile(r"#[0-9a-f]{6}", re.IGNORECASE)
+COLOUR = "#[0-9a-f]{6}"
 
 
 @dataclass(frozen=True)
@@ -22,12 +22,27 @@ class Stroke:
     Attributes:
         points: at least one (x, y), as shares of the picture's width and height.
         radius: radius of the brush, as a share of the picture's short side.
-        paint: meaning of the stroke: a colour ``#rrggbb``, or a word that the edit declares.
+        paint: meaning of the stroke: a word that the edit declares, with a colour ``#rrggbb`` in place of ``colour``.
     """
 
     points: tuple[tuple[float, float], ...]
     radius: float
     paint: str
+
+    def means(self, word: str) -> bool:
+        """Whether the stroke has the meaning of a word, in which ``colour`` stands for any colour.
+
+        >>> Stroke(((0.5, 0.5),), 0.1, "add #2040e0").means("add colour")
+        True
+        """
+        pattern = re.escape(word).replace("colour", COLOUR)
+        return re.fullmatch(pattern, self.paint, re.IGNORECASE) is not None
+
+    @property
+    def colour(self) -> str | None:
+        """The colour ``#rrggbb`` in its meaning, or None."""
+        at = self.paint.find("#")
+        return None if at < 0 else self.paint[at:]
 
     def entries(self) -> dict[str, object]:
         """Return the stroke as a JSON object."""
@@ -35,7 +50,7 @@ class Stroke:
 
     @staticmethod
     def from_entries(value: object, words: tuple[str, ...], place: str) -> "Stroke":
-        """Create a stroke from a JSON value; ``words`` are the allowed paints, of which ``colour`` allows any colour.
+        """Create a stroke from a JSON value; ``words`` are the allowed paints, see :meth:`means`.
 
         Raises:
             ValueError: if ``value`` is no stroke; ``place`` says in the message where it was found.
@@ -52,13 +67,20 @@ class Stroke:
             )
         if not (is_within(radius, 0, 1) and radius > 0):
             raise ValueError(f"radius of a stroke in {place} must be in (0, 1], got {shown(radius)}; correct it")
-        is_colour = "colour" in words and isinstance(paint, str) and COLOUR.fullmatch(paint)
-        if not is_colour and (paint not in words or paint == "colour"):
-            wanted = ", ".join("a colour such as #c04020" if word == "colour" else word for word in words)
+        lines = tuple((float(x), float(y)) for x, y in points)
+        stroke = Stroke(lines, float(radius), paint) if isinstance(paint, str) else None
+        if stroke is None or not any(map(stroke.means, words)):
+            wanted = ", ".join(map(_described, words))
             raise ValueError(
                 f"paint of a stroke in {place} must be one of {wanted}, got {reprlib.repr(paint)}; correct it"
             )
-        return Stroke(tuple((float(x), float(y)) for x, y in points), float(radius), paint)
+        return stroke
+
+
+def _described(word: str) -> str:
+    """A meaning of strokes, for errors."""
+    before, colour, _ = word.partition("colour")
+    return f"{before}{'with ' if before else ''}a colour such as {before}#c04020" if colour else word
 
 
 def _is_point(value: object) -> TypeGuard[list[float]]:

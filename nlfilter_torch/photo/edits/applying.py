@@ -42,19 +42,24 @@ def scribbles_of(step: Step, size: tuple[int, int], painter: Painter[M]) -> Draw
     """
     if not step.is_drawn():
         return Drawn()
+    _check_covered(step, step.marks_object())
     masks: dict[str, M] = {}
     colours: M | None = None
-    on_object = step.painted(step.declared.words[0])
+    on_object, on_mask = step.painted_as("object"), step.painted_as("added", "removed")
     for scribble in step.declared.scribbles:
         strokes = step.painted(scribble.word)
-        if scribble.kind == "colours":
+        if not strokes:
+            continue
+        if scribble.role in ("added", "removed"):
+            masks[scribble.argument] = painter.on_mask(on_mask, scribble.word, size)
+        elif scribble.kind == "colours":
             colours, mask = painter.colours(strokes, size)
             _check_covered(step, painter.covers(colours if mask is None else mask))
             masks |= {} if mask is None else {scribble.argument: mask}
         elif scribble.role == "object":
             masks[scribble.argument] = painter.mask(strokes, size)
             _check_covered(step, painter.covers(masks[scribble.argument]))
-        elif strokes:
+        else:
             mask = painter.mask(strokes, size, above=on_object)
             masks |= {scribble.argument: mask} if painter.covers(mask) else {}
     if step.declared.regional is None:

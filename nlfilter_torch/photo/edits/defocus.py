@@ -15,7 +15,9 @@ from nlfilter_torch.photo.declared.declaration import Edit
 from nlfilter_torch.photo.declared.parameters import DEFOCUS
 from nlfilter_torch.photo.picture.drawn import Drawn, M
 from nlfilter_torch.photo.picture.in_memory import edit_image
+from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles
 from nlfilter_torch.photo.picture.source import Fitted, Source
+from nlfilter_torch.photo.selections.by_hand import ByHand
 from nlfilter_torch.photo.selections.connected import Extent
 from nlfilter_torch.photo.selections.mask import ObjectEdit, background_of, fit_regions
 
@@ -30,9 +32,11 @@ ROWS, FAST = 192, 64  # rows of a Fourier transform, about; its sizes are multip
 
 def defocus(
     image: Tensor,
-    focus_region: Tensor,
+    focus_region: Tensor | None,
     *,
     background: Tensor | None = None,
+    added: Tensor | None = None,
+    removed: Tensor | None = None,
     radius: float | None = None,
     aperture: Aperture = DEFOCUS.defaults["aperture"],
     reach: float | Tensor = DEFOCUS.defaults["reach"],
@@ -52,9 +56,11 @@ def defocus(
 
     Args:
         image: (B, C, H, W) in [0, 1], C = 1 or 3.
-        focus_region: (B, 1, H, W) in [0, 1], above 0 on part or all of the subject.
+        focus_region: (B, 1, H, W) in [0, 1], above 0 on part or all of the subject; None if it is ``added``.
         background: (B, 1, H, W) in [0, 1], background scribbles, above 0 on pixels that are blurred together with
             similar ones. ``focus_region`` takes precedence over it.
+        added: (B, 1, H, W) in [0, 1], painted on the mask of the subject by hand: 1 stays sharp, whatever is computed.
+        removed: (B, 1, H, W) in [0, 1], likewise: 1 is blurred. It takes precedence over ``added``.
         radius: radius of the strongest blur, in pixels, at most half the short side; None is 2.5 % of the short side.
         aperture: ``"disc"`` turns bright dots into discs, as a lens does; ``"gaussian"`` is the paper's, with the same
             variance.
@@ -100,8 +106,8 @@ def defocus(
         completion=completion,
         generator=generator,
     )
-    masks = {"focus_region": focus_region} | ({} if background is None else {"background": background})
-    return edit_image(edit, image, Drawn(masks))
+    masks = {"focus_region": focus_region, "background": background, "added": added, "removed": removed}
+    return edit_image(edit, image, Drawn.of(masks))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -120,9 +126,13 @@ class Defocus(ObjectEdit):
         DEFOCUS.check(aperture=self.aperture, radius=self.radius)
         radius = float(DEFOCUS["radius"].pixels(self.radius, source.size))
         check_reach(radius, "radius", source.size)
-        scribbles = source.scribbles(drawn.masks.get("focus_region"), None, "focus_region")
-        background = background_of(source, drawn.masks.get("background"), scribbles, "background")
-        subject = fit_regions(source, [scribbles], background, self.selection_in(source.size))
+        region, added = drawn.masks.get("focus_region"), drawn.masks.get("added")
+        by_hand = ByHand.of(source, added, drawn.masks.get("removed"), 1)
+        inside, background = [], list[Scribbles]()
+        if region is not None or added is None:
+            inside = [source.scribbles(region, None, "focus_region", needed=added is None)]
+            background = background_of(source, drawn.masks.get("background"), inside[0], "background")
+        subject = fit_regions(source, inside, background, self.selection_in(source.size), by_hand)
         finish = partial(_blurred, radius=radius, aperture=self.aperture)
         return Fitted(subject.masks, finish, _kernel_radius(radius, self.aperture))
 

@@ -50,6 +50,8 @@ def enhance(
     regions: Tensor | None = None,
     *,
     negative: Tensor | None = None,
+    added: Tensor | None = None,
+    removed: Tensor | None = None,
     outside: Tensor | None = None,
     residual: float | Tensor | None = DETAIL.defaults["residual"],
     channels: Channels = DETAIL.defaults["channels"],
@@ -79,6 +81,9 @@ def enhance(
         regions: (B, K, H, W) in [0, 1], above 0 on part or all of each of K regions, like the scribbles of
             :func:`region_mask`; None edits the whole image.
         negative: (B, 1 or K, H, W) in [0, 1], above 0 on part of the background of all regions, or of each region.
+        added: (B, K, H, W) in [0, 1], painted on the masks of the regions by hand, see :func:`region_mask`; it may take
+            the place of ``regions``.
+        removed: (B, 1 or K, H, W) in [0, 1], likewise: pixels that belong to no region, or not to each.
         outside: sliders (k+1,) outside all regions; None leaves these pixels unchanged.
         residual: weight of the residual of the eigenvectors, see :func:`polynomial_filter`.
         channels: ``"luminance"`` keeps the colours, ``"all"`` edits red, green and blue alike.
@@ -135,8 +140,8 @@ def enhance(
         guide_channels=guide_channels,
         generator=generator,
     )
-    masks = {"regions": regions, "negative": negative}
-    return edit_image(edit, image, Drawn({name: mask for name, mask in masks.items() if mask is not None}))
+    masks = {"regions": regions, "negative": negative, "added": added, "removed": removed}
+    return edit_image(edit, image, Drawn.of(masks))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -178,12 +183,12 @@ class Detail(FilteredEdit):
         """Fit the change of detail of a picture, or of its regions."""
         alpha = self.alpha if drawn.sliders is None else drawn.sliders
         outside = self.outside if drawn.outside is None else drawn.outside
-        regions = drawn.masks.get("regions")
-        count = None if regions is None else source.num_regions(regions, "regions")
-        self._check(source.batch, drawn.masks, alpha, outside)
-        if count is None:
+        masks = drawn.masks
+        counts = [source.num_regions(masks[name], name) for name in ("regions", "added") if name in masks]
+        self._check(source.batch, masks, alpha, outside)
+        if not counts:
             return self._fit_whole(source, alpha)
-        return self._fit_regions(source, drawn.masks, region_sliders(alpha, count), outside)
+        return self._fit_regions(source, masks, region_sliders(alpha, counts[0]), outside)
 
     def _check(self, batch: int, masks: Mapping[str, object], alpha: Tensor, outside: Tensor | None) -> None:
         """Raise an error for an invalid setting."""
@@ -191,14 +196,15 @@ class Detail(FilteredEdit):
         check_count(self.num_landmarks, "num_landmarks")
         DETAIL.check(batch, channels=self.channels, limits=self.limits, viewing_size=self.viewing_size)
         DETAIL.check(batch, threshold=self.threshold, residual=self.residual)
-        if "regions" not in masks and ("negative" in masks or outside is not None):
-            name = "outside" if "negative" not in masks else "negative"
+        marked = "regions" in masks or "added" in masks
+        if not marked and (outside is not None or masks):
+            name = next((name for name in ("negative", "removed") if name in masks), "outside")
             raise ValueError(f"{name} must be given together with regions, got no regions; mark the regions to edit")
         if outside is not None:
             check_shape(outside, (alpha.shape[-1],), "outside", "give as many sliders as alpha has")
             check_dtype(outside, "outside", "write 1.0 instead of 1")
             check_finite(outside, "outside")
-        if "regions" in masks:
+        if marked:
             check_positive(self.mask_bandwidth, "mask_bandwidth", batch)
 
     @property
@@ -257,7 +263,7 @@ class Detail(FilteredEdit):
         filtered = self._filtered(viewed, sliders[0].shape[-1] - 1)
         if viewed.size != source.size:
             masks = {name: source.resized_weights(mask, viewed.size, name) for name, mask in masks.items()}
-        regions = selector.select(viewed, masks["regions"], masks.get("negative"))
+        regions = selector.select(viewed, self.marks(Drawn(masks)))
         changes = [DetailChange(filtered, row) for row in sliders]
         return Fitted(RegionalChange(changes, regions), self._limited, blur_margin(VARIANCE_SIGMA))
 

@@ -1,11 +1,14 @@
 """Recolouring of objects by strokes of colour. Paper: Sec. V-A, Figs. 14, 15."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import ClassVar
 
 import torch
 from torch import Tensor
 
+from nlfilter_torch.core.checks import check_image
 from nlfilter_torch.core.precision import per_image, squarable
 from nlfilter_torch.operator.options import Completion, Sampling
 from nlfilter_torch.photo.declared.declaration import Edit
@@ -20,9 +23,11 @@ from nlfilter_torch.photo.picture.colour import (
 )
 from nlfilter_torch.photo.picture.drawn import Drawn, M
 from nlfilter_torch.photo.picture.in_memory import edit_image
+from nlfilter_torch.photo.picture.pixels import whole_image
 from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles
 from nlfilter_torch.photo.picture.source import Fitted, Pixels, Source
 from nlfilter_torch.photo.selections.border_colours import Sides, colours_beside, refine_mask
+from nlfilter_torch.photo.selections.by_hand import ByHand, opaque
 from nlfilter_torch.photo.selections.connected import Extent
 from nlfilter_torch.photo.selections.mask import ObjectEdit, Regions, background_of, fit_regions
 from nlfilter_torch.photo.selections.stray import without_strays
@@ -37,10 +42,12 @@ GREY_CHROMA = 0.05  # chroma below this counts as grey, without variations to ke
 
 def recolor(
     image: Tensor,
-    strokes: Tensor,
-    stroke_mask: Tensor,
+    strokes: Tensor | None,
+    stroke_mask: Tensor | None,
     *,
     keep: Tensor | None = None,
+    added: Tensor | None = None,
+    removed: Tensor | None = None,
     brightness: float | Tensor = RECOLOR.defaults["brightness"],
     reach: float | Tensor = RECOLOR.defaults["reach"],
     extent: Extent = RECOLOR.defaults["extent"],
@@ -64,6 +71,9 @@ def recolor(
         stroke_mask: (B, 1, H, W) in [0, 1], above 0 where painted.
         keep: (B, 1, H, W) in [0, 1], background scribbles, above 0 on pixels that stay unchanged together with similar
             ones. Strokes take precedence over it.
+        added: (B, 4, H, W), RGB and, in [0, 1], how much of it: painted by hand, takes that colour whatever is
+            computed. Without other strokes, these are None.
+        removed: (B, 1, H, W) in [0, 1], likewise: 1 stays unchanged. It takes precedence over ``added``.
         brightness: in [0, 1], 0 keeps the luminance of the image, 1 gives the object's pixels under a stroke the mean
             luminance of the stroke, and others theirs in proportion; highlights stay white.
         reach: in [0, 1), probability that a walk over similar pixels continues after each step; larger includes less
@@ -107,8 +117,10 @@ def recolor(
         completion=completion,
         generator=generator,
     )
-    masks = {"stroke_mask": stroke_mask} | ({} if keep is None else {"keep": keep})
-    return edit_image(edit, image, Drawn(masks, strokes), channels=3)
+    if added is not None:
+        check_image(added, "added", channels=4)
+    masks = {"stroke_mask": stroke_mask, "keep": keep, "added": added, "removed": removed}
+    return edit_image(edit, image, Drawn.of(masks, strokes), channels=3)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -126,21 +138,20 @@ class Recolor(ObjectEdit):
     def fit(self, source: Source[M], drawn: Drawn[M]) -> Fitted:
         """Fit the new colours of the objects under the strokes."""
         RECOLOR.check(source.batch, reach=self.reach, brightness=self.brightness)
-        scribbles = source.scribbles(drawn.masks.get("stroke_mask"), drawn.colours, "stroke_mask")
-        kept = background_of(source, drawn.masks.get("keep"), scribbles, "keep")
+        painted = Painted.of(source, drawn)
+        if painted is None:
+            return Fitted(whole_image)
         matches = acts(torch.as_tensor(self.brightness), 0.0)
-        shown, regions, valid = _grouped(scribbles, matches)
-        counted = without_strays(scribbles.weighted(regions), source.size).weights
-        brightness, old = (
-            region_means(part, counted.unsqueeze(2)) for part in split_luminance(scribbles.image.unsqueeze(2))
-        )
+        shown, valid, groups = painted.grouped(matches)
+        brightness, old = groups.means(source.size)
         brightening = None
         if matches:
             brightening = Brightening.of(brightness, shown, self.brightness)
             brightness = brightening.new
         colours = with_room(split_colours(shown)[1] if matches else shown, brightness)
-        inside = [scribbles.weighted(part) for part in regions.split(1, dim=1)]
-        objects = fit_regions(source, inside, kept, self.selection_in(source.size))
+        by_hand = groups.by_hand(source, drawn.masks.get("removed"))
+        kept = painted.background(source, drawn.masks.get("keep"))
+        objects = fit_regions(source, groups.inside, kept, self.selection_in(source.size), by_hand)
         change = Recoloring(colours, old, valid, brightening)
         reduced = change.compared(objects.reduced)
         beside = []
@@ -166,7 +177,8 @@ class RecoloredPixels:
     def __call__(self, pixels: Pixels) -> Tensor:
         """Recolour pixels."""
         sides = [Sides.of(self.objects.rows(planes, pixels)) for planes in self.beside]
-        return self.change(pixels.image, self.objects.masks(pixels), sides)
+        by_hand = None if self.objects.by_hand is None else partial(self.objects.by_hand.over, pixels=pixels)
+        return self.change(pixels.image, self.objects.computed(pixels), sides, by_hand)
 
 
 def with_room(chroma: Tensor, brightness: Tensor) -> Tensor:
@@ -185,15 +197,100 @@ def split_colours(colours: Tensor) -> tuple[Tensor, Tensor]:
     return luminance.squeeze(3).mT, chroma.squeeze(3).mT
 
 
-def _grouped(scribbles: Scribbles, matches: bool) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the colours (B, K, 3) of scribbles, their regions (B, K, n), and which of them are valid, (B, K).
+@dataclass(frozen=True, eq=False)
+class Painted:
+    """What is painted on a picture: strokes on objects, and on the mask by hand; there may be one of them only.
 
-    Colours are chroma, or RGB if their brightness counts.
+    Attributes:
+        strokes: with their colours, or None.
+        on_mask: likewise.
     """
-    shown = scribbles.shown.unsqueeze(2)
-    values = shown if matches else split_luminance(shown)[1]
-    regions, colours, valid = group_colours(values, scribbles.weights.unsqueeze(2))
-    return colours, regions.squeeze(2), valid
+
+    strokes: Scribbles | None
+    on_mask: Scribbles | None
+
+    @staticmethod
+    def of(source: Source[M], drawn: Drawn[M]) -> "Painted | None":
+        """Read what is painted; None if nothing is left of what was added by hand to a single picture.
+
+        Raises:
+            TypeError, ValueError: if it does not suit the picture, or there is nothing.
+        """
+        mask, added = drawn.masks.get("stroke_mask"), drawn.masks.get("added")
+        strokes, on_mask = None, None
+        if added is not None:
+            on_mask = opaque(source, source.scribbles(None, added, "added", needed=False))
+        if added is None or mask is not None or drawn.colours is not None:
+            strokes = source.scribbles(mask, drawn.colours, "stroke_mask", needed=added is None)
+        marks = [marks for marks in (strokes, on_mask) if marks is not None and len(marks.places)]
+        if not marks:
+            return None
+        is_painted = torch.cat([drawn.weights.detach() > 0 for drawn in marks], dim=2).flatten(1).any(1)
+        if not bool(is_painted.all()):
+            raise ValueError(
+                "stroke_mask or added must hold a painted pixel in every image, got some without; paint one"
+            )
+        return Painted(*(part if part is not None and len(part.places) else None for part in (strokes, on_mask)))
+
+    def grouped(self, matches: bool) -> tuple[Tensor, Tensor, "Groups"]:
+        """Return the colours (B, K, 3), which of them are valid, (B, K), and the pixels of each.
+
+        Colours are chroma, or RGB if their brightness counts.
+        """
+        marks = [marks for marks in (self.strokes, self.on_mask) if marks is not None]
+        shown = torch.cat([drawn.shown for drawn in marks], dim=2).unsqueeze(2)
+        weights = torch.cat([drawn.weights for drawn in marks], dim=2).unsqueeze(2)
+        regions, colours, valid = group_colours(shown if matches else split_luminance(shown)[1], weights)
+        parts = regions.squeeze(2).split([len(drawn.places) for drawn in marks], dim=2)
+        weighted = [drawn.weighted(part) for drawn, part in zip(marks, parts, strict=True)]
+        strokes = None if self.strokes is None else weighted[0]
+        return colours, valid, Groups(strokes, None if self.on_mask is None else weighted[-1])
+
+    def background(self, source: Source[M], keep: M | None) -> list[Scribbles]:
+        """Read background scribbles; there are none without strokes on objects."""
+        return [] if self.strokes is None else background_of(source, keep, self.strokes, "keep")
+
+
+@dataclass(frozen=True, eq=False)
+class Groups:
+    """What is painted in each of K colours: the weights of strokes on objects, and on the mask, are (B, K, n)."""
+
+    strokes: Scribbles | None
+    on_mask: Scribbles | None
+
+    @property
+    def inside(self) -> list[Scribbles]:
+        """The strokes of each colour on objects; none if there are no strokes."""
+        return [] if self.strokes is None else split_regions(self.strokes)
+
+    def means(self, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
+        """Mean luminance (B, K, 1) and chroma (B, K, 3) of a picture (H, W) under each colour.
+
+        What is painted on the mask counts for colours without strokes on an object.
+        """
+        weights, images = list[Tensor](), list[Tensor]()
+        if self.strokes is not None:
+            weights.append(without_strays(self.strokes, size).weights)
+            images.append(self.strokes.image)
+        if self.on_mask is not None:
+            alone = 1.0 if not weights else (weights[0] <= 0).all(2, keepdim=True).to(weights[0])
+            weights.append(self.on_mask.weights * alone)
+            images.append(self.on_mask.image)
+        counted, image = torch.cat(weights, dim=2).unsqueeze(2), torch.cat(images, dim=2).unsqueeze(2)
+        luminance, chroma = (region_means(part, counted) for part in split_luminance(image))
+        return luminance, chroma
+
+    def by_hand(self, source: Source[M], removed: M | None) -> ByHand | None:
+        """What is painted on the mask of each colour."""
+        less = ByHand.of(source, None, removed, 1)
+        if less is None and self.on_mask is None:
+            return None
+        return ByHand([] if self.on_mask is None else split_regions(self.on_mask), [] if less is None else less.removed)
+
+
+def split_regions(scribbles: Scribbles) -> list[Scribbles]:
+    """The scribbles of each of K regions."""
+    return [scribbles.weighted(part) for part in scribbles.weights.split(1, dim=1)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -272,19 +369,21 @@ class Recoloring:
         shares = certain * self.valid[..., None, None]
         return shares if shares.shape[1] == 1 else shares / shares.sum(1, keepdim=True).clamp(min=1.0)
 
-    def __call__(self, pixels: Tensor, masks: Tensor, beside: list[Sides]) -> Tensor:
-        """Recolour pixels (B, 3, H, W), given masks (B, K, H, W) and the colours on both sides of their borders."""
-        shares = self.shares(masks)
+    def __call__(
+        self, pixels: Tensor, masks: Tensor, beside: list[Sides], by_hand: Callable[[Tensor], Tensor] | None = None
+    ) -> Tensor:
+        """Recolour pixels (B, 3, H, W), given masks (B, K, H, W) and the colours on both sides of their borders.
+
+        ``by_hand`` paints on the shares (B, K, H, W) of the colours.
+        """
+        shares = self.refined(pixels, masks, beside)
+        if by_hand is not None:
+            shares = by_hand(shares) * self.valid[..., None, None]
         luminance, chroma = split_luminance(pixels)
         compared = self.compared(pixels)
         brightness, changed, total = luminance, chroma, torch.zeros_like(luminance)
         for k in range(shares.shape[1]):
-            sides = beside[k]
-            share = shares[:, k : k + 1]
-            if self.brightening is not None:
-                # A border pixel that is a tenth white on black ground is a bright rim once the white is dark.
-                share = torch.lerp(share, masks[:, k : k + 1] * self.valid[:, k, None, None, None], sides.trust)
-            share = sides.refine(compared, share)
+            sides, share = beside[k], shares[:, k : k + 1]
             # Colour of the object's part of a mixed pixel; inside the object, that of the pixel.
             object_colour = torch.addcmul(compared, 1 - share, sides.across)
             object_luminance, object_chroma = None, object_colour
@@ -301,6 +400,18 @@ class Recoloring:
             total = total + share
         untouched = (total == 0).expand_as(pixels)
         return torch.where(untouched, pixels, merge_luminance(brightness.clamp(0.0, 1.0), changed))
+
+    def refined(self, pixels: Tensor, masks: Tensor, beside: list[Sides]) -> Tensor:
+        """:meth:`shares` of masks, corrected along borders by the mixing ratio of the colours on both sides."""
+        shares, compared = self.shares(masks), self.compared(pixels)
+        refined = []
+        for k, sides in enumerate(beside):
+            share = shares[:, k : k + 1]
+            if self.brightening is not None:
+                # A border pixel that is a tenth white on black ground is a bright rim once the white is dark.
+                share = torch.lerp(share, masks[:, k : k + 1] * self.valid[:, k, None, None, None], sides.trust)
+            refined.append(sides.refine(compared, share))
+        return torch.cat(refined, dim=1)
 
     def relative(self, number: int, chroma: Tensor, luminance: Tensor | None) -> Tensor:
         """Saturation (B, 1, H, W) of an object's pixels relative to that under its stroke, which the new colour takes.

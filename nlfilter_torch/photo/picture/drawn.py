@@ -31,6 +31,11 @@ class Drawn(Generic[M_co]):
     sliders: Tensor | None = None
     outside: Tensor | None = None
 
+    @staticmethod
+    def of(masks: Mapping[str, M | None], colours: M | None = None) -> "Drawn[M]":
+        """Scribbles of which some may be None, where there are none."""
+        return Drawn({name: mask for name, mask in masks.items() if mask is not None}, colours)
+
 
 class Painter(Protocol[M]):
     """Rasterises strokes to masks and colours as a source takes them."""
@@ -40,6 +45,12 @@ class Painter(Protocol[M]):
 
     def colours(self, strokes: Sequence[Stroke], size: Size) -> tuple[M, M | None]:
         """Colours of strokes and their mask, which is None if it is the fourth channel of the colours."""
+
+    def on_mask(self, strokes: Sequence[Stroke], word: str, size: Size) -> M:
+        """What strokes of a meaning set on a mask of a picture (H, W), with RGB before it if the meaning has a colour.
+
+        Later strokes of any meaning cover earlier ones.
+        """
 
     def covers(self, marks: M) -> bool:
         """Whether a mask or colours cover a pixel of the picture."""

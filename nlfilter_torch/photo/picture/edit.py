@@ -10,11 +10,19 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.operator.options import Completion, GuideChannels, OperatorOptions, Sampling
-from nlfilter_torch.photo.declared.declaration import Arguments, Edit
+from nlfilter_torch.photo.declared.declaration import Arguments, Edit, ScribbleRole
 from nlfilter_torch.photo.picture.drawn import Drawn, M
 from nlfilter_torch.photo.picture.pixels import Fitted
 from nlfilter_torch.photo.picture.source import Source
 from nlfilter_torch.photo.picture.working_range import WorkingRange
+
+#: Names of the scribbles of an edit that computes masks, by their roles.
+MARKS: dict[ScribbleRole, str] = {
+    "object": "scribbles",
+    "background": "background",
+    "added": "added",
+    "removed": "removed",
+}
 
 
 @dataclass(frozen=True)
@@ -96,9 +104,8 @@ class PhotoEdit(ABC):
 
     def marks(self, drawn: Drawn[M]) -> Drawn[M]:
         """The scribbles under the names that :meth:`selection` takes."""
-        names = {"object": "scribbles", "background": "background"}
-        scribbles = (scribble for scribble in self.declared.scribbles if scribble.argument in drawn.masks)
-        return Drawn({names[scribble.role]: drawn.masks[scribble.argument] for scribble in scribbles})
+        scribbles = [scribble for scribble in self.declared.scribbles if scribble.argument in drawn.masks]
+        return Drawn({MARKS[scribble.role]: drawn.masks[scribble.argument] for scribble in scribbles})
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

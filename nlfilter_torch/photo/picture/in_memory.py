@@ -76,16 +76,22 @@ class InMemory:
         return InMemoryOperator(operator, self, guide.sampled, None if self.cache is None else {})
 
     def scribbles(self, mask: Tensor | None, colours: Tensor | None, name: str, *, needed: bool = True) -> Scribbles:
-        """Read scribbles from tensors, ``mask`` (B, 1, H, W) and ``colours`` (B, 3, H, W)."""
+        """Read scribbles from tensors, ``mask`` (B, 1, H, W) and ``colours`` (B, 3, H, W).
+
+        Without a mask, colours are (B, 4, H, W), whose last plane is the mask.
+        """
+        called = "strokes"
         if colours is not None:
-            check_tensor(colours, "strokes")
+            check_tensor(colours, called)
+            if mask is None and colours.ndim == 4 and colours.shape[1] == 4:
+                (colours, mask), called = colours.split([3, 1], dim=1), name
         if mask is None:
             raise TypeError(f"{name} must be a torch.Tensor, got NoneType; convert it with torch.as_tensor")
         check_image(mask, name, channels=1, batch=self.batch)
         check_same_size(mask, self.size, name, "image")
         if colours is not None:
-            check_photograph(colours, "strokes", channels=3, batch=self.batch)
-            check_same_size(colours, self.size, "strokes", "image")
+            check_photograph(colours, called, channels=3, batch=self.batch)
+            check_same_size(colours, self.size, called, "image")
         if needed:
             check_painted(mask, name)
         else:
@@ -176,10 +182,10 @@ class InMemory:
         """The weights of single pixels."""
         return None if self.weights is None else self.weights.flatten(2)[:, :, places]
 
-    def regions(self, masks: Tensor, name: str) -> list[Scribbles]:
+    def regions(self, masks: Tensor, name: str, *, needed: bool = True) -> list[Scribbles]:
         """Read the scribbles of K regions from a tensor (B, K, H, W)."""
         check_image(masks, name, batch=self.batch)
-        return [self.scribbles(mask, None, name) for mask in masks.split(1, dim=1)]
+        return [self.scribbles(mask, None, name, needed=needed) for mask in masks.split(1, dim=1)]
 
     def num_regions(self, masks: Tensor, name: str) -> int:
         """K, of masks (B, K, H, W)."""

@@ -1,6 +1,6 @@
 """Rasterisation of brush strokes to masks and colours."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from functools import lru_cache
 from itertools import pairwise
 
@@ -10,6 +10,7 @@ from torch import Tensor
 from nlfilter_torch.photo.declared.strokes import Stroke
 
 MIN_RADIUS = 0.75  # minimum radius in pixels, at which a dot always covers a pixel
+BORDER = 1.0  # width in pixels of the border of a brush that paints on a mask
 
 
 def cover(stroke: Stroke, size: tuple[int, int], rows: slice | None = None) -> Tensor:
@@ -22,24 +23,48 @@ def cover(stroke: Stroke, size: tuple[int, int], rows: slice | None = None) -> T
             [0, 0, 0, 0, 0],
             [0, 0, 0, 0, 0]], dtype=torch.int32)
     """
-    height, width = size
-    radius = max(stroke.radius * min(size), MIN_RADIUS)
-    first = 0 if rows is None else rows.start
+    radius = _radius(stroke, size)
     covered = torch.zeros(_shape(size, rows), dtype=torch.bool)
+    for part, squared in _squared_distances(stroke, size, rows, radius):
+        covered[part] |= squared <= radius * radius
+    return covered
+
+
+def soft_cover(stroke: Stroke, size: tuple[int, int], rows: slice | None = None) -> Tensor:
+    """The share of each pixel that a stroke covers, (H, W): 1 inside, 0 outside, with a border of one pixel.
+
+    ``rows`` as in :func:`cover`.
+    """
+    radius = _radius(stroke, size) + BORDER / 2
+    covered = torch.zeros(_shape(size, rows))
+    for part, squared in _squared_distances(stroke, size, rows, radius):
+        covered[part] = covered[part].maximum(((radius - squared.sqrt()) / BORDER).clamp(0.0, 1.0))
+    return covered
+
+
+def _radius(stroke: Stroke, size: tuple[int, int]) -> float:
+    """Radius of a stroke in pixels."""
+    return max(stroke.radius * min(size), MIN_RADIUS)
+
+
+def _squared_distances(
+    stroke: Stroke, size: tuple[int, int], rows: slice | None, reach: float
+) -> Iterator[tuple[tuple[slice, slice], Tensor]]:
+    """Yield squared distances of pixels from each line of a stroke, for parts that hold all pixels within ``reach``."""
+    (height, width), first = size, 0 if rows is None else rows.start
     # The origin is the centre of the first pixel.
     points = [(x * width - 0.5, y * height - 0.5) for x, y in stroke.points]
     for (x0, y0), (x1, y1) in pairwise(points if len(points) > 1 else points * 2):
-        top, bottom = _span(y0, y1, radius, first, first + len(covered))
-        left, right = _span(x0, x1, radius, 0, width)
+        top, bottom = _span(y0, y1, reach, first, first + _shape(size, rows)[0])
+        left, right = _span(x0, x1, reach, 0, width)
         if top >= bottom or left >= right:
             continue
         y = torch.arange(top, bottom, dtype=torch.float32).unsqueeze(1) - y0
         x = torch.arange(left, right, dtype=torch.float32) - x0
         dx, dy = x1 - x0, y1 - y0
         along = ((x * dx + y * dy) / max(dx * dx + dy * dy, 1e-12)).clamp(0, 1)  # nearest point of the line
-        near = (x - along * dx).square() + (y - along * dy).square() <= radius * radius
-        covered[top - first : bottom - first, left:right] |= near
-    return covered
+        part = slice(top - first, bottom - first), slice(left, right)
+        yield part, (x - along * dx).square() + (y - along * dy).square()
 
 
 def _span(a: float, b: float, radius: float, first: int, last: int) -> tuple[int, int]:
@@ -72,6 +97,27 @@ def paint(strokes: Iterable[Stroke], size: tuple[int, int], rows: slice | None =
     return colours[None], painted[None, None].float()
 
 
+def painted_on_mask(strokes: Iterable[Stroke], word: str, size: tuple[int, int], rows: slice | None = None) -> Tensor:
+    """What strokes of a meaning set on a mask, where later strokes of any meaning cover earlier ones: (1, 1, H, W).
+
+    If the meaning holds a colour, there are four planes: RGB, and these. ``rows`` as in :func:`cover`.
+
+    >>> brush, eraser = (Stroke(((0.5, 0.5),), 0.4, word) for word in ("add", "remove"))
+    >>> [float(painted_on_mask(drawn, "add", (9, 9))[0, 0, 4, 4]) for drawn in ([eraser, brush], [brush, eraser])]
+    [1.0, 0.0]
+    """
+    shape = _shape(size, rows)
+    planes = torch.zeros(4 if "colour" in word else 1, *shape)
+    for stroke in strokes:
+        covered = soft_cover(stroke, size, rows)
+        planes[-1] *= 1 - covered
+        if stroke.means(word):
+            planes[-1] += covered
+            if stroke.colour is not None:
+                planes[:3, covered > 0] = colour_of(stroke.colour).unsqueeze(1)
+    return planes[None]
+
+
 def _shape(size: tuple[int, int], rows: slice | None) -> tuple[int, int]:
     return size if rows is None else (rows.stop - rows.start, size[1])
 
@@ -90,6 +136,7 @@ class TensorPainter:
 
     def __init__(self) -> None:
         self._paint, self._mask = lru_cache(maxsize=1)(paint), lru_cache(maxsize=2)(mask_of)
+        self._on_mask = lru_cache(maxsize=2)(painted_on_mask)
 
     def mask(self, strokes: Sequence[Stroke], size: tuple[int, int], *, above: Sequence[Stroke] = ()) -> Tensor:
         """Return :func:`mask_of` strokes, (1, 1, H, W)."""
@@ -98,6 +145,10 @@ class TensorPainter:
     def colours(self, strokes: Sequence[Stroke], size: tuple[int, int]) -> tuple[Tensor, Tensor]:
         """Colours (1, 3, H, W) and their mask (1, 1, H, W), see :func:`paint`."""
         return self._paint(tuple(strokes), size)
+
+    def on_mask(self, strokes: Sequence[Stroke], word: str, size: tuple[int, int]) -> Tensor:
+        """Return :func:`painted_on_mask`, (1, 1 or 4, H, W)."""
+        return self._on_mask(tuple(strokes), word, size)
 
     def covers(self, marks: Tensor) -> bool:
         """Whether a mask or colours cover a pixel."""

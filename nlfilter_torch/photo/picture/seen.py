@@ -296,9 +296,9 @@ class Seen(Generic[M]):
         """Means of a function of the image and of an edit's result."""
         return self.source.mean_of(of_picture(fitted, self.working), partial(_of_seen, function, self.working))
 
-    def regions(self, masks: M, name: str) -> list[Scribbles]:
+    def regions(self, masks: M, name: str, *, needed: bool = True) -> list[Scribbles]:
         """Read the scribbles of several regions."""
-        return [self._seen_under(scribbles) for scribbles in self.source.regions(masks, name)]
+        return [self._seen_under(scribbles) for scribbles in self.source.regions(masks, name, needed=needed)]
 
     def num_regions(self, masks: M, name: str) -> int:
         """Number of regions that have scribbles."""

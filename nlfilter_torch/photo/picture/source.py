@@ -166,7 +166,7 @@ class Source(Protocol[M]):
     def mean_of(self, fitted: "Fitted", function: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
         """Means (B, S, 1, 1) of a function of the image and of an edit's result; the function returns (B, S, h, W)."""
 
-    def regions(self, masks: M, name: str) -> list[Scribbles]:
+    def regions(self, masks: M, name: str, *, needed: bool = True) -> list[Scribbles]:
         """Read the scribbles of several regions, see :meth:`scribbles`."""
 
     def num_regions(self, masks: M, name: str) -> int:

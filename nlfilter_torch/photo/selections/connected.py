@@ -1,13 +1,12 @@
 """Which part of a mask belongs to the object under a scribble: what is connected with it."""
 
-from typing import Literal, get_args
+from typing import Literal
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 Extent = Literal["near", "object", "everywhere"]
-EXTENTS: tuple[Extent, ...] = get_args(Extent)
 INSIDE = 0.5  # mask from which on a pixel is inside an object, in which pixels are connected
 BORDER = 8  # width in pixels of a soft border, which belongs to the nearest object
 SMALL = 0.03  # of the pixels of the object; smaller pieces within its border, such as hair, belong to it

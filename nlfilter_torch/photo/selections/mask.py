@@ -25,12 +25,13 @@ from nlfilter_torch.photo.declared.parameters import MASK
 from nlfilter_torch.photo.declared.shared_parameters import VIEWING_SIZE
 from nlfilter_torch.photo.picture.drawn import Drawn, M
 from nlfilter_torch.photo.picture.edit import PhotoEdit
-from nlfilter_torch.photo.picture.in_memory import edit_image
+from nlfilter_torch.photo.picture.in_memory import InMemory, edit_image
 from nlfilter_torch.photo.picture.pixels import Pixels, corner
 from nlfilter_torch.photo.picture.resizing import enlarged
 from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles, parts_in_blocks
 from nlfilter_torch.photo.picture.source import Fitted, Reduced, Source
 from nlfilter_torch.photo.picture.viewing import viewed_size
+from nlfilter_torch.photo.selections.by_hand import ByHand
 from nlfilter_torch.photo.selections.closed_form import LinearMasks, linear_mask, linear_models, solve_linear
 from nlfilter_torch.photo.selections.connected import Extent, connected
 from nlfilter_torch.photo.selections.random_walker import solve_mask
@@ -48,9 +49,11 @@ EPSILON = 1e-6
 
 def region_mask(
     image: Tensor,
-    scribbles: Tensor,
+    scribbles: Tensor | None,
     background: Tensor | None = None,
     *,
+    added: Tensor | None = None,
+    removed: Tensor | None = None,
     reach: float | Tensor = MASK.defaults["reach"],
     extent: Extent = MASK.defaults["extent"],
     photometric_bandwidth: float | Tensor = MASK.defaults["photometric_bandwidth"],
@@ -75,9 +78,12 @@ def region_mask(
         image: (B, C, H, W) in [0, 1], C = 1 or 3.
         scribbles: (B, K, H, W) in [0, 1], above 0 on part or all of each of K regions; a rough mask is fine. Exactly 0
             elsewhere: pixels with faint scribbles count as parts of the region too. Scribbles of other regions are
-            background, except where they overlap.
+            background, except where they overlap. None computes no masks: they are ``added``.
         background: (B, 1 or K, H, W) in [0, 1], above 0 on part of the background of all regions or of each;
             ``scribbles`` take precedence. None means no background scribbles.
+        added: (B, K, H, W) in [0, 1], painted on the masks by hand: where it is 1, the mask of that region is 1,
+            whatever is computed, and those of the others are 0. A region without scribbles is what is added to it.
+        removed: (B, 1 or K, H, W) in [0, 1], likewise: where it is 1, masks are 0. It takes precedence over ``added``.
         reach: in [0, 1), probability that a random walk over similar pixels continues after each step; larger values
             include less similar pixels.
         extent: ``"near"`` selects what is similar and nearby, ``"object"`` only what is connected with a scribble of
@@ -92,7 +98,7 @@ def region_mask(
 
     Returns:
         (B, K, H, W) in [0, 1], about 1 on scribbles and about 0 on those of the background. Differentiable in image,
-        scribbles, background and parameters.
+        scribbles, background, parameters, and in what is added and removed.
 
     Raises:
         TypeError, ValueError: if a tensor has another size, leaves [0, 1], or has no painted pixel that no other
@@ -118,8 +124,8 @@ def region_mask(
         completion=completion,
         generator=generator,
     )
-    masks = {"scribbles": scribbles} | ({} if background is None else {"background": background})
-    return edit_image(edit, image, Drawn(masks))
+    masks = {"scribbles": scribbles, "background": background, "added": added, "removed": removed}
+    return edit_image(edit, image, Drawn.of(masks))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -146,25 +152,31 @@ class RegionMask(PhotoEdit):
 
     def fit(self, source: Source[M], drawn: Drawn[M]) -> Fitted:
         """Fit the masks of scribbled regions."""
-        return Fitted(self.select(source, drawn.masks["scribbles"], drawn.masks.get("background")).masks)
+        return Fitted(self.select(source, drawn).masks)
 
     def selection(self) -> "RegionMask":
         """The masks themselves."""
         return self
 
-    def select(self, source: Source[M], scribbles: M, background: M | None = None) -> "Regions":
-        """Compute the masks of regions from scribbles in the form that the source takes."""
+    def select(self, source: Source[M], drawn: Drawn[M]) -> "Regions":
+        """Compute the masks of regions from scribbles in the form that the source takes, under its own names."""
         if source.channels not in (1, 3):
             raise ValueError(f"image must have 1 or 3 channels, got {source.channels}; select 1 or 3")
-        inside = source.regions(scribbles, self.names[0])
+        scribbles, background, added = (drawn.masks.get(name) for name in ("scribbles", "background", "added"))
+        if scribbles is None and added is None:
+            raise TypeError(f"{self.names[0]} must be a torch.Tensor, got NoneType; paint some, or pass added")
+        inside = [] if scribbles is None else source.regions(scribbles, self.names[0], needed=added is None)
+        by_hand = ByHand.of(source, added, drawn.masks.get("removed"), len(inside) or None)
         outside = [] if background is None else source.regions(background, self.names[1])
         if len(outside) not in (0, 1, len(inside)):
             raise ValueError(
                 f"{self.names[1]} must have 1 channel or one for each of the {len(inside)} regions, got "
                 f"{len(outside)}; add or drop some"
             )
-        regions = fit_regions(source, inside, outside, self)
-        if outside and bool((regions.background_weights.detach() <= 0).any()):
+        if not inside:
+            outside = []
+        regions = fit_regions(source, inside, outside, self, by_hand)
+        if outside and by_hand is None and bool((regions.background_weights.detach() <= 0).any()):
             raise ValueError(
                 f"{self.names[1]} must hold a painted pixel outside the scribbles of each region in every image, got "
                 "none; paint outside them, or omit it"
@@ -207,19 +219,21 @@ class ObjectEdit(PhotoEdit):
 
 @dataclass(frozen=True, eq=False)
 class Regions:
-    """Masks of K regions, as other edits use them.
+    """Masks of K regions, as other edits use them: computed ones, with what is painted by hand on them.
 
     Attributes:
         reduced: the reduced picture in which the masks were computed, (B, C, h, w) in [0, 1].
         steps: height and width of a pixel of ``reduced``, in pixels of the picture.
         functions: linear functions from colours in [0, 1] to masks, (B, K, C+1, h, w), see :meth:`LinearMasks.fit`.
         scribbles: for each region, weights on the region and on its background.
+        by_hand: what is painted on the masks, or None.
     """
 
     reduced: Tensor
     steps: tuple[float, float]
     functions: Tensor
     scribbles: list[Scribbles]
+    by_hand: ByHand | None = None
 
     @property
     def background_weights(self) -> Tensor:
@@ -233,6 +247,11 @@ class Regions:
 
     def masks(self, pixels: Pixels) -> Tensor:
         """Masks (B, K, h, w) of the given pixels."""
+        computed = self.computed(pixels)
+        return computed if self.by_hand is None else self.by_hand.over(computed, pixels)
+
+    def computed(self, pixels: Pixels) -> Tensor:
+        """Masks (B, K, h, w) of the given pixels, without what is painted on them by hand."""
         image, masks = pixels.image.clamp(0.0, 1.0) - 0.5, []
         for functions, scribbles in zip(self.functions.unbind(1), self.scribbles, strict=True):
             mask = calibrated(linear_mask(image, self.rows(functions, pixels)))
@@ -240,8 +259,20 @@ class Regions:
             masks.append(mask * (1 - front - back) + front)
         return torch.cat(masks, dim=1)
 
+    def selected(self) -> Tensor:
+        """Masks (B, K, h, w) of the reduced picture, with what is painted on them by hand."""
+        masks = self.reduced_masks()
+        if self.by_hand is None:
+            return masks
+        small = InMemory(self.reduced)
+        size = (round(small.size[0] * self.steps[0]), round(small.size[1] * self.steps[1]))
+        sides = self.by_hand.added, self.by_hand.removed
+        return ByHand(*([blocks_of(part, small, size, self.steps) for part in side] for side in sides)).over(
+            masks, small
+        )
+
     def reduced_masks(self) -> Tensor:
-        """Masks (B, K, h, w) of the reduced picture."""
+        """Computed masks (B, K, h, w) of the reduced picture."""
         image = self.reduced - 0.5
         return torch.cat([calibrated(linear_mask(image, functions)) for functions in self.functions.unbind(1)], dim=1)
 
@@ -266,9 +297,40 @@ def background_of(source: Source[M], mask: M | None, inside: Scribbles, name: st
 
 
 def fit_regions(
+    source: Source[M],
+    inside: list[Scribbles],
+    background: list[Scribbles],
+    settings: RegionMask,
+    by_hand: ByHand | None = None,
+) -> Regions:
+    """Compute the masks of regions from scribbles on each, and on the background: none, for all, or for each.
+
+    Masks of regions without scribbles are 0, except for what is painted by hand.
+    """
+    if by_hand is None:
+        return _computed_regions(source, inside, background, settings)
+    MASK.check(source.batch, reach=settings.reach, extent=settings.extent)
+    count = len(inside) or len(by_hand.added)
+    numbers = [k for k, drawn in enumerate(inside) if bool((drawn.weights.detach() > 0).any())]
+    if numbers:
+        opposed = [background[k] for k in numbers] if len(background) > 1 else background
+        regions = _computed_regions(source, [inside[k] for k in numbers], opposed, settings)
+        reduced, steps = regions.reduced, regions.steps
+    else:
+        small, steps = _reduced(source, FLOATS_PER_PIXEL)
+        reduced = small.image.clamp(0.0, 1.0)
+    nowhere = reduced.flatten(2)[..., :0]
+    scribbles = [Scribbles(nowhere[0, 0].long(), nowhere[:, :1].expand(-1, 2, -1), nowhere)] * count
+    functions = list(reduced.new_zeros(count, len(reduced), reduced.shape[1] + 1, *reduced.shape[2:]))
+    for place, number in enumerate(numbers):
+        functions[number], scribbles[number] = regions.functions[:, place], regions.scribbles[place]
+    return Regions(reduced, steps, torch.stack(functions, dim=1), scribbles, by_hand)
+
+
+def _computed_regions(
     source: Source[M], inside: list[Scribbles], background: list[Scribbles], settings: RegionMask
 ) -> Regions:
-    """Compute the masks of regions from scribbles on each, and on the background: none, for all, or for each."""
+    """:func:`fit_regions` without what is painted by hand."""
     MASK.check(source.batch, reach=settings.reach, extent=settings.extent)
     inside, background = ([without_strays(drawn, source.size) for drawn in side] for side in (inside, background))
     several = len(background) > 1

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from nlfilter_torch.photo.declared.strokes import Stroke
-from nlfilter_torch.photo.picture.painting import mask_of, paint
+from nlfilter_torch.photo.picture.painting import mask_of, paint, painted_on_mask
 from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles
 from nlfilter_torch.photo.tiled.pictures import LazyRows, Picture, RowSource, stored_as, transparency
 
@@ -27,6 +27,11 @@ class RowPainter:
         """Strokes over a picture (H, W): rows (H, W, 4) in RGB with their mask, and None."""
         return LazyRows((*size, 4), partial(_colour_rows, strokes, size)), None
 
+    def on_mask(self, strokes: Sequence[Stroke], word: str, size: tuple[int, int]) -> RowSource:
+        """What strokes of a meaning set on a mask: rows (H, W, 1 or 4), see :func:`painted_on_mask`."""
+        samples = 4 if "colour" in word else 1
+        return LazyRows((*size, samples), partial(_on_mask_rows, strokes, word, size))
+
     def covers(self, marks: RowSource) -> bool:
         """Whether a mask or colours cover a pixel."""
         return LazyRows(tuple(marks.shape), partial(_rows_of, marks), marks.dtype).any()
@@ -40,6 +45,10 @@ def _mask_rows(
     strokes: Sequence[Stroke], size: tuple[int, int], above: Sequence[Stroke], rows: slice
 ) -> NDArray[np.generic]:
     return stored_as(mask_of(strokes, size, rows, above=above), "float32")
+
+
+def _on_mask_rows(strokes: Sequence[Stroke], word: str, size: tuple[int, int], rows: slice) -> NDArray[np.generic]:
+    return stored_as(painted_on_mask(strokes, word, size, rows), "float32")
 
 
 def _colour_rows(strokes: Sequence[Stroke], size: tuple[int, int], rows: slice) -> NDArray[np.generic]:

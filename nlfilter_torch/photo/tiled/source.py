@@ -254,15 +254,15 @@ class Tiled:
         self.scribbled_pixels += len(scribbles.places)
         return scribbles
 
-    def regions(self, masks: RowSource, name: str) -> list[Scribbles]:
+    def regions(self, masks: RowSource, name: str, *, needed: bool = True) -> list[Scribbles]:
         """Read the scribbles of K regions from rows (H, W, K) in [0, 1].
 
         Raises:
             ValueError, MemoryError: as :meth:`scribbles`.
         """
         if len(masks.shape) == 2:
-            return [self.scribbles(masks, None, name)]
-        return [self.scribbles(region_rows(masks, k), None, name) for k in range(masks.shape[2])]
+            return [self.scribbles(masks, None, name, needed=needed)]
+        return [self.scribbles(region_rows(masks, k), None, name, needed=needed) for k in range(masks.shape[2])]
 
     def num_regions(self, masks: RowSource, name: str) -> int:
         """K, of rows (H, W, K), or 1 for rows (H, W)."""

@@ -39,6 +39,8 @@ def test_the_settings_of_the_brush(shown: Controls) -> None:
     assert (words.value, others.value) == ("colour", "in")
     words.set_value("keep")
     assert shown.brush.paint("recolor") == "keep"
+    words.set_value("add colour")
+    assert shown.brush.paint("recolor") == f"add {COLOURS[0]}"
     assert shown.brush.paint("defocus") == "in"
     words.set_value("colour")
     buttons = [button for button in shown.of(ui.button) if button.props.get("aria-label") == COLOURS[2]]

@@ -67,6 +67,18 @@ def test_it_prints_how_much_is_selected(
     assert "nearly all of the picture's borders are selected" in printed.err
 
 
+def test_a_mask_may_be_painted_by_rectangles(photograph: Path, tmp_path: Path) -> None:
+    painted = ["--add", "4,40,20,10", "--remove", "10,44,2,2"]
+    for memory in ([], ["--memory", "0.05"]):
+        assert run(photograph, tmp_path / "out.pfm", *painted, *memory) == 0
+        wanted = expected(photograph)
+        wanted[40:50, 4:24] = 1
+        wanted[44:46, 10:12] = 0
+        np.testing.assert_allclose(floats(tmp_path / "out.pfm"), wanted, atol=1e-4)
+    assert main(["mask", str(photograph), str(tmp_path / "out.pfm"), *painted]) == 0
+    assert floats(tmp_path / "out.pfm").sum() == 196
+
+
 def test_files_of_every_kind(photograph: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     wanted = expected(photograph)
     assert run(photograph, tmp_path / "out.png") == 0

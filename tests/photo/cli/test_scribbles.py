@@ -210,23 +210,25 @@ def unread(path: Path) -> StoredPicture:
 
 
 def test_what_options_mark() -> None:
-    assert not ScribbleOptions(backgrounds={"--keep": ["1,2,3,4"]}).marks_objects
-    assert not ScribbleOptions(region=[]).marks_objects
+    edit = EDITS["recolor"]
+    assert not ScribbleOptions(rectangles={"--keep": ["1,2,3,4"], "--remove": ["1,2,3,4"]}).marks_objects(edit)
+    assert not ScribbleOptions(region=[]).marks_objects(edit)
     for options in (
         ScribbleOptions(region=["1,2,3,4"]),
         ScribbleOptions(strokes=Path("a.png")),
         ScribbleOptions(mask=Path("a.png")),
+        ScribbleOptions(rectangles={"--add": ["1,2,3,4:red"]}),
     ):
-        assert options.marks_objects
+        assert options.marks_objects(edit)
     assert ScribbleOptions(region=["1,2,3,4:red"]).called == "--region"
     assert ScribbleOptions(strokes=Path("a.png")).called == "a.png"
 
 
 def test_two_kinds_of_scribbles() -> None:
-    options = ScribbleOptions(["2,3,4,5", "10,3,4,5"], backgrounds={"--keep": ["20,30,4,5"]})
+    options = ScribbleOptions(["2,3,4,5", "10,3,4,5"], rectangles={"--keep": ["20,30,4,5"]})
     drawn = of_edit(DESATURATE, None, SIZE, options, unread)
     assert (drawn.colours, drawn.sliders) == (None, None)
-    assert [option for option, _ in overlays(DESATURATE, drawn)] == ["--region", "--keep"]
+    assert [option for _, option, _ in overlays(DESATURATE, drawn)] == ["--region", "--keep"]
     tensors = at_once(DESATURATE, drawn).masks
     assert torch.equal(tensors["scribbles"], box(3, 2, 5, 4, SIZE) + box(3, 10, 5, 4, SIZE))
     assert torch.equal(tensors["keep"], box(30, 20, 5, 4, SIZE))
@@ -235,7 +237,7 @@ def test_two_kinds_of_scribbles() -> None:
 
 def test_an_object_may_be_needed() -> None:
     with pytest.raises(ValueError, match="give --region X,Y,W,H, the part to desaturate"):
-        of_edit(DESATURATE, None, SIZE, ScribbleOptions(backgrounds={"--keep": ["1,2,3,4"]}), unread)
+        of_edit(DESATURATE, None, SIZE, ScribbleOptions(rectangles={"--keep": ["1,2,3,4"]}), unread)
     assert not of_edit(EDITS["detail"], (2.0, 1.0), SIZE, ScribbleOptions(), unread).masks
 
 
@@ -248,9 +250,31 @@ def test_regions_have_sliders() -> None:
     assert torch.equal(regions, torch.cat([box(3, 2, 5, 4, SIZE), box(3, 10, 5, 4, SIZE)], dim=1))
 
 
+def test_masks_are_painted_by_rectangles() -> None:
+    rectangles = {"--add": ["2,3,4,5", "10,3,4,5:0,1,2"], "--remove": ["2,3,1,1"]}
+    drawn = of_edit(
+        EDITS["detail"], (3.0, 2.0, 1.0), SIZE, ScribbleOptions(["20,3,4,5:0,1,2"], rectangles=rectangles), unread
+    )
+    assert drawn.sliders is not None
+    assert drawn.sliders.tolist() == [[0, 1, 2], [3, 2, 1]]
+    masks = at_once(EDITS["detail"], drawn).masks
+    assert torch.equal(masks["added"], torch.cat([box(3, 10, 5, 4, SIZE), box(3, 2, 5, 4, SIZE)], dim=1))
+    assert torch.equal(masks["removed"], box(3, 2, 1, 1, SIZE))
+    assert torch.equal(masks["regions"][:, 1:], torch.zeros(1, 1, *SIZE))
+    coloured = at_once(
+        EDITS["recolor"],
+        of_edit(EDITS["recolor"], None, SIZE, ScribbleOptions(rectangles={"--add": ["2,3,4,5:red"]}), unread),
+    )
+    assert coloured.colours is None
+    red = box(3, 2, 5, 4, SIZE)
+    assert torch.equal(coloured.masks["added"], torch.cat([red, 0 * red, 0 * red, red], dim=1))
+    with pytest.raises(ValueError, match="--add must end in a colour"):
+        of_edit(EDITS["recolor"], None, SIZE, ScribbleOptions(rectangles={"--add": ["2,3,4,5"]}), unread)
+
+
 def test_colours_and_their_mask() -> None:
     drawn = of_edit(EDITS["colorize"], None, SIZE, ScribbleOptions(["2,3,4,5:#0000ff", "4,3,4,5:red"]), unread)
-    assert [option for option, _ in overlays(EDITS["colorize"], drawn)] == ["--region"]
+    assert [option for _, option, _ in overlays(EDITS["colorize"], drawn)] == ["--region"]
     tensors = at_once(EDITS["colorize"], drawn)
     assert tensors.colours is not None
     red, blue = box(3, 4, 5, 4, SIZE), box(3, 2, 5, 2, SIZE)  # the later rectangle covers the earlier one

@@ -141,7 +141,8 @@ def test_an_edit_knows_its_parameters_by_name_and_by_argument() -> None:
 def test_an_edit_tells_its_scribbles() -> None:
     assert EDIT.words == ("colour", "keep")
     assert EDIT.requires_strokes
-    assert [scribble.argument for scribble in EDIT.backgrounds] == ["keep"]
+    assert [scribble.argument for scribble in EDIT.with_options] == ["keep"]
+    assert [scribble.argument for scribble in EDIT.with_role("background", "added")] == ["keep"]
     assert EDIT.regional is None
     regions = Scribble("regions", "in", "Edit this", "sliders")
     regional = Edit("detail", "", (SLIDERS,), scribbles=(regions,))

@@ -187,7 +187,7 @@ def step_file(edit: str, entries: str) -> str:
         ),
         (
             step_file("recolor", '"strokes": [{"points": [[0, 0]], "radius": 0.1, "paint": "blue"}]'),
-            "must be one of a colour such as #c04020, keep, got 'blue'",
+            "must be one of a colour such as #c04020, keep, add with a colour such as add #c04020, remove, got 'blue'",
         ),
     ],
 )

@@ -1,5 +1,7 @@
 """Steps and recipes applied to an image: they call the functions with the arguments that they stand for."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -27,6 +29,7 @@ from nlfilter_torch.photo.picture.painting import TensorPainter, mask_of, paint
 SIZE = (48, 64)
 LINE = ((0.25, 0.25), (0.5, 0.25))
 IN, OUT = Stroke(LINE, 0.05, "in"), Stroke(((0.8, 0.8),), 0.1, "out")
+ADD, REMOVE = Stroke(((0.3, 0.7), (0.5, 0.7)), 0.08, "add"), Stroke(((0.4, 0.3),), 0.08, "remove")
 BLUE, KEEP = Stroke(LINE, 0.05, "#2040e0"), Stroke(((0.8, 0.8),), 0.1, "keep")
 ALPHA, INSIDE = (0.5, 1.0, 1.0, 1.0), (3.0, 3.0, 2.0, 1.0)
 DETAIL = Step("detail", (IN, OUT), alpha=ALPHA, inside=INSIDE, reach=0.7, bandwidth=30.0)
@@ -178,6 +181,41 @@ def test_edits_have_the_settings_of_their_steps() -> None:
     assert torch.equal(torch.rand(3, generator=vars(edit)["generator"]), torch.rand(3, generator=seeded()))
     own = torch.Generator().manual_seed(7)
     assert vars(edit_of(Step("tone"), SIZE, generator=own))["generator"] is own
+
+
+@pytest.mark.parametrize(
+    ("step", "strokes", "names"),
+    [
+        (DEFOCUS, (IN, ADD, REMOVE), ["focus_region", "added", "removed"]),
+        (DEFOCUS, (ADD,), ["added"]),
+        (DETAIL, (ADD, REMOVE), ["added", "removed"]),
+        (RECOLOR, (BLUE, REMOVE, replace(ADD, paint="add #c04020")), ["stroke_mask", "added", "removed"]),
+        (RECOLOR, (replace(ADD, paint="add #c04020"),), ["added"]),
+    ],
+)
+def test_a_step_has_a_mask_painted_by_hand(
+    step: Step, strokes: tuple[Stroke, ...], names: list[str], pixels: torch.Tensor
+) -> None:
+    painted = step.changed(strokes=strokes)
+    recipe = Recipe((painted,))
+    assert Recipe.from_json(recipe.to_json(), "edit.json") == recipe
+    drawn = scribbles_of(painted, SIZE, TensorPainter())
+    assert list(drawn.masks) == names
+    edited = apply_recipe(recipe, pixels)
+    assert edited.isfinite().all()
+    assert not torch.equal(edited, pixels)
+    erased = painted.changed(strokes=(*strokes, replace(REMOVE, points=((0.0, 0.5), (1.0, 0.5)), radius=1.0)))
+    wanted = (
+        pixels
+        if step is RECOLOR
+        else apply_recipe(Recipe((erased.changed(strokes=(ADD, *erased.strokes[-1:])),)), pixels)
+    )
+    assert torch.equal(apply_recipe(Recipe((erased,)), pixels), wanted)
+
+
+def test_an_eraser_alone_changes_nothing() -> None:
+    assert not DEFOCUS.changed(strokes=(REMOVE,)).changes()
+    assert not DETAIL.changed(strokes=(REMOVE,)).has_region()
 
 
 def test_scribbles_are_painted_under_the_names_of_the_arguments() -> None:

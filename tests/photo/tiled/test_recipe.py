@@ -18,6 +18,7 @@ from tests.problems import cat, difference
 from tests.recipes import BLUE, COLORIZE, DETAIL, IN, RECOLOR, by_rows, from_rows, rows_of
 from tests.tiles import cat as photograph
 
+ADD, REMOVE = Stroke(((0.2, 0.7), (0.6, 0.8)), 0.08, "add"), Stroke(((0.4, 0.5),), 0.1, "remove")
 FAR = Stroke(((1.8, 1.8),), 0.05, "out")  # covers no pixel
 
 
@@ -46,7 +47,8 @@ def test_denoising_by_a_sample_is_within_a_grey_level() -> None:
         Recipe((Step("tone", contrast=1.3, clarity=1.5, landmarks=60),)),
         Recipe((Step("abstract", landmarks=60),)),
         Recipe((Step("abstract", landmarks=60, edges=0.7, tones=6),)),
-        Recipe((Step("defocus", (IN,), landmarks=60, radius=3.0),)),
+        Recipe((Step("defocus", (IN, ADD, REMOVE), landmarks=60, radius=3.0),)),
+        Recipe((Step("recolor", (replace(ADD, paint="add #2040e0"), REMOVE), landmarks=60),)),
         Recipe((DETAIL, COLORIZE, RECOLOR)),
         Recipe((RECOLOR, Step("detail", alpha=(1.5, 1.0)))),
     ],
