@@ -102,6 +102,7 @@ class Editor:
         ui.on("closeup", lambda event: self._look(event.args))
         ui.on("stroke_dropped", self._canvas.drop_stroke)
         ui.on("save_photo", self._ask_photo_name)
+        ui.on("tool", lambda event: self._panel.take(event.args))
         self._client.on_connect(lambda: self._begin(image, address))
 
     def picture(self, kind: str, place: str) -> bytes | None:

@@ -8,6 +8,7 @@ from nlfilter_torch.photo.app.detail_tab import DetailTab
 from nlfilter_torch.photo.app.look_tab import LookTab
 from nlfilter_torch.photo.app.step_list import StepList
 from nlfilter_torch.photo.app.tabs import EditTab, Link
+from nlfilter_torch.photo.declared.declaration import ScribbleRole
 from nlfilter_torch.photo.declared.parameters import DETAIL, EDITS
 from nlfilter_torch.photo.declared.shared_parameters import LOOK
 
@@ -31,6 +32,7 @@ class Panel:
             bar.props("dense no-caps align=justify")
             self._titles = {edit: ui.tab(edit, label=edit.capitalize()) for edit in TABS}
         panels = ui.tab_panels(bar, value=next(iter(TABS)), animated=False, keep_alive=True)
+        self._bar = bar
         self._tabs: list[EditTab] = []
         with panels.classes("w-full bg-transparent"):
             for edit, kind in TABS.items():
@@ -51,6 +53,10 @@ class Panel:
         for edit, title in self._titles.items():
             state = f'alert=amber aria-label="{edit.capitalize()}, in use"'
             title.props(state if edit in acting else "", remove="" if edit in acting else "alert aria-label")
+
+    def take(self, role: ScribbleRole) -> None:
+        """Take the tool that draws scribbles with a role, in the open tab."""
+        self._tabs[list(TABS).index(self._bar.value)].take(role)
 
     def draw_levels(self, histogram: str, clipped: tuple[float, float], before: tuple[float, float]) -> None:
         """Show the histogram, and how much of the picture is white or black, now and before the edit."""

@@ -10,8 +10,11 @@ from nlfilter_torch.photo.app import controls
 from nlfilter_torch.photo.app.brush import BRUSHES, COLOURS, RADIUS, Brush
 from nlfilter_torch.photo.app.controls import Change, Choice, Control, Slider, SteadySlider
 from nlfilter_torch.photo.app.step_list import Replace
+from nlfilter_torch.photo.declared.declaration import ScribbleRole
 from nlfilter_torch.photo.declared.parameters import EDITS
 from nlfilter_torch.photo.declared.presets import Recipe
+
+BY_HAND = "Brush (B) and Eraser (E) paint on the mask itself; S is the first tool again."
 
 
 @dataclass(frozen=True)
@@ -51,6 +54,11 @@ class EditTab:
         for choice in self._choices:
             choice.follow()
 
+    def take(self, role: ScribbleRole) -> None:
+        """Take the tool that draws scribbles with a role, if the edit has one."""
+        for scribble in EDITS[self._edit].with_role(role):
+            self._tools.set_value(scribble.word)
+
     def draw_response(self, svg: str) -> None:
         """Show the response of the sliders, in a tab that has a place for it."""
 
@@ -72,15 +80,18 @@ class EditTab:
         if self._edit not in BRUSHES:
             return
         brush, edit = self._link.brush, self._edit
-        ui.label("Brush").classes("group")
-        if hint:
-            ui.label(hint).classes("hint")
-        with ui.row().classes("w-full items-center no-wrap gap-2 q-mt-xs"):
-            words = ui.toggle(BRUSHES[edit], value=brush.word[edit]).props("dense no-caps unelevated")
-            words.on_value_change(lambda event: brush.word.update({edit: event.value}))
+        with ui.row().classes("w-full items-center no-wrap"):
+            ui.label("Tools").classes("group")
             ui.space()
             clear = ui.button("Clear strokes", on_click=partial(self._link.clear, edit))
             clear.props("flat dense no-caps")
+        if hint:
+            ui.label(hint).classes("hint")
+        self._tools = ui.toggle(BRUSHES[edit], value=brush.word[edit])
+        self._tools.props('dense no-caps unelevated spread role="group" aria-label="Tools"').classes("w-full q-mt-xs")
+        self._tools.on_value_change(lambda event: brush.word.update({edit: event.value}))
+        if EDITS[edit].with_role("added"):
+            ui.label(BY_HAND).classes("hint wide")
         if "colour" in BRUSHES[edit]:
             self._build_colours()
         with ui.row().classes("w-full items-center no-wrap gap-3 q-mt-xs"):

@@ -39,6 +39,21 @@ def test_every_edit_has_a_tab_with_its_sliders(shown: Controls, panel: Panel, op
     assert opened[-1] == "recolor"
 
 
+def test_a_key_takes_a_tool_of_the_open_tab(shown: Controls, panel: Panel) -> None:
+    for edit, role, paint in (
+        ("detail", "added", "add"),
+        ("recolor", "added", f"add {shown.brush.colour}"),
+        ("recolor", "removed", "remove"),
+        ("recolor", "object", shown.brush.colour),
+        ("colorize", "removed", shown.brush.colour),
+    ):
+        shown.of(ui.tabs)[0].set_value(edit)
+        panel.take(role)
+        assert shown.brush.paint(edit) == paint
+    shown.of(ui.tabs)[0].set_value("tone")
+    panel.take("added")
+
+
 def test_all_tabs_follow_the_edit(shown: Controls, panel: Panel) -> None:
     shown.recipe = Recipe((Step("detail", alpha=(3.0, 1.0, 1.0, 1.0)), Step("tone", contrast=0.8)))
     panel.follow()

@@ -22,7 +22,7 @@ def test_an_edit_has_its_hint_its_sliders_and_its_brush(shown: Controls, name: s
     assert EDITS[name].hint in shown.texts()
     labels = {p.slider.label for p in EDITS[name] if p.slider is not None}
     assert shown.sliders().keys() - {"Brush size"} == labels
-    assert ("Brush" in shown.texts()) == (name in BRUSHES) == ("Brush size" in shown.sliders())
+    assert ("Tools" in shown.texts()) == (name in BRUSHES) == ("Brush size" in shown.sliders())
 
 
 def test_the_sliders_follow_the_edit(shown: Controls) -> None:

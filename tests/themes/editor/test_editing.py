@@ -96,12 +96,19 @@ def test_saved_files_are_what_the_library_and_the_command_line_make(opened: Tab,
     page.get_by_role("button", name="#8a46c8").first.click()
     opened.paint((0.37, 0.35), (0.4, 0.37))
     opened.wait_for_picture(before)
+    for key, tool, y in (("b", "Brush", 0.8), ("e", "Eraser", 0.82)):
+        before = opened.source()
+        page.keyboard.press(key)
+        tools = page.get_by_role("group", name="Tools").get_by_role("button", name=tool)
+        expect(tools.locator("visible=true")).to_have_attribute("aria-pressed", "true")
+        opened.paint((0.7, y), (0.8, 0.8))
+        opened.wait_for_picture(before)
     opened.save("Save photo", "out.png")
     opened.save("Save edit", "edit.json")
 
     recipe = find_recipe(str(folder / "edit.json"))
     assert recipe.last("detail")["inside"] == (1.0, 3.0, 1.0, 1.0)
-    assert recipe.last("recolor").strokes[0].paint == "#8a46c8"
+    assert [stroke.paint for stroke in recipe.last("recolor").strokes] == ["#8a46c8", "add #8a46c8", "remove"]
     saved = read_photograph(folder / "out.png").pixels
     assert (saved - apply_recipe(recipe, cat()).clamp(0, 1)).abs().max() <= 1 / 255
     assert main(["apply", str(folder / "cat.png"), str(folder / "cli.png"), "--preset", str(folder / "edit.json")]) == 0

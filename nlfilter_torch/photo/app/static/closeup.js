@@ -86,6 +86,11 @@ class Closeup {
     }
   }
 
+  /** Take the tool that draws scribbles with a role. */
+  tool(role) {
+    emitEvent("tool", role);
+  }
+
   /** Hundredths of what is visible that show the photograph before the edit. */
   get #before() {
     return this.#isOriginal ? 100 : this.#wipe;
@@ -342,7 +347,7 @@ class Closeup {
     if (name === "pan") {
       this.#pan(...values);
     } else {
-      this[name](...values); // step, fit, full, hand, original
+      this[name](...values); // step, fit, full, hand, original, tool
     }
   }
 }

@@ -2,6 +2,7 @@
 
 const LINE = 24; // pixels of a line, for wheels that count lines
 const FAR = 0.15; // of the width of the canvas, by which an arrow key moves the photograph
+const TOOLS = { b: "added", e: "removed", s: "object" }; // what the tools draw, by their keys
 const ARROWS = { ArrowLeft: [1, 0], ArrowRight: [-1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] };
 
 /**
@@ -99,6 +100,9 @@ export function actionOfKey(key, width) {
     case "\\":
       return ["original", true];
     default:
+      if (Object.hasOwn(TOOLS, key.toLowerCase())) {
+        return ["tool", TOOLS[key.toLowerCase()]];
+      }
       return Object.hasOwn(ARROWS, key) ? ["pan", ...ARROWS[key].map((share) => share * FAR * width)] : null;
   }
 }

@@ -113,6 +113,11 @@ test("keys", () => {
   ]);
   assert.deepEqual(actionOfKey("ArrowLeft", 800), ["pan", 120, 0]);
   assert.deepEqual(actionOfKey("ArrowDown", 800), ["pan", 0, -120]);
+  assert.deepEqual(["b", "E", "s"].map((key) => actionOfKey(key, 800)), [
+    ["tool", "added"],
+    ["tool", "removed"],
+    ["tool", "object"],
+  ]);
   assert.equal(actionOfKey("a", 800), null);
   assert.equal(actionOfKey("toString", 800), null);
 });
