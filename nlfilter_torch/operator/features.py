@@ -222,13 +222,15 @@ class _ScaledPatches(torch.autograd.Function):
         size = _inner_size(padded, scale)
         grad_padded, grad_scale = torch.zeros_like(padded), torch.zeros_like(scale)
         planes = grad.unflatten(2, size)
-        offsets = product(*map(range, (padded.shape[1], *scale.shape[1:])))  # channel, row and column of each plane
-        for plane, (channel, *place) in enumerate(offsets):
-            window: tuple[int | slice, ...] = (slice(None), channel, *map(_interval, place, size))
+        axes = len(size)
+        planes = planes.unflatten(1, (padded.shape[1], *scale.shape[1:]))  # (B, C, p, p, H, W)
+        for place in product(*map(range, scale.shape[1:])):
+            window = (..., *map(_interval, place, size))
             weight: tuple[int | slice, ...] = (slice(None), *place)
-            grad_padded[window] += planes[:, plane] * for_planes(scale[weight], len(size))
-            moved = (planes[:, plane] * padded[window]).flatten(1).sum(1)  # (B,)
-            grad_scale[weight] += moved if scale.shape[0] == moved.shape[0] else moved.sum()
+            moved = planes[(slice(None), slice(None), *place)]  # (B, C, H, W)
+            grad_padded[window] += moved * for_planes(scale[weight].unsqueeze(1), axes)
+            total = (moved * padded[window]).flatten(2).sum(2).sum(1)  # (B,)
+            grad_scale[weight] += total if scale.shape[0] == total.shape[0] else total.sum()
         return grad_padded, grad_scale
 
 

@@ -31,6 +31,7 @@ class PivotSampler:
         divisor: divisor of the probabilities in the draw, (B, 1, S): how likely it was that a point is among these.
         captured: lower bound of residuals; a smaller residual counts as captured.
         matrix: residual matrix (B, S, S) if other points than these are pivots already; None: the affinities.
+        squares: squared distances (B, S, S) of the points from each other, if they are known.
     """
 
     points: Tensor
@@ -38,6 +39,7 @@ class PivotSampler:
     divisor: Tensor
     captured: float
     matrix: Tensor | None = None
+    squares: Tensor | None = None
 
     def draw(self, residual: Tensor, nearest: Tensor, draws: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Randomly pivoted Cholesky decomposition: pivots (B, 1, M), rows (B, M, S) and divisors of the rows (B, M).
@@ -72,8 +74,11 @@ class PivotSampler:
         summed = (odds(residual, nearest, self.captured) / self.divisor).cumsum(2, dtype=torch.float64)  # (B, 2, S)
         ticks = numbers.view(2, -1) * summed[:, :, -1:]
         proposed = torch.searchsorted(summed, ticks).clamp_(max=residual.shape[2] - 1).flatten(1).unsqueeze(1)
-        others, lengths = pick(self.points, proposed), pick(self.norms, proposed)
-        apart = squared_distances(self.points, self.norms, others, lengths)  # (B, TRIALS, S)
+        if self.squares is None:
+            others, lengths = pick(self.points, proposed), pick(self.norms, proposed)
+            apart = squared_distances(self.points, self.norms, others, lengths)  # (B, TRIALS, S)
+        else:
+            apart = pick(self.squares, proposed).mT
         best = best_trial(apart, nearest, self.divisor)
         return proposed.gather(2, best), pick(apart.mT, best).mT
 

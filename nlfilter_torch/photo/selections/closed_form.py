@@ -7,8 +7,10 @@ also give the mask of any pixel of a larger picture (:class:`LinearMasks`).
 from dataclasses import dataclass
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
+from nlfilter_torch.core.workers import single_threaded, threads_for
 from nlfilter_torch.photo.picture.colour import dot
 from nlfilter_torch.photo.selections.pyramid import doubled, halved, pyramid_levels
 from nlfilter_torch.photo.selections.trimap import by_trimap
@@ -75,14 +77,16 @@ def linear_mask(image: Tensor, functions: Tensor) -> Tensor:
 
 
 def window_sums(planes: Tensor) -> Tensor:
-    """Sums over the window around each pixel, cut off at the borders of the picture."""
-    for axis in (2, 3):
-        total, length = planes.clone(), planes.shape[axis]
-        for shift in range(1, min(WINDOW_RADIUS + 1, length)):  # F.avg_pool2d takes several times as long
-            total.narrow(axis, shift, length - shift).add_(planes.narrow(axis, 0, length - shift))
-            total.narrow(axis, 0, length - shift).add_(planes.narrow(axis, shift, length - shift))
-        planes = total
-    return planes
+    """Sums over the window around each pixel, cut off at the borders of the picture: five pixels as two pairs and one.
+
+    ``F.avg_pool2d`` takes several times as long.
+    """
+    height, width = planes.shape[-2:]
+    planes = F.pad(planes, [WINDOW_RADIUS] * 4)
+    pairs = planes[:, :, :-1] + planes[:, :, 1:]
+    planes = (pairs[:, :, :height] + pairs[:, :, 2 : height + 2]).add_(planes[:, :, 4:])
+    pairs = planes[..., :-1] + planes[..., 1:]
+    return (pairs[..., :width] + pairs[..., 2 : width + 2]).add_(planes[..., 4:])
 
 
 def linear_models(image: Tensor) -> list[LinearMasks]:
@@ -107,6 +111,12 @@ def solve_linear(
     trust = LINEAR_ROUGH_CONFIDENCE * ((2 * rough - 1).square() + 0.01)
     certain = LINEAR_SCRIBBLE_CONFIDENCE * (front + back)
     planes = torch.cat([trust * rough + LINEAR_SCRIBBLE_CONFIDENCE * front, trust + certain, start], dim=1)
+    with single_threaded(threads_for(planes)):  # so few pixels that a second thread would wait most of the time
+        return _solve_levels(models, planes, trimap).to(start)
+
+
+def _solve_levels(models: list[LinearMasks], planes: Tensor, trimap: Tensor) -> Tensor:
+    """:func:`solve_linear`, of the planes (B, 3 K, H, W) of the target, the confidence and the initial masks."""
     coarser: Tensor | None = None
     levels = zip(models, halved(planes, len(models) - 1), strict=True)
     for level, (model, planes_of_level) in reversed(list(enumerate(levels))):
@@ -121,7 +131,7 @@ def solve_linear(
     functions = torch.stack([models[0].fit(mask.clamp(0.0, 1.0).double()) for mask in coarser.split(1, 1)], dim=1)
     slopes, constant = functions.tensor_split([-1], dim=2)
     margin = by_trimap(END_MARGIN, trimap)[:, :, None, None, None]
-    return (torch.cat([slopes, constant - margin], dim=2) / (1 - 2 * margin)).to(start)
+    return torch.cat([slopes, constant - margin], dim=2) / (1 - 2 * margin)
 
 
 def damped(model: LinearMasks, mask: Tensor, target: Tensor, trust: Tensor) -> Tensor:
