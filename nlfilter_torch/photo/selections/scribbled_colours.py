@@ -5,6 +5,7 @@ separate hair and thin parts, too, where their colours differ.
 """
 
 import math
+from functools import partial
 
 import torch
 import torch.nn.functional as F
@@ -12,6 +13,7 @@ from torch import Tensor
 
 from nlfilter_torch.core.blocks import order_by, pixel_blocks
 from nlfilter_torch.core.precision import per_image
+from nlfilter_torch.core.workers import in_order, threads_for
 from nlfilter_torch.operator.features import blur
 from nlfilter_torch.photo.picture.colour import hundredths_of_lab
 from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles
@@ -223,13 +225,18 @@ def density(places: Tensor, points: Tensor, weights: Tensor, bandwidth: Tensor) 
     places, points = (t / (bandwidth * math.sqrt(t.shape[1])) for t in (places, points))
     squares = points.square().sum(1, keepdim=True)
     left = torch.cat([2 * points, -torch.ones_like(squares), -squares], dim=1)  # (B, C+2, m)
-    sums = []
-    for block in pixel_blocks(places.shape[2], len(places), places.device):
-        part = places[:, :, block]
-        right = torch.cat([part, part.square().sum(1, keepdim=True), torch.ones_like(part[:, :1])], dim=1)
-        exponents = right.mT @ left  # (B, k, m), minus the squared distances
-        sums.append(exponents.clamp(SMALLEST_EXPONENT, 0.0).exp() @ weights.mT)
-    return torch.cat(sums, dim=1).mT
+    part, blocks = partial(_density, places, left, weights), pixel_blocks(places.shape[2], len(places), places.device)
+    workers = threads_for(places, left, weights)
+    sums = map(part, blocks) if workers == 1 else in_order(part, blocks, workers)
+    return torch.cat(list(sums), dim=1).mT
+
+
+def _density(places: Tensor, left: Tensor, weights: Tensor, block: slice) -> Tensor:
+    """Sums (B, k, J) at a block of the places, of which ``left`` (B, C+2, m) has the exponents by a product."""
+    part = places[:, :, block]
+    right = torch.cat([part, part.square().sum(1, keepdim=True), torch.ones_like(part[:, :1])], dim=1)
+    exponents = right.mT @ left  # (B, k, m), minus the squared distances
+    return exponents.clamp(SMALLEST_EXPONENT, 0.0).exp() @ weights.mT
 
 
 def colours_in_lab(colours: Tensor) -> Tensor:
