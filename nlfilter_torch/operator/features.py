@@ -7,6 +7,7 @@ import math
 from dataclasses import dataclass
 from functools import reduce
 from itertools import product
+from types import EllipsisType
 from typing import Any
 
 import torch
@@ -225,7 +226,7 @@ class _ScaledPatches(torch.autograd.Function):
         axes = len(size)
         planes = planes.unflatten(1, (padded.shape[1], *scale.shape[1:]))  # (B, C, p, p, H, W)
         for place in product(*map(range, scale.shape[1:])):
-            window = (..., *map(_interval, place, size))
+            window: tuple[EllipsisType | slice, ...] = (..., *map(_interval, place, size))
             weight: tuple[int | slice, ...] = (slice(None), *place)
             moved = planes[(slice(None), slice(None), *place)]  # (B, C, H, W)
             grad_padded[window] += moved * for_planes(scale[weight].unsqueeze(1), axes)
