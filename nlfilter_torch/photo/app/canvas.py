@@ -230,7 +230,7 @@ class Canvas:
             return
         strokes: tuple[Stroke, ...] = ()
         if self._show_strokes.value:
-            strokes = self._session.recipe.last(self._step).strokes
+            strokes = self._session.recipe.current(self._step).strokes
             if self._line:
                 height, width = self._preview_size
                 points = tuple((x / width, y / height) for x, y in self._line)

@@ -39,14 +39,14 @@ class Control:
         """The slider's value for an edit."""
         if self.index is not None:
             return float(self._numbers(recipe)[self.index])
-        value: float | None = recipe.last(self.edit)[self.parameter.name]
+        value: float | None = recipe.current(self.edit)[self.parameter.name]
         if value is None:
             return self.slider.low if self.slider.none is None else self.slider.none
         return float(value)
 
     def _numbers(self, recipe: Recipe) -> tuple[float, ...]:
         """The numbers of which the slider sets one."""
-        step = recipe.last(self.edit)
+        step = recipe.current(self.edit)
         numbers: tuple[float, ...] = step[self.parameter.name]
         return step.sliders_inside if self.parameter.name == "inside" else numbers
 
@@ -58,7 +58,7 @@ class Control:
         """
         step = Step.idle(self.edit)
         if self.parameter.name == "inside":
-            step = step.changed(inside=recipe.last(self.edit)["alpha"])
+            step = step.changed(inside=recipe.current(self.edit)["alpha"])
         elif self.index is not None:
             step = step.changed(strokes=None, **{self.parameter.name: (1.0,) * len(self._numbers(recipe))})
         return self.read(Recipe((step,)))
@@ -192,7 +192,7 @@ class Choice:
 
     @property
     def _chosen(self) -> str:
-        return str(self._recipe().last(self._edit)[self._parameter.name])
+        return str(self._recipe().current(self._edit)[self._parameter.name])
 
     def follow(self) -> None:
         """Show the current edit."""

@@ -45,7 +45,7 @@ class DetailTab(EditTab):
     @property
     def _step(self) -> Step:
         """The current step of the edit."""
-        return self._link.recipe().last(self._edit)
+        return self._link.recipe().current(self._edit)
 
     def _build(self) -> None:
         names = {name: f"{name}: {PURPOSES[name]}" for name in PRESETS}

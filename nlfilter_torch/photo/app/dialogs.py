@@ -39,6 +39,10 @@ class NameDialog:
     def _build_options(self) -> None:
         """Build what is asked beside the name."""
 
+    def _trouble(self) -> str | None:
+        """What is wrong with what is asked beside the name, as a sentence, or None."""
+        return None
+
     def _follow(self) -> None:
         """Say where the file goes, and whether there is one of that name."""
         self._ok.set_text("Save")
@@ -61,6 +65,10 @@ class NameDialog:
         except EXPECTED as error:
             self._note.set_text(str(error))
             return
+        trouble = self._trouble()
+        if trouble is not None:
+            self._note.set_text(trouble)
+            return
         if exists and self._ok.text != "Replace":
             self._ok.set_text("Replace")
             self._note.set_text(f"{EXISTS} Replace it?")
@@ -82,8 +90,17 @@ class SaveDialog(NameDialog):
     def options(self) -> FileOptions:
         """The options of the file."""
         side = self._side.value
-        shrinks = side is not None and LEAST_SIDE <= side < self._longest
+        shrinks = side is not None and side < self._longest
         return FileOptions(round(self._quality.value), round(side) if shrinks else None)
+
+    def _trouble(self) -> str | None:
+        side = self._side.value
+        if side is None or LEAST_SIDE <= side <= self._longest:
+            return None
+        return (
+            f"the longest side must be from {LEAST_SIDE} to {self._longest} pixels, got {side:g}; leave it empty to "
+            "keep the size"
+        )
 
     def _build_options(self) -> None:
         with ui.row().classes("w-full items-center no-wrap gap-3") as self._lossy:
@@ -91,13 +108,14 @@ class SaveDialog(NameDialog):
             self._quality = SteadySlider(min=LEAST_QUALITY, max=100, step=1, value=QUALITY)
             label.bind_text_from(self._quality, "value", lambda value: f"JPEG quality {value:.0f}")
             self._quality.props('dense aria-label="JPEG quality"').on_reset(lambda: self._quality.set_value(QUALITY))
-        self._side = ui.number(
-            "Longest side in pixels", value=self._longest, min=LEAST_SIDE, max=self._longest, precision=0
-        )
-        self._side.props("outlined dense").classes("w-full")
+        self._side = ui.number("Longest side in pixels", value=self._longest, precision=0)
+        self._side.props("outlined dense").classes("w-full").on_value_change(self._follow)
 
     def _follow(self) -> None:
         super()._follow()
+        trouble = self._trouble()
+        if trouble is not None:
+            self._note.set_text(trouble)
         self._lossy.set_visibility(Path(str(self._name.value).lower()).suffix in (".jpg", ".jpeg"))
 
 

@@ -41,7 +41,7 @@ class LookTab(EditTab):
     def follow(self) -> None:
         """Show the current edit."""
         super().follow()
-        look = self._link.recipe().last(self._edit)
+        look = self._link.recipe().current(self._edit)
         has_look = look.changed(amount=1.0).would_change()
         for slider in self._sliders:
             slider.set_enabled(has_look)
@@ -67,6 +67,6 @@ class LookTab(EditTab):
 
     def _choose(self, name: str) -> None:
         entries = entries_of(LOOKS[name])
-        if self._link.recipe().last(self._edit)[AMOUNT] == 0:
+        if self._link.recipe().current(self._edit)[AMOUNT] == 0:
             entries[AMOUNT] = 1.0  # a look that is chosen is to be seen
         self._link.change(self._edit, entries, True)

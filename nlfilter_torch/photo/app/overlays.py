@@ -23,12 +23,14 @@ class Overlays:
         ``image`` (1, C, h, w) is the picture before the step, and ``stride`` its sampling step relative to the
         photograph.
         """
+        step = step.mixed(on=True, opacity=1.0)  # the mask does not depend on these
         if self._selected is None or self._selected[0] is not image or self._selected[1] != step:
             self._selected = image, step, _selected(step, image, stride)
         return self._selected[2]
 
     def ignored(self, step: Step, image: Tensor) -> Tensor | None:
         """Which pixels (1, 1, h, w) under the scribbles of a step do not count, or None."""
+        step = step.mixed(on=True, opacity=1.0)
         if self._ignored is None or self._ignored[0] is not image or self._ignored[1] != step:
             self._ignored = image, step, _ignored(step, image)
         return self._ignored[2]

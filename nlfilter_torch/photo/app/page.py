@@ -179,7 +179,7 @@ class Editor:
 
     def _draw(self, step: str, add: Callable[[], None]) -> None:
         """Add a stroke to a step, after a question if the photograph would lose its colours."""
-        if EDITS[step].coloured and not self.session.recipe.last(step).strokes and self.session.has_colours:
+        if EDITS[step].coloured and not self.session.recipe.current(step).strokes and self.session.has_colours:
             self._tasks.start(self._ask_to_colorize(add))
         else:
             add()
@@ -295,7 +295,7 @@ class Editor:
         return self.session is session and not (self._client.is_deleted or is_drawing or self._closeup.is_busy)
 
     def _draw_response(self) -> None:
-        detail = self.session.recipe.last("detail")
+        detail = self.session.recipe.current("detail")
         curves = [(OUTSIDE, detail["alpha"]), *([(INSIDE, detail.sliders_inside)] if detail.has_region() else [])]
         self._panel.draw_response(drawing.response_svg(self.session.preview.layers(detail).eigenvalues, curves))
 

@@ -189,11 +189,11 @@ class Session:
         return self.preview.stride > 1
 
     def set(self, edit: str, *, strokes: tuple[Stroke, ...] | None = None, **values: Value) -> None:
-        """Change the last step with that edit, or add such a step, and switch it on.
+        """Change the last step with that edit, or add such a step, and let it be seen.
 
         :meth:`commit` completes the change.
         """
-        self.recipe = self.recipe.with_last(self.recipe.last(edit).changed(strokes=strokes, **values).mixed(on=True))
+        self.recipe = self.recipe.with_current(self.recipe.current(edit).changed(strokes=strokes, **values).shown())
 
     def commit(self) -> None:
         """Complete a change, so that it can be undone."""
@@ -244,11 +244,11 @@ class Session:
         if not words:
             raise ValueError(f"{step} takes no strokes: it holds for the whole photograph")
         stroke = Stroke.from_entries(entries, words, step)
-        last = self.recipe.last(step)
-        painted = last.changed(strokes=(*last.strokes, stroke)).mixed(on=True)
+        last = self.recipe.current(step)
+        painted = last.changed(strokes=(*last.strokes, stroke)).shown()
         if painted.has_region() and not last.has_region():  # it begins with the sliders of the rest
             painted = painted.changed(inside=last["alpha"])
-        self.recipe = self.recipe.with_last(painted)
+        self.recipe = self.recipe.with_current(painted)
         self.commit()
 
     def render(self, moving: int | None = None) -> Tensor:
@@ -258,7 +258,7 @@ class Session:
 
     def mask(self, edit: str) -> Tensor | None:
         """The mask (1, 1, h, w) of what the scribbles of the last step of an edit select, or None."""
-        step, preview = self.recipe.last(edit), self.preview
+        step, preview = self.recipe.current(edit), self.preview
         with self._drawing:
             if step.declared.regional is not None:
                 return preview.mask(step)
@@ -266,7 +266,7 @@ class Session:
 
     def ignored(self, edit: str) -> Tensor | None:
         """Which pixels (1, 1, h, w) under these scribbles do not count, or None."""
-        step = self.recipe.last(edit)
+        step = self.recipe.current(edit)
         with self._drawing:
             return self._overlays.ignored(step, self.preview.before(step))
 

@@ -45,6 +45,7 @@ class Row:
     on: ui.checkbox
     opacity: SteadySlider
     value: ui.label
+    title: ui.button
 
 
 class StepList:
@@ -53,7 +54,7 @@ class StepList:
     Args:
         recipe: returns the current edit.
         replace: is called with a changed edit.
-        open_tab: is called with the name of an edit whose controls are to be shown.
+        open_tab: is called with the name of an edit whose controls are to be shown, of the step that is chosen.
     """
 
     def __init__(self, recipe: Callable[[], Recipe], replace: Replace, open_tab: Callable[[str], object]) -> None:
@@ -77,6 +78,9 @@ class StepList:
             row.on.set_value(step.on)
             row.opacity.set_value(100 * step.opacity)
             row.value.set_text(f"{100 * step.opacity:.0f} %")
+            several = sum(other.edit == step.edit for other in recipe.steps) > 1
+            is_chosen = several and recipe.place_of(step.edit) == row.place
+            row.title.props('aria-current="true"' if is_chosen else "", remove="" if is_chosen else "aria-current")
         self._following = False
 
     def _build(self, recipe: Recipe) -> None:
@@ -93,7 +97,7 @@ class StepList:
         with ui.row().classes("step w-full items-center no-wrap"):
             on = ui.checkbox(value=step.on, on_change=lambda event: self._switch(place, bool(event.value)))
             on.props(f'dense aria-label="{name}: on"').tooltip("Switch this step on or off")
-            title = ui.button(name, on_click=partial(self._open_tab, step.edit)).props("flat dense no-caps align=left")
+            title = ui.button(name, on_click=partial(self._choose, place)).props("flat dense no-caps align=left")
             title.classes("name").tooltip("Show its controls")
             opacity = SteadySlider(min=0, max=100, step=1, value=100 * step.opacity).classes("mixing")
             opacity.props(f'dense aria-label="{name}: opacity"').tooltip(
@@ -109,12 +113,19 @@ class StepList:
                 name, "down", "arrow_downward", number < last, partial(self._move, place, places[min(number + 1, last)])
             )
             self._button(name, "remove", "close", True, partial(self._remove, place))
-        return Row(place, on, opacity, value)
+        return Row(place, on, opacity, value, title)
 
     @staticmethod
     def _button(name: str, action: str, icon: str, enabled: bool, act: Callable[[], None]) -> None:
         button = ui.button(icon=icon, on_click=act).props(f'flat dense size=sm aria-label="{name}: {action}"')
         button.tooltip(TIPS[action]).set_enabled(enabled)
+
+    def _choose(self, place: int) -> None:
+        """Show the controls of a step."""
+        recipe = self._recipe()
+        if recipe.place_of(recipe.steps[place].edit) != place:
+            self._replace(recipe.choosing(place), None)
+        self._open_tab(recipe.steps[place].edit)
 
     def _switch(self, place: int, on: bool) -> None:
         if not self._following:

@@ -17,7 +17,7 @@ relative to the picture as it is before it is developed, so that an edit made on
 and strokes stay in place when the crop changes. Does not import torch.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -48,10 +48,13 @@ class Recipe:
         steps: each applied to the result of the one before; of any kind, in any order, and any number of times.
         develop: exposure, white balance, straightening and crop, which come before all steps. Strokes are in
             coordinates of the picture before that.
+        chosen: place of the step that the editor's controls show where there are several of its edit; None is the last
+            of them. It is no part of the edit: recipes are equal without it.
     """
 
     steps: tuple[Step, ...] = ()
     develop: Development = AS_IT_IS
+    chosen: int | None = field(default=None, compare=False, repr=False)
 
     @property
     def acting(self) -> tuple[Step, ...]:
@@ -79,28 +82,40 @@ class Recipe:
     @property
     def drawn(self) -> "Recipe":
         """The recipe without the steps that would have no effect if they were on, and have no strokes."""
-        return self._of(*(step for step in self.steps if step.would_change() or step.strokes))
+        return self._of(tuple(step for step in self.steps if step.would_change() or step.strokes))
 
-    def last(self, edit: str) -> Step:
-        """Return the last step of an edit, or one that changes nothing if there is none."""
-        return next((step for step in reversed(self.steps) if step.edit == edit), Step.idle(edit))
+    def choosing(self, place: int) -> "Recipe":
+        """The same recipe, of which the step at a place is edited."""
+        return replace(self, chosen=place)
 
-    def with_last(self, step: Step) -> "Recipe":
-        """Replace the last step of the same edit, or insert the step at its usual place if there is none."""
+    def current(self, edit: str) -> Step:
+        """Return the step of an edit at :meth:`place_of`, or one that changes nothing if there is none."""
+        place = self.place_of(edit)
+        return Step.idle(edit) if place is None else self.steps[place]
+
+    def with_current(self, step: Step) -> "Recipe":
+        """Replace the current step of the same edit, or insert the step at its usual place if there is none."""
         place = self.place_of(step.edit)
         if place is not None:
             return self.replaced(place, step)
         rank = ORDER.index(step.edit)
         place = max((i + 1 for i, other in enumerate(self.steps) if ORDER.index(other.edit) < rank), default=0)
-        return self._of(*self.steps[:place], step, *self.steps[place:])
+        return self._of((*self.steps[:place], step, *self.steps[place:]), self._after(place, 1))
 
     def place_of(self, edit: str) -> int | None:
-        """The place of the last step of an edit, or None."""
-        return max((place for place, step in enumerate(self.steps) if step.edit == edit), default=None)
+        """The place of the chosen step if it is one of that edit, or else of the last one, or None."""
+        places = [place for place, step in enumerate(self.steps) if step.edit == edit]
+        return self.chosen if self.chosen in places else max(places, default=None)
 
     def replaced(self, place: int, *steps: Step) -> "Recipe":
         """Replace the step at a place by others, or by none."""
-        return self._of(*self.steps[:place], *steps, *self.steps[place + 1 :])
+        chosen = self.chosen if steps or self.chosen != place else None
+        moved = replace(self, chosen=chosen)._after(place + 1, len(steps) - 1)
+        return self._of((*self.steps[:place], *steps, *self.steps[place + 1 :]), moved)
+
+    def _after(self, place: int, by: int) -> int | None:
+        """The place of the chosen step if the steps from a place on move."""
+        return self.chosen if self.chosen is None or self.chosen < place else self.chosen + by
 
     def moved(self, place: int, to: int) -> "Recipe":
         """Move the step at a place to another.
@@ -108,12 +123,14 @@ class Recipe:
         >>> [step.edit for step in Recipe((Step("tone"), Step("sharpen"), Step("denoise"))).moved(0, 2).steps]
         ['sharpen', 'denoise', 'tone']
         """
-        others = [*self.steps[:place], *self.steps[place + 1 :]]
-        return self._of(*others[:to], self.steps[place], *others[to:])
+        order = [other for other in range(len(self.steps)) if other != place]
+        order.insert(to, place)
+        chosen = None if self.chosen is None else order.index(self.chosen)
+        return self._of(tuple(self.steps[other] for other in order), chosen)
 
-    def _of(self, *steps: Step) -> "Recipe":
+    def _of(self, steps: tuple[Step, ...], chosen: int | None = None) -> "Recipe":
         """A recipe of other steps, developed alike."""
-        return replace(self, steps=steps)
+        return replace(self, steps=steps, chosen=chosen)
 
     @property
     def bytes_per_pixel(self) -> int:
@@ -127,7 +144,7 @@ class Recipe:
         return any(step.declared.coloured for step in self.acting)
 
     def to_json(self, *, drawn: bool = False, complete: bool = False) -> str:
-        """Format the recipe as JSON, without steps that change nothing and without defaults.
+        """Format the recipe as JSON, without defaults, and without steps that change nothing even if they are on.
 
         Args:
             drawn: whether to keep the steps that change nothing but have strokes.
@@ -150,7 +167,8 @@ class Recipe:
             }
             <BLANKLINE>
         """
-        steps = self.steps if complete else self.drawn.steps if drawn else self.acting
+        used = tuple(step for step in self.steps if step.would_change())
+        steps = self.steps if complete else self.drawn.steps if drawn else used
         develop = "" if self.develop.is_idle else self.develop.to_json("  ", complete=complete)
         return json_of(steps, develop, complete=complete)
 

@@ -86,6 +86,10 @@ class Step:
                 object.__setattr__(step, name, value)
         return step
 
+    def shown(self) -> "Step":
+        """Return a copy whose changes are seen: switched on, and at full opacity if it had none."""
+        return self.mixed(on=True, opacity=self.opacity or 1.0)
+
     @property
     def declared(self) -> Edit:
         """Declaration of the edit."""

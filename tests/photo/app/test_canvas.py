@@ -92,9 +92,9 @@ def test_a_stroke(opened: Page, session: Session) -> None:
     canvas._pointer("pointerdown", 20, 20)
     canvas._pointer("pointermove", 40, 20)
     assert canvas._photo.content.count("<path") == 1  # while it is drawn
-    assert session.recipe.last("detail").strokes == ()
+    assert session.recipe.current("detail").strokes == ()
     canvas._pointer("pointerup", 40, 20)
-    (stroke,) = session.recipe.last("detail").strokes
+    (stroke,) = session.recipe.current("detail").strokes
     assert (stroke.paint, stroke.radius) == ("in", 0.02)
     assert stroke.points[0] == (round(20 / 150, 4), 0.2)
     assert opened.strokes == 1
@@ -108,7 +108,7 @@ def test_a_stroke_that_is_dropped(opened: Page, session: Session) -> None:
     opened.canvas._pointer("pointerdown", 20, 20)
     opened.canvas.drop_stroke()
     opened.canvas._pointer("pointerup", 40, 20)
-    assert session.recipe.last("detail").strokes == ()
+    assert session.recipe.current("detail").strokes == ()
     assert opened.canvas._photo.content == ""
 
 
@@ -117,7 +117,7 @@ def test_each_step_has_its_strokes(opened: Page, session: Session, scripts: list
     opened.canvas.switch("recolor")
     assert opened.canvas._photo.content == ""
     opened.paint((20.0, 20.0), (40.0, 20.0))
-    assert session.recipe.last("recolor").strokes[0].paint == opened.brush.colour
+    assert session.recipe.current("recolor").strokes[0].paint == opened.brush.colour
     opened.canvas.switch("tone")
     opened.paint((20.0, 20.0), (40.0, 20.0))  # it takes no strokes
     assert opened.strokes == 2
@@ -184,8 +184,12 @@ def test_parts_of_strokes_that_do_not_count_are_hatched(opened: Page, tmp_path: 
     assert ignored.nonzero()[:, 3].min() >= 47
     canvas._show_strokes.set_value(False)
     assert not canvas._ignored.visible
-    overlays, step = Overlays(), session.recipe.last("detail")
-    assert overlays.ignored(step, session.preview.pixels) is not None
+    overlays, step = Overlays(), session.recipe.current("detail")
+    first = overlays.ignored(step, session.preview.pixels)
+    assert first is not None
+    assert overlays.ignored(step.mixed(on=False, opacity=0.3), session.preview.pixels) is first
+    mask = overlays.selected(step, session.preview.pixels)
+    assert overlays.selected(step.mixed(opacity=0.3), session.preview.pixels) is mask
     assert overlays.ignored(step, torch.full_like(session.preview.pixels, 0.5)) is None
 
 

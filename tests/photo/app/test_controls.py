@@ -22,7 +22,7 @@ def test_controls_stay_within_what_a_step_takes(control: Control) -> None:
     for value in (low, high):
         changed = control.entries(recipe, value)
         assert control.parameter.is_valid(changed[control.parameter.name])
-        assert control.read(recipe.with_last(recipe.last(control.edit).changed(**changed))) == value
+        assert control.read(recipe.with_current(recipe.current(control.edit).changed(**changed))) == value
 
 
 def test_a_slider_of_a_list_sets_the_number_of_its_layer() -> None:

@@ -53,6 +53,20 @@ def test_options_of_a_file(client: Client, tmp_path: Path) -> None:
     dialog._quality.set_value(80)
     dialog._side.set_value(75)
     assert dialog.options == FileOptions(80, 75)
-    for side in (None, 3, 150, 4000):
+    for side in (None, 150):
         dialog._side.set_value(side)
         assert dialog.options.side is None
+        assert dialog._note.text == f"In {tmp_path}"
+
+
+def test_a_size_out_of_range_is_refused(client: Client, answers: list[str], tmp_path: Path) -> None:
+    dialog = SaveDialog("Save the photograph", "photo.png", tmp_path, lambda name: tmp_path / name, 150)
+    for side in (3, 4000):
+        dialog._side.set_value(side)
+        said = f"the longest side must be from 16 to 150 pixels, got {side}; leave it empty to keep the size"
+        assert dialog._note.text == said
+        dialog._confirm()
+        assert (answers, dialog._note.text) == ([], said)
+    dialog._side.set_value(16)
+    dialog._confirm()
+    assert (answers, dialog.options.side) == (["photo.png"], 16)

@@ -112,7 +112,7 @@ def test_a_full_disk_loses_nothing_that_was_kept(shots: Path, monkeypatch: pytes
         assert session.trouble is not None
         assert "No space left on device" in session.trouble
         session.restore()  # a second tab
-        assert session.recipe.last("tone")["contrast"] == 1.6
+        assert session.recipe.current("tone")["contrast"] == 1.6
     assert Library(shots).open(shots / "cat.png").recipe == recipe
     session.set("tone", contrast=1.7)
     session.commit()

@@ -135,11 +135,11 @@ def test_strokes_are_cleared(opened: Page) -> None:
     for kind in ("pointerdown", "pointerup"):
         opened.editor._canvas._pointer(kind, 20, 20)
     opened.finish()
-    assert len(session.recipe.last("detail").strokes) == 1
+    assert len(session.recipe.current("detail").strokes) == 1
     assert opened.picture("mask")
     opened.editor._clear_strokes("detail")
     opened.finish()
-    assert session.recipe.last("detail").strokes == ()
+    assert session.recipe.current("detail").strokes == ()
     assert not opened.picture("mask")
 
 
@@ -156,7 +156,7 @@ def test_colorize_asks_before_it_replaces_colours(opened: Page, monkeypatch: pyt
         for kind in ("pointerdown", "pointerup"):
             editor._canvas._pointer(kind, 20, 20)
         opened.finish()
-        assert len(session.recipe.last("colorize").strokes) == strokes
+        assert len(session.recipe.current("colorize").strokes) == strokes
     assert answers == []
 
 

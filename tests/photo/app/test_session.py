@@ -66,14 +66,14 @@ def test_undo_in_the_midst_of_a_drag_takes_it_back_whole(session: Session) -> No
 
 def test_strokes(session: Session) -> None:
     session.add_stroke("detail", LINE, 0.03, "in")
-    (stroke,) = session.recipe.last("detail").strokes
+    (stroke,) = session.recipe.current("detail").strokes
     assert stroke.points[0] == (round(20 / 150, 4), 0.2)
     assert stroke.paint == "in"
-    mask = session.preview.mask(session.recipe.last("detail"))
+    mask = session.preview.mask(session.recipe.current("detail"))
     assert mask is not None
     assert mask[0, 0, 20, 30] > 0.9
     session.add_stroke("recolor", LINE, 0.03, "#2040e0")
-    assert session.recipe.last("recolor") == Step("recolor", (Stroke(stroke.points, 0.03, "#2040e0"),))
+    assert session.recipe.current("recolor") == Step("recolor", (Stroke(stroke.points, 0.03, "#2040e0"),))
     with pytest.raises(ValueError, match="abstract takes no strokes"):
         session.add_stroke("abstract", LINE, 0.03, "in")
     with pytest.raises(ValueError, match="must be one of in, out, add, remove, got 'red'"):
@@ -84,9 +84,9 @@ def test_strokes_under_others_count_as_absent(session: Session) -> None:
     session.add_stroke("detail", LINE, 0.06, "in")
     session.set("detail", inside=(3.0, 3.0, 2.0, 1.0))
     session.commit()
-    without, alone = session.render(), session.preview.mask(session.recipe.last("detail"))
+    without, alone = session.render(), session.preview.mask(session.recipe.current("detail"))
     session.add_stroke("detail", LINE, 0.03, "out")
-    mask = session.preview.mask(session.recipe.last("detail"))
+    mask = session.preview.mask(session.recipe.current("detail"))
     assert mask is not None
     assert alone is not None
     assert torch.equal(mask, alone)
@@ -100,11 +100,13 @@ def test_the_first_region_begins_with_the_sliders_of_the_rest(session: Session) 
     session.set("detail", alpha=(3.0, 3.0, 4.0, 1.05))
     before = session.render()
     session.add_stroke("detail", LINE, 0.03, "in")
-    assert session.recipe.last("detail")["inside"] == session.recipe.last("detail")["alpha"] == (3.0, 3.0, 4.0, 1.05)
+    assert (
+        session.recipe.current("detail")["inside"] == session.recipe.current("detail")["alpha"] == (3.0, 3.0, 4.0, 1.05)
+    )
     assert difference(session.render(), before) <= 1e-3
     session.set("detail", alpha=(0.0, 1.0, 1.0, 1.0))
     session.add_stroke("detail", LINE, 0.03, "in")
-    assert session.recipe.last("detail")["inside"] == (3.0, 3.0, 4.0, 1.05)
+    assert session.recipe.current("detail")["inside"] == (3.0, 3.0, 4.0, 1.05)
 
 
 def test_the_last_step_of_an_edit_is_the_one_at_work(session: Session) -> None:
@@ -112,9 +114,26 @@ def test_the_last_step_of_an_edit_is_the_one_at_work(session: Session) -> None:
     session.load(Recipe((Step("abstract"), Step("tone"), Step("detail"), Step("tone", clarity=3.0))))
     session.set("tone", contrast=0.9)
     assert [step["contrast"] for step in session.recipe.steps if step.edit == "tone"] == [1.2, 0.9]
+    session.recipe = session.recipe.choosing(1)
+    session.set("tone", contrast=0.7)
     session.set("denoise", noise_level=5.0)
+    session.set("tone", clarity=1.5)
+    assert [(step["contrast"], step["clarity"]) for step in session.recipe.steps if step.edit == "tone"] == [
+        (0.7, 1.5),
+        (0.9, 3.0),
+    ]
     session.set("recolor", reach=0.5)
     assert [step.edit for step in session.recipe.steps] == ["denoise", "abstract", "tone", "detail", "tone", "recolor"]
+
+
+def test_what_is_changed_is_seen(session: Session) -> None:
+    for hidden in (Step("tone").mixed(on=False), Step("tone").mixed(opacity=0.0)):
+        session.load(Recipe((hidden,)))
+        session.set("tone", contrast=0.9)
+        assert session.recipe.steps == (Step("tone", contrast=0.9),)
+    session.load(Recipe((Step("tone").mixed(opacity=0.3),)))
+    session.set("tone", contrast=0.9)
+    assert session.recipe.steps[0].opacity == 0.3
 
 
 def test_a_stroke_before_a_photograph(tmp_path: Path) -> None:

@@ -66,3 +66,22 @@ def test_a_step_is_switched_mixed_moved_and_removed(shown: Controls, steps: Step
     shown.click("Tone")
     assert opened == ["tone"]
     assert shown.replaced == []
+
+
+def test_one_of_two_steps_of_an_edit_is_chosen(shown: Controls, steps: StepList, opened: list[str]) -> None:
+    def current() -> list[str]:
+        return [button.text for button in shown.of(ui.button) if "aria-current" in button.props]
+
+    assert current() == []
+    shown.recipe = Recipe((TONE, SHARPEN, TONE.changed(clarity=2.0)))
+    steps.follow()
+    assert current() == ["Tone 2"]
+    shown.click("Tone 1")
+    ((recipe, moving),) = shown.replaced
+    assert (recipe, recipe.chosen, moving) == (shown.recipe, 0, None)
+    shown.recipe = recipe
+    steps.follow()
+    assert current() == ["Tone 1"]
+    shown.click("Tone 1")
+    assert opened == ["tone", "tone"]
+    assert len(shown.replaced) == 1

@@ -86,7 +86,7 @@ def test_strokes_of_steps_are_mapped() -> None:
     assert mapped.steps[0].strokes[0].points == ((0.5, 0.5), (0.0, 0.25))
     assert mapped.steps[0].strokes[0].radius == pytest.approx(0.02)  # the short side is the height before and after
     assert mapped.steps[1] == Step("tone")
-    assert recipe.replaced(0).develop == recipe.with_last(Step("sharpen")).drawn.develop == recipe.develop
+    assert recipe.replaced(0).develop == recipe.with_current(Step("sharpen")).drawn.develop == recipe.develop
     assert recipe.moved(0, 1).effect != recipe.effect
 
 

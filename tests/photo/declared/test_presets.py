@@ -104,9 +104,26 @@ def test_what_changes_nothing_is_left_out(pixels: torch.Tensor) -> None:
 
 def test_files_hold_the_whole_edit() -> None:
     assert Recipe.from_json(WHOLE.to_json(), "edit.json") == WHOLE
+    off = Recipe((Step("tone").mixed(on=False), Step("sharpen").mixed(opacity=0.0)))  # they may be wanted again
+    assert Recipe.from_json(off.to_json(), "edit.json") == off
     entries = json.loads(WHOLE.to_json())
     assert list(entries) == ["version", "steps"]
     assert [step["edit"] for step in entries["steps"]] == ["detail", "colorize", "recolor", "defocus", "abstract"]
+
+
+def test_a_step_that_is_chosen_stays_chosen() -> None:
+    recipe = Recipe((Step("tone"), Step("detail"), Step("tone", clarity=2.0))).choosing(0)
+    assert recipe == recipe.choosing(2)
+    assert recipe.current("tone") == Step("tone")
+    assert recipe.current("detail") == Step("detail")
+    changed = recipe.with_current(Step("tone", contrast=0.8))
+    assert changed.steps[0] == changed.current("tone") == Step("tone", contrast=0.8)
+    more = changed.with_current(Step("denoise"))  # it comes first
+    assert (more.chosen, more.current("tone")) == (1, changed.steps[0])
+    assert more.moved(1, 3).current("tone") == changed.steps[0]
+    assert more.moved(3, 0).current("tone") == changed.steps[0]
+    assert more.replaced(0).current("tone") == changed.steps[0]
+    assert more.replaced(1).current("tone") == Step("tone", clarity=2.0)
 
 
 def test_steps_are_replaced_and_moved() -> None:

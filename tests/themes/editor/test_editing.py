@@ -107,8 +107,8 @@ def test_saved_files_are_what_the_library_and_the_command_line_make(opened: Tab,
     opened.save("Save edit", "edit.json")
 
     recipe = find_recipe(str(folder / "edit.json"))
-    assert recipe.last("detail")["inside"] == (1.0, 3.0, 1.0, 1.0)
-    assert [stroke.paint for stroke in recipe.last("recolor").strokes] == ["#8a46c8", "add #8a46c8", "remove"]
+    assert recipe.current("detail")["inside"] == (1.0, 3.0, 1.0, 1.0)
+    assert [stroke.paint for stroke in recipe.current("recolor").strokes] == ["#8a46c8", "add #8a46c8", "remove"]
     saved = read_photograph(folder / "out.png").pixels
     assert (saved - apply_recipe(recipe, cat()).clamp(0, 1)).abs().max() <= 1 / 255
     assert main(["apply", str(folder / "cat.png"), str(folder / "cli.png"), "--preset", str(folder / "edit.json")]) == 0

@@ -70,7 +70,7 @@ def test_reload_second_tab_and_new_start(browser: Browser, shots: Path) -> None:
         expect(other.page.locator("path.stroke")).to_have_count(1)
         other.page.close()
         recipe = Recipe.from_json(kept.read_text(), "")
-        assert len(recipe.last("detail").strokes) == 1
+        assert len(recipe.current("detail").strokes) == 1
         port = editor.url.rstrip("/").rsplit(":", 1)[1]
         editor.process.send_signal(signal.SIGKILL)
         editor.process.wait(30)

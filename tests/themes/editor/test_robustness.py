@@ -198,7 +198,7 @@ def test_a_full_disk(opened: Tab, editor: Editor, folder: Path) -> None:
     opened.paint((0.6, 0.6), (0.7, 0.6))
     expect(strokes).to_have_count(3)
     opened.save("Save photo", "full.png")
-    assert len(Recipe.from_json(kept.read_text(), "").last("detail").strokes) == 3
+    assert len(Recipe.from_json(kept.read_text(), "").current("detail").strokes) == 3
 
 
 def wait_for_part(folder: Path, name: str) -> None:

@@ -179,7 +179,7 @@ def test_scribbles_before_and_pieces_follow_the_zoom(browser: Browser, editor: E
     expect(page.get_by_text("4.00 ×")).to_be_visible()
     tab.save("Save photo", "out.png")
     tab.save("Save edit", "edit.json")
-    stroke = find_recipe(str(folder / "edit.json")).last("detail").strokes[0]
+    stroke = find_recipe(str(folder / "edit.json")).current("detail").strokes[0]
     assert stroke.points[0] == pytest.approx(start, abs=0.005)
     assert stroke.points[-1] == pytest.approx(end, abs=0.005)
     tab.wait_for_pieces()
