@@ -1,10 +1,10 @@
 """Time of the editor from a pointer movement to the picture: python -m benchmarks.app [--side 1000] [--browser].
 
-Prints medians and quartiles of 20, in milliseconds, on a square preview. Then, for a photograph of ``--megapixels``,
-the same; with ``--browser`` from the pointer's move to the picture in a headless Chromium as well, over the server and
-its pictures as JPEG; from a pan at 100 % to the PNG files of what is newly seen, and of a view that is all new; the
-time to open it and to save three edits of it as a JPEG, beside that of ``nlfilter-torch apply`` with the same edit,
-and the memory at the peak, above that before the photograph was opened.
+Prints medians and quartiles of ``--repeats``, in milliseconds, on a square preview. Then, for a photograph of
+``--megapixels``, the same; with ``--browser`` from the pointer's move to the picture in a headless Chromium as well,
+over the server and its pictures as JPEG; from a pan at 100 % to the PNG files of what is newly seen, and of a view that
+is all new; the time to open it and to save three edits of it as a JPEG, beside that of ``nlfilter-torch apply`` with
+the same edit, and the memory at the peak, above that before the photograph was opened.
 """
 
 import argparse
@@ -33,7 +33,6 @@ from nlfilter_torch.photo.app.session import Session
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.io.photographs import Photograph, write_photograph
 
-REPEATS = 20
 MOVES = 9  # of the sliders of the other edits
 VIEW = (864, 648)  # width and height of the canvas in a window of 1280x800
 SAVED = ("detail", "recolor", "denoise")
@@ -58,7 +57,7 @@ def report(name: str, times: list[float]) -> None:
     print(f"{name:<52} {middle:>8.0f}   {low:.0f} to {high:.0f}")
 
 
-def in_the_library(path: Path) -> None:
+def in_the_library(path: Path, repeats: int) -> None:
     """Sliders and strokes without a page."""
     session = Session(path.parent)
     report("open", [milliseconds(lambda: session.open(path))])
@@ -69,16 +68,16 @@ def in_the_library(path: Path) -> None:
         session.render(0)
 
     report("first slider: the operator and its layers", [milliseconds(lambda: slide(2.0))])
-    report("slider to pixels", [milliseconds(lambda i=i: slide(1 + i / 10)) for i in range(REPEATS)])
+    report("slider to pixels", [milliseconds(lambda i=i: slide(1 + i / 10)) for i in range(repeats)])
     pixels = session.render()
-    report("pixels to JPEG", [milliseconds(lambda: drawing.picture(pixels)) for _ in range(REPEATS)])
+    report("pixels to JPEG", [milliseconds(lambda: drawing.picture(pixels)) for _ in range(repeats)])
 
     def stroke(shift: float) -> None:
         session.add_stroke("detail", [(shift * size[1], 0.8 * size[0]), (0.6 * size[1], 0.85 * size[0])], 0.01, "in")
         session.preview.mask(session.recipe.current("detail"))
 
     report("first stroke to mask", [milliseconds(lambda: stroke(0.3))])
-    report("stroke to mask", [milliseconds(lambda i=i: stroke(0.3 + i / 100)) for i in range(REPEATS)])
+    report("stroke to mask", [milliseconds(lambda i=i: stroke(0.3 + i / 100)) for i in range(repeats)])
     for step, paint, entry, first, last in (
         ("tone", "", "contrast", 1.1, 1.3),
         ("sharpen", "", "amount", 2.0, 4.0),
@@ -90,7 +89,8 @@ def in_the_library(path: Path) -> None:
         ("look", "", "amount", 0.4, 1.2),
     ):
         session.load(RECIPES[step] if step == "look" else Recipe())
-        values = [first + (last - first) * i / MOVES for i in range(MOVES + 1)]
+        moves = min(MOVES, repeats)
+        values = [first + (last - first) * i / moves for i in range(moves + 1)]
         if paint:
             session.add_stroke(step, [(0.4 * size[1], 0.4 * size[0]), (0.5 * size[1], 0.4 * size[0])], 0.02, paint)
         else:
@@ -103,7 +103,7 @@ def in_the_library(path: Path) -> None:
         report(f"{step}, {entry} changed", times)
 
 
-def at_full_size(path: Path) -> None:
+def at_full_size(path: Path, repeats: int) -> None:
     """The part that is seen at 100 %, after pans by a third of it, and after jumps to other places."""
     session, tasks = Session(path.parent), list[Awaitable[None]]()
     session.open(path)
@@ -139,7 +139,7 @@ def at_full_size(path: Path) -> None:
         report(f"{step} of a region: first 100 % view", [look(0.1, 0.2)])
         third = VIEW[0] / 3 / max(1, width - VIEW[0])
         name = f"100 % view after a pan at {width * height / 1e6:.0f} MP"
-        report(f"{name}, a third", [look(0.1 + i * third, 0.2) for i in range(1, REPEATS // 2)])
+        report(f"{name}, a third", [look(0.1 + i * third, 0.2) for i in range(1, max(2, repeats // 2))])
         report(f"{name}, all of it", [look(0.5, 0.3 + 0.2 * i) for i in range(3)])
 
 
@@ -154,10 +154,10 @@ def opened_and_saved(path: Path, edit: str) -> tuple[float, float, float]:
     return opening, saving, (resident("VmHWM") - before) * MIB / 1e6
 
 
-def files(path: Path) -> None:
+def files(path: Path, saved: list[str]) -> None:
     """Opening and saving in the editor, and on the command line."""
     folder = path.parent
-    for edit in SAVED:
+    for edit in saved:
         with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as fresh:
             opening, saving, memory = fresh.submit(opened_and_saved, path, edit).result()
         preset = folder / "edit.json"
@@ -169,7 +169,7 @@ def files(path: Path) -> None:
         report("the same on the command line", [1e3 * wall])
 
 
-def in_the_browser(path: Path) -> None:
+def in_the_browser(path: Path, repeats: int) -> None:
     """From the pointer's move to the picture in the page."""
     from tests.browser import Editor, Tab, chromium
 
@@ -186,7 +186,7 @@ def in_the_browser(path: Path) -> None:
             box = slider.bounding_box()
             assert box is not None
             times = []
-            for i in range(REPEATS):
+            for i in range(repeats):
                 before, x = tab.source(), box["x"] + (0.3 + 0.03 * i) * box["width"]
                 start = time.perf_counter()
                 tab.page.mouse.move(x, box["y"] + box["height"] / 2)
@@ -204,23 +204,25 @@ def main() -> None:
     parser.add_argument("--side", type=int, default=1000, help="pixels of a square preview")
     parser.add_argument("--megapixels", type=float, default=24, help="of the photograph that is seen at 100 %%")
     parser.add_argument("--browser", action="store_true", help="with headless Chromium too")
+    parser.add_argument("--repeats", type=int, default=20, help="of each movement")
+    parser.add_argument("--saved", nargs="+", choices=SAVED, default=[*SAVED], help="edits that are saved")
     arguments = parser.parse_args()
     print(f"{arguments.side}x{arguments.side} pixels, {torch.get_num_threads()} threads, {platform.machine()}")
     print(f"{'milliseconds, median and quartiles':<52}")
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "photograph.png"
         write_photograph(Photograph(photograph(arguments.side, arguments.side)), path)
-        in_the_library(path)
+        in_the_library(path, arguments.repeats)
         print(f"\n{arguments.megapixels:g} megapixels")
         large, compressed = Path(folder) / "large.tif", Path(folder) / "large.jpg"
         height = round((arguments.megapixels * 1e6 / 1.5) ** 0.5)
         for file in (large, compressed):
             write_photograph(Photograph(photograph(height, round(1.5 * height))), file)
-        in_the_library(compressed)
-        files(compressed)
-        at_full_size(large)
+        in_the_library(compressed, arguments.repeats)
+        files(compressed, arguments.saved)
+        at_full_size(large, arguments.repeats)
         if arguments.browser:
-            in_the_browser(compressed)
+            in_the_browser(compressed, arguments.repeats)
 
 
 if __name__ == "__main__":

@@ -309,11 +309,11 @@ def _trainings(unseen: Tensor, steps: int) -> Iterable[Figure]:
         yield Figure(f"time of a training step: {name}", 1e3 * run.seconds / steps, unit="ms")
 
 
-def draw(path: Path) -> None:
+def draw(path: Path, side: int = SIDE) -> None:
     """Draw the loss over the bandwidth and the course of L-BFGS."""
     from matplotlib.figure import Figure as Plot
 
-    image = crop(photograph("coffee"))
+    image = crop(photograph("coffee"), side)
     plot = Plot(figsize=(9, 3.4), dpi=100, layout="constrained")
     near, course = plot.subplots(1, 2)
     for choice in CHOICES:

@@ -30,7 +30,7 @@ def share_off(operator: NonlocalOperator, features: Tensor, weights: Tensor | No
     counts = torch.ones(len(x), dtype=torch.float64) if weights is None else weights.double()
     kernel = (-torch.cdist(x, x).square()).exp()
     scaling = torch.ones_like(counts)
-    for _ in range(200):
+    for _ in range(60):
         scaling = (scaling / (kernel @ (counts * scaling))).sqrt()
     rows = scaling[:, None] * kernel * scaling * counts
     off = (operator.to_dense()[0] - rows).abs().sum(1) / 2 > 0.5

@@ -26,6 +26,6 @@ def test_slopes_and_recovery_with_landmarks_that_are_held() -> None:
 
 @pytest.mark.slow
 def test_curves_are_drawn(tmp_path: Path) -> None:
-    landmarks.draw(tmp_path / "curves.png")
+    landmarks.draw(tmp_path / "curves.png", side=24)
     with Image.open(tmp_path / "curves.png") as picture:
         assert picture.width == 900

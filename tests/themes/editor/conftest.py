@@ -1,4 +1,4 @@
-"""Fixtures of tests in a browser: Chromium, one editor for each module, its folder and a page of it."""
+"""Fixtures of tests in a browser: Chromium, one editor for all modules, its folder and a page of it."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,7 +11,7 @@ from tests.browser import CHROMIUM, Editor, Tab, chromium, running
 from tests.problems import cat
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="package")
 def browser() -> Iterator[Browser]:
     if CHROMIUM is None:
         pytest.skip("no Chromium here; install it: apt-get install chromium")
@@ -19,7 +19,7 @@ def browser() -> Iterator[Browser]:
         yield browser
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="package")
 def editor(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Editor]:
     with running(tmp_path_factory.mktemp("editor")) as editor:
         yield editor

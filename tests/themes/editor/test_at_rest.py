@@ -14,7 +14,7 @@ from nlfilter_torch.photo.picture.resizing import resize
 from tests.browser import TIMEOUT, Tab, difference, running
 from tests.problems import cat
 
-LINES = Recipe((Step("abstract", edges=0.8, tones=6),))
+LINES = Recipe((Step("abstract", edges=0.8, tones=6, landmarks=40, patch_size=1),))
 
 
 def test_the_preview_is_replaced_by_what_a_file_holds(browser: Browser, tmp_path: Path) -> None:

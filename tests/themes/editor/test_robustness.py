@@ -211,7 +211,7 @@ def wait_for_part(folder: Path, name: str) -> None:
 
 def test_stopped_in_the_midst_of_saving(browser: Browser, tmp_path: Path) -> None:
     """The process is killed: the old file is unchanged, and after a new start the page has the edit and saves it."""
-    large = torch.nn.functional.interpolate(cat(), size=(700, 1050), mode="bicubic").clamp(0, 1)
+    large = torch.nn.functional.interpolate(cat(), size=(560, 840), mode="bicubic").clamp(0, 1)
     write_photograph(Photograph(large), tmp_path / "large.png")
     (tmp_path / "out.png").write_bytes(b"what was there")
     editor = Editor(tmp_path, "large.png")
