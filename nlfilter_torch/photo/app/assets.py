@@ -5,5 +5,5 @@ from pathlib import Path
 STATIC = Path(__file__).with_name("static")
 STATIC_ADDRESS = "/static"
 SCRIPTS = "".join(
-    f'<script type="module" src="{STATIC_ADDRESS}/{name}"></script>\n' for name in ("page.js", "closeup.js")
+    f'<script type="module" src="{STATIC_ADDRESS}/{name}"></script>\n' for name in ("page.js", "closeup.js", "crop.js")
 )

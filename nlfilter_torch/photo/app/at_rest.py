@@ -62,7 +62,7 @@ class AtRest:
             self._working = False
 
     def _is_outdated(self, session: Reduced, recipe: Recipe) -> bool:
-        return self._again is not None or session.recipe.acting != recipe.acting or not self._wanted(session)
+        return self._again is not None or session.recipe.effect != recipe.effect or not self._wanted(session)
 
     async def _edit(self, session: Reduced, recipe: Recipe) -> None:
         progress = Progress()

@@ -1,6 +1,6 @@
 """The large picture with its overlays, and the brush that draws on it."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Protocol
 
@@ -9,8 +9,9 @@ from torch import Tensor
 
 from nlfilter_torch.photo.app import drawing
 from nlfilter_torch.photo.app.brush import BRUSHES, Brush
+from nlfilter_torch.photo.app.crop_tool import CropTool
 from nlfilter_torch.photo.declared.parameters import DETAIL, EDITS
-from nlfilter_torch.photo.declared.presets import Recipe
+from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.declared.strokes import Stroke
 
 Draw = Callable[[str, Callable[[], None]], None]  # adds a stroke to a step
@@ -19,7 +20,16 @@ Draw = Callable[[str, Callable[[], None]], None]  # adds a stroke to a step
 class Painted(Protocol):
     """The session of an open photograph, as far as its preview and its strokes are concerned."""
 
-    recipe: Recipe
+    @property
+    def uncropped(self) -> Tensor:
+        """The photograph straightened and not cropped, (1, C, h, w) in [0, 1]."""
+
+    @property
+    def crop(self) -> Sequence[float]:
+        """Left, top, right and bottom edge of what is kept of it."""
+
+    def shown(self, edit: str) -> Step:
+        """The last step of an edit, with its strokes where they are in the preview."""
 
     def render(self, moving: int | None = None) -> Tensor:
         """The preview under the edit, (1, C, h, w) in [0, 1], quickly while a slider of a step moves."""
@@ -55,7 +65,7 @@ class Canvas:
         self.histogram = ""
         self.clipped = self.clipped_before = (0.0, 0.0)  # shares of white and of black, after and before the edit
         self._session: Painted | None = None
-        self._preview_size = (1, 1)
+        self._preview_size = self._whole_size = (1, 1)
         self._brush, self._token, self._draw, self._lay = brush, token, draw, lay
         self._frame = 0
         self._flashes = 0
@@ -65,6 +75,7 @@ class Canvas:
         with ui.element("div").classes("canvas"):
             self._build_welcome(show_error)
             self._build_photo()
+            self._crop_tool = CropTool()
             _build_zoom()
         self._build_bar()
 
@@ -115,19 +126,41 @@ class Canvas:
         """Show a photograph of ``size`` (height, width) that was opened, first its preview (1, C, h, w)."""
         self._session = session
         self._edited = preview.clamp(0, 1)
-        self._preview_size = (preview.shape[-2], preview.shape[-1])
+        self._mask_shown = None
+        self.pictures = {}
+        self.frame(preview, size)
+        self._show("before", self._photo)
+        self._welcome.set_visibility(False)
+        self._photo.set_visibility(True)
+
+    def frame(self, before: Tensor, size: tuple[int, int]) -> None:
+        """Show the photograph straightened and cropped to a size, with its preview (1, C, h, w) before the edit."""
+        before = before.clamp(0, 1)
+        self._preview_size = (before.shape[-2], before.shape[-1])
         (height, width), (preview_height, preview_width) = size, self._preview_size
         self._size.set_text(f"{width}\u00d7{height} pixels, shown at {preview_width}\u00d7{preview_height}")
         fitting = f"min(100cqw, calc(100cqh * {preview_width / preview_height:.4f}))"
         self._photo.style(f"width: var(--photo-width, {fitting})")
         ui.run_javascript(f"closeup.open({width}, {height}, '/picture/{self._token}')")
-        self._mask_shown = None
-        self.pictures = {"before": drawing.picture(self._edited)}
-        self.clipped_before = drawing.clipped_shares(self._edited)
+        self.pictures["before"] = drawing.picture(before)
+        self.clipped_before = drawing.clipped_shares(before)
         self._show("before", self._before)
-        self._show("before", self._photo)
-        self._welcome.set_visibility(False)
-        self._photo.set_visibility(True)
+
+    def draw_whole(self) -> None:
+        """Compute the picture without a crop; may run in a thread."""
+        if self._session is not None:
+            whole = self._session.uncropped
+            self._whole_size = (whole.shape[-2], whole.shape[-1])
+            self.pictures["whole"] = drawing.picture(whole)
+
+    def show_crop(self) -> None:
+        """Show this picture, and the frame of the crop over it."""
+        if self._session is not None:
+            self._crop_tool.show(self._address("whole"), self._whole_size, self._session.crop)
+
+    def hide_crop(self) -> None:
+        """Show the photograph as it is cropped."""
+        self._crop_tool.hide()
 
     def switch(self, step: str) -> None:
         """Show the strokes of another step."""
@@ -197,7 +230,7 @@ class Canvas:
         """Show the mask, except while a slider is moving; for a second, if it is new and not to be kept in sight."""
         mask, keep = self.pictures.get("mask"), bool(self._show_mask.value)
         new = mask != self._mask_shown
-        passing = EDITS[self._step].regional is not None  # shows for a moment after a stroke
+        passing = self._step in BRUSHES and EDITS[self._step].regional is not None  # shows for a moment after a stroke
         if not mask or moving or not (keep or passing):
             self._hide_mask()
             self._mask_shown = mask if not moving else self._mask_shown
@@ -230,7 +263,7 @@ class Canvas:
             return
         strokes: tuple[Stroke, ...] = ()
         if self._show_strokes.value:
-            strokes = self._session.recipe.current(self._step).strokes
+            strokes = self._session.shown(self._step).strokes if self._step in BRUSHES else ()
             if self._line:
                 height, width = self._preview_size
                 points = tuple((x / width, y / height) for x, y in self._line)
@@ -262,9 +295,13 @@ class Canvas:
         self._line = []
         self.draw_strokes()
 
-    def _show(self, kind: str, element: ui.element) -> None:
+    def _address(self, kind: str) -> str:
+        """A new address of a picture."""
         self._frame += 1
-        address = f"/picture/{self._token}/{kind}?{self._frame}"
+        return f"/picture/{self._token}/{kind}?{self._frame}"
+
+    def _show(self, kind: str, element: ui.element) -> None:
+        address = self._address(kind)
         if isinstance(element, ui.interactive_image):
             element.set_source(address)
         else:

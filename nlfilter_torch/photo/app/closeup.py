@@ -82,7 +82,7 @@ class Closeup:
     def follow(self) -> None:
         """Show the current edit of the session."""
         self._held = False
-        if self.session is not None and self.session.recipe.acting != self._recipe.acting:
+        if self.session is not None and self.session.recipe.effect != self._recipe.effect:
             self._forget()
         self._wake()
 
@@ -125,7 +125,7 @@ class Closeup:
             while (piece := self._next()) is not None:
                 session, part = piece
                 recipe = session.recipe
-                if recipe.acting != self._recipe.acting:
+                if recipe.effect != self._recipe.effect:
                     self._forget()
                 self._recipe = recipe
                 try:
@@ -140,7 +140,7 @@ class Closeup:
             self._working = False
 
     def _is_outdated(self, session: Enlarged, recipe: Recipe) -> bool:
-        return self._held or self.session is not session or session.recipe.acting != recipe.acting
+        return self._held or self.session is not session or session.recipe.effect != recipe.effect
 
     def _work_out(self, session: Enlarged, recipe: Recipe, part: Rectangle, progress: Progress) -> bytes:
         """Compute a piece, as a PNG file; runs in a thread."""

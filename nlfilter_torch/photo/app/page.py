@@ -21,6 +21,7 @@ from nlfilter_torch.photo.app.at_rest import AtRest
 from nlfilter_torch.photo.app.brush import Brush
 from nlfilter_torch.photo.app.canvas import Canvas
 from nlfilter_torch.photo.app.closeup import Closeup
+from nlfilter_torch.photo.app.developed import DEVELOPING
 from nlfilter_torch.photo.app.dialogs import NameDialog, Question, SaveDialog
 from nlfilter_torch.photo.app.look_tab import thumbnails
 from nlfilter_torch.photo.app.panel import Panel
@@ -29,7 +30,7 @@ from nlfilter_torch.photo.app.tabs import Link
 from nlfilter_torch.photo.app.tasks import EXPECTED, Tasks
 from nlfilter_torch.photo.app.uploads import Upload
 from nlfilter_torch.photo.declared.json_values import Value
-from nlfilter_torch.photo.declared.parameters import EDITS
+from nlfilter_torch.photo.declared.parameters import DETAIL, EDITS
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.tiled.sampling import Report
 
@@ -71,6 +72,9 @@ class Editor:
         self._openings = 0  # photographs that were opened, so that browsers do not show thumbnails of another
         self._wanted: list[int | None] = []  # at most one picture to draw next: the place of a step that moves, or None
         self._drawing = False
+        self._framed: object = None  # what canvas and closeup show
+        self._tab = DETAIL.name
+        self._is_cropping = False
 
     def build(self, image: Path | None, address: str = "") -> None:
         """Lay the page out, and open the photograph of an address that the page had before, or an image."""
@@ -96,13 +100,18 @@ class Editor:
                     self._clear_strokes,
                     self._replace,
                     self._thumbnail,
+                    self._develop,
+                    self._toggle_crop,
+                    lambda: self._is_cropping,
                 )
-                self._panel = Panel(link, self._canvas.switch)
+                self._panel = Panel(link, self._switch)
         ui.keyboard(on_key=self._key)
         ui.on("closeup", lambda event: self._look(event.args))
         ui.on("stroke_dropped", self._canvas.drop_stroke)
         ui.on("save_photo", self._ask_photo_name)
         ui.on("tool", lambda event: self._panel.take(event.args))
+        ui.on("crop", lambda event: self._crop(event.args))
+        ui.on("crop_done", lambda: self._toggle_crop() if self._is_cropping else None)
         self._client.on_connect(lambda: self._begin(image, address))
 
     def picture(self, kind: str, place: str) -> bytes | None:
@@ -168,6 +177,44 @@ class Editor:
         self.session.recipe = recipe
         self._follow_change(moving)
 
+    def _develop(self, values: Mapping[str, Value], complete: bool) -> None:
+        """Change how the photograph is developed; ``complete`` when the pointer is released."""
+        session = self.session
+        if session.opened is None:
+            self._panel.follow()
+            return
+        try:
+            recipe = session.developing(values)
+        except ValueError as error:  # the middle of the crop would be outside
+            self._tasks.show_error(str(error))
+            self._panel.follow()
+        else:
+            self._replace(recipe, None if complete else DEVELOPING)
+
+    def _toggle_crop(self) -> None:
+        """Show the frame of the crop over the whole photograph, or hide it."""
+        if self.session.opened is None:
+            self._tasks.show_error("open a photograph first; there is nothing to crop")
+            return
+        self._is_cropping = not self._is_cropping
+        self._panel.follow()
+        if self._is_cropping:
+            self._tasks.start(self._show_crop())
+        else:
+            self._canvas.hide_crop()
+
+    async def _show_crop(self) -> None:
+        """Show the frame of the crop as it is now."""
+        await self._tasks.run("Working", self._canvas.draw_whole)
+        if self._is_cropping and not self._client.is_deleted:
+            with self._client:
+                self._canvas.show_crop()
+
+    def _crop(self, edges: Sequence[float]) -> None:
+        """Take the edges that a person has set."""
+        if len(edges) == 4 and self._is_cropping:
+            self._develop({"crop": tuple(float(edge) for edge in edges)}, True)
+
     def _follow_change(self, moving: int | None) -> None:
         """Show a changed edit, quickly while a slider of a step moves."""
         if moving is None:
@@ -210,7 +257,10 @@ class Editor:
         self._panel.follow()
         self._show_state()
         self._redraw()
-        self._closeup.follow()
+        if self._framed == (self.session.opened, self.session.recipe.develop.geometry):
+            self._closeup.follow()
+        else:
+            self._closeup.hold()  # until the photograph is cut anew
 
     def _show_state(self) -> None:
         """Show what can be undone, and whether the edit is kept."""
@@ -256,9 +306,16 @@ class Editor:
         try:
             while self._wanted:
                 moving = self._wanted.pop()
+                if self._is_cropping:
+                    await self._show_crop()
+                    if moving == DEVELOPING:
+                        continue
                 await self._tasks.run("Working", partial(self._canvas.draw, moving))
+                if moving is None:
+                    self._frame()
                 self._show()
-                self._draw_response()
+                if self._tab == DETAIL.name:
+                    await self._respond()
                 self._canvas.draw_mask(moving=moving is not None)
                 self._canvas.draw_strokes()
         finally:
@@ -294,10 +351,28 @@ class Editor:
         is_drawing = self._drawing or bool(self._wanted)
         return self.session is session and not (self._client.is_deleted or is_drawing or self._closeup.is_busy)
 
-    def _draw_response(self) -> None:
-        detail = self.session.recipe.current("detail")
+    def _frame(self) -> None:
+        """Show the photograph as it is straightened and cropped now, if that has changed."""
+        if self._framed != framed(self.session):
+            self._framed = framed(self.session)
+            self._closeup.open(self.session)
+            with self._client:
+                self._canvas.frame(self.session.developed.before, self.session.size)
+            self._closeup.follow()
+
+    async def _respond(self) -> None:
+        """Show the response of the sliders for the layers."""
+        detail = self.session.recipe.current(DETAIL.name)
         curves = [(OUTSIDE, detail["alpha"]), *([(INSIDE, detail.sliders_inside)] if detail.has_region() else [])]
-        self._panel.draw_response(drawing.response_svg(self.session.preview.layers(detail).eigenvalues, curves))
+        eigenvalues = await self._tasks.run("Working", partial(self.session.eigenvalues, detail))
+        self._panel.draw_response(drawing.response_svg(eigenvalues, curves))
+
+    def _switch(self, tab: str) -> None:
+        """Show what belongs to a tab that was opened."""
+        self._tab = tab
+        self._canvas.switch(tab)
+        if tab == DETAIL.name and self.session.opened is not None:
+            self._tasks.start(self._respond())
 
     # Files
 
@@ -330,8 +405,9 @@ class Editor:
         self._title.set_text(opened.name)
         self._tasks.clear_error()
         self._closeup.open(self.session)
+        self._framed = framed(self.session)
         with self._client:
-            self._canvas.open(self.session, opened.preview.pixels, opened.photograph.size)
+            self._canvas.open(self.session, self.session.developed.before, self.session.size)
         pictures = await self._tasks.run("Opening", partial(thumbnails, opened.preview.pixels))
         if self.session.opened is not opened or self._client.is_deleted:  # meanwhile
             return
@@ -383,6 +459,11 @@ class Editor:
         self._show_state()
         with self._client:
             ui.notify(f"Saved {path.resolve()}", type="positive", position="bottom-left", timeout=6000)
+
+
+def framed(session: Session) -> object:
+    """What decides where the pixels of the developed photograph of a session are."""
+    return session.opened, session.developed.geometry
 
 
 @dataclass(frozen=True)

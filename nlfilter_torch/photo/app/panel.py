@@ -5,18 +5,22 @@ from collections.abc import Callable
 from nicegui import ui
 
 from nlfilter_torch.photo.app.detail_tab import DetailTab
+from nlfilter_torch.photo.app.develop_tab import DevelopTab
 from nlfilter_torch.photo.app.look_tab import LookTab
 from nlfilter_torch.photo.app.step_list import StepList
 from nlfilter_torch.photo.app.tabs import EditTab, Link
 from nlfilter_torch.photo.declared.declaration import ScribbleRole
+from nlfilter_torch.photo.declared.development import DEVELOP
 from nlfilter_torch.photo.declared.parameters import DETAIL, EDITS
 from nlfilter_torch.photo.declared.shared_parameters import LOOK
 
 #: The kind of tab of each edit, in the order of the tabs.
-TABS: dict[str, type[EditTab]] = dict.fromkeys((DETAIL.name, *EDITS), EditTab) | {
+TABS: dict[str, type[EditTab]] = dict.fromkeys((DEVELOP.name, DETAIL.name, *EDITS), EditTab) | {
+    DEVELOP.name: DevelopTab,
     DETAIL.name: DetailTab,
     LOOK.name: LookTab,
 }
+TITLES = {edit: edit.capitalize() for edit in TABS} | {DEVELOP.name: "Photo"}
 CLIPPED = 0.001  # share of the picture that an edit may clip without a warning
 
 
@@ -30,8 +34,8 @@ class Panel:
         self._recipe = link.recipe
         with ui.tabs(on_change=lambda event: switch(event.value)).classes("w-full") as bar:
             bar.props("dense no-caps align=justify")
-            self._titles = {edit: ui.tab(edit, label=edit.capitalize()) for edit in TABS}
-        panels = ui.tab_panels(bar, value=next(iter(TABS)), animated=False, keep_alive=True)
+            self._titles = {edit: ui.tab(edit, label=TITLES[edit]) for edit in TABS}
+        panels = ui.tab_panels(bar, value=DETAIL.name, animated=False, keep_alive=True)
         self._bar = bar
         self._tabs: list[EditTab] = []
         with panels.classes("w-full bg-transparent"):
@@ -49,9 +53,10 @@ class Panel:
         for tab in self._tabs:
             tab.follow()
         self._steps.follow()
-        acting = {step.edit for step in self._recipe().acting}
+        recipe = self._recipe()
+        acting = {step.edit for step in recipe.acting} | (set() if recipe.develop.is_idle else {DEVELOP.name})
         for edit, title in self._titles.items():
-            state = f'alert=amber aria-label="{edit.capitalize()}, in use"'
+            state = f'alert=amber aria-label="{TITLES[edit]}, in use"'
             title.props(state if edit in acting else "", remove="" if edit in acting else "alert aria-label")
 
     def take(self, role: ScribbleRole) -> None:

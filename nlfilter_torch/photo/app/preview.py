@@ -283,13 +283,14 @@ class Preview:
         whole = step.mixed(opacity=1.0)
         return next((picture.before for picture in self._pictures if picture.key[-1] == whole), self.pixels)
 
-    def render(self, recipe: Recipe, moving: int | None = None) -> Tensor:
+    def render(self, recipe: Recipe, moving: int | None = None, start: Tensor | None = None) -> Tensor:
         """The preview after all steps, (1, 1 or 3, h, w) in [0, 1].
 
         While a slider of the step at the place ``moving`` moves, the steps after it are approximate: they are applied
         as fitted to the last complete picture, or make the same change as there, and are left out if there was none.
+        ``start`` takes the place of the reduced photograph then.
         """
-        result, used, computed = self.pixels, list[StepPicture](), False
+        result, used, computed = self.pixels if start is None else start, list[StepPicture](), False
         key: tuple[Step, ...] = ()
         for place, step in enumerate(recipe.steps):
             if not step.changes():

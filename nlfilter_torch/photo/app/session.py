@@ -1,6 +1,7 @@
 """A session: an open photograph, its edit, and the history of undo. It does not depend on the page."""
 
 import threading
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -8,9 +9,11 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from nlfilter_torch.photo.app.developed import DEVELOPING, Developed, uncropped
 from nlfilter_torch.photo.app.overlays import Overlays
 from nlfilter_torch.photo.app.preview import PIXELS, Preview
 from nlfilter_torch.photo.app.sidecar import Sidecar
+from nlfilter_torch.photo.declared.development import Crop, Development
 from nlfilter_torch.photo.declared.json_values import Value
 from nlfilter_torch.photo.declared.parameters import EDITS
 from nlfilter_torch.photo.declared.presets import Recipe
@@ -65,9 +68,8 @@ class Opened:
     Attributes:
         path: its file, which may be a copy.
         name: the name of the file for the user.
-        photograph: its pixels.
+        photograph: its pixels, before it is developed.
         preview: its preview.
-        parts: parts of it at full size.
         pages: number of pages of the file.
     """
 
@@ -75,7 +77,6 @@ class Opened:
     name: str
     photograph: Photograph
     preview: Preview
-    parts: Parts
     pages: int = 1
 
 
@@ -101,10 +102,12 @@ class Session:
         self.saved = Recipe()
         self._sidecar: Sidecar | None = None
         self._kept = Recipe()  # what the sidecar holds
+        self._developed: Developed | None = None  # the photograph as it was shown last
+        self._outdated: list[Parts] = []  # of other developments
         self._drawing = threading.Lock()  # previews cache what they compute, so they draw one picture at a time
         self._fitting = threading.Lock()  # the same holds for parts at full size
         self._overlays = Overlays()
-        self._at_rest: tuple[tuple[Step, ...], Tensor] | None = None  # the last result, for other tabs
+        self._at_rest: tuple[object, Tensor] | None = None  # the last result, for other tabs
         self._pixels = pixels
         self._past: list[Recipe] = []
         self._future: list[Recipe] = []
@@ -121,12 +124,11 @@ class Session:
             photograph = read_photograph(path, bytes_per_pixel=OPEN_BYTES)
         except (ValueError, OSError, MemoryError) as error:
             raise type(error)(str(error).replace(str(path), name or str(path))) from error
-        if self.opened is not None:
-            self.opened.parts.close()
-        parts = Parts(photograph.pixels[0].permute(1, 2, 0).numpy(), name or path.name)
+        if self._developed is not None:
+            self._developed.parts.close()
         pages = tiff.count_pages(path) if tiff.is_tiff(first_bytes(path)) else 1
-        preview = Preview(photograph.pixels, self._pixels)
-        self.opened = Opened(path.resolve(), name or path.name, photograph, preview, parts, pages)
+        self._developed = Developed.of(photograph, name or path.name, self._pixels)
+        self.opened = Opened(path.resolve(), name or path.name, photograph, self._developed.preview, pages)
         self.recipe = self._shown = self.saved = Recipe()
         self._at_rest = None
         self._overlays = Overlays()
@@ -168,14 +170,45 @@ class Session:
     @property
     def preview(self) -> Preview:
         """The preview; raises ValueError if no photograph is open."""
-        if self.opened is None:
+        return self.developed.preview
+
+    @property
+    def developed(self) -> Developed:
+        """The photograph as it was developed last; raises ValueError if none is open."""
+        if self._developed is None:
             raise ValueError("open a photograph first")
-        return self.opened.preview
+        return self._developed
 
     @property
     def size(self) -> tuple[int, int]:
-        """(height, width) of the photograph; raises ValueError if none is open."""
-        return self._opened_to("show").photograph.size
+        """(height, width) of the developed photograph; raises ValueError if none is open."""
+        return self.developed.photograph.size
+
+    def _develop(self, development: Development) -> Developed:
+        """The photograph developed in a way, which takes a second for each ten megapixels unless it is shown so.
+
+        Raises:
+            ValueError, MemoryError: if nothing is open, or the photograph cannot be developed.
+        """
+        opened, developed = self._opened_to("develop"), self.developed
+        if developed.development == development:
+            return developed
+        return Developed.of(opened.photograph, opened.name, self._pixels, development)
+
+    def shown(self, edit: str) -> Step:
+        """The last step of an edit, whose strokes are where they are in the developed photograph."""
+        step = self.recipe.current(edit)
+        return step.changed(strokes=self.developed.inward(step.strokes)) if step.strokes else step
+
+    @property
+    def crop(self) -> Crop:
+        """The edges of what is kept of :attr:`uncropped`."""
+        return self.recipe.develop.frame(self._opened_to("show").photograph.size).edges
+
+    @property
+    def uncropped(self) -> Tensor:
+        """The photograph as it is turned and lit, not cropped, with black corners, (1, C, h, w) in [0, 1], reduced."""
+        return uncropped(self._opened_to("show").preview.pixels, self.recipe.develop)
 
     @property
     def has_colours(self) -> bool:
@@ -194,6 +227,19 @@ class Session:
         :meth:`commit` completes the change.
         """
         self.recipe = self.recipe.with_current(self.recipe.current(edit).changed(strokes=strokes, **values).shown())
+
+    def developing(self, values: Mapping[str, Value]) -> Recipe:
+        """The edit with other values of how the photograph is developed.
+
+        Edges of a crop are those of whole pixels that the straightened photograph has.
+
+        Raises:
+            ValueError: if the middle of the crop is outside, or nothing is open.
+        """
+        size = self._opened_to("develop").photograph.size
+        develop = Development(**{**vars(self.recipe.develop), **values})
+        frame = develop.frame(size)
+        return replace(self.recipe, develop=replace(develop, crop=frame.edges) if "crop" in values else develop)
 
     def commit(self) -> None:
         """Complete a change, so that it can be undone."""
@@ -243,7 +289,7 @@ class Session:
         words = EDITS[step].words
         if not words:
             raise ValueError(f"{step} takes no strokes: it holds for the whole photograph")
-        stroke = Stroke.from_entries(entries, words, step)
+        stroke = self.developed.frame.stroke_outward(Stroke.from_entries(entries, words, step))
         last = self.recipe.current(step)
         painted = last.changed(strokes=(*last.strokes, stroke)).shown()
         if painted.has_region() and not last.has_region():  # it begins with the sliders of the rest
@@ -252,13 +298,34 @@ class Session:
         self.commit()
 
     def render(self, moving: int | None = None) -> Tensor:
-        """The preview under the edit, (1, C, h, w) in [0, 1]; see :meth:`Preview.render`."""
+        """The preview under the edit, (1, C, h, w) in [0, 1]; see :meth:`Preview.render`.
+
+        ``moving`` may be :data:`DEVELOPING`, too.
+        """
+        recipe = self.recipe
         with self._drawing:
-            return self.preview.render(self.recipe, moving)
+            if moving == DEVELOPING:
+                developed = self.developed
+                start = developed.approximate(recipe.develop, self._opened_to("show").preview)
+            else:
+                developed, start = self._develop(recipe.develop), None
+                if developed is not self.developed:
+                    self._outdated.append(self.developed.parts)
+                    self._developed = developed
+            return developed.preview.render(self._on(developed, recipe), moving, start)
+
+    def _on(self, developed: Developed, recipe: Recipe) -> Recipe:
+        """The steps of a recipe for the developed photograph."""
+        return replace(recipe, develop=developed.development).on_developed(developed.frame.original)
+
+    def eigenvalues(self, detail: Step) -> Tensor:
+        """Eigenvalues (R,) of the filter of a step of detail, which its layers belong to."""
+        with self._drawing:
+            return self.preview.layers(detail).eigenvalues
 
     def mask(self, edit: str) -> Tensor | None:
         """The mask (1, 1, h, w) of what the scribbles of the last step of an edit select, or None."""
-        step, preview = self.recipe.current(edit), self.preview
+        step, preview = self.shown(edit), self.preview
         with self._drawing:
             if step.declared.regional is not None:
                 return preview.mask(step)
@@ -266,13 +333,13 @@ class Session:
 
     def ignored(self, edit: str) -> Tensor | None:
         """Which pixels (1, 1, h, w) under these scribbles do not count, or None."""
-        step = self.recipe.current(edit)
+        step = self.shown(edit)
         with self._drawing:
             return self._overlays.ignored(step, self.preview.before(step))
 
     def original(self, place: Rectangle) -> Tensor:
         """A part of the photograph before the edit, (1, C, h, w) in [0, 1]; raises ValueError if none is open."""
-        return self._opened_to("show").parts.original(place)
+        return self.developed.original(place)
 
     def part(self, place: Rectangle, recipe: Recipe, report: Report = in_silence) -> Tensor:
         """A part of the photograph under an edit as :meth:`save` makes it, (1, C, h, w) in [0, 1].
@@ -284,7 +351,7 @@ class Session:
             ValueError, OSError, MemoryError: if nothing is open, or the photograph cannot be edited.
         """
         with self._fitting:
-            return self._fitted(recipe, report).edited(place)
+            return self._fitted(self._develop(recipe.develop), recipe, report).edited(place)
 
     def at_rest(self, recipe: Recipe, report: Report = in_silence) -> Tensor:
         """The photograph under an edit as :meth:`save` makes it, reduced to the size of the preview.
@@ -296,30 +363,31 @@ class Session:
             ValueError, OSError, MemoryError: as :meth:`part`.
         """
         with self._fitting:
-            if self._at_rest is None or self._at_rest[0] != recipe.acting:
-                pixels = self._edited_at_once(recipe, report)
+            if self._at_rest is None or self._at_rest[0] != recipe.effect:
+                developed = self._develop(recipe.develop)
+                pixels, size = self._edited_at_once(developed, recipe, report), developed.preview.size
                 if pixels is None:
-                    reduced = self._fitted(recipe, report).reduced(self.preview.size, report)
+                    reduced = self._fitted(developed, recipe, report).reduced(size, report)
                 else:
-                    reduced = resize(pixels.clamp(0, 1), self.preview.size).clamp(0, 1)  # a file holds no more
-                self._at_rest = recipe.acting, reduced
+                    reduced = resize(pixels.clamp(0, 1), size).clamp(0, 1)  # a file holds no more
+                self._at_rest = recipe.effect, reduced
             return self._at_rest[1]
 
-    def _fitted(self, recipe: Recipe, report: Report) -> Parts:
+    def _fitted(self, developed: Developed, recipe: Recipe, report: Report) -> Parts:
         """The parts of the photograph, with the edit fitted to the whole photograph."""
-        opened = self._opened_to("show")
-        opened.parts.fit(recipe.steps, self._passes(opened.photograph, report))
-        return opened.parts
+        while self._outdated:
+            self._outdated.pop().close()
+        developed.parts.fit(self._on(developed, recipe).steps, self._passes(developed.photograph, report))
+        return developed.parts
 
-    def _edited_at_once(self, recipe: Recipe, report: Report) -> Tensor | None:
+    def _edited_at_once(self, developed: Developed, recipe: Recipe, report: Report) -> Tensor | None:
         """The edited pixels (1, C, H, W), as the command line computes them; None if that needs too much memory."""
-        opened = self._opened_to("edit")
-        height, width = opened.photograph.size
-        if width * height * recipe.bytes_per_pixel > WHOLE:
+        opened, photograph, steps = self._opened_to("edit"), developed.photograph, self._on(developed, recipe)
+        height, width = photograph.size
+        if width * height * steps.bytes_per_pixel > WHOLE:
             return None
-        check_memory(Path(opened.name), width, height, recipe.bytes_per_pixel)
-        photograph = opened.photograph
-        return apply_recipe(recipe, photograph.pixels, partial(report, "Editing"), weights=photograph.weights)
+        check_memory(Path(opened.name), width, height, steps.bytes_per_pixel)
+        return apply_recipe(steps, photograph.pixels, partial(report, "Editing"), weights=photograph.weights)
 
     def _opened_to(self, purpose: str) -> Opened:
         """The open photograph; if there is none, raises a ValueError that names the purpose."""
@@ -351,7 +419,7 @@ class Session:
                 f"the name must not be that of the photograph, got {name!r}: its edit is kept, and would be "
                 "applied again; choose another name"
             )
-        check_output(target, opened.photograph)
+        check_output(target, self.developed.photograph)
         return target
 
     def check_preset(self, name: str) -> Path:
@@ -380,14 +448,16 @@ class Session:
             ValueError, OSError, MemoryError: if nothing is open, or the file cannot be edited or written.
         """
         target, opened = self.check_photograph(name), self._opened_to("save")
-        recipe, photograph = self.recipe, opened.photograph
+        recipe, developed = self.recipe, self._develop(self.recipe.develop)
+        photograph = developed.photograph
         size = reduced_size(photograph, options.side)
-        pixels = self._edited_at_once(recipe, report)
+        pixels = self._edited_at_once(developed, recipe, report)
         if pixels is None:
             rows = photograph.pixels[0].permute(1, 2, 0).numpy()
             channels = 3 if recipe.gives_colour else rows.shape[2]
             pixels = photograph.pixels.new_empty((1, channels, *photograph.size))
-            for part, values in edit_rows(self._passes(photograph, report), rows, recipe.steps, opened.name):
+            steps = self._on(developed, recipe).steps
+            for part, values in edit_rows(self._passes(photograph, report), rows, steps, opened.name):
                 pixels[0, :, part] = torch.from_numpy(values).permute(2, 0, 1)
         report("Writing", 0, 1)
         write_photograph(resized(photograph.with_pixels(pixels), size), target, quality=options.quality)
@@ -410,8 +480,9 @@ class Session:
 
     def load_preset(self, content: bytes, name: str) -> None:
         """Load an edit from the content of a file; raises ValueError if it has none, or if no photograph is open."""
-        self._opened_to("edit")
-        self.load(Recipe.from_file(content, name))
+        opened, recipe = self._opened_to("edit"), Recipe.from_file(content, name)
+        recipe.develop.frame(opened.photograph.size)  # refuses a crop that is outside
+        self.load(recipe)
 
 
 def reduced_size(photograph: Photograph, side: int | None) -> tuple[int, int]:

@@ -1,6 +1,6 @@
 """The tab of an edit: its sliders, and the settings of the brush that draws strokes for it."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 
@@ -11,6 +11,7 @@ from nlfilter_torch.photo.app.brush import BRUSHES, COLOURS, RADIUS, Brush
 from nlfilter_torch.photo.app.controls import Change, Choice, Control, Slider, SteadySlider
 from nlfilter_torch.photo.app.step_list import Replace
 from nlfilter_torch.photo.declared.declaration import ScribbleRole
+from nlfilter_torch.photo.declared.json_values import Value
 from nlfilter_torch.photo.declared.parameters import EDITS
 from nlfilter_torch.photo.declared.presets import Recipe
 
@@ -28,6 +29,9 @@ class Link:
         clear: is called with a step whose strokes are to be removed.
         replace: is called with another edit, and the place of the step whose slider moves, or None.
         thumbnail: returns the address of a picture of the photograph under a look, or "" if there is none.
+        develop: is called with changes of how the photograph is developed.
+        crop: is called to show the frame of the crop, or to hide it.
+        is_cropping: returns whether it is shown.
     """
 
     recipe: Callable[[], Recipe]
@@ -36,6 +40,9 @@ class Link:
     clear: Callable[[str], None]
     replace: Replace
     thumbnail: Callable[[str], str]
+    develop: Callable[[Mapping[str, Value], bool], None]
+    crop: Callable[[], None]
+    is_cropping: Callable[[], bool]
 
 
 class EditTab:

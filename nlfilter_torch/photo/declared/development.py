@@ -236,6 +236,17 @@ class Frame:
         return self.height, self.width
 
     @property
+    def edges(self) -> Crop:
+        """The crop that gives this rectangle.
+
+        >>> Development(crop=(0.52, 0.0, 1.0, 1.0)).frame((10, 20)).edges
+        (0.5, 0.0, 1.0, 1.0)
+        """
+        height, width = self.original
+        bottom, right = self.top + self.height, self.left + self.width
+        return self.left / width, self.top / height, right / width, bottom / height
+
+    @property
     def is_whole(self) -> bool:
         """Whether it is the original itself."""
         return self.angle == 0 and self.size == self.original

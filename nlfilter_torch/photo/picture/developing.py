@@ -68,6 +68,16 @@ def develop_planes(planes: Tensor, frame: Frame) -> Tensor:
     return torch.cat([torch.cat(parts, dim=3) for parts in bands], dim=2)
 
 
+def turned_canvas(image: Tensor, development: Development) -> Tensor:
+    """An image (B, C, H, W) in [0, 1] that is turned within its own size, without a crop; empty corners are black."""
+    height, width = size = image.shape[-2], image.shape[-1]
+    frame = Frame(size, math.radians(development.straighten), 0, 0, *size)
+    x, y = torch.arange(width) + (0.5 - width / 2), torch.arange(height)[:, None] + (0.5 - height / 2)
+    cosine, sine = math.cos(frame.angle), math.sin(frame.angle)
+    inside = ((x * cosine + y * sine).abs() <= width / 2) & ((y * cosine - x * sine).abs() <= height / 2)
+    return develop_planes(image, frame).clamp(0, 1) * inside.to(image)
+
+
 def part_of_planes(planes: Tensor, rows: range, columns: range) -> Tensor:
     """A part of planes (B, C, H, W)."""
     return planes[..., rows.start : rows.stop, columns.start : columns.stop]

@@ -22,6 +22,8 @@ class Controls:
         self.changes: list[tuple[str, Mapping[str, object], bool]] = []
         self.cleared: list[str] = []
         self.thumbnails: dict[str, str] = {}
+        self.developed: list[object] = []
+        self.is_cropping = False
         self.replaced: list[tuple[Recipe, int | None]] = []
         self.link = Link(
             lambda: self.recipe,
@@ -30,6 +32,9 @@ class Controls:
             self.cleared.append,
             lambda *change: self.replaced.append(change),
             lambda look: self.thumbnails.get(look, ""),
+            lambda *change: self.developed.append(change),
+            lambda: self.developed.append("crop"),
+            lambda: self.is_cropping,
         )
 
     def show(self, tab: EditTab, recipe: Recipe) -> None:

@@ -210,12 +210,12 @@ def test_functions_of_the_script() -> None:
     done = subprocess.run([program, "--test", *files], cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "# fail 0" in done.stdout
-    assert len(files) == 2
+    assert len(files) == 3
 
 
 def test_scripts_of_the_page_are_files() -> None:
-    assert SCRIPTS.count("<script") == 2
-    for name in ("page.js", "closeup.js"):
+    assert SCRIPTS.count("<script") == 3
+    for name in ("page.js", "closeup.js", "crop.js"):
         assert f'src="{STATIC_ADDRESS}/{name}"' in SCRIPTS
         assert (STATIC / name).is_file()
 

@@ -29,9 +29,10 @@ def panel(shown: Controls, opened: list[str]) -> Panel:
 
 def test_every_edit_has_a_tab_with_its_sliders(shown: Controls, panel: Panel, opened: list[str]) -> None:
     tabs = [tab.props["name"] for tab in shown.of(ui.tab)]
-    assert set(tabs) == set(EDITS)
-    assert len(tabs) == len(EDITS)
-    assert tabs[0] == "detail"
+    assert tabs[:2] == ["develop", "detail"]
+    assert set(tabs[1:]) == set(EDITS)
+    assert len(tabs) == len(EDITS) + 1
+    assert shown.of(ui.tabs)[0].value == "detail"
     labels = {p.slider.label for edit in EDITS.values() for p in edit if p.slider is not None and edit.name != "detail"}
     assert labels | {"Texture", "Shading"} <= shown.sliders().keys()
     assert len(shown.of(ui.toggle)) == len(BRUSHES)

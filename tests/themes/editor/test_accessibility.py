@@ -42,6 +42,11 @@ def test_no_serious_defect(browser: Browser, editor: Editor, width: int, height:
     page = tab.page
     tab.wait_until_ready()
     result = {"Detail": defects(page)}
+    page.get_by_role("tab", name="Photo").click()
+    page.get_by_role("button", name="Crop").click()
+    tab.slider("Left edge").wait_for()
+    result["crop"] = defects(page)
+    page.keyboard.press("Escape")
     page.get_by_role("tab", name="Look").click()
     page.get_by_role("button", name="faded").click()
     expect(page.get_by_role("checkbox", name="Look: on")).to_be_attached()

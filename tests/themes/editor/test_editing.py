@@ -215,3 +215,62 @@ def test_wipe_shows_what_was_before(opened: Tab) -> None:
     clip = opened.page.get_by_alt_text("before").evaluate("element => getComputedStyle(element).clipPath")
     assert clip.startswith(("inset(0px calc(50%", "inset(0px 50%")), clip
     expect(opened.page.get_by_text("before", exact=True)).to_be_visible()
+
+
+def test_a_photograph_is_developed(opened: Tab, folder: Path) -> None:
+    """Exposure, straightening, a crop by keys and by pointer, and a stroke on what is left; the file as of `apply`."""
+    page = opened.page
+    page.get_by_role("tab", name="Photo").click()
+    before = opened.source()
+    opened.drag(opened.slider("Exposure"), 0.5, 0.6)
+    opened.wait_for_picture(before)
+    expect(page.get_by_role("tab", name="Photo, in use")).to_be_visible()
+    before = opened.source()
+    opened.drag(opened.slider("Straighten"), 0.5, 0.6)
+    opened.wait_for_picture(before)
+    expect(page.get_by_text("138×92 pixels")).to_be_visible()
+
+    page.get_by_role("button", name="Crop").click()
+    left, bottom = opened.slider("Left edge"), opened.slider("Bottom edge")
+    expect(left).to_be_visible()
+    assert float(left.get_attribute("aria-valuenow") or 0) == pytest.approx(100 * 6 / 150, abs=0.1)
+    left.focus()
+    for _ in range(10):
+        page.keyboard.press("ArrowRight")
+    expect(left).to_have_attribute("aria-valuetext", "14.0 %")
+    expect(page.get_by_text("123×92 pixels")).to_be_attached()
+    box = bottom.bounding_box()
+    assert box is not None
+    page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+    page.mouse.down()
+    page.mouse.move(box["x"] + box["width"] / 2, box["y"] - 200, steps=4)
+    page.mouse.up()
+    expect(page.get_by_text("123×92 pixels")).to_have_count(0)
+    page.keyboard.press("Escape")
+    expect(left).not_to_be_visible()
+
+    page.get_by_role("tab", name="Recolor").click()
+    before = opened.source()
+    opened.paint((0.3, 0.5), (0.5, 0.5))
+    opened.wait_for_picture(before)
+    recipe = Recipe.from_json((folder / "cat.png.edit.json").read_bytes(), "cat.png.edit.json")
+    frame = recipe.develop.frame((100, 150))
+    assert recipe.develop.exposure == pytest.approx(0.6, abs=0.1)
+    assert recipe.steps[0].strokes[0].points[0] == pytest.approx(frame.outward(0.3, 0.5), abs=0.02)
+    opened.save("Save photo", "developed.png")
+    assert (
+        main(
+            [
+                "apply",
+                str(folder / "cat.png"),
+                str(folder / "by-command.png"),
+                "--preset",
+                str(folder / "cat.png.edit.json"),
+            ]
+        )
+        == 0
+    )
+    saved, wanted = (read_photograph(folder / name).pixels for name in ("developed.png", "by-command.png"))
+    assert saved.shape[-2:] == frame.size
+    assert difference(saved, wanted) < 0.1
+    assert difference(opened.picture(), wanted) < 4

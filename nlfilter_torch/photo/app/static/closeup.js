@@ -43,7 +43,9 @@ class Closeup {
     this.#address = address;
     this.#told = "";
     this.clear();
-    document.querySelector(".originals").replaceChildren();
+    const originals = document.querySelector(".originals");
+    originals.replaceChildren();
+    originals.dataset.shown = "";
     this.fit();
   }
 
@@ -267,7 +269,7 @@ class Closeup {
   }
 
   #isOnCanvas(event) {
-    return this.#size && event.target.closest?.(".canvas") && !event.target.closest(".zoom");
+    return this.#size && event.target.closest?.(".canvas") && !event.target.closest(".zoom, .cropper");
   }
 
   #down(event) {

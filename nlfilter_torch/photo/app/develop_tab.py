@@ -1,0 +1,71 @@
+"""The tab of the photograph itself: exposure, white balance, straightening and crop, which come before all edits."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from nicegui import ui
+
+from nlfilter_torch.photo.app.controls import Control, Slider
+from nlfilter_torch.photo.app.tabs import EditTab
+from nlfilter_torch.photo.declared.declaration import ScribbleRole
+from nlfilter_torch.photo.declared.development import DEVELOP, WHOLE
+from nlfilter_torch.photo.declared.json_values import Value
+from nlfilter_torch.photo.declared.presets import Recipe
+
+UNITS = {"exposure": " stops", "straighten": "\u00b0"}
+
+
+@dataclass(frozen=True)
+class DevelopControl(Control):
+    """A slider for a value of how the photograph is developed."""
+
+    def read(self, recipe: Recipe) -> float:
+        """The slider's value for an edit."""
+        return float(getattr(recipe.develop, self.parameter.name))
+
+    def usual(self, recipe: Recipe) -> float:
+        """The slider's value at the start."""
+        return self.parameter.default_number
+
+    def entries(self, recipe: Recipe, value: float) -> dict[str, Value]:
+        """The changed value."""
+        return {self.parameter.name: round(value, 4)}
+
+    def show(self, value: float) -> str:
+        """The value as text."""
+        return super().show(value) + UNITS.get(self.parameter.name, "")
+
+
+CONTROLS = tuple(DevelopControl(DEVELOP.name, p, p.slider, p.help) for p in DEVELOP if p.slider is not None)
+
+
+class DevelopTab(EditTab):
+    """The tab, built into the open element."""
+
+    def follow(self) -> None:
+        """Show the current edit."""
+        super().follow()
+        development, is_cropping = self._link.recipe().develop, self._link.is_cropping()
+        self._crop.props(f'aria-pressed="{str(is_cropping).lower()}"')
+        self._crop.classes(add="chosen" if is_cropping else "", remove="" if is_cropping else "chosen")
+        self._whole.set_enabled(development.crop != WHOLE)
+
+    def take(self, role: ScribbleRole) -> None:
+        """There are no tools that draw."""
+
+    def _build(self) -> None:
+        ui.label(DEVELOP.hint).classes("hint")
+        self._sliders = [Slider(control, self._link.recipe, self._develop) for control in CONTROLS]
+        ui.label("Crop").classes("group")
+        with ui.row().classes("w-full items-center no-wrap gap-2 q-mt-xs"):
+            self._crop = ui.button("Crop", icon="crop", on_click=lambda: self._link.crop()).props("flat dense no-caps")
+            self._crop.tooltip("Drag a frame over the whole photograph; Escape ends it")
+            ui.space()
+            self._whole = ui.button("Whole picture", on_click=self._uncrop).props("flat dense no-caps")
+
+    def _develop(self, _: str, values: Mapping[str, Value], complete: bool) -> None:
+        """Change some values."""
+        self._link.develop(values, complete)
+
+    def _uncrop(self) -> None:
+        self._link.develop({"crop": WHOLE}, True)

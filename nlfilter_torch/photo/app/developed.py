@@ -1,0 +1,85 @@
+"""The open photograph as it is developed, and what the editor shows of it."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from torch import Tensor
+
+from nlfilter_torch.photo.app.preview import Preview
+from nlfilter_torch.photo.declared.development import AS_IT_IS, Development, Frame
+from nlfilter_torch.photo.declared.presets import DEVELOPING_BYTES
+from nlfilter_torch.photo.declared.strokes import Stroke
+from nlfilter_torch.photo.io.developed import develop_photograph
+from nlfilter_torch.photo.io.photographs import Photograph, check_memory
+from nlfilter_torch.photo.picture.developing import develop_image, in_light, limits_of, turned_canvas
+from nlfilter_torch.photo.picture.resizing import resize
+from nlfilter_torch.photo.tiled.parts import Parts, Rectangle
+
+DEVELOPING = -1  # the place before all steps, of a slider that moves
+
+
+@dataclass(frozen=True, eq=False)
+class Developed:
+    """A photograph as it is developed.
+
+    Attributes:
+        development: how.
+        frame: where it lies in the original.
+        photograph: its pixels.
+        cut: its pixels (1, C, H, W) in the light of the original, with which the edit is compared.
+        before: these, reduced to the size of the preview.
+        preview: its preview.
+        parts: parts of it at full size.
+    """
+
+    development: Development
+    frame: Frame
+    photograph: Photograph
+    cut: Tensor
+    before: Tensor
+    preview: Preview
+    parts: Parts
+
+    @staticmethod
+    def of(photograph: Photograph, name: str, pixels: int, development: Development = AS_IT_IS) -> "Developed":
+        """Develop a photograph, whose file is called ``name``; its preview has at most so many pixels.
+
+        Raises:
+            ValueError: if the middle of the crop is outside.
+            MemoryError: if there is no room for it.
+        """
+        frame = development.frame(photograph.size)
+        if not development.is_idle:
+            check_memory(Path(name), photograph.size[1], photograph.size[0], DEVELOPING_BYTES)
+        edited = develop_photograph(photograph, development)
+        cut = edited if not development.changes_tones else develop_photograph(photograph, development.geometry)
+        preview = Preview(edited.pixels, pixels)
+        parts = Parts(edited.pixels[0].permute(1, 2, 0).numpy(), name)
+        before = preview.pixels if cut is edited else resize(cut.pixels.float(), preview.size)
+        return Developed(development, frame, edited, cut.pixels, before, preview, parts)
+
+    @property
+    def geometry(self) -> Development:
+        """How it is straightened and cropped."""
+        return self.development.geometry
+
+    def original(self, place: Rectangle) -> Tensor:
+        """A part before the edit, (1, C, h, w) in [0, 1]."""
+        rows, columns = place.rows, place.columns
+        return self.cut[..., rows.start : rows.stop, columns.start : columns.stop].clamp(0, 1)
+
+    def inward(self, strokes: tuple[Stroke, ...]) -> tuple[Stroke, ...]:
+        """Strokes in coordinates of the original, in those of the developed photograph."""
+        return tuple(map(self.frame.stroke_inward, strokes))
+
+    def approximate(self, development: Development, original: Preview) -> Tensor:
+        """The preview, quickly, as it would be developed in another way, from the preview of the photograph itself."""
+        limits = limits_of(original.pixels)
+        if development.geometry == self.development.geometry:
+            return in_light(self.before, development, limits)
+        return develop_image(original.pixels, development)
+
+
+def uncropped(pixels: Tensor, development: Development) -> Tensor:
+    """A picture (1, C, h, w), turned and in other light but not cropped, with black corners, in [0, 1]."""
+    return turned_canvas(in_light(pixels, development, limits_of(pixels)).clamp(0, 1), development)

@@ -1,0 +1,29 @@
+/** The frame of a crop while it is dragged. */
+
+import assert from "node:assert/strict";
+import { test } from "node:test";
+
+import { atLeast, moved } from "../../../../nlfilter_torch/photo/app/static/frames.js";
+
+const ALL = ["left", "top", "right", "bottom"];
+const close = (edges, wanted) => edges.forEach((edge, i) => assert.ok(Math.abs(edge - wanted[i]) < 1e-12, `${edges}`));
+
+test("an edge follows the pointer, and stops at the border and before the other edge", () => {
+  const frame = [0.2, 0.2, 0.8, 0.9];
+  close(moved(frame, ["left"], 0.1, 0.5), [0.3, 0.2, 0.8, 0.9]);
+  close(moved(frame, ["left"], -0.5, 0), [0, 0.2, 0.8, 0.9]);
+  close(moved(frame, ["left"], 0.9, 0), [0.79, 0.2, 0.8, 0.9]);
+  close(moved(frame, ["bottom"], 0.5, -0.9), [0.2, 0.2, 0.8, 0.21]);
+  close(moved(frame, ["bottom", "right"], 0.1, 0.5), [0.2, 0.2, 0.9, 1]);
+});
+
+test("the whole frame keeps its size", () => {
+  const frame = [0.2, 0.2, 0.8, 0.9];
+  close(moved(frame, ALL, 0.1, -0.1), [0.3, 0.1, 0.9, 0.8]);
+  close(moved(frame, ALL, 5, -5), [0.4, 0, 1, 0.7]);
+});
+
+test("a frame is never empty", () => {
+  close(atLeast([0.5, 0.5, 0.5, 0.5]), [0.5, 0.5, 0.505, 0.505]);
+  close(atLeast([0, 0, 1, 1]), [0, 0, 1, 1]);
+});

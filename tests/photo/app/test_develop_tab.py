@@ -1,0 +1,56 @@
+"""The tab of the photograph itself, and the frame of the crop, without a browser."""
+
+import pytest
+from nicegui import Client, ui
+
+from nlfilter_torch.photo.app.crop_tool import CropTool
+from nlfilter_torch.photo.app.develop_tab import CONTROLS, DevelopTab
+from nlfilter_torch.photo.declared.development import WHOLE, Development
+from nlfilter_torch.photo.declared.presets import Recipe
+from tests.photo.app.page_controls import Controls
+
+
+def test_sliders_show_and_change_the_development(client: Client) -> None:
+    shown = Controls(client)
+    tab = DevelopTab("develop", shown.link)
+    shown.show(tab, Recipe((), Development(0.5, -0.2, 0.1, 3.0)))
+    assert shown.sliders() == {"Exposure": 0.5, "Temperature": -0.2, "Tint": 0.1, "Straighten": 3.0}
+    assert {"0.50 stops", "3.0\u00b0"} <= set(shown.texts())
+    slider = shown.of(ui.slider)[0]
+    for listener in list(slider._event_listeners.values()):
+        if listener.type == "dblclick":
+            listener.handler(None)
+    assert shown.developed == [({"exposure": 0.0}, True)]
+    assert [control.usual(Recipe()) for control in CONTROLS] == [0, 0, 0, 0]
+
+
+def test_the_crop_is_shown_and_reset(client: Client) -> None:
+    shown = Controls(client)
+    tab = DevelopTab("develop", shown.link)
+    shown.show(tab, Recipe())
+    crop, whole = shown.of(ui.button)
+    assert not whole.enabled
+    assert crop.props["aria-pressed"] == "false"
+    shown.click("Crop")
+    assert shown.developed == ["crop"]
+    shown.is_cropping = True
+    shown.show(tab, Recipe((), Development(crop=(0.1, 0.0, 1.0, 1.0))))
+    assert crop.props["aria-pressed"] == "true"
+    shown.click("Whole picture")
+    assert shown.developed[-1] == ({"crop": WHOLE}, True)
+
+
+def test_the_tool_tells_the_page_what_to_show(client: Client, scripts: list[str]) -> None:
+    tool = CropTool()
+    handles = [e for e in client.elements.values() if e.props.get("role") == "slider"]
+    assert [e.props["aria-label"] for e in handles] == ["Left edge", "Top edge", "Right edge", "Bottom edge"]
+    tool.show("/picture/token/whole?1", (100, 150), (0.1, 0.0, 1.0, 0.5))
+    assert scripts.pop() == "cropper.show('/picture/token/whole?1', 150, 100, [0.1, 0.0, 1.0, 0.5])"
+    tool.hide()
+    assert scripts == ["cropper.hide()"]
+
+
+@pytest.mark.parametrize("name", ["exposure", "straighten"])
+def test_values_of_sliders_are_rounded(name: str) -> None:
+    control = next(control for control in CONTROLS if control.parameter.name == name)
+    assert control.entries(Recipe(), 0.123456) == {name: 0.1235}

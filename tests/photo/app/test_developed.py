@@ -1,0 +1,112 @@
+"""A session whose photograph is developed: its preview, its parts, its file, and strokes in place."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from nlfilter_torch.photo.app.developed import DEVELOPING
+from nlfilter_torch.photo.app.session import FileOptions, Session
+from nlfilter_torch.photo.declared.development import Development
+from nlfilter_torch.photo.declared.presets import Recipe
+from nlfilter_torch.photo.declared.steps import Step
+from nlfilter_torch.photo.declared.strokes import Stroke
+from nlfilter_torch.photo.edits.applying import apply_recipe
+from nlfilter_torch.photo.io.photographs import Photograph, read_photograph, write_photograph
+from nlfilter_torch.photo.picture.developing import develop_image
+from nlfilter_torch.photo.picture.resizing import resize
+from nlfilter_torch.photo.tiled.parts import Rectangle
+from tests.browser import difference
+from tests.problems import cat
+
+ALL = Development(0.4, 0.2, 0.1, 4.0, (0.1, 0.0, 1.0, 0.9))
+BLUE = Stroke(((0.37, 0.35), (0.45, 0.37)), 0.04, "#2040e0")
+
+
+def test_preview_part_and_file_agree(session: Session, tiled: bool) -> None:
+    recipe = Recipe((Step("recolor", (BLUE,)), Step("tone", contrast=1.3)), ALL)
+    wanted = apply_recipe(recipe, cat()).clamp(0, 1)
+    session.load(recipe)
+    assert difference(session.render(), wanted) < 1
+    assert session.size == wanted.shape[-2:] == session.developed.frame.size
+    assert difference(read_photograph(session.save("out.png")).pixels, wanted) < (1.5 if tiled else 0.51)
+    part = Rectangle(range(10, 40), range(20, 90))
+    assert difference(session.part(part, recipe), wanted[..., 10:40, 20:90]) < 1.5
+    before = develop_image(cat(), ALL.geometry)
+    assert torch.equal(session.original(part), before[..., 10:40, 20:90])
+    assert torch.equal(session.developed.before, before)
+
+
+def test_the_preview_at_rest_is_the_file(tmp_path: Path) -> None:
+    write_photograph(Photograph(cat(1)), tmp_path / "large.png")
+    session = Session(tmp_path, pixels=15_000)
+    session.open(tmp_path / "large.png")
+    session.load(Recipe((Step("tone", contrast=1.3),), ALL))
+    preview = session.render()
+    assert session.is_reduced
+    rest = session.at_rest(session.recipe)
+    saved = read_photograph(session.save("out.png")).pixels
+    size = (preview.shape[-2], preview.shape[-1])
+    assert rest.shape == preview.shape
+    assert difference(rest, resize(saved, size)) < 0.3
+    assert difference(preview, rest) < 2
+    assert max(read_photograph(session.save("small.png", options=FileOptions(side=60))).size) == 60
+
+
+def test_strokes_are_stored_in_coordinates_of_the_original(session: Session) -> None:
+    session.load(Recipe((), Development(straighten=5.0, crop=(0.3, 0.2, 1.0, 1.0))))
+    session.render()
+    height, width = session.preview.size
+    session.add_stroke("recolor", [(width / 4, height / 2), (width / 2, height / 2)], 0.05, "#2040e0")
+    (stroke,) = session.recipe.steps[0].strokes
+    frame = session.developed.frame
+    assert stroke.points[0] == pytest.approx(frame.outward(0.25, 0.5))
+    assert stroke.radius == pytest.approx(0.05 / frame.scale)
+    (shown,) = session.shown("recolor").strokes
+    assert shown.points[0] == pytest.approx((0.25, 0.5))
+    assert shown.radius == pytest.approx(0.05)
+    session.load(replace(session.recipe, develop=Development()))
+    session.render()
+    assert session.shown("recolor").strokes == (stroke,)  # another crop moves none
+
+
+def test_a_moving_slider_is_followed_and_later_steps_stay(session: Session) -> None:
+    session.load(Recipe((Step("tone", contrast=1.5),), Development(crop=(0.1, 0.0, 1.0, 1.0))))
+    session.render()
+    session.recipe = session.developing({"exposure": 0.5})
+    wanted = apply_recipe(session.recipe, cat()).clamp(0, 1)
+    assert difference(session.render(DEVELOPING), wanted) < 3
+    assert not session.developed.development.exposure  # until the slider is released
+    assert difference(session.render(), wanted) < 1
+    session.recipe = session.developing({"straighten": 3.0})
+    assert session.render(DEVELOPING).shape[-2:] == session.recipe.develop.frame((100, 150)).size
+
+
+def test_undo_redo_and_the_sidecar(session: Session) -> None:
+    session.load(session.developing({"exposure": 1.0}))
+    session.load(session.developing({"crop": (0.2, 0.0, 0.9, 1.0)}))
+    assert session.undo()
+    assert session.recipe.develop == Development(exposure=1.0)
+    assert session.redo()
+    assert session.recipe.develop.crop == pytest.approx((0.2, 0.0, 0.9, 1.0))
+    preset = session.save_preset("edit.json").read_bytes()
+    session.load(Recipe())
+    session.load_preset(preset, "edit.json")
+    assert session.recipe.develop.exposure == 1
+
+
+def test_a_crop_is_what_the_photograph_can_have(session: Session) -> None:
+    session.load(session.developing({"straighten": 10.0}))
+    session.load(session.developing({"crop": (0.0, 0.0, 1.0, 1.0)}))
+    assert session.crop == session.recipe.develop.crop == session.recipe.develop.frame((100, 150)).edges
+    again = session.developing({"crop": session.crop})
+    assert again == session.recipe  # it does not shrink any further
+    whole = session.uncropped
+    assert whole.shape == (1, 3, 100, 150)
+    assert whole[..., 0, 0].max() == 0  # an empty corner
+    with pytest.raises(ValueError, match="crop must have its middle within the photograph"):
+        session.developing({"straighten": 45.0, "crop": (0.0, 0.0, 0.1, 0.1)})
+    outside = '{"version": 1, "develop": {"straighten": 45, "crop": [0, 0, 0.1, 0.1]}, "steps": []}'
+    with pytest.raises(ValueError, match="move it inwards"):
+        session.load_preset(outside.encode(), "edit.json")
