@@ -168,5 +168,5 @@ class MaskJob:
         working, edit = range_of(source), self._edit_at(source.size)
         seen = source if working is None else Seen(source, working)
         regions = edit.select(seen, drawn)
-        tell_selected(regions.selected(), self.scribbles.rectangles["--background"])
+        tell_selected(regions.selected(seen), self.scribbles.rectangles["--background"])
         return Fitted(regions.masks) if working is None else of_picture(Fitted(regions.masks), working)

@@ -261,7 +261,9 @@ class Groups:
     @property
     def inside(self) -> list[Scribbles]:
         """The strokes of each colour on objects; none if there are no strokes."""
-        return [] if self.strokes is None else split_regions(self.strokes)
+        if self.strokes is None:
+            return []
+        return [self.strokes.weighted(part) for part in self.strokes.weights.split(1, dim=1)]
 
     def means(self, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
         """Mean luminance (B, K, 1) and chroma (B, K, 3) of a picture (H, W) under each colour.
@@ -283,14 +285,9 @@ class Groups:
     def by_hand(self, source: Source[M], removed: M | None) -> ByHand | None:
         """What is painted on the mask of each colour."""
         less = ByHand.of(source, None, removed, 1)
-        if less is None and self.on_mask is None:
-            return None
-        return ByHand([] if self.on_mask is None else split_regions(self.on_mask), [] if less is None else less.removed)
-
-
-def split_regions(scribbles: Scribbles) -> list[Scribbles]:
-    """The scribbles of each of K regions."""
-    return [scribbles.weighted(part) for part in scribbles.weights.split(1, dim=1)]
+        if self.on_mask is None:
+            return less
+        return ByHand(self.on_mask.weights.shape[1], self.on_mask.planes, None if less is None else less.removed)
 
 
 @dataclass(frozen=True, eq=False)

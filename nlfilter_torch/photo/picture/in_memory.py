@@ -187,6 +187,13 @@ class InMemory:
         check_image(masks, name, batch=self.batch)
         return [self.scribbles(mask, None, name, needed=needed) for mask in masks.split(1, dim=1)]
 
+    def weights_of(self, masks: Tensor, name: str) -> Planes:
+        """Weights of given pixels in masks (B, K, H, W) in [0, 1]."""
+        check_image(masks, name, batch=self.batch)
+        check_same_size(masks, self.size, name, "image")
+        check_unit_range(masks, name)
+        return part_of(masks.to(self.image).expand(self.batch, -1, -1, -1))
+
     def num_regions(self, masks: Tensor, name: str) -> int:
         """K, of masks (B, K, H, W)."""
         check_image(masks, name, batch=self.batch)

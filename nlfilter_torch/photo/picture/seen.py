@@ -300,6 +300,10 @@ class Seen(Generic[M]):
         """Read the scribbles of several regions."""
         return [self._seen_under(scribbles) for scribbles in self.source.regions(masks, name, needed=needed)]
 
+    def weights_of(self, masks: M, name: str) -> Planes:
+        """Weights of given pixels in masks of several regions."""
+        return self.source.weights_of(masks, name)
+
     def num_regions(self, masks: M, name: str) -> int:
         """Number of regions that have scribbles."""
         return self.source.num_regions(masks, name)

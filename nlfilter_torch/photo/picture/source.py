@@ -169,6 +169,13 @@ class Source(Protocol[M]):
     def regions(self, masks: M, name: str, *, needed: bool = True) -> list[Scribbles]:
         """Read the scribbles of several regions, see :meth:`scribbles`."""
 
+    def weights_of(self, masks: M, name: str) -> "Planes":
+        """Weights (B, K, h, w) of given pixels in masks of K regions, which are read as they are needed.
+
+        Raises:
+            ValueError: if they do not fit the picture; ``name`` is their name in the message.
+        """
+
     def num_regions(self, masks: M, name: str) -> int:
         """Number of regions that have scribbles in ``masks``, which errors call ``name``."""
 

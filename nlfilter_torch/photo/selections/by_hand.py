@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.photo.picture.drawn import M
-from nlfilter_torch.photo.picture.pixels import Pixels
+from nlfilter_torch.photo.picture.pixels import Pixels, Planes
 from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles
 from nlfilter_torch.photo.picture.source import Source
 
@@ -20,12 +20,14 @@ class ByHand:
     What is added to one region is removed from the others, unless it is added to them, too.
 
     Attributes:
-        added: for each region.
-        removed: for none, for all of them or for each; it takes precedence.
+        count: K.
+        added: weights (B, K, h, w) of given pixels, or None.
+        removed: weights (B, 1 or K, h, w) of given pixels, or None; these take precedence.
     """
 
-    added: list[Scribbles]
-    removed: list[Scribbles]
+    count: int
+    added: Planes | None
+    removed: Planes | None
 
     @staticmethod
     def of(source: Source[M], added: M | None, removed: M | None, count: int | None = None) -> "ByHand | None":
@@ -36,22 +38,32 @@ class ByHand:
         """
         if added is None and removed is None:
             return None
-        more = [] if added is None else source.regions(added, "added", needed=False)
-        less = [] if removed is None else source.regions(removed, "removed", needed=False)
-        count = len(more) if count is None else count
-        if len(more) not in (0, count):
+        more, less = (
+            None if masks is None else source.weights_of(masks, name)
+            for masks, name in ((added, "added"), (removed, "removed"))
+        )
+        of_added, of_removed = (
+            0 if masks is None else source.num_regions(masks, name)
+            for masks, name in ((added, "added"), (removed, "removed"))
+        )
+        count = of_added if count is None else count
+        if of_added not in (0, count):
             raise ValueError(
-                f"added must have a channel for each of the {count} regions, got {len(more)}; add or drop some"
+                f"added must have a channel for each of the {count} regions, got {of_added}; add or drop some"
             )
-        if len(less) not in (0, 1, count):
+        if of_removed not in (0, 1, count):
             raise ValueError(
-                f"removed must have 1 channel or one for each of the {count} regions, got {len(less)}; add or drop some"
+                f"removed must have 1 channel or one for each of the {count} regions, got {of_removed}; add or drop "
+                "some"
             )
-        return ByHand([opaque(source, part) for part in more], [opaque(source, part) for part in less])
+        return ByHand(count, more, less)
 
     def over(self, masks: Tensor, pixels: Pixels) -> Tensor:
         """Masks (B, K, h, w) of the given pixels, with what is painted over them."""
-        added, removed = (_planes(parts, pixels, masks) for parts in (self.added, self.removed))
+        added, removed = (
+            torch.zeros_like(masks) if planes is None else planes(pixels).to(masks)
+            for planes in (self.added, self.removed)
+        )
         if masks.shape[1] > 1:
             others = [_without(added, k).amax(1, keepdim=True) for k in range(masks.shape[1])]
             removed = removed.maximum(torch.cat(others, dim=1) * (1 - added))
@@ -65,13 +77,6 @@ def opaque(source: Source[M], painted: Scribbles) -> Scribbles:
     if opacity is None:
         return painted
     return painted.weighted((painted.weights / opacity.to(painted.weights).clamp(min=EPSILON)).clamp(max=1.0))
-
-
-def _planes(parts: list[Scribbles], pixels: Pixels, masks: Tensor) -> Tensor:
-    """Weights (B, K or 1, h, w) at some pixels, in the precision of the masks."""
-    if not parts:
-        return torch.zeros_like(masks)
-    return torch.cat([part.planes(pixels) for part in parts], dim=1).to(masks)
 
 
 def _without(planes: Tensor, number: int) -> Tensor:

@@ -25,7 +25,7 @@ from nlfilter_torch.photo.declared.parameters import MASK
 from nlfilter_torch.photo.declared.shared_parameters import VIEWING_SIZE
 from nlfilter_torch.photo.picture.drawn import Drawn, M
 from nlfilter_torch.photo.picture.edit import PhotoEdit
-from nlfilter_torch.photo.picture.in_memory import InMemory, edit_image
+from nlfilter_torch.photo.picture.in_memory import edit_image
 from nlfilter_torch.photo.picture.pixels import Pixels, corner
 from nlfilter_torch.photo.picture.resizing import enlarged
 from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles, parts_in_blocks
@@ -259,17 +259,11 @@ class Regions:
             masks.append(mask * (1 - front - back) + front)
         return torch.cat(masks, dim=1)
 
-    def selected(self) -> Tensor:
-        """Masks (B, K, h, w) of the reduced picture, with what is painted on them by hand."""
-        masks = self.reduced_masks()
+    def selected(self, source: Source[M]) -> Tensor:
+        """Masks (B, K, h, w) of the picture, reduced, with what is painted on them by hand."""
         if self.by_hand is None:
-            return masks
-        small = InMemory(self.reduced)
-        size = (round(small.size[0] * self.steps[0]), round(small.size[1] * self.steps[1]))
-        sides = self.by_hand.added, self.by_hand.removed
-        return ByHand(*([blocks_of(part, small, size, self.steps) for part in side] for side in sides)).over(
-            masks, small
-        )
+            return self.reduced_masks()
+        return source.shrunk(self.masks, (self.reduced.shape[-2], self.reduced.shape[-1]))
 
     def reduced_masks(self) -> Tensor:
         """Computed masks (B, K, h, w) of the reduced picture."""
@@ -310,7 +304,7 @@ def fit_regions(
     if by_hand is None:
         return _computed_regions(source, inside, background, settings)
     MASK.check(source.batch, reach=settings.reach, extent=settings.extent)
-    count = len(inside) or len(by_hand.added)
+    count = len(inside) or by_hand.count
     numbers = [k for k, drawn in enumerate(inside) if bool((drawn.weights.detach() > 0).any())]
     if numbers:
         opposed = [background[k] for k in numbers] if len(background) > 1 else background

@@ -1,6 +1,7 @@
 """The scribbled pixels of a picture that is read by rows."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -10,6 +11,7 @@ from torch import Tensor
 
 from nlfilter_torch.photo.declared.strokes import Stroke
 from nlfilter_torch.photo.picture.painting import mask_of, paint, painted_on_mask
+from nlfilter_torch.photo.picture.pixels import Pixels, corner
 from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles
 from nlfilter_torch.photo.tiled.pictures import LazyRows, Picture, RowSource, stored_as, transparency
 
@@ -89,7 +91,7 @@ def read_scribbles(
         ValueError: if the size or number of channels of an input does not fit, or a weight is outside [0, 1].
         MemoryError: if there are too many scribbled pixels.
     """
-    over = None if colours is None else _overlay(picture, colours, strokes)
+    over = None if colours is None else overlay(picture, colours, strokes)
     if over is not None and over.samples != (4 if mask is None else 3):
         raise ValueError(
             f"{strokes} must have 3 channels with a stroke_mask, or 4 channels without one, got {over.samples} "
@@ -134,20 +136,33 @@ def _transparency(over: Picture) -> ReadRows:
 
 def _plane(picture: Picture, mask: RowSource, name: str) -> ReadRows:
     """Read the rows (h, W) of a mask."""
-    over = _overlay(picture, mask, name)
+    over = overlay(picture, mask, name)
     if over.samples != 1:
         raise ValueError(f"{name} must have 1 channel, got {over.samples}; select one")
     return lambda start, stop: over.tile(start, stop, 0).pixels[0, 0]
 
 
-def _overlay(picture: Picture, rows: RowSource, name: str) -> Picture:
-    """Wrap a source of rows, which must have the size of a picture."""
+def overlay(picture: Picture, rows: RowSource, name: str, *, channels: int | None = None) -> Picture:
+    """Wrap a source of rows, which must have the size of a picture; ``channels`` as for :class:`Picture`."""
     if tuple(rows.shape[:2]) != picture.size:
         raise ValueError(
             f"{name} must have the height and width of {picture.name}, {picture.size[0]}x{picture.size[1]}, got "
             f"{'x'.join(map(str, rows.shape[:2]))}; resize one"
         )
-    return Picture(rows, name, hides=False)
+    return Picture(rows, name, channels=channels, hides=False)
+
+
+@dataclass(frozen=True, eq=False)
+class WeightRows:
+    """Weights (1, K, h, w) of given pixels in rows (H, W, K) over a picture."""
+
+    rows: Picture
+
+    def __call__(self, pixels: Pixels) -> Tensor:
+        """The weights of some pixels."""
+        (top, left), (height, width) = corner(pixels), pixels.image.shape[-2:]
+        planes = self.rows.tile(top, top + height, 0).pixels[..., left : left + width]
+        return planes.to(pixels.image).clamp(0.0, 1.0)
 
 
 def floats_per_scribbled_pixel(num_features: int) -> int:

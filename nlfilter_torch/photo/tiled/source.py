@@ -35,8 +35,10 @@ from nlfilter_torch.photo.tiled.operator import TiledOperator, TilePixels
 from nlfilter_torch.photo.tiled.pictures import Picture, Rows, RowSource, Stored, Tile
 from nlfilter_torch.photo.tiled.sampling import ColumnCache, GuidePicture, take_pilot, visit
 from nlfilter_torch.photo.tiled.scribbles import (
+    WeightRows,
     check_scribble_memory,
     floats_per_scribbled_pixel,
+    overlay,
     read_scribbles,
     region_rows,
 )
@@ -263,6 +265,10 @@ class Tiled:
         if len(masks.shape) == 2:
             return [self.scribbles(masks, None, name, needed=needed)]
         return [self.scribbles(region_rows(masks, k), None, name, needed=needed) for k in range(masks.shape[2])]
+
+    def weights_of(self, masks: RowSource, name: str) -> WeightRows:
+        """Weights of given pixels in masks, rows (H, W) or (H, W, K); values are limited to [0, 1]."""
+        return WeightRows(overlay(self.picture, masks, name, channels=self.num_regions(masks, name)))
 
     def num_regions(self, masks: RowSource, name: str) -> int:
         """K, of rows (H, W, K), or 1 for rows (H, W)."""
