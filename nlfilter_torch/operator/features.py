@@ -32,6 +32,7 @@ from nlfilter_torch.operator.assignment import Layout
 from nlfilter_torch.operator.hidden import fill_hidden
 from nlfilter_torch.operator.options import GuideChannels, SpatialBandwidth, bandwidths_of
 
+LUMINANCE = (0.299, 0.587, 0.114)  # shares of red, green and blue
 FAINT_WEIGHT = 1e-12  # in place of patch weights of 0
 
 
@@ -78,9 +79,8 @@ def unit_window(patch_size: int, patch_weights: Tensor | None, axes: int = 2) ->
 def reduce_channels(guide: Tensor, guide_channels: GuideChannels) -> Tensor:
     """Reduce three channels to luminance (B, 1, ...) unless ``guide_channels`` is ``"all"``; keep other guides."""
     if guide_channels == "luminance" and guide.shape[1] == 3:
-        from kornia.color import rgb_to_grayscale  # importing kornia takes half a second
-
-        return rgb_to_grayscale(guide.flatten(3)).unflatten(3, guide.shape[3:])
+        red, green, blue = (guide[:, channel : channel + 1] for channel in range(3))
+        return (LUMINANCE[0] * red).add(green, alpha=LUMINANCE[1]).add(blue, alpha=LUMINANCE[2])
     return guide
 
 

@@ -132,7 +132,8 @@ def plot_response(alpha: Tensor, spectrum: Spectrum) -> Figure:
 def save_figure(figure: Figure, path: str | Path) -> None:
     """Write a figure as PNG; the file appears complete or not at all."""
     with open_beside(path) as stream:
-        figure.savefig(stream, format="png")
+        # The usual compression takes as long as drawing, for files that are a fifth smaller.
+        figure.savefig(stream, format="png", pil_kwargs={"compress_level": 2})
 
 
 def _plot() -> tuple[Figure, Axes]:

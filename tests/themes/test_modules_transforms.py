@@ -85,7 +85,10 @@ def test_the_whole_layer_compiles_as_one_graph() -> None:
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.*autograd.function.Function.* should not be instantiated:DeprecationWarning")
 def test_a_compiled_layer_takes_other_sizes_without_compiling_again() -> None:
-    layer = NonlocalFilter(ALPHA, photometric_bandwidth=0.2, num_landmarks=20, learn=("photometric_bandwidth",))
+    # Two sliders and small patches, since tracing with symbolic sizes takes time in proportion to the operations.
+    layer = NonlocalFilter(
+        (2.0, 1.0), photometric_bandwidth=0.2, num_landmarks=20, patch_size=3, learn=("photometric_bandwidth",)
+    )
     torch.compiler.reset()
     fast = torch.compile(layer, backend="aot_eager", fullgraph=True, dynamic=True)
     fast(noise(2, 3, 24, 32, dtype=torch.float32))
