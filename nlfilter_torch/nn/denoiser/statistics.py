@@ -21,8 +21,8 @@ NEARBY = 0.01  # weight of cells of other brightness, where those of the knot's 
 FALL = 0.2  # by which it falls from one knot to the next
 HARDLY = 1e-6  # weight of cells that do not count
 SAMPLED_COLOURS = 4096
-MIXTURE = (1.0, 3.14159, 9.8696)  # of the channels, which tells colours apart
-FEW_COLOURS = {1: 16, 3: 256}  # of the sampled pixels: those of a drawing, a scan in few greys or a dithered picture
+MIXTURE = 3.14159  # factor from channel to channel of a sum of them that tells colours apart
+FEW_GREYS, FEW_COLOURS = 16, 256  # of the sampled pixels: those of a drawing, a scan or a dithered picture
 
 
 def window_pixels(size: tuple[int, int]) -> Tensor:
@@ -70,11 +70,12 @@ def statistics_of(windows: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def has_few_colours(windows: Tensor) -> Tensor:
-    """Whether pixels of windows (n, 1 or 3, SIDE, SIDE) have so few colours that they were chosen from a palette."""
+    """Whether pixels of windows (n, C, SIDE, SIDE) have so few colours that they were chosen from a palette."""
     pixels = windows.transpose(0, 1).flatten(1)
     pixels = pixels[:, :: max(1, pixels.shape[1] // SAMPLED_COLOURS)]
-    mixed = (pixels.double() * pixels.new_tensor(MIXTURE[: len(pixels)]).double()[:, None]).sum(0).sort().values
-    return 1 + (mixed.diff() != 0).sum() <= FEW_COLOURS[len(pixels)]
+    factors = MIXTURE ** torch.arange(len(pixels), dtype=torch.float64, device=pixels.device)
+    mixed = (pixels.double() * factors[:, None]).sum(0).sort().values
+    return 1 + (mixed.diff() != 0).sum() <= (FEW_GREYS if len(pixels) == 1 else FEW_COLOURS)
 
 
 def _axis(length: int, count: int) -> Tensor:

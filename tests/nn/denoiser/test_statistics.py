@@ -80,3 +80,7 @@ def test_pictures_of_few_colours() -> None:
     indices = torch.randint(64, (200, 200), generator=torch.Generator().manual_seed(0))
     assert bool(has_few_colours(windows_of(palette[indices].permute(2, 0, 1)[None])))
     assert bool(has_few_colours(windows_of((noisy(1, 1, 200, 200) > 0.5).float())))
+    for channels in (2, 4):  # pictures may have any number
+        windows = noisy(9, channels, 48, 48)
+        assert not bool(has_few_colours(windows))
+        assert bool(has_few_colours(windows.round()))
