@@ -35,11 +35,25 @@ def soft_cover(stroke: Stroke, size: tuple[int, int], rows: slice | None = None)
 
     ``rows`` as in :func:`cover`.
     """
-    radius = _radius(stroke, size) + BORDER / 2
     covered = torch.zeros(_shape(size, rows))
-    for part, squared in _squared_distances(stroke, size, rows, radius):
-        covered[part] = covered[part].maximum(((radius - squared.sqrt()) / BORDER).clamp(0.0, 1.0))
+    place, shares = _soft_part(stroke, size, rows)
+    covered[place] = shares
     return covered
+
+
+def _soft_part(stroke: Stroke, size: tuple[int, int], rows: slice | None) -> tuple[tuple[slice, slice], Tensor]:
+    """The part of a picture that holds all of a stroke, and :func:`soft_cover` of it."""
+    radius = _radius(stroke, size) + BORDER / 2
+    lines = list(_squared_distances(stroke, size, rows, radius))
+    if not lines:
+        return (slice(0, 0), slice(0, 0)), torch.zeros(0, 0)
+    top, left = (min(part[axis].start for part, _ in lines) for axis in (0, 1))
+    bottom, right = (max(part[axis].stop for part, _ in lines) for axis in (0, 1))
+    covered = torch.zeros(bottom - top, right - left)
+    for (down, across), squared in lines:
+        near = covered[down.start - top : down.stop - top, across.start - left : across.stop - left]
+        near.copy_(near.maximum(((radius - squared.sqrt()) / BORDER).clamp(0.0, 1.0)))
+    return (slice(top, bottom), slice(left, right)), covered
 
 
 def _radius(stroke: Stroke, size: tuple[int, int]) -> float:
@@ -109,12 +123,13 @@ def painted_on_mask(strokes: Iterable[Stroke], word: str, size: tuple[int, int],
     shape = _shape(size, rows)
     planes = torch.zeros(4 if "colour" in word else 1, *shape)
     for stroke in strokes:
-        covered = soft_cover(stroke, size, rows)
-        planes[-1] *= 1 - covered
+        (down, across), covered = _soft_part(stroke, size, rows)
+        part = planes[:, down, across]
+        part[-1] *= 1 - covered
         if stroke.means(word):
-            planes[-1] += covered
+            part[-1] += covered
             if stroke.colour is not None:
-                planes[:3, covered > 0] = colour_of(stroke.colour).unsqueeze(1)
+                part[:3, covered > 0] = colour_of(stroke.colour).unsqueeze(1)
     return planes[None]
 
 
