@@ -155,12 +155,18 @@ def check_fits(
     check_same_size(image, expected, name, other, part)
 
 
-def check_same_size(tensor: Tensor, size: tuple[int, ...], name: str, other: str, part: Tensor | None = None) -> None:
-    """Raise unless the last dimensions of ``tensor`` are ``size``, and it is on the device of ``part`` if given."""
-    if part is not None and tensor.device != part.device:
+def check_same_device(tensor: Tensor, part: Tensor, name: str, other: str) -> None:
+    """Raise unless ``tensor`` is on the device of ``part``, a part of ``other``."""
+    if tensor.device != part.device:
         raise ValueError(
             f"{name} must be on the device of the {other}, {part.device}, got {tensor.device}; move one by .to()"
         )
+
+
+def check_same_size(tensor: Tensor, size: tuple[int, ...], name: str, other: str, part: Tensor | None = None) -> None:
+    """Raise unless the last dimensions of ``tensor`` are ``size``, and it is on the device of ``part`` if given."""
+    if part is not None:
+        check_same_device(tensor, part, name, other)
     actual = tuple(tensor.shape[-len(size) :])
     if actual != tuple(size):
         extent = {1: "number of points", 2: "height and width"}.get(len(size), "size")

@@ -284,7 +284,7 @@ def _read(before: Path, after: Path, step: "Step") -> "tuple[Tensor, Tensor]":
     from nlfilter_torch.photo.cli.editing import viewed_within_memory
     from nlfilter_torch.photo.io.photographs import read_photograph
     from nlfilter_torch.photo.look_fitting.alignment import align
-    from nlfilter_torch.photo.look_fitting.fit_look import check_belong
+    from nlfilter_torch.photo.look_fitting.pairs import check_belong
 
     images = [read_photograph(path, bytes_per_pixel=PAIR_BYTES).pixels for path in (before, after)]
     viewed_within_memory(before, (images[0].shape[2], images[0].shape[3]), step)

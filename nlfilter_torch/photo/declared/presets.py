@@ -22,6 +22,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from nlfilter_torch.core.warning import warn
 from nlfilter_torch.photo.declared.colour_tables import step_of_cube, step_of_hald
 from nlfilter_torch.photo.declared.development import AS_IT_IS, Development
 from nlfilter_torch.photo.declared.json_values import Value, parse_json, shown
@@ -33,7 +34,8 @@ if TYPE_CHECKING:
     from nlfilter_torch.photo.declared.colour_tables import Values
 
 ORDER = tuple(EDITS)  # order in which the editor adds steps
-PICTURES = (b"\x89PNG", b"II*\0", b"MM\0*", b"\xff\xd8\xff")  # how files of pictures start
+JPEG = b"\xff\xd8\xff"
+PICTURES = (b"\x89PNG", b"II*\0", b"MM\0*", JPEG)  # how files of pictures start
 OTHER_PICTURES = (b"BM", b"RIFF", b"GIF8", b"P6", b"\0\0\0")  # of kinds that are not read here
 MARKS = ((b"\xff\xfe", "utf-16"), (b"\xfe\xff", "utf-16"), (b"", "utf-8-sig"))  # how files of text start
 DEVELOPING_BYTES = 32  # per pixel: two copies in colour with transparency
@@ -198,7 +200,10 @@ class Recipe:
             encoding = next(encoding for mark, encoding in MARKS if content.startswith(mark))
             return Recipe((step_of_cube(content.decode(encoding, "replace"), name),))
         if content.startswith(PICTURES):
-            return Recipe((step_of_hald(_decoded(content, name), name),))
+            step = step_of_hald(_decoded(content, name), name)
+            if content.startswith(JPEG):
+                warn(f"{name} is a Hald in a JPEG file, whose compression shifts the colours; save it as PNG")
+            return Recipe((step,))
         if content.startswith(OTHER_PICTURES):
             raise ValueError(
                 f"{name} must be a preset, a .cube file or a Hald, got a file of another kind; save a Hald as PNG"

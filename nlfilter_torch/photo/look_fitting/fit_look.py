@@ -1,22 +1,20 @@
 """Looks from pairs of photographs before and after an edit."""
 
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import reduce
 
 import torch
 from torch import Tensor
 
-from nlfilter_torch.core.checks import check_image, check_order, check_photograph, check_same_size
+from nlfilter_torch.core.checks import check_order
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.filtering.fit import fit_layers
 from nlfilter_torch.nn.parameters import check_learn
-from nlfilter_torch.operator.features import reduce_channels
 from nlfilter_torch.photo.declared.shared_parameters import KNOTS, SATURATIONS, STRAIGHT
 from nlfilter_torch.photo.declared.steps import Step, json_of
 from nlfilter_torch.photo.edits.applying import apply_step
-from nlfilter_torch.photo.look_fitting.alignment import inside_frame
-from nlfilter_torch.photo.look_fitting.kept_pixels import KEPT, KeptPixels, is_of_colours, squares
+from nlfilter_torch.photo.look_fitting.kept_pixels import KEPT, KeptPixels, LookWithLattice, is_of_colours, squares
 from nlfilter_torch.photo.look_fitting.look_choice import (
     CHOICES,
     RIDGES,
@@ -28,17 +26,16 @@ from nlfilter_torch.photo.look_fitting.look_choice import (
     simplest,
 )
 from nlfilter_torch.photo.look_fitting.look_pixels import EditedPhotograph, PixelSample
-from nlfilter_torch.photo.look_fitting.look_sums import MOST, SHADES, Layout, Parts, Sums, means_of_shades
+from nlfilter_torch.photo.look_fitting.look_sums import MOST, Layout, Parts, Sums
+from nlfilter_torch.photo.look_fitting.pairs import Pair, images_of
 from nlfilter_torch.photo.looks.lattice import lattice_of
 from nlfilter_torch.photo.looks.look_filter import NAMES
 
-Pair = tuple[Tensor, ...]  # before and after an edit, and masks of regions, if any
 SLIDERS: Parts = ("alpha",)  # of looks that are steps of detail
 FOLDS = 5  # of cross-validation, among which the pairs are divided
 STIFF, STIFF_ALONE = 3e-3, 1e-2  # smallest ridge of tone curves and saturation, for several pairs and for one
 SLIDERS_ONLY = 0.98  # share of the change from which on an edit counts as one by sliders alone
 LIKELY = 0.95  # share that the layers of a sample of the pixels explain of such an edit
-ALIKE = 0.5  # least correlation of the luminance of a photograph with that of its edit
 KINDS_OF_CURVES = {"tone": "curves"}  # a tone curve for all channels is a part of this name
 
 
@@ -119,8 +116,8 @@ def fit_look(
         The look, or with masks one for each region.
 
     Raises:
-        TypeError, ValueError: if there is no pair, or the pictures of one do not belong together, are the same, or are
-            black or white all over after the edit.
+        TypeError, ValueError: if there is no pair, or the pictures of one do not belong together, are the same, are
+            black or white all over after the edit, or are on several devices.
 
     Example:
         >>> before = torch.rand(1, 3, 32, 32, generator=torch.Generator().manual_seed(0))
@@ -205,7 +202,7 @@ class _Region:
         else:
             self.folds[fold] = self.folds[fold] + whole
         if self.kept is not None:
-            self.kept.add_pair(pixels, colours, fold, width)
+            self.kept.add(pixels, colours, fold, width)
         self._add_sliders(pixels, whole, rounding)
 
     def _add_sliders(self, pixels: PixelSample, sums: Sums, rounding: float) -> None:
@@ -227,28 +224,36 @@ class _Region:
 
     def look(self, step: Step, choices: Sequence[Parts]) -> FittedLook:
         """The look, of one of these choices of parts."""
-        if len(self.folds) == 1 and self.squares:
-            best, candidates = choose_from_one(self.squares, self.layout, choices, STIFF_ALONE)
-        else:
-            candidates = choose(self.folds, self.layout, choices, STIFF)
-            best = simplest(candidates)
+        best, candidates = self._chosen(choices)
         explained = {parts: (look.fitted, look.left_out) for parts, look in candidates.items()}
+        more = self._with_lattice(candidates)
+        if more is None:
+            added = self._added(best)
+            return FittedLook(self._step(best, step), best.parts, best.fitted, best.left_out, explained, added)
+        basis = more.basis
+        parts = (*basis.parts, "lattice")
+        explained[parts] = more.fitted, more.left_out
+        changed = self._step(replace(basis, parts=parts, coefficients=more.coefficients), step, more.lattice)
+        added = self._added(basis) | {"lattice": (more.fitted - basis.fitted, more.left_out - basis.left_out)}
+        return FittedLook(changed, parts, more.fitted, more.left_out, explained, added)
+
+    def _chosen(self, choices: Sequence[Parts]) -> tuple[Candidate, dict[Parts, Candidate]]:
+        """The look without a lattice that suits the pairs best, and all that were tried."""
+        if len(self.folds) == 1 and self.squares:
+            return choose_from_one(self.squares, self.layout, choices, STIFF_ALONE)
+        candidates = choose(self.folds, self.layout, choices, STIFF)
+        return simplest(candidates), candidates
+
+    def _with_lattice(self, candidates: dict[Parts, Candidate]) -> LookWithLattice | None:
+        """A look with a lattice for what one of the candidates leaves; None if that explains hardly more."""
         groups = self.folds if len(self.folds) > 1 else self.squares
-        if self.kept is not None and groups:
-            bases = [simplest(candidates)]
-            if not is_of_colours(bases[0].parts):
-                plain = {parts: look for parts, look in candidates.items() if is_of_colours(parts)}
-                bases += [simplest(plain)] if plain else []
-            more = self.kept.lattice(bases, groups, self.layout)
-            if more is not None:
-                basis = more.basis
-                parts = (*basis.parts, "lattice")
-                explained[parts] = more.fitted, more.left_out
-                changed = self._step(replace(basis, parts=parts, coefficients=more.coefficients), step, more.lattice)
-                added = self._added(basis)
-                added["lattice"] = more.fitted - basis.fitted, more.left_out - basis.left_out
-                return FittedLook(changed, parts, more.fitted, more.left_out, explained, added)
-        return FittedLook(self._step(best, step), best.parts, best.fitted, best.left_out, explained, self._added(best))
+        if self.kept is None or not groups:
+            return None
+        bases = [simplest(candidates)]
+        if not is_of_colours(bases[0].parts):
+            plain = {parts: look for parts, look in candidates.items() if is_of_colours(parts)}
+            bases += [simplest(plain)] if plain else []
+        return self.kept.lattice(bases, groups, self.layout)
 
     def _added(self, look: Candidate) -> dict[str, tuple[float, float]]:
         """What each part adds to the shares that a look explains."""
@@ -301,68 +306,6 @@ FILTER_NAMES = ("bandwidth", "spatial_bandwidth", "patch_size", "landmarks", "sa
 
 def _rounded(values: Tensor) -> tuple[float, ...]:
     return tuple(values.double().round(decimals=6).tolist())
-
-
-def images_of(pairs: Iterable[Pair]) -> Iterator[tuple[Tensor, Tensor, Tensor | None]]:
-    """Each image of the pairs, in colour: (3, H, W) before and after the edit, and masks (K, H, W)."""
-    number = 0
-    for pair in pairs:
-        _check_pair(pair, number)
-        before, after = pair[:2]
-        masks = pair[2] if len(pair) == 3 else None
-        names = _names(number)
-        for i in range(before.shape[0]):
-            image, edited = before[i].expand(3, -1, -1), after[i % after.shape[0]].expand(3, -1, -1)
-            check_belong(image, edited, *names)
-            yield image, edited, None if masks is None else masks[i % masks.shape[0]]
-            number += 1
-
-
-def _names(number: int) -> tuple[str, str]:
-    """Names in errors of the two photographs of a pair."""
-    return f"before of pair {number + 1}", f"after of pair {number + 1}"
-
-
-def _check_pair(pair: Pair, number: int) -> None:
-    """Raise unless a pair holds two photographs of the same shape, and masks of their size, if any."""
-    if not isinstance(pair, tuple | list) or len(pair) not in (2, 3):
-        raise TypeError(
-            f"pairs must hold tuples of two photographs, or these and masks, got {type(pair).__name__}; "
-            "pass [(before, after)]"
-        )
-    before, after, *masks = pair
-    names = _names(number)
-    check_photograph(before, names[0])
-    check_photograph(after, names[1], channels=before.shape[1], batch=before.shape[0])
-    check_same_size(after, (before.shape[-2], before.shape[-1]), names[1], names[0])
-    if before.shape[1] not in (1, 3):
-        raise ValueError(f"{names[0]} must have 1 or 3 channels, got {before.shape[1]}; pass grey or RGB")
-    for mask in masks:
-        if mask is not None:
-            check_image(mask, "masks", batch=before.shape[0])
-            check_same_size(mask, (before.shape[-2], before.shape[-1]), "masks", names[0])
-
-
-def check_belong(before: Tensor, after: Tensor, first: str, second: str) -> None:
-    """Raise unless an image (3, H, W) can be an edit of another one.
-
-    Edits keep most of what is dark and light, or at least (negatives, false colours) most of what luminance says: its
-    correlation with the means of the edited luminance of every shade, and the other way round.
-    """
-    if bool((before == after).all()):
-        return  # says that the look leaves it as it is
-    shown = inside_frame(before, after) & ((after > 0) & (after < 1)).any(0)
-    if not bool(shown.any()):
-        raise ValueError(f"{second} must have pixels that are not clipped to black or white, got none; edit it less")
-    grey, edited = (reduce_channels(image[None], "luminance")[0, 0, shown].double() for image in (before, after))
-    if min(float(grey.std(correction=0)), float(edited.std(correction=0))) < 1 / 255:
-        return  # nothing to compare
-    shared = float(((means_of_shades(grey, edited) - edited.mean()).square().mean() / edited.var(correction=0)).sqrt())
-    if len(grey) >= 4 * SHADES and shared < ALIKE:
-        raise ValueError(
-            f"{second} must be an edit of {first}, but their brightness agrees only to {100 * shared:.0f} % "
-            f"(at least {100 * ALIKE:.0f} % is needed); check that they show the same picture"
-        )
 
 
 def _add(regions: list[_Region], number: int, photograph: EditedPhotograph) -> None:

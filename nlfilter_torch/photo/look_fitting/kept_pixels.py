@@ -125,18 +125,20 @@ class ThinnedPixels:
 
 
 @dataclass
-class KeptPixels(ThinnedPixels):
+class KeptPixels:
     """Pixels of all pairs that the lattice of a look is fitted to.
 
     Attributes:
+        sample: pixels with columns.
         colours: more pixels of the same pairs, without columns, for details of the lattice; or none.
     """
 
+    sample: ThinnedPixels = field(default_factory=ThinnedPixels)
     colours: ThinnedPixels = field(default_factory=ThinnedPixels)
 
-    def add_pair(self, pixels: PixelSample, colours: PixelSample | None, fold: int, width: int) -> None:
+    def add(self, pixels: PixelSample, colours: PixelSample | None, fold: int, width: int) -> None:
         """Add the pixels of a pair in a fold, of a picture of that width, and if there are, more without columns."""
-        self.add(pixels, fold, width)
+        self.sample.add(pixels, fold, width)
         self.colours.add(pixels if colours is None else colours, fold, width)
 
     def lattice(self, bases: Sequence[Candidate], folds: Sequence[Sums], layout: Layout) -> LookWithLattice | None:
@@ -149,8 +151,8 @@ class KeptPixels(ThinnedPixels):
             folds: the sums that they were chosen from, of pairs or, for a single one, of its squares.
             layout: of the columns.
         """
-        alone = len({fold for _, fold, _ in self.samples}) == 1
-        group = self._groups(self)
+        alone = len({fold for _, fold, _ in self.sample.samples}) == 1
+        group = self._groups(self.sample)
         if int(group.max()) == 0:
             return None
         groups = [latin(i) if alone else i for i in range(len(folds))]
@@ -173,11 +175,11 @@ class KeptPixels(ThinnedPixels):
         """The lattice for what a look leaves of the pixels in groups (P,), to which the folds belong."""
         others = [[sums for sums, own in folds if own != left] for left in (*range(int(group.max()) + 1), -1)]
         looks = [basis.fitted_to(reduce(Sums.__add__, sums), layout) for sums in others]
-        plain = self.change(self._predicted(looks, layout), group)
+        plain = self.sample.change(self._predicted(looks, layout), group)
         hues = fit_hues(plain)
         colours = more = plain.followed_by(hues)
         lattice = fit_lattice(colours)
-        if is_of_colours(basis.parts) and len(self.colours) > len(self):
+        if is_of_colours(basis.parts) and len(self.colours) > len(self.sample):
             more = self.colours.change([], self._groups(self.colours))
             more = replace(more, predicted=[coloured(more.before, look, layout) for look in (looks[0], looks[-1])])
             more = more.followed_by([hues[0], hues[-1]])
@@ -188,9 +190,9 @@ class KeptPixels(ThinnedPixels):
 
     def _groups(self, pixels: ThinnedPixels) -> Tensor:
         """The groups (P,) of pixels that are left out at once: those of a pair, or of squares of a single one."""
-        if len({fold for _, fold, _ in self.samples}) > 1:
-            return torch.searchsorted(self.fold.unique(), pixels.fold)
-        values = self.square.unique()
+        if len({fold for _, fold, _ in self.sample.samples}) > 1:
+            return torch.searchsorted(self.sample.fold.unique(), pixels.fold)
+        values = self.sample.square.unique()
         return latin(torch.searchsorted(values, pixels.square).clamp(max=len(values) - 1))
 
     def _agree(self, colours: ColourChange) -> bool:
@@ -198,7 +200,7 @@ class KeptPixels(ThinnedPixels):
 
         Colours of one pair that no other has say nothing when pairs are left out.
         """
-        square = latin(self.square.unique(return_inverse=True)[1])
+        square = latin(self.sample.square.unique(return_inverse=True)[1])
         parts = replace(colours, predicted=colours.predicted[-1:] * (int(square.max()) + 2), folds=square)
         lattice = refined(parts, fit_lattice(parts))
         return 1 - lattice.without > WITHIN * (1 - lattice.left_out)
@@ -207,7 +209,7 @@ class KeptPixels(ThinnedPixels):
         """The pixels under looks with coefficients (3, F), (3, P) each."""
         coefficients = torch.stack(list(looks))
         parts = []
-        for pixels, _, _ in self.samples:
+        for pixels, _, _ in self.sample.samples:
             for start in range(0, len(pixels.places), BATCH):
                 inside = slice(start, start + BATCH)
                 weighed = {name: columns[..., inside] for name, columns in pixels.weighed.items()}

@@ -19,9 +19,10 @@ from nlfilter_torch.photo.declared.json_values import Value
 from nlfilter_torch.photo.declared.presets import PRESETS, Recipe
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.edits.applying import apply_recipe
-from nlfilter_torch.photo.look_fitting.fit_look import FILTER_NAMES, Pair, images_of
+from nlfilter_torch.photo.look_fitting.fit_look import FILTER_NAMES
 from nlfilter_torch.photo.look_fitting.own_chains import Chain, is_exact
 from nlfilter_torch.photo.look_fitting.own_edits import Ingredients, Key, OwnDetail, OwnEdit, OwnSharpen, OwnTone
+from nlfilter_torch.photo.look_fitting.pairs import Pair, images_of
 from nlfilter_torch.photo.look_fitting.parameter_fit import Minimum, minimize, rounded
 from nlfilter_torch.photo.look_fitting.viewed_pair import ViewedPair
 from nlfilter_torch.photo.picture.in_memory import InMemory
@@ -88,7 +89,7 @@ def fit_steps(pairs: Iterable[Pair], *, order: int = 3, step: Step | None = None
     result over 32,768 pixels of each pair at the viewing size.
 
     Args:
-        pairs: as for :func:`fit_look`, without masks. The first three photographs are looked at.
+        pairs: as for :func:`fit_look`, without masks. The first three photographs that the edit changes are looked at.
         order: k; k + 1 sliders of ``detail``.
         step: ``look`` with the parameters of the filter of ``detail`` and ``tone``; None has the defaults.
 
@@ -111,7 +112,7 @@ def fit_steps(pairs: Iterable[Pair], *, order: int = 3, step: Step | None = None
         if masks is not None:
             raise ValueError("pairs must hold no masks for fit_steps, got some; pass (before, after)")
         search.add(before, after)
-    if not search.pairs:
+    if not search.shown:
         raise ValueError("pairs must hold a pair of photographs, got none; pass (before, after)")
     return search.fitted()
 
@@ -178,6 +179,7 @@ class StepSearch:
         names = [name for name in FILTER_NAMES if name != "viewing_size"]
         self.filter = tuple((name, step[name]) for name in names if step[name] != step.declared[name].default)
         self.pairs: list[ViewedPair] = []
+        self.shown = 0  # photographs, unchanged ones included
         self.candidates: list[Candidate] = []
         self._rough: list[Candidate] = []
         self._whole: dict[Key, list[Ingredients]] = {}  # of all pixels
@@ -186,9 +188,14 @@ class StepSearch:
         self._started = self._refined = False
 
     def add(self, before: Tensor, after: Tensor) -> None:
-        """Add a photograph (C, H, W) before and after the edit, unless there are enough of them."""
+        """Add a photograph (C, H, W) before and after the edit, unless there are enough of them.
+
+        One that is left as it is, such as an original among edited ones by mistake, says nothing of the steps.
+        """
+        self.shown += 1
         if len(self.pairs) < MOST_PAIRS:
-            self.pairs.append(ViewedPair(before, after, self.viewing_size, len(self.pairs)))
+            pair = ViewedPair(before, after, self.viewing_size, len(self.pairs))
+            self.pairs += [pair] if pair.is_changed() else []
 
     def watching(self, pairs: Iterable[tuple[Tensor, ...]]) -> Iterator[tuple[Tensor, ...]]:
         """Yield pairs, (B, C, H, W) each, that are added on the way."""
@@ -202,7 +209,7 @@ class StepSearch:
         """About the share of the change that steps explain, from a look at a sample of the pixels."""
         if not self._started:
             self._started = True
-            if all(pair.is_of_brightness() for pair in self.pairs):
+            if self.pairs and all(pair.is_of_brightness() for pair in self.pairs):
                 self._look_around()
         best = self._best()
         single = 0.0 if best is None else best.left_out

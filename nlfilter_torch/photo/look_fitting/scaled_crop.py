@@ -30,8 +30,7 @@ def scaled_crop(whole: Tensor, part: Tensor) -> tuple[int, int, int, int] | None
     place = _first_place(whole, part, largest)
     if place is None:
         return None
-    sides = [side for side in (FIRST_SIDE, LAST_SIDE) if side < 2 * min(whole.shape)]
-    for side in sides:
+    for side in (FIRST_SIDE, LAST_SIDE) if 2 * min(whole.shape) > LAST_SIDE else (FIRST_SIDE,):
         place = _refined(whole, part, place, min(1.0, side / min(whole.shape)))
     middle_row, middle_column, pixel = place
     height, width = part.shape[0] * pixel, part.shape[1] * pixel

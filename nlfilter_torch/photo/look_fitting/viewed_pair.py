@@ -16,6 +16,7 @@ from nlfilter_torch.photo.picture.viewing import viewed_size
 # An edit of brightness moves colours along grey, and their chroma in proportion. Shares of a change that must be so,
 # and along grey; noise of compression is not.
 ALONG_BOTH, ALONG_GREY = 0.6, 0.5
+ROUNDING = 0.51 / 255  # of files of 8 bits
 CURVE = 0.996  # share that a function of brightness explains from which on an edit counts as a tone curve
 
 
@@ -67,6 +68,10 @@ class ViewedPair:
     def change(self) -> Tensor:
         """The weighted change (C P,)."""
         return ((self.before - self.after) * self.weights).flatten()
+
+    def is_changed(self) -> bool:
+        """Whether a pixel differs by more than the rounding of a file of 8 bits."""
+        return bool(((self.before - self.after).abs() > ROUNDING).any())
 
     def groups(self, alone: bool) -> Tensor:
         """What is left out together, (C P,): the pair or, if it is the only one, a third of its squares."""

@@ -108,5 +108,11 @@ def test_files_are_recipes(tmp_path: Path) -> None:
     assert float((first - CAT**1.5).abs().max()) < 0.5 / 255 * 3
     with pytest.raises(ValueError, match="must be a Hald"):
         find_recipe(str(grey))
+    lossy = tmp_path / "d.jpg"
+    lossy.write_bytes(imagecodecs.jpeg_encode((hald_of(table) >> 8).astype(np.uint8), level=95))
+    with pytest.warns(UserWarning, match=r"d\.jpg is a Hald in a JPEG file, .*; save it as PNG") as told:
+        recipes = [find_recipe(str(lossy)) for _ in range(2)]
+    assert len(told) == 1
+    assert 1 / 255 < float((apply_step(recipes[0].steps[0], CAT) - first).abs().mean()) < 10 / 255
     with pytest.raises(ValueError, match="must be a Hald, got a picture that cannot be read"):
         Recipe.from_file(b"\x89PNG and nothing", "it.png")

@@ -184,24 +184,6 @@ def test_more_parameters_than_pixels_are_told_by_what_is_left_out() -> None:
     assert all(abs(value) < 1e3 for value in look.tensors["alpha"].tolist())
 
 
-@pytest.mark.parametrize(
-    ("pairs", "message"),
-    [
-        ([], "pairs must hold a pair"),
-        ([(CAT, CAT)], "each is the same before and after"),
-        ([(CAT, torch.zeros_like(CAT))], "not clipped to black or white"),
-        ([(CAT, CUP.flip(2, 3))], "must be an edit of before of pair 1"),
-        ([(CAT, CAT[..., :50])], "after of pair 1"),
-        ([CAT], "pairs must hold tuples"),
-        ([(CAT, CAT**0.5, torch.zeros_like(CAT))], "masks must hold a pixel"),
-    ],
-)
-def test_bad_pairs_are_refused_in_a_sentence(pairs: list[object], message: str) -> None:
-    with pytest.raises((ValueError, TypeError), match=message) as error:
-        fit_look(pairs, step=FEW)  # type: ignore[arg-type]
-    assert "\n" not in str(error.value)
-
-
 def test_files_keep_looks(tmp_path: Path) -> None:
     look = single_look(fit_look([(CAT, in_bytes(CAT**0.6))], step=FEW))
     text = look.to_json()

@@ -12,6 +12,7 @@ from nlfilter_torch.photo.look_fitting.kept_pixels import (
     COLOURS,
     KEPT,
     KeptPixels,
+    ThinnedPixels,
     coloured,
     is_of_colours,
     nondecreasing,
@@ -90,7 +91,7 @@ def test_the_nearest_values_that_do_not_fall() -> None:
 
 
 def test_never_more_pixels_than_enough_are_kept(monkeypatch: pytest.MonkeyPatch) -> None:
-    kept = KeptPixels()
+    kept = ThinnedPixels()
     assert KEPT >= 1 << 16
     monkeypatch.setattr("nlfilter_torch.photo.look_fitting.kept_pixels.KEPT", 15_000)
     for number, image in enumerate((CAT, CUP, SUIT, CAT, CUP)):
@@ -106,16 +107,16 @@ def test_never_more_pixels_than_enough_are_kept(monkeypatch: pytest.MonkeyPatch)
 def test_details_have_more_pixels_under_the_same_look() -> None:
     photograph = EditedPhotograph(CUP[0], by_hue(CUP)[0], None, FEW, 3, None)
     kept, layout = KeptPixels(), Layout(17, 5, 4)
-    kept.add_pair(photograph.regions()[0].every(4), photograph.colours(5000)[0], 0, photograph.size[1])
-    assert (len(kept), len(kept.colours)) == (2000, 5000)
-    weights = [sum(float(pixels.shown.sum()) for pixels, _, _ in part.samples) for part in (kept, kept.colours)]
+    kept.add(photograph.regions()[0].every(4), photograph.colours(5000)[0], 0, photograph.size[1])
+    assert (len(kept.sample), len(kept.colours)) == (2000, 5000)
+    weights = [sum(float(pixels.shown.sum()) for pixels, _, _ in part.samples) for part in (kept.sample, kept.colours)]
     assert weights[0] == pytest.approx(weights[1], rel=0.01)
     coefficients = torch.randn(3, layout.columns, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     coefficients[:, layout.place("saturation")] = coefficients[:1, layout.place("saturation")]  # for all channels
     others = [layout.place(name) for name in layout.lengths if name not in COLOURS]
     for place in others:
         coefficients[:, place] = 0
-    (pixels, _, _) = kept.samples[0]
+    (pixels, _, _) = kept.sample.samples[0]
     change = torch.einsum("cf,cfp->cp", coefficients, columns_of(pixels.before, pixels.weighed, layout))
     shown = coloured(pixels.before.double(), coefficients, layout)
     torch.testing.assert_close(shown, pixels.before + change)

@@ -36,3 +36,14 @@ def test_pictures_without_anything_to_compare() -> None:
     top, left, height, width = place
     assert 0 <= top < top + height <= 40
     assert 0 <= left < left + width <= 50
+
+
+@pytest.mark.parametrize("side", [40, 60, 61])
+def test_parts_of_small_pictures_are_found_to_a_pixel(side: int) -> None:
+    small = resize(GREY[None, None], (side, round(1.25 * side)))[0, 0].clamp(0, 1)
+    row, column, height, width = round(0.1 * side), round(0.3 * side), round(0.63 * side), round(0.69 * side)
+    part = small[row : row + height, column : column + width] ** 0.6
+    for size in ((height, width), (2 * height, 2 * width)):
+        place = scaled_crop(small, resize(part[None, None], size)[0, 0])
+        assert place is not None
+        assert max(abs(got - wanted) for got, wanted in zip(place, (row, column, height, width), strict=True)) <= 1
