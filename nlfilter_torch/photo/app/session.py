@@ -243,10 +243,10 @@ class Session:
 
     def commit(self) -> None:
         """Complete a change, so that it can be undone."""
-        if self.recipe != self._shown:
-            self._past = [*self._past[-UNDOS + 1 :], self._shown]
+        before, self._shown = self._shown, self.recipe  # also if only another step was chosen
+        if self.recipe != before:
+            self._past = [*self._past[-UNDOS + 1 :], before]
             self._future = []
-            self._shown = self.recipe
             self._keep()
 
     def _keep(self) -> None:

@@ -115,7 +115,12 @@ def test_the_last_step_of_an_edit_is_the_one_at_work(session: Session) -> None:
     session.set("tone", contrast=0.9)
     assert [step["contrast"] for step in session.recipe.steps if step.edit == "tone"] == [1.2, 0.9]
     session.recipe = session.recipe.choosing(1)
+    session.commit()
     session.set("tone", contrast=0.7)
+    session.commit()
+    assert session.undo()
+    assert session.recipe.current("tone") == Step("tone")
+    session.redo()
     session.set("denoise", noise_level=5.0)
     session.set("tone", clarity=1.5)
     assert [(step["contrast"], step["clarity"]) for step in session.recipe.steps if step.edit == "tone"] == [
