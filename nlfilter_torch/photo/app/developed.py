@@ -9,7 +9,7 @@ from nlfilter_torch.photo.app.preview import Preview
 from nlfilter_torch.photo.declared.development import AS_IT_IS, Development, Frame
 from nlfilter_torch.photo.declared.presets import DEVELOPING_BYTES
 from nlfilter_torch.photo.declared.strokes import Stroke
-from nlfilter_torch.photo.io.developed import develop_photograph
+from nlfilter_torch.photo.io.developed import cut_photograph, lit_photograph
 from nlfilter_torch.photo.io.photographs import Photograph, check_memory
 from nlfilter_torch.photo.picture.developing import develop_image, in_light, limits_of, turned_canvas
 from nlfilter_torch.photo.picture.resizing import resize
@@ -26,8 +26,8 @@ class Developed:
         development: how.
         frame: where it lies in the original.
         photograph: its pixels.
-        cut: its pixels (1, C, H, W) in the light of the original, with which the edit is compared.
-        before: these, reduced to the size of the preview.
+        cut: it in the light of the original, with which the edit is compared.
+        before: the pixels of that, reduced to the size of the preview.
         preview: its preview.
         parts: parts of it at full size.
     """
@@ -35,28 +35,35 @@ class Developed:
     development: Development
     frame: Frame
     photograph: Photograph
-    cut: Tensor
+    cut: Photograph
     before: Tensor
     preview: Preview
     parts: Parts
 
     @staticmethod
-    def of(photograph: Photograph, name: str, pixels: int, development: Development = AS_IT_IS) -> "Developed":
-        """Develop a photograph, whose file is called ``name``; its preview has at most so many pixels.
+    def of(photograph: Photograph, name: str, pixels: int) -> "Developed":
+        """A photograph as it is, whose file is called ``name``; its preview has at most so many pixels."""
+        preview = Preview(photograph.pixels, pixels)
+        frame, parts = AS_IT_IS.frame(photograph.size), parts_of(photograph, name)
+        return Developed(AS_IT_IS, frame, photograph, photograph, preview.pixels, preview, parts)
+
+    def changed(self, original: Photograph, name: str, pixels: int, development: Development) -> "Developed":
+        """The original photograph, developed in another way.
 
         Raises:
             ValueError: if the middle of the crop is outside.
             MemoryError: if there is no room for it.
         """
-        frame = development.frame(photograph.size)
-        if not development.is_idle:
-            check_memory(Path(name), photograph.size[1], photograph.size[0], DEVELOPING_BYTES)
-        edited = develop_photograph(photograph, development)
-        cut = edited if not development.changes_tones else develop_photograph(photograph, development.geometry)
+        frame = development.frame(original.size)
+        check_memory(Path(name), original.size[1], original.size[0], DEVELOPING_BYTES)
+        is_cut = development.geometry == self.geometry
+        cut = self.cut if is_cut else cut_photograph(original, development)
+        edited = lit_photograph(cut, development, limits_of(original.pixels))
         preview = Preview(edited.pixels, pixels)
-        parts = Parts(edited.pixels[0].permute(1, 2, 0).numpy(), name)
-        before = preview.pixels if cut is edited else resize(cut.pixels.float(), preview.size)
-        return Developed(development, frame, edited, cut.pixels, before, preview, parts)
+        before = (
+            self.before if is_cut else preview.pixels if cut is edited else resize(cut.pixels.float(), preview.size)
+        )
+        return Developed(development, frame, edited, cut, before, preview, parts_of(edited, name))
 
     @property
     def geometry(self) -> Development:
@@ -66,7 +73,7 @@ class Developed:
     def original(self, place: Rectangle) -> Tensor:
         """A part before the edit, (1, C, h, w) in [0, 1]."""
         rows, columns = place.rows, place.columns
-        return self.cut[..., rows.start : rows.stop, columns.start : columns.stop].clamp(0, 1)
+        return self.cut.pixels[..., rows.start : rows.stop, columns.start : columns.stop].clamp(0, 1)
 
     def inward(self, strokes: tuple[Stroke, ...]) -> tuple[Stroke, ...]:
         """Strokes in coordinates of the original, in those of the developed photograph."""
@@ -78,6 +85,11 @@ class Developed:
         if development.geometry == self.development.geometry:
             return in_light(self.before, development, limits)
         return develop_image(original.pixels, development)
+
+
+def parts_of(photograph: Photograph, name: str) -> Parts:
+    """The parts of a photograph, whose file is called ``name``."""
+    return Parts(photograph.pixels[0].permute(1, 2, 0).numpy(), name)
 
 
 def uncropped(pixels: Tensor, development: Development) -> Tensor:

@@ -193,7 +193,7 @@ class Session:
         opened, developed = self._opened_to("develop"), self.developed
         if developed.development == development:
             return developed
-        return Developed.of(opened.photograph, opened.name, self._pixels, development)
+        return developed.changed(opened.photograph, opened.name, self._pixels, development)
 
     def shown(self, edit: str) -> Step:
         """The last step of an edit, whose strokes are where they are in the developed photograph."""

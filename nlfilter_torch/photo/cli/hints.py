@@ -6,6 +6,7 @@ Does not import torch, so that errors in options appear at once.
 import re
 from collections.abc import Collection, Mapping, Sequence
 
+DEVELOPING = "nlfilter-torch develop has --exposure, --temperature, --tint, --straighten and --crop"
 #: What other programs call an option: our options, of which those of the command are named, or a sentence.
 OTHER_NAMES: Mapping[str, tuple[str, ...] | str] = {
     "--sigma": ("--noise-level", "--bandwidth", "--radius", "--tolerance"),
@@ -49,6 +50,15 @@ OTHER_NAMES: Mapping[str, tuple[str, ...] | str] = {
     "--input": "the photograph is the first argument: nlfilter-torch COMMAND IN OUT",
     "--overwrite": ("--force",),
     "--yes": ("--force",),
+    "--exposure": DEVELOPING,
+    "--brightness": DEVELOPING,
+    "--temperature": DEVELOPING,
+    "--tint": DEVELOPING,
+    "--wb": DEVELOPING,
+    "--white-balance": DEVELOPING,
+    "--straighten": DEVELOPING,
+    "--rotate": DEVELOPING,
+    "--crop": DEVELOPING,
     "--resize": "photographs keep their size",
     "--gpu": "the commands work on the processor; the functions of the library take tensors on any device",
     "--device": "the commands work on the processor; the functions of the library take tensors on any device",

@@ -24,13 +24,24 @@ def develop_photograph(photograph: Photograph, development: Development) -> Phot
     Raises:
         ValueError: if the middle of the crop is outside the turned picture.
     """
+    limits = limits_of(photograph.pixels) if not development.is_idle else None
+    return (
+        photograph if limits is None else lit_photograph(cut_photograph(photograph, development), development, limits)
+    )
+
+
+def cut_photograph(photograph: Photograph, development: Development) -> Photograph:
+    """Straighten and crop a photograph; raises as :func:`develop_photograph`."""
     frame = development.frame(photograph.size)
-    least, most = limits_of(photograph.pixels)
-    if not frame.is_whole:
-        limits = float(least), float(most)
-        photograph = _cropped(photograph, frame) if frame.angle == 0 else _turned(photograph, frame, limits)
-        photograph = replace(photograph, exif=of_part(photograph.exif, frame.size[::-1]))
-    return replace(photograph, pixels=in_light(photograph.pixels, development, (least, most)))
+    if frame.is_whole:
+        return photograph
+    cut = _cropped(photograph, frame) if frame.angle == 0 else _turned(photograph, frame)
+    return replace(cut, exif=of_part(photograph.exif, frame.size[::-1]))
+
+
+def lit_photograph(cut: Photograph, development: Development, limits: tuple[Tensor, Tensor]) -> Photograph:
+    """Change exposure and white balance of a photograph; ``limits`` are those of its pixels before it was cut."""
+    return replace(cut, pixels=in_light(cut.pixels, development, limits)) if development.changes_tones else cut
 
 
 def _cropped(photograph: Photograph, frame: Frame) -> Photograph:
@@ -50,16 +61,17 @@ def _cropped(photograph: Photograph, frame: Frame) -> Photograph:
     )
 
 
-def _turned(photograph: Photograph, frame: Frame, limits: tuple[float, float]) -> Photograph:
+def _turned(photograph: Photograph, frame: Frame) -> Photograph:
     """A photograph that is straightened and cropped; hidden pixels have the colours around them if it has opacity."""
     hidden, colours = photograph.hidden, photograph.pixels.shape[1]
+    least, most = limits_of(photograph.pixels)
     planes = [photograph.pixels]
     nodata = None if hidden is None else hidden.nodata
     if photograph.alpha is not None:
         planes.append(photograph.alpha)
     elif hidden is not None:
         planes.append(torch.from_numpy(~hidden.places)[None, None].to(photograph.pixels))
-    turned = finished(develop_planes(torch.cat(planes, dim=1), frame), colours, limits, None)
+    turned = finished(develop_planes(torch.cat(planes, dim=1), frame), colours, (float(least), float(most)))
     pixels, opacity = turned[:, :colours], turned[:, colours:]
     if nodata is not None:
         places = (opacity.round() <= 0)[0, 0].numpy()

@@ -145,20 +145,13 @@ def colour_guide(image: Tensor) -> Tensor:
     """
     from kornia.color import rgb_to_lab  # kornia takes half a second to import
 
-    lab = in_even_parts(rgb_to_lab, image.clamp(0.0, 1.0))
-    return lab / 100 * lab.new_tensor([LIGHTNESS, 1.0, 1.0]).view(1, 3, 1, 1)
-
-
-def in_even_parts(function: Callable[[Tensor], Tensor], image: Tensor) -> Tensor:
-    """Apply a function of single pixels, with powers, to an image (B, 3, H, W), so that no pixel depends on its place.
-
-    Powers round differently in the scalar remainder at the end of a tensor, or of a thread's part of it.
-    """
+    # Powers round differently in the scalar remainder at the end of a tensor, or of a thread's part of it.
     parts = []
-    for part in image.flatten(2).split(CHUNK, dim=2):
+    for part in image.clamp(0.0, 1.0).flatten(2).split(CHUNK, dim=2):
         full = F.pad(part, (0, -part.shape[2] % VECTOR_LENGTH)).unsqueeze(2).contiguous()
-        parts.append(function(full)[..., 0, : part.shape[2]])
-    return torch.cat(parts, dim=2).unflatten(2, image.shape[-2:])
+        parts.append(rgb_to_lab(full)[..., 0, : part.shape[2]])
+    lab = torch.cat(parts, dim=2).unflatten(2, image.shape[-2:])
+    return lab / 100 * lab.new_tensor([LIGHTNESS, 1.0, 1.0]).view(1, 3, 1, 1)
 
 
 def hundredths_of_lab(image: Tensor) -> Tensor:

@@ -5,22 +5,27 @@ becomes the same, bit for bit, as one in memory.
 """
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
+from typing import TypeVar
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from nlfilter_torch.core.workers import in_order, threads_for
 from nlfilter_torch.photo.declared.development import Development, Frame, turned
-from nlfilter_torch.photo.picture.colour import in_even_parts
 
 BLOCK = 256  # side in pixels of the squares that are turned at once
 MARGIN = 2  # pixels around a point that bicubic interpolation reads
 BLUE_TO_AMBER = 0.75  # stops that temperature 1 adds to red and takes from blue
 GREEN_TO_MAGENTA = 0.5  # stops that tint 1 takes from green
+#: The tone curve of sRGB: a line up to a value, and a power beyond it.
+LINEAR, SLOPE, OFFSET, GAMMA = 0.04045, 12.92, 0.055, 2.4
+STRIP = 1 << 18  # pixels whose light is changed at once
 LUMINANCE = (0.2126, 0.7152, 0.0722)  # weights of red, green and blue in linear light
 
+Item = TypeVar("Item")
 ReadPart = Callable[[range, range], Tensor]  # returns rows and columns (B, C, h, w) of a picture
 
 
@@ -64,8 +69,8 @@ def develop_planes(planes: Tensor, frame: Frame) -> Tensor:
     rows, columns = range(frame.top, frame.top + frame.height), range(frame.left, frame.left + frame.width)
     if frame.angle == 0:
         return part_of_planes(planes, rows, columns)
-    bands = (list(parts) for _, parts in turned_bands(partial(part_of_planes, planes), frame))
-    return torch.cat([torch.cat(parts, dim=3) for parts in bands], dim=2)
+    turn = partial(turned_band, partial(part_of_planes, planes), frame)
+    return torch.cat(_divided(turn, bands_of(frame), planes), dim=2)
 
 
 def turned_canvas(image: Tensor, development: Development) -> Tensor:
@@ -83,12 +88,16 @@ def part_of_planes(planes: Tensor, rows: range, columns: range) -> Tensor:
     return planes[..., rows.start : rows.stop, columns.start : columns.stop]
 
 
-def turned_bands(read: ReadPart, frame: Frame) -> Iterator[tuple[range, Iterator[Tensor]]]:
-    """Yield rows of a developed picture, a few at a time, and their parts (B, C, h, w) from left to right."""
-    for top in range(0, frame.height, BLOCK):
-        rows = range(top, min(top + BLOCK, frame.height))
-        lefts = range(0, frame.width, BLOCK)
-        yield rows, (turned_part(read, frame, rows, range(c, min(c + BLOCK, frame.width))) for c in lefts)
+def bands_of(frame: Frame) -> list[range]:
+    """The rows of a developed picture that are turned at once."""
+    return [range(top, min(top + BLOCK, frame.height)) for top in range(0, frame.height, BLOCK)]
+
+
+def turned_band(read: ReadPart, frame: Frame, rows: range) -> Tensor:
+    """Rows (B, C, h, W) of a developed picture that is turned."""
+    lefts = range(0, frame.width, BLOCK)
+    parts = [turned_part(read, frame, rows, range(left, min(left + BLOCK, frame.width))) for left in lefts]
+    return torch.cat(parts, dim=3)
 
 
 def turned_part(read: ReadPart, frame: Frame, rows: range, columns: range) -> Tensor:
@@ -156,20 +165,34 @@ def in_light(image: Tensor, development: Development, limits: tuple[Tensor, Tens
     """
     if not development.changes_tones:
         return image
-    colours = image.expand(-1, 3, -1, -1) if image.shape[1] == 1 else image
-    gains = gains_of(development, coloured=image.shape[1] == 3)
-    edited = in_even_parts(partial(_times, gains=image.new_tensor(gains).view(1, 3, 1, 1)), colours)[
-        :, : image.shape[1]
-    ]
+    gains = gains_of(development, coloured=image.shape[1] == 3)[: image.shape[1]]
+    lit = partial(_times, gains=gains, limits=limits)
+    return torch.cat(_divided(lit, image.split(max(1, STRIP // image.shape[3]), dim=2), image), dim=2)
+
+
+def _times(image: Tensor, gains: Sequence[float], limits: tuple[Tensor, Tensor]) -> Tensor:
+    """Multiply the linear light of an image (B, C, H, W), and keep to [0, 1] if the picture did.
+
+    The power of the tone curve cancels: where light before and after is beyond its linear part, values are multiplied,
+    and powers are needed for the few that go from one part to the other.
+    """
+    light = image.new_tensor(gains).view(1, -1, 1, 1)
+    edited = torch.where(image > LINEAR, (image + OFFSET) * light ** (1 / GAMMA) - OFFSET, image * light)
+    crossing = torch.nonzero((image > LINEAR) != (edited > LINEAR), as_tuple=True)
+    if len(crossing[0]):
+        before, factors = image[crossing].double(), light.expand_as(image)[crossing].double()  # rounded alike anywhere
+        linear = ((before.clamp(min=LINEAR) + OFFSET) / (1 + OFFSET)) ** GAMMA
+        values = torch.where(before > LINEAR, linear, before / SLOPE) * factors
+        curved = (1 + OFFSET) * values.clamp(min=LINEAR / SLOPE) ** (1 / GAMMA) - OFFSET
+        edited = edited.index_put(crossing, torch.where(before > LINEAR, SLOPE * values, curved).to(edited))
     is_wide = (limits[0] < 0) | (limits[1] > 1)
     return torch.where(is_wide, edited, edited.clamp(0, 1))
 
 
-def _times(image: Tensor, gains: Tensor) -> Tensor:
-    """Multiply the linear light of an image (B, 3, H, W)."""
-    from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb  # kornia takes half a second to import
-
-    return linear_rgb_to_rgb(rgb_to_linear_rgb(image) * gains)
+def _divided(function: Callable[[Item], Tensor], items: Iterable[Item], image: Tensor) -> list[Tensor]:
+    """Results of a function of parts of an image, each in a thread of its own unless derivatives are wanted."""
+    workers = threads_for(image)
+    return list(map(function, items) if workers == 1 else in_order(function, items, workers))
 
 
 def gains_of(development: Development, *, coloured: bool = True) -> list[float]:

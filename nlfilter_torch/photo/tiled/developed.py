@@ -12,10 +12,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from nlfilter_torch.core.workers import in_order
 from nlfilter_torch.photo.declared.development import Development, Frame
-from nlfilter_torch.photo.picture.developing import finished, in_light, turned_bands
+from nlfilter_torch.photo.picture.developing import bands_of, finished, in_light, turned_band
 from nlfilter_torch.photo.tiled.pictures import WHITE, FileRows, Picture, Rows, RowSource, Stored, Tile, transparency
-from nlfilter_torch.photo.tiled.sampling import Report
 from nlfilter_torch.photo.tiled.tiles import TILE_PIXELS, Passes, Tiling, between_steps, intermediate, tile_by_tile
 
 
@@ -122,7 +122,7 @@ def _turned(
     """The rows of a picture that is straightened and cropped, as floats in a temporary file."""
     with ExitStack() as stack:
         with intermediate(_as_floats(picture, floats.kind), picture.size, floats.folder) as whole:
-            bands = _bands(whole, frame, picture, limits, nodata, floats.report)
+            bands = _bands(whole, frame, picture, limits, nodata, floats)
             turned = stack.enter_context(intermediate(bands, frame.size, floats.folder))
         yield turned
 
@@ -136,13 +136,14 @@ def _as_floats(picture: Picture, kind: str) -> Rows:
 
 
 def _bands(
-    whole: FileRows, frame: Frame, picture: Picture, limits: tuple[float, float], nodata: float | None, report: Report
+    whole: FileRows, frame: Frame, picture: Picture, limits: tuple[float, float], nodata: float | None, passes: Passes
 ) -> Rows:
     """The rows (h, w, S) of the developed picture."""
     hidden = None if nodata is None else nodata / WHITE.get(picture.kind, 1)
-    for rows, parts in turned_bands(partial(_part, whole), frame):
-        report("Straightening", rows.start, frame.height)
-        planes = finished(torch.cat(list(parts), dim=3), picture.colours, limits, hidden)
+    bands, turn = bands_of(frame), partial(turned_band, partial(_part, whole), frame)
+    for rows, band in zip(bands, in_order(turn, bands, passes.workers(1)), strict=True):
+        passes.report("Straightening", rows.start, frame.height)
+        planes = finished(band, picture.colours, limits, hidden)
         yield slice(rows.start, rows.stop), np.ascontiguousarray(planes[0].permute(1, 2, 0).numpy())
 
 

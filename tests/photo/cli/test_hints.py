@@ -37,6 +37,11 @@ DETAIL = ["--alpha", "--bandwidth", "--region", "--force", "--quality"]
         (["sharpen", "a.png", "b.png", "--overwrite"], "No such option: --overwrite; here it is --force"),
         (["sharpen", "a.png", "b.png", "--strength", "3"], "No such option: --strength; here it is --amount"),
         (
+            ["detail", "a.png", "b.png", "--rotate", "2"],
+            "No such option: --rotate; nlfilter-torch develop has --exposure, --temperature, --tint, --straighten and "
+            "--crop",
+        ),
+        (
             ["a.png", "b.png"],
             "No such command 'a.png'; the command comes first, such as nlfilter-torch detail a.png OUT --preset crisp, "
             "and nlfilter-torch --help lists all of them",
