@@ -30,6 +30,7 @@ colorize grey.png coloured.png --strokes strokes.png --show seen-colour.png
 colorize grey.png pale.png --region 30,45,8,8:#b03020 --region 62,36,8,5:#e09a40 --strength 0.8 --patch-size 3
 colorize grey.png segments.png --strokes strokes.png --method kmeans --bandwidth 20 --landmarks 60
 defocus photo.png focus.png --region 40,15,30,30 --background 5,5,20,20 --show seen-focus.png
+defocus photo.png by-hand.png --add 40,15,30,30 --remove 50,20,5,5
 defocus photo.png blurred.png --mask mask.png --radius 6 --aperture gaussian --tolerance 12
 abstract photo.png flat.png
 abstract photo.png painting.png --edges 0.8 --edge-width 0.5 --tones 8 --power 0.5 --bandwidth 20 --patch-size 5

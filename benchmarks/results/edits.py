@@ -102,7 +102,11 @@ def of_strokes(photo: Tensor, grey: Tensor, dtype: torch.dtype) -> Calls:
         "colorize: k-means": lambda: nf.colorize(grey, mixed, painted, **kmeans),
         "defocus": lambda: with_gradients(focused, photo),
         "defocus: options": lambda: nf.defocus(photo, inside, aperture="gaussian", reach=0.5, num_landmarks=40),
+        "recolor: by hand": lambda: nf.recolor(
+            photo, None, None, added=torch.cat([mixed, painted], dim=1), removed=box(8, 10, dtype)
+        ),
         "region_mask": lambda: with_gradients(selected, photo),
+        "region_mask: by hand": lambda: nf.region_mask(photo, inside, added=outside, removed=box(8, 10, dtype)),
         "region_mask: options": lambda: nf.region_mask(
             photo, inside, reach=0.8, spatial_bandwidth=12.0, num_landmarks=40
         ),

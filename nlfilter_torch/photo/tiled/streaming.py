@@ -41,7 +41,7 @@ def stream(
             that add colours to a grey picture it has three colours, and transparency if the source has it.
         drawn: scribbles in place of the step's strokes: masks are rows (H, W), (H, W, 1) or, of K regions, (H, W, K)
             in [0, 1]; colours are rows (H, W, 3) in RGB, read under their mask only, or (H, W, 4) with the mask as last
-            channel.
+            channel, as is what :func:`recolor` adds by hand.
         statistics: ``"sample"`` balances the filter and computes its coefficients on a sample of the pixels that
             favours rare patches, and reads the source twice; ``"full"`` continues from there with all pixels, in three
             or four passes that each cost more than the output.
