@@ -94,6 +94,7 @@ QUICK := \
 	'streaming_cpu --quick' \
 	'streaming_busy --quick' \
 	'busy --quick sharpen' \
+	'durations --quick sharpen' \
 	'scribbles --quick' \
 	'app --side 96 --megapixels 0.05 --repeats 3 --saved denoise' \
 	'denoising --quick --megapixel' \

@@ -2,7 +2,7 @@
 
 import pytest
 
-from nlfilter_torch.core.progress import Progress
+from nlfilter_torch.core.progress import Progress, Stage
 
 #: Times in seconds of the reports, evenly spaced in the work, of stages of edits of 0.64 megapixels in tiles; recorded
 #: with two threads on two cores that other programs kept busy.
@@ -167,3 +167,53 @@ def test_recorded_runs(run: str) -> None:
             assert left == pytest.approx(total - clock.now, rel=0.25)
             checked = True
     assert checked
+
+
+def test_time_left_of_a_job_counts_its_later_stages() -> None:
+    clock = Clock()
+    told = Progress(clock, [Stage("Looking", 1.0, rest=1.0), Stage("Sampling", 2.0), Stage("Filtering", 6.0)])
+    told("Looking", 0, 4)
+    assert told.seconds_left is None
+    clock.now = 2.0
+    told("Looking", 4, 4)
+    assert told.fraction == pytest.approx(0.1)
+    assert told.seconds_left == pytest.approx(18, rel=0.13)  # everything takes twice as long as expected
+    clock.now = 4.0
+    told("Filtering", 0, 2)  # without the stage before
+    assert told.seconds_left == pytest.approx(12, rel=0.13)
+    assert str(told) == "Filtering, 40 %, about 13 s left"
+    clock.now = 10.0
+    told("Filtering", 1, 2)
+    assert told.seconds_left == pytest.approx(6, rel=0.02)
+
+
+def test_time_left_of_a_job_does_not_rise() -> None:
+    clock = Clock()
+    told = Progress(clock, [Stage("Looking", 1.0), Stage("Filtering", 1.0)])
+    told("Looking", 0, 10)
+    clock.now = 1.0
+    told("Looking", 5, 10)
+    first = told.seconds_left
+    assert first is not None
+    clock.now = 50.0  # something slows it down
+    told("Looking", 6, 10)
+    assert told.seconds_left == pytest.approx(1.1 * first)
+    clock.now = 51.0
+    told("Filtering", 9, 10)
+    left = told.seconds_left
+    assert left is not None
+    assert left <= 1.1 * first
+
+
+def test_stages_of_a_job_that_were_not_expected() -> None:
+    clock = Clock()
+    names = ("Looking", "Filtering", "Looking", "Filtering")
+    told = Progress(clock, [Stage(name, seconds) for name, seconds in zip(names, (1.0, 4.0, 1.0, 4.0), strict=True)])
+    for now, name in enumerate(("Looking", "Looking", "Straightening", "Filtering")):  # the second pass is no other job
+        clock.now = float(now)
+        told(name, 0, 2)
+        told(name, 1, 2)
+    assert told.fraction == pytest.approx((1 + 2) / 10)
+    told("Writing", 0, 1)
+    assert told.fraction == pytest.approx(0.5)
+    assert told.seconds_left is not None

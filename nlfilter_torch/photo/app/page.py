@@ -440,7 +440,8 @@ class Editor:
             dialog = SaveDialog("Save the photograph", name, session.folder, session.check_photograph, side)
         chosen = await dialog.answer()
         if chosen is not None:
-            self._tasks.start(self._save(partial(session.save, options=dialog.options), chosen))
+            progress = Progress(stages=session.stages(chosen))
+            self._tasks.start(self._save(partial(session.save, options=dialog.options), chosen, progress))
 
     async def _ask_edit_name(self) -> None:
         name = "edit" if self.session.opened is None else Path(self.session.opened.name).stem
@@ -448,10 +449,9 @@ class Editor:
             dialog = NameDialog("Save the edit", f"{name}.json", self.session.folder, self.session.check_preset)
         chosen = await dialog.answer()
         if chosen is not None:
-            self._tasks.start(self._save(self.session.save_preset, chosen))
+            self._tasks.start(self._save(self.session.save_preset, chosen, Progress()))
 
-    async def _save(self, save: Save, name: str) -> None:
-        progress = Progress()
+    async def _save(self, save: Save, name: str, progress: Progress) -> None:
         path = await self._tasks.run("Saving", partial(save, name, progress), progress)
         self._tasks.clear_error()
         if self._client.is_deleted:

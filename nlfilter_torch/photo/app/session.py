@@ -1,5 +1,6 @@
 """A session: an open photograph, its edit, and the history of undo. It does not depend on the page."""
 
+import math
 import threading
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -9,6 +10,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from nlfilter_torch.core.progress import Stage
 from nlfilter_torch.photo.app.developed import DEVELOPING, Developed, uncropped
 from nlfilter_torch.photo.app.overlays import Overlays
 from nlfilter_torch.photo.app.preview import PIXELS, Preview
@@ -36,6 +38,7 @@ from nlfilter_torch.photo.io.photographs import (
 from nlfilter_torch.photo.io.rows import TILED, WHOLE, usual_memory
 from nlfilter_torch.photo.io.writing import open_beside
 from nlfilter_torch.photo.picture.resizing import resize
+from nlfilter_torch.photo.tiled.durations import duration, expected_stages, writing
 from nlfilter_torch.photo.tiled.parts import Parts, Rectangle
 from nlfilter_torch.photo.tiled.recipe import edit_rows
 from nlfilter_torch.photo.tiled.sampling import Report, in_silence
@@ -384,10 +387,11 @@ class Session:
         """The edited pixels (1, C, H, W), as the command line computes them; None if that needs too much memory."""
         opened, photograph, steps = self._opened_to("edit"), developed.photograph, self._on(developed, recipe)
         height, width = photograph.size
-        if width * height * steps.bytes_per_pixel > WHOLE:
+        if _in_tiles(photograph.size, steps):
             return None
         check_memory(Path(opened.name), width, height, steps.bytes_per_pixel)
-        return apply_recipe(steps, photograph.pixels, partial(report, "Editing"), weights=photograph.weights)
+        tell = partial(_tell, report, [duration(step, photograph.size) for step in steps.acting])
+        return apply_recipe(steps, photograph.pixels, tell, weights=photograph.weights)
 
     def _opened_to(self, purpose: str) -> Opened:
         """The open photograph; if there is none, raises a ValueError that names the purpose."""
@@ -397,8 +401,7 @@ class Session:
 
     def _passes(self, photograph: Photograph, report: Report) -> Passes:
         """How an edit passes over the photograph in tiles."""
-        height, width = photograph.size
-        statistics: Statistics = "full" if width * height <= SMALL else "sample"
+        statistics: Statistics = "full" if math.prod(photograph.size) <= SMALL else "sample"
         kind = str(photograph.pixels.numpy().dtype)
         return Passes(kind, statistics, memory=usual_memory(TILED), report=report, folder=self.folder)
 
@@ -440,6 +443,15 @@ class Session:
         if not fits:
             suffix = ".tif" if BITS[photograph.depth] == "floats" else ".png"
         return f"{path.stem}-edited{suffix}"
+
+    def stages(self, name: str) -> list[Stage]:
+        """The stages of :meth:`save`, if they are known."""
+        whole = self._opened_to("save").photograph.size
+        size, recipe = self.recipe.develop.frame(whole).size, self.recipe.on_developed(whole)
+        if math.prod(size) <= SMALL or not _in_tiles(size, recipe):
+            return []
+        stages = expected_stages(recipe.steps, size)
+        return [*stages, Stage("Writing", writing(size, Path(name)))] if stages else []
 
     def save(self, name: str, report: Report = in_silence, options: FileOptions = FileOptions()) -> Path:
         """Edit the photograph at its full size and write it to the folder; the file appears complete or not at all.
@@ -483,6 +495,16 @@ class Session:
         opened, recipe = self._opened_to("edit"), Recipe.from_file(content, name)
         recipe.develop.frame(opened.photograph.size)  # refuses a crop that is outside
         self.load(recipe)
+
+
+def _in_tiles(size: tuple[int, int], recipe: Recipe) -> bool:
+    """Whether a photograph (H, W) is edited in tiles, since that at once needs too much memory."""
+    return math.prod(size) * recipe.bytes_per_pixel > WHOLE
+
+
+def _tell(report: Report, seconds: list[float], done: int, total: int) -> None:
+    """Report that so many of the steps are done, by how long they take."""
+    report("Editing", round(1000 * sum(seconds[:done]) / sum(seconds)), 1000)
 
 
 def reduced_size(photograph: Photograph, side: int | None) -> tuple[int, int]:

@@ -11,6 +11,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from nlfilter_torch.core.progress import Stage
 from nlfilter_torch.photo.cli import options
 from nlfilter_torch.photo.cli.changes import MAP_DEPTH
 from nlfilter_torch.photo.cli.progress import stages, steps
@@ -39,6 +40,7 @@ from nlfilter_torch.photo.io.rows import (
 )
 from nlfilter_torch.photo.picture.edit import Rows
 from nlfilter_torch.photo.picture.viewing import viewed_size
+from nlfilter_torch.photo.tiled.durations import written
 from nlfilter_torch.photo.tiled.pictures import Picture, mask_plane
 from nlfilter_torch.photo.tiled.sampling import Report
 from nlfilter_torch.photo.tiled.tiles import Passes, Processes, Statistics, Tiling
@@ -262,6 +264,9 @@ class FileEdit(Protocol):
     def edited(self, photograph: Photograph) -> Tensor:
         """New pixels (1, C, H, W) of a photograph in memory that is developed already."""
 
+    def stages(self, size: tuple[int, int]) -> list[Stage]:
+        """The stages of the edit in tiles of a photograph (H, W), if they are known."""
+
     def tiling(self, job: Job) -> AbstractContextManager[Tiling]:
         """The edited rows of a photograph that does not fit in memory, which are computed within the block."""
 
@@ -314,10 +319,11 @@ def edit_file(
         stored = kind or own_depth
         note_grey(edit.develop, source, picture.shape[2])
         part = picture.of_part(edit.develop.frame(picture.shape[:2]).size)
-        written = part.in_colour() if edit.coloured else part
-        check_place(Path(target), stored, written, allowed)
+        like = part.in_colour() if edit.coloured else part
+        check_place(Path(target), stored, like, allowed)
         processes = processes_for(workers, cluster, stack)
-        report = stack.enter_context(stages())
+        size = picture.shape[:2]
+        report = stack.enter_context(stages(written(edit.stages(size), size, Path(target))))
         job = Job(picture, stored, allowed - picture.cached, allowed_memory(memory, TILED), report, stack, processes)
         with edit.tiling(job) as tiling:
-            write_picture(Path(target), tiling, stored, written, quality)
+            write_picture(Path(target), tiling, stored, like, quality)

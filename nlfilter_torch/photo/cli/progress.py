@@ -2,7 +2,7 @@
 
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 
@@ -12,11 +12,11 @@ from rich.progress import (
     Progress,
     ProgressColumn,
     SpinnerColumn,
+    Task,
     TaskID,
     TaskProgressColumn,
     TextColumn,
     TimeElapsedColumn,
-    TimeRemainingColumn,
 )
 
 from nlfilter_torch.core import progress
@@ -31,10 +31,23 @@ def _bar(*columns: ProgressColumn) -> Progress:
     return Progress(*columns, console=console, transient=True, disable=console.quiet)
 
 
+class _TimeLeft(ProgressColumn):
+    """The time left, as the lines say it."""
+
+    def __init__(self, current: progress.Progress) -> None:
+        super().__init__()
+        self._current = current
+
+    def render(self, task: Task) -> str:
+        """The time left, or nothing if it is unknown."""
+        left = self._current.seconds_left
+        return "" if left is None else f"about {progress.time_text(left)} left"
+
+
 @contextmanager
-def _lines(wanted: bool) -> Iterator[progress.Progress]:
+def _lines(current: progress.Progress, wanted: bool) -> Iterator[progress.Progress]:
     """Print progress every few seconds from a thread, if ``wanted``."""
-    current, ended = progress.Progress(), threading.Event()
+    ended = threading.Event()
     thread = threading.Thread(target=_print_lines, args=(current, ended), daemon=True)
     if wanted:
         thread.start()
@@ -74,10 +87,8 @@ class _Shown:
 
     def report(self, stage: str, done: int, total: int) -> None:
         """Show how much of a stage is done."""
-        if stage != self.bar.tasks[0].description:
-            self.bar.reset(self.task, description=stage)
-        self.bar.update(self.task, completed=done, total=total)
         self.lines(stage, done, total)
+        self.bar.update(self.task, description=stage, completed=self.lines.fraction, total=1.0)
 
 
 @contextmanager
@@ -87,13 +98,17 @@ def steps(total: int, *, lines: bool = True) -> Iterator[Callable[[str], None]]:
     Without ``lines``, nothing is printed if there is no terminal.
     """
     columns = (SpinnerColumn(), TextColumn("{task.description}", markup=False), BarColumn(), TimeElapsedColumn())
-    with _bar(*columns) as bar, _lines(bar.disable and lines) as current:
+    with _bar(*columns) as bar, _lines(progress.Progress(), bar.disable and lines) as current:
         yield _Shown(bar, bar.add_task("", total=total, completed=-1), current).begin
 
 
 @contextmanager
-def stages() -> Iterator[Callable[[str, int, int], None]]:
-    """Show a bar that restarts with every stage; yield a function of the stage, the amount done and the total."""
-    columns = (TextColumn("{task.description}", markup=False), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
-    with _bar(*columns) as bar, _lines(bar.disable) as lines:
-        yield _Shown(bar, bar.add_task(""), lines).report
+def stages(expected: Sequence[progress.Stage] = ()) -> Iterator[Callable[[str, int, int], None]]:
+    """Show a bar of a job; yield a function of the stage, the amount done and the total.
+
+    The bar is that of the whole job if its stages are expected, and otherwise restarts with every stage.
+    """
+    current = progress.Progress(stages=expected)
+    columns = (TextColumn("{task.description}", markup=False), BarColumn(), TaskProgressColumn(), _TimeLeft(current))
+    with _bar(*columns) as bar, _lines(current, bar.disable) as lines:
+        yield _Shown(bar, bar.add_task("", total=1.0), lines).report

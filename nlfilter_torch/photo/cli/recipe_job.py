@@ -8,6 +8,7 @@ from pathlib import Path
 
 from torch import Tensor
 
+from nlfilter_torch.core.progress import Stage
 from nlfilter_torch.photo.cli import editing, options
 from nlfilter_torch.photo.cli.editing import Job, pixels_of, rows_of
 from nlfilter_torch.photo.declared.development import Development
@@ -17,6 +18,7 @@ from nlfilter_torch.photo.io.photographs import Photograph
 from nlfilter_torch.photo.picture.changes import blend_edited
 from nlfilter_torch.photo.picture.edit import Rows
 from nlfilter_torch.photo.tiled.developed import developed_rows
+from nlfilter_torch.photo.tiled.durations import expected_stages
 from nlfilter_torch.photo.tiled.pictures import Picture, RowSource
 from nlfilter_torch.photo.tiled.recipe import edit_regions, edit_tiling
 from nlfilter_torch.photo.tiled.tiles import Passes, Tiling
@@ -67,6 +69,10 @@ class RecipeJob:
         if not self.masks:
             return pixels[0]
         return blend_edited(photograph.pixels, pixels, editing.read_masks(self.masks, self.source, photograph.size))
+
+    def stages(self, size: tuple[int, int]) -> list[Stage]:
+        """The stages of the recipes in tiles of a photograph (H, W), if they are known."""
+        return [] if self.full else expected_stages((step for recipe in self.recipes for step in recipe.steps), size)
 
     @contextmanager
     def tiling(self, job: Job) -> Iterator[Tiling]:

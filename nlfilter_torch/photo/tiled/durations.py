@@ -1,0 +1,68 @@
+"""The stages of edits in tiles, and how long they take compared with each other, for the estimate of the time left.
+
+``durations.json`` has for each stage the seconds on a core until all of it is reported, those for each megapixel in
+addition, and both for what follows until the next stage; for pictures up to the viewing size, and for larger ones, that
+filters look at in that size. ``python -m benchmarks.durations`` measures them.
+"""
+
+import json
+from collections.abc import Iterable
+from dataclasses import replace
+from functools import cache
+from importlib.resources import files
+from pathlib import Path
+
+from nlfilter_torch.core.progress import Stage
+from nlfilter_torch.photo.declared.shared_parameters import VIEWING_SIZE
+from nlfilter_torch.photo.declared.steps import Step, acting_steps
+
+USUAL = 5.0  # seconds
+WRITING = {".png": 0.2}  # seconds of writing a megapixel, by the suffix of the file
+QUICK_WRITING = 0.05  # of other files
+Durations = dict[
+    str, dict[str, list[tuple[str, float, float, float, float]]]
+]  # of "small" and "large" pictures, by edit
+
+
+@cache
+def _durations() -> Durations:
+    """What the file says."""
+    text = files("nlfilter_torch.photo.tiled").joinpath("durations.json").read_text()
+    durations: Durations = json.loads(text)
+    return durations
+
+
+def expected_stages(steps: Iterable[Step], size: tuple[int, int]) -> list[Stage]:
+    """The stages of an edit of a photograph (H, W) in tiles; none if those of a step are not known."""
+    stages = [stages_of(step, size, regional=step.has_region()) for step in acting_steps(steps)]
+    return [stage for stages_of_step in stages for stage in stages_of_step] if all(stages) else []
+
+
+def duration(step: Step, size: tuple[int, int]) -> float:
+    """How long a step takes on a photograph (H, W), compared with others; as long as usual if that is not known."""
+    return sum(stage.total for stage in stages_of(step, size, regional=step.has_region())) or USUAL
+
+
+def writing(size: tuple[int, int], path: Path) -> float:
+    """How long it takes to write a photograph (H, W) to a file."""
+    return WRITING.get(path.suffix.lower(), QUICK_WRITING) * size[0] * size[1] / 1e6
+
+
+def written(stages: list[Stage], size: tuple[int, int], path: Path) -> list[Stage]:
+    """Stages of which the last one writes its rows to a file, too."""
+    return [*stages[:-1], *(replace(last, seconds=last.seconds + writing(size, path)) for last in stages[-1:])]
+
+
+def stages_of(step: Step, size: tuple[int, int], *, regional: bool) -> list[Stage]:
+    """The stages of a step on a photograph (H, W), in a region or everywhere; none if they are not known."""
+    name = f"{step.edit} of a region" if regional else step.edit
+    methods = [parameter for parameter in step.declared if parameter.name == "method"]
+    if name not in _durations() or any(step["method"] != method.default for method in methods):
+        return []
+    megapixels = size[0] * size[1] / 1e6
+    kind = "small" if megapixels <= VIEWING_SIZE.default_number else "large"
+    lines = _durations()[name][kind]
+    return [
+        Stage(stage, seconds + more_seconds * megapixels, rest + more_rest * megapixels)
+        for stage, seconds, more_seconds, rest, more_rest in lines
+    ]
