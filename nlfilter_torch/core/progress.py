@@ -11,7 +11,6 @@ KNOWN_OF_JOB = 0.1  # fraction of a job, likewise
 # are not even: what is kept of a pass makes the first tiles of the next one quicker than the rest.
 TRUST_IN_PLAN = 0.4
 MOST_SKIPPED = 0.5  # of a job; expected stages that do not occur are skipped, up to this share at once
-AGAIN = 0.05  # of a job; a stage that occurs once more than expected is not taken for a much later one of its name
 CAUTION = 0.15  # share by which the first estimate is longer
 MOST_RISE = 1.1  # a later estimate exceeds the least earlier one by this factor at most
 
@@ -53,11 +52,11 @@ class _Job:
     def report(self, name: str, share: float, now: float) -> None:
         """Take note of the share of a stage that is done."""
         if not self.expected or name != self._stages[self.place].name:
-            self._begin(self._following(name, MOST_SKIPPED), share, now)
+            self._begin(self._following(name), share, now)
         elif share > self.share:
             self.share, self._last = share, now
-        elif share < self.share and (again := self._following(name, AGAIN)) is not None:
-            self._begin(again, share, now)
+        elif share < self.share and name in (stage.name for stage in self._stages[self.place + 1 : self.place + 2]):
+            self._begin(self.place + 1, share, now)  # otherwise it goes on: it has more passes than expected
 
     def _begin(self, place: int | None, share: float, now: float) -> None:
         if self.expected:
@@ -67,12 +66,12 @@ class _Job:
         if place is not None:
             self.place = place
 
-    def _following(self, name: str, most: float) -> int | None:
-        """Number of the next stage of that name, if at most a share ``most`` of the job is left out before it."""
+    def _following(self, name: str) -> int | None:
+        """Number of the next stage of that name; None if too much would be skipped before it."""
         skipped, total = 0.0, sum(stage.total for stage in self._stages)
         for place in range(self.place + 1, len(self._stages)):
             if self._stages[place].name == name:
-                return place if skipped <= most * total else None
+                return place if skipped <= MOST_SKIPPED * total else None
             skipped += self._stages[place].total
         return None
 

@@ -17,8 +17,8 @@ from nlfilter_torch.photo.declared.shared_parameters import VIEWING_SIZE
 from nlfilter_torch.photo.declared.steps import Step, acting_steps
 
 USUAL = 5.0  # seconds
-WRITING = {".png": 0.2}  # seconds of writing a megapixel, by the suffix of the file
-QUICK_WRITING = 0.05  # of other files
+WRITING = {".png": 0.25}  # seconds of writing a megapixel, by the suffix of the file
+QUICK_WRITING = 0.02  # of other files
 Durations = dict[
     str, dict[str, list[tuple[str, float, float, float, float]]]
 ]  # of "small" and "large" pictures, by edit

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
+from nlfilter_torch.core.progress import Stage
 from nlfilter_torch.photo.cli import progress
 
 
@@ -43,3 +44,16 @@ def test_report_of_progress_is_drawn_on_a_terminal(monkeypatch: pytest.MonkeyPat
     shown.file.close()
     assert "Filtering" in text
     assert "75%" in text
+
+
+def test_a_bar_of_the_whole_job_if_its_stages_are_known(monkeypatch: pytest.MonkeyPatch) -> None:
+    shown = Console(force_terminal=True, width=80, record=True, file=open(os.devnull, "w"))  # noqa: SIM115
+    monkeypatch.setattr(progress, "Console", lambda stderr: shown)
+    with progress.stages([Stage("Looking", 1.0), Stage("Filtering", 4.0)]) as report:
+        report("Looking", 1, 1)
+        report("Filtering", 0, 4)
+        report("Filtering", 1, 4)
+    text = shown.export_text()
+    shown.file.close()
+    assert "40%" in text
+    assert "about 1 s left" in text
