@@ -1,12 +1,12 @@
 """Other methods for masks from scribbles; each takes an image (1, 3, H, W) and two masks (1, 1, H, W) of scribbles."""
 
+import os
 import warnings
 from collections.abc import Callable
 from typing import Any
 
 import cv2
 import numpy as np
-import pymatting
 import torch
 from numpy.typing import NDArray
 from scipy.sparse import diags
@@ -39,6 +39,10 @@ def closed_form(image: Tensor, inside: Tensor, outside: Tensor) -> Tensor:
     front, back = _seeds(inside, outside)
     # Not estimate_alpha_cf: its preconditioner fails on trimaps with so few known pixels.
     known = np.where(front | back, 100.0, 0.0).ravel()
+    # numba would let all of OpenMP have as many threads as there are cores.
+    os.environ.setdefault("NUMBA_NUM_THREADS", str(torch.get_num_threads()))
+    import pymatting
+
     system = pymatting.cf_laplacian(_array(image)) + diags(known)
     inverse = diags(1 / system.diagonal())
     solution, _ = cg(system, known * front.ravel(), rtol=1e-5, maxiter=3000, M=inverse)

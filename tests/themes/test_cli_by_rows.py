@@ -3,7 +3,6 @@
 import os
 import resource
 import signal
-import subprocess
 import sys
 import time
 from collections.abc import Iterator
@@ -22,7 +21,9 @@ from PIL import Image
 from nlfilter_torch.photo.cli import main
 from nlfilter_torch.photo.io.photographs import Photograph, read_photograph, write_photograph
 from nlfilter_torch.photo.io.tiff import TiffRows
+from nlfilter_torch.photo.tiled import pictures, tiles
 from tests.files import PROFILE, Array, cat
+from tests.ranks import forked
 
 LITTLE = "0.03"  # gigabytes: less than the whole picture needs, more than small blocks of rows need
 
@@ -235,6 +236,23 @@ def test_what_is_too_large_to_be_put_together_is_named(
         assert "--memory must be a " in refused(capsys, photo, tmp_path / "o.tif", "--memory", wrong)
 
 
+def edit_slowly(*arguments: str) -> None:
+    """The command, which sleeps in its last pass, when it writes."""
+    original = tiles.Tiling._edited
+
+    def edited(tiling: tiles.Tiling, tile: Any) -> Any:
+        time.sleep(0.2 * tiling.transparent)
+        return original(tiling, tile)
+
+    # Background jobs of a shell, and so their children, ignore this signal; these tests may be such a job.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
+    tiles.Tiling._edited = edited  # type: ignore[method-assign]
+    tiles.TILE_PIXELS = 300
+    tiles.sampling.PILOT = pictures.STATISTICS_PIXELS = 8000
+    sys.exit(main(list(arguments)))
+
+
 @pytest.mark.parametrize(
     ("target", "number"),
     [
@@ -248,34 +266,21 @@ def test_what_is_too_large_to_be_put_together_is_named(
 def test_interrupted_work_leaves_nothing_that_looks_finished(
     photo: Path, tmp_path: Path, number: signal.Signals, target: str
 ) -> None:
-    program = (
-        "import signal, sys, time\n"
-        # Background jobs of a shell, and so their children, ignore this signal; these tests may be such a job.
-        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
-        "from nlfilter_torch.photo.tiled import pictures, tiles\n"
-        "def slow(original):\n"
-        "    def edited(tiling, tile):\n"
-        "        time.sleep(0.2 * tiling.transparent)\n"  # in the last pass, which writes
-        "        return original(tiling, tile)\n"
-        "    return edited\n"
-        "tiles.Tiling._edited, tiles.TILE_PIXELS = slow(tiles.Tiling._edited), 300\n"
-        "tiles.sampling.PILOT = pictures.STATISTICS_PIXELS = 8000\n"
-        "from nlfilter_torch.photo.cli import main\n"
-        "sys.exit(main(sys.argv[1:]))\n"
-    )
     arguments = ["detail", str(photo), str(tmp_path / target), "--landmarks", "40", "--memory", LITTLE]
-    process = subprocess.Popen([sys.executable, "-c", program, *arguments], stderr=subprocess.DEVNULL)
+    process = forked(edit_slowly, arguments)
     try:
         deadline = time.monotonic() + 60
         while not list(tmp_path.glob(f".{target}.*.part")):
-            assert process.poll() is None
+            assert process.is_alive()
             assert time.monotonic() < deadline
             time.sleep(0.02)
-        process.send_signal(number)
-        assert process.wait(60) != 0
+        assert process.pid is not None
+        os.kill(process.pid, number)
+        process.join(60)
+        assert process.exitcode not in (None, 0)
     finally:
         process.kill()
-        process.wait()
+        process.join()
     assert not (tmp_path / target).exists()
     left = list(tmp_path.glob(".*"))
     assert bool(left) == (number == signal.SIGKILL)  # only a killed process leaves a hidden part

@@ -41,6 +41,7 @@ def test_compiled_layer_gives_the_same() -> None:
         learn=("alpha", "residual"),
         photometric_bandwidth=0.5,
         spatial_bandwidth=9.0,
+        patch_size=3,
         num_landmarks=20,
         guide_channels="all",
     )
