@@ -56,6 +56,7 @@ class Canvas:
 
     Attributes:
         pictures: image files, by their kind.
+        pick: is called with the next point (x, y) that is clicked, in pixels of the preview, or None.
     """
 
     def __init__(
@@ -64,6 +65,7 @@ class Canvas:
         self.pictures: dict[str, bytes] = {}
         self.histogram = ""
         self.clipped = self.clipped_before = (0.0, 0.0)  # shares of white and of black, after and before the edit
+        self.pick: Callable[[float, float], None] | None = None
         self._session: Painted | None = None
         self._preview_size = self._whole_size = (1, 1)
         self._brush, self._token, self._draw, self._lay = brush, token, draw, lay
@@ -162,6 +164,16 @@ class Canvas:
         """Show the photograph as it is cropped."""
         self._crop_tool.hide()
 
+    def await_click(self, pick: Callable[[float, float], None] | None) -> None:
+        """Call a function with the next point that is clicked, in place of drawing; None does so no longer."""
+        self.pick = pick
+        self._let_draw()
+
+    def _let_draw(self) -> None:
+        """Tell the page whether a pointer draws or chooses a point, and does not move the photograph."""
+        draws = self._step in BRUSHES or self.pick is not None
+        ui.run_javascript(f"closeup.brush({'true' if draws else 'false'})")
+
     def switch(self, step: str) -> None:
         """Show the strokes of another step."""
         if step != self._step:
@@ -169,7 +181,8 @@ class Canvas:
         self._step = step
         self._show_mask.set_enabled(step in BRUSHES and not EDITS[step].coloured)  # others select nothing
         self._lay()
-        ui.run_javascript(f"closeup.brush({'true' if step in BRUSHES else 'false'})")
+        self.pick = None
+        self._let_draw()
         self.draw_strokes()
         self.draw_mask()
 
@@ -275,7 +288,12 @@ class Canvas:
         self._ignored.set_visibility(is_hatched)
 
     def _pointer(self, kind: str, x: float, y: float) -> None:
-        """Begin, continue or end a stroke."""
+        """Begin, continue or end a stroke, or choose a point."""
+        if self.pick is not None and kind == "pointerdown":
+            pick = self.pick
+            self.await_click(None)
+            pick(x, y)
+            return
         if self._step not in BRUSHES or self._session is None:
             return
         if kind == "pointerdown":

@@ -45,10 +45,11 @@ class DevelopTab(EditTab):
     def follow(self) -> None:
         """Show the current edit."""
         super().follow()
-        development, is_cropping = self._link.recipe().develop, self._link.is_cropping()
-        self._crop.props(f'aria-pressed="{str(is_cropping).lower()}"')
-        self._crop.classes(add="chosen" if is_cropping else "", remove="" if is_cropping else "chosen")
-        self._whole.set_enabled(development.crop != WHOLE)
+        photo = self._link.photo
+        for button, is_on in ((self._crop, photo.is_cropping()), (self._pick, photo.is_picking())):
+            button.props(f'aria-pressed="{str(is_on).lower()}"')
+            button.classes(add="chosen" if is_on else "", remove="" if is_on else "chosen")
+        self._whole.set_enabled(self._link.recipe().develop.crop != WHOLE)
 
     def take(self, role: ScribbleRole) -> None:
         """There are no tools that draw."""
@@ -56,16 +57,19 @@ class DevelopTab(EditTab):
     def _build(self) -> None:
         ui.label(DEVELOP.hint).classes("hint")
         self._sliders = [Slider(control, self._link.recipe, self._develop) for control in CONTROLS]
+        photo = self._link.photo
+        self._pick = ui.button("Grey point", icon="colorize", on_click=lambda: photo.pick()).props("flat dense no-caps")
+        self._pick.tooltip("Click on something that is grey or white: the white balance makes it so")
         ui.label("Crop").classes("group")
         with ui.row().classes("w-full items-center no-wrap gap-2 q-mt-xs"):
-            self._crop = ui.button("Crop", icon="crop", on_click=lambda: self._link.crop()).props("flat dense no-caps")
+            self._crop = ui.button("Crop", icon="crop", on_click=lambda: photo.crop()).props("flat dense no-caps")
             self._crop.tooltip("Drag a frame over the whole photograph; Escape ends it")
             ui.space()
             self._whole = ui.button("Whole picture", on_click=self._uncrop).props("flat dense no-caps")
 
     def _develop(self, _: str, values: Mapping[str, Value], complete: bool) -> None:
         """Change some values."""
-        self._link.develop(values, complete)
+        self._link.photo.develop(values, complete)
 
     def _uncrop(self) -> None:
-        self._link.develop({"crop": WHOLE}, True)
+        self._link.photo.develop({"crop": WHOLE}, True)

@@ -26,7 +26,7 @@ from nlfilter_torch.photo.app.dialogs import NameDialog, Question, SaveDialog
 from nlfilter_torch.photo.app.look_tab import thumbnails
 from nlfilter_torch.photo.app.panel import Panel
 from nlfilter_torch.photo.app.session import Session
-from nlfilter_torch.photo.app.tabs import Link
+from nlfilter_torch.photo.app.tabs import Link, PhotoLink
 from nlfilter_torch.photo.app.tasks import EXPECTED, Tasks
 from nlfilter_torch.photo.app.uploads import Upload
 from nlfilter_torch.photo.declared.json_values import Value
@@ -100,9 +100,13 @@ class Editor:
                     self._clear_strokes,
                     self._replace,
                     self._thumbnail,
-                    self._develop,
-                    self._toggle_crop,
-                    lambda: self._is_cropping,
+                    PhotoLink(
+                        self._develop,
+                        self._toggle_crop,
+                        lambda: self._is_cropping,
+                        self._toggle_pick,
+                        lambda: self._canvas.pick is not None,
+                    ),
                 )
                 self._panel = Panel(link, self._switch)
         ui.keyboard(on_key=self._key)
@@ -190,6 +194,24 @@ class Editor:
             self._panel.follow()
         else:
             self._replace(recipe, None if complete else DEVELOPING)
+
+    def _toggle_pick(self) -> None:
+        """Let the next click on the photograph choose what is grey, or no longer."""
+        if self.session.opened is None:
+            self._tasks.show_error("open a photograph first; there is nothing grey to point at")
+            return
+        self._canvas.await_click(None if self._canvas.pick is not None else self._balance)
+        self._panel.follow()
+
+    def _balance(self, x: float, y: float) -> None:
+        """Make the photograph grey at a point (x, y) in pixels of the preview."""
+        try:
+            values = self.session.balance(x, y)
+        except ValueError as error:
+            self._tasks.show_error(str(error))
+            self._panel.follow()
+        else:
+            self._develop(values, True)
 
     def _toggle_crop(self) -> None:
         """Show the frame of the crop over the whole photograph, or hide it."""

@@ -37,6 +37,7 @@ from nlfilter_torch.photo.io.photographs import (
 )
 from nlfilter_torch.photo.io.rows import TILED, WHOLE, usual_memory
 from nlfilter_torch.photo.io.writing import open_beside
+from nlfilter_torch.photo.picture.developing import balance_of
 from nlfilter_torch.photo.picture.resizing import resize
 from nlfilter_torch.photo.tiled.durations import duration, expected_stages, writing
 from nlfilter_torch.photo.tiled.parts import Parts, Rectangle
@@ -44,6 +45,7 @@ from nlfilter_torch.photo.tiled.recipe import edit_rows
 from nlfilter_torch.photo.tiled.sampling import Report, in_silence
 from nlfilter_torch.photo.tiled.tiles import Passes, Statistics
 
+POINTED = 2  # pixels of the preview on all sides of a point that are averaged
 SPACING = 0.2  # distance of the points of a stroke, as a share of its radius
 UNDOS = 100
 SMALL = 1 << 18  # pixels, up to which statistics are those of all pixels; a sample is nearly as exact, and fast
@@ -243,6 +245,18 @@ class Session:
         develop = Development(**{**vars(self.recipe.develop), **values})
         frame = develop.frame(size)
         return replace(self.recipe, develop=replace(develop, crop=frame.edges) if "crop" in values else develop)
+
+    def balance(self, x: float, y: float) -> dict[str, Value]:
+        """The white balance that makes the photograph grey at a point (x, y) in pixels of the preview.
+
+        Raises:
+            ValueError: if it is grey anyway, or too dark there.
+        """
+        before, reach = self.developed.before, POINTED
+        column, row = round(x), round(y)
+        part = before[..., max(0, row - reach) : row + reach + 1, max(0, column - reach) : column + reach + 1]
+        temperature, tint = balance_of(part)
+        return {"temperature": temperature, "tint": tint}
 
     def commit(self) -> None:
         """Complete a change, so that it can be undone."""

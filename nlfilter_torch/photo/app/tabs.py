@@ -19,6 +19,25 @@ BY_HAND = "Brush (B) and Eraser (E) paint on the mask itself; S is the first too
 
 
 @dataclass(frozen=True)
+class PhotoLink:
+    """What the tab of the photograph itself calls.
+
+    Attributes:
+        develop: is called with changes, and whether they are complete.
+        crop: is called to show the frame of the crop, or to hide it.
+        is_cropping: returns whether it is shown.
+        pick: is called to let a person point at something grey, or no longer.
+        is_picking: returns whether the next click does that.
+    """
+
+    develop: Callable[[Mapping[str, Value], bool], None]
+    crop: Callable[[], None]
+    is_cropping: Callable[[], bool]
+    pick: Callable[[], None]
+    is_picking: Callable[[], bool]
+
+
+@dataclass(frozen=True)
 class Link:
     """What the tabs show, and what they call.
 
@@ -29,9 +48,7 @@ class Link:
         clear: is called with a step whose strokes are to be removed.
         replace: is called with another edit, and the place of the step whose slider moves, or None.
         thumbnail: returns the address of a picture of the photograph under a look, or "" if there is none.
-        develop: is called with changes of how the photograph is developed.
-        crop: is called to show the frame of the crop, or to hide it.
-        is_cropping: returns whether it is shown.
+        photo: the same for how the photograph is developed.
     """
 
     recipe: Callable[[], Recipe]
@@ -40,9 +57,7 @@ class Link:
     clear: Callable[[str], None]
     replace: Replace
     thumbnail: Callable[[str], str]
-    develop: Callable[[Mapping[str, Value], bool], None]
-    crop: Callable[[], None]
-    is_cropping: Callable[[], bool]
+    photo: PhotoLink
 
 
 class EditTab:

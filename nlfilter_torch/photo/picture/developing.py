@@ -22,6 +22,7 @@ BLUE_TO_AMBER = 0.75  # stops that temperature 1 adds to red and takes from blue
 GREEN_TO_MAGENTA = 0.5  # stops that tint 1 takes from green
 #: The tone curve of sRGB: a line up to a value, and a power beyond it.
 LINEAR, SLOPE, OFFSET, GAMMA = 0.04045, 12.92, 0.055, 2.4
+DARK = 1e-3  # light in which nobody sees colours
 STRIP = 1 << 18  # pixels whose light is changed at once
 LUMINANCE = (0.2126, 0.7152, 0.0722)  # weights of red, green and blue in linear light
 
@@ -206,3 +207,29 @@ def gains_of(development: Development, *, coloured: bool = True) -> list[float]:
     luminance = sum(weight * gain for weight, gain in zip(LUMINANCE, gains, strict=True))
     light = 2.0**development.exposure
     return [light * gain / luminance if coloured else light for gain in gains]
+
+
+def balance_of(part: Tensor) -> tuple[float, float]:
+    """The temperature and tint that make a part (1, C, h, w) of a picture grey, on average, within their ranges.
+
+    Raises:
+        ValueError: if the picture has no colours, or the part no light in one of them.
+
+    Example:
+        >>> balance_of(develop_image(torch.full((1, 3, 1, 1), 0.5), Development(temperature=-0.4, tint=0.2)))
+        (0.4, -0.2)
+    """
+    if part.shape[1] != 3 or part.numel() == 0:
+        raise ValueError("the photograph must have colours to balance, got a grey one; choose another")
+    values = part.double()
+    light = torch.where(
+        values > LINEAR, ((values.clamp(min=LINEAR) + OFFSET) / (1 + OFFSET)) ** GAMMA, values / SLOPE
+    ).mean((0, 2, 3))
+    if float(light.min()) < DARK:
+        raise ValueError(
+            "a grey point must have red, green and blue light, got one that is nearly black; choose another"
+        )
+    red, green, blue = light.log2().tolist()
+    temperature = (blue - red) / (2 * BLUE_TO_AMBER)
+    tint = (green - (red + blue) / 2) / GREEN_TO_MAGENTA
+    return round(min(max(temperature, -1.0), 1.0), 3), round(min(max(tint, -1.0), 1.0), 3)

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from nicegui import Client, ui
 
 from nlfilter_torch.photo.app.brush import Brush
-from nlfilter_torch.photo.app.tabs import EditTab, Link
+from nlfilter_torch.photo.app.tabs import EditTab, Link, PhotoLink
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.declared.strokes import Stroke
 
@@ -23,7 +23,7 @@ class Controls:
         self.cleared: list[str] = []
         self.thumbnails: dict[str, str] = {}
         self.developed: list[object] = []
-        self.is_cropping = False
+        self.is_cropping = self.is_picking = False
         self.replaced: list[tuple[Recipe, int | None]] = []
         self.link = Link(
             lambda: self.recipe,
@@ -32,9 +32,13 @@ class Controls:
             self.cleared.append,
             lambda *change: self.replaced.append(change),
             lambda look: self.thumbnails.get(look, ""),
-            lambda *change: self.developed.append(change),
-            lambda: self.developed.append("crop"),
-            lambda: self.is_cropping,
+            PhotoLink(
+                lambda *change: self.developed.append(change),
+                lambda: self.developed.append("crop"),
+                lambda: self.is_cropping,
+                lambda: self.developed.append("pick"),
+                lambda: self.is_picking,
+            ),
         )
 
     def show(self, tab: EditTab, recipe: Recipe) -> None:

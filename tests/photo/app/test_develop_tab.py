@@ -28,14 +28,17 @@ def test_the_crop_is_shown_and_reset(client: Client) -> None:
     shown = Controls(client)
     tab = DevelopTab("develop", shown.link)
     shown.show(tab, Recipe())
-    crop, whole = shown.of(ui.button)
+    pick, crop, whole = shown.of(ui.button)
     assert not whole.enabled
     assert crop.props["aria-pressed"] == "false"
     shown.click("Crop")
     assert shown.developed == ["crop"]
-    shown.is_cropping = True
+    shown.click("Grey point")
+    assert shown.developed.pop() == "pick"
+    assert pick.props["aria-pressed"] == "false"
+    shown.is_cropping = shown.is_picking = True
     shown.show(tab, Recipe((), Development(crop=(0.1, 0.0, 1.0, 1.0))))
-    assert crop.props["aria-pressed"] == "true"
+    assert crop.props["aria-pressed"] == pick.props["aria-pressed"] == "true"
     shown.click("Whole picture")
     assert shown.developed[-1] == ({"crop": WHOLE}, True)
 

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from torch.nn.functional import avg_pool2d
 
 from nlfilter_torch.photo.app.developed import DEVELOPING
 from nlfilter_torch.photo.app.session import FileOptions, Session
@@ -14,7 +15,7 @@ from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.declared.strokes import Stroke
 from nlfilter_torch.photo.edits.applying import apply_recipe
 from nlfilter_torch.photo.io.photographs import Photograph, read_photograph, write_photograph
-from nlfilter_torch.photo.picture.developing import develop_image
+from nlfilter_torch.photo.picture.developing import balance_of, develop_image
 from nlfilter_torch.photo.picture.resizing import resize
 from nlfilter_torch.photo.tiled.parts import Rectangle
 from tests.browser import difference
@@ -81,6 +82,22 @@ def test_a_moving_slider_is_followed_and_later_steps_stay(session: Session) -> N
     assert difference(session.render(), wanted) < 1
     session.recipe = session.developing({"straighten": 3.0})
     assert session.render(DEVELOPING).shape[-2:] == session.recipe.develop.frame((100, 150)).size
+
+
+def test_a_point_becomes_grey(session: Session) -> None:
+    session.load(Recipe((), Development(temperature=-0.5, tint=0.3, crop=(0.2, 0.0, 1.0, 1.0))))
+    session.render()
+    means = avg_pool2d(session.developed.before, 5)
+    least = int((means.amax(1) - means.amin(1)).argmin())  # the least saturated of the places
+    row, column = 5 * (least // means.shape[3]), 5 * (least % means.shape[3])
+    session.load(session.developing(session.balance(column + 2, row + 2)))
+    place = session.render()[..., row : row + 5, column : column + 5].mean((0, 2, 3))
+    assert place.amax() - place.amin() < 0.01
+    assert session.recipe.develop.temperature > -0.4
+    with pytest.raises(ValueError, match="a grey point must have red, green and blue light"):
+        balance_of(torch.zeros(1, 3, 5, 5))
+    with pytest.raises(ValueError, match="must have colours to balance, got a grey one"):
+        balance_of(torch.ones(1, 1, 5, 5))
 
 
 def test_undo_redo_and_the_sidecar(session: Session) -> None:

@@ -274,3 +274,15 @@ def test_a_photograph_is_developed(opened: Tab, folder: Path) -> None:
     assert saved.shape[-2:] == frame.size
     assert difference(saved, wanted) < 0.1
     assert difference(opened.picture(), wanted) < 4
+
+
+def test_a_grey_point_sets_the_white_balance(opened: Tab) -> None:
+    opened.page.get_by_role("tab", name="Photo").click()
+    button = opened.page.get_by_role("button", name="Grey point")
+    before = opened.source()
+    button.click()
+    expect(button).to_have_attribute("aria-pressed", "true")
+    opened.paint((0.5, 0.5))
+    opened.wait_for_picture(before)
+    expect(button).to_have_attribute("aria-pressed", "false")
+    expect(opened.slider("Temperature")).not_to_have_attribute("aria-valuenow", "0")
