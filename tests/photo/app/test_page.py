@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 from nicegui import Client, background_tasks, ui
 
+from nlfilter_torch.core.progress import Progress
 from nlfilter_torch.photo.app import drawing
 from nlfilter_torch.photo.app.assets import SCRIPTS, STATIC, STATIC_ADDRESS
 from nlfilter_torch.photo.app.dialogs import Question
@@ -186,9 +187,9 @@ def test_saving(opened: Page, photo: Path) -> None:
     editor = opened.editor
     editor._change("detail", {"alpha": ALPHA}, True)
     opened.finish()
-    asyncio.run(editor._save(editor.session.save, "out.png"))
+    asyncio.run(editor._save(editor.session.save, "out.png", Progress()))
     assert photo.with_name("out.png").is_file()
-    asyncio.run(editor._save(editor.session.save_preset, "edit.json"))
+    asyncio.run(editor._save(editor.session.save_preset, "edit.json", Progress()))
     assert Recipe.from_json(photo.with_name("edit.json").read_bytes(), "") == editor.session.recipe
     assert not editor.session.unsaved
 
