@@ -11,7 +11,7 @@ KNOWN_OF_JOB = 0.1  # fraction of a job, likewise
 # are not even: what is kept of a pass makes the first tiles of the next one quicker than the rest.
 TRUST_IN_PLAN = 0.4
 MOST_SKIPPED = 0.5  # of a job; expected stages that do not occur are skipped, up to this share at once
-CAUTION = 0.15  # share by which the first estimate is longer
+CAUTION = 0.1  # share by which the first estimate is longer
 MOST_RISE = 1.1  # a later estimate exceeds the least earlier one by this factor at most
 
 

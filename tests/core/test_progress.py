@@ -181,7 +181,7 @@ def test_time_left_of_a_job_counts_its_later_stages() -> None:
     clock.now = 4.0
     told("Filtering", 0, 2)  # without the stage before
     assert told.seconds_left == pytest.approx(12, rel=0.13)
-    assert str(told) == "Filtering, 40 %, about 13 s left"
+    assert str(told) == "Filtering, 40 %, about 12 s left"
     clock.now = 10.0
     told("Filtering", 1, 2)
     assert told.seconds_left == pytest.approx(6, rel=0.02)
