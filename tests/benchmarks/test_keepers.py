@@ -37,7 +37,7 @@ def test_edits_change_a_photograph_and_the_mask_cuts_its_object_out():
     torch.testing.assert_close(cut[..., 11:13, 13:19], image[..., 11:13, 13:19], atol=0.05, rtol=0)
     torch.testing.assert_close(cut[..., :4, :], torch.full_like(cut[..., :4, :], 0.6), atol=0.05, rtol=0)
     preset = Job.of(2, {"photograph": "coffee", "what": "clear", "edit": "preset", "preset": "clear"})
-    assert not torch.equal(preset.after(image), image)
+    assert preset.recipe.steps[0]["alpha"] == (1.5, 1.5, 1.5, 1.0)
     recoloured = Job.of(3, RECOLOURED | {"strokes": [middle[0] | {"paint": "#0040c0"}]})
     assert (recoloured.after(image) - image)[:, 2, 10:14, 12:20].mean() > 0.1
     assert torch.equal(recoloured.marked(image)[..., :4, :], image[..., :4, :])
