@@ -1,9 +1,11 @@
 """Stray parts of scribbles: what a stroke covers besides the thing it is meant for, and what therefore does not count.
 
-A stroke that leaves a flower at a gap, or a hat at the cheek, covers a second thing by a small part of it. Within a
-stroke, colours are divided in two by their means. The smaller part is stray if it is small, differs strongly from the
-larger, is cut off from it in colour, and lies in one or two pieces: parts of a pattern lie in many, and shading changes
-gradually. Dabs, boxes and rough masks, which are not drawn along a thing, stay what they are.
+A stroke that leaves a flower at a gap, or a hat at the cheek, covers a second thing by a small part of it. First, ends
+of a stroke are stray that differ from all the rest (:mod:`~nlfilter_torch.photo.selections.stroke_ends`). Then colours
+of what is left are divided in two by their means, for gaps that a stroke crosses and things that it touches. The
+smaller part is stray if it is small, differs strongly from the larger, is cut off from it in colour, and lies in one or
+two pieces: parts of a pattern lie in many, and shading changes gradually. Dabs, boxes and rough masks, which are not
+drawn along a thing, stay what they are.
 """
 
 from dataclasses import dataclass
@@ -16,6 +18,7 @@ from torch import Tensor
 from nlfilter_torch.core.torch_internals import is_unreadable
 from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles, blocks_at
 from nlfilter_torch.photo.selections.scribbled_colours import colours_in_lab
+from nlfilter_torch.photo.selections.stroke_ends import stray_runs
 
 CELLS = 1 << 17  # of the picture, about; colours are compared between their means
 FEWEST = 12  # cells of a stroke that may have stray parts
@@ -66,20 +69,31 @@ def _of_region(points: Colours, at: Cells, shape: tuple[int, int]) -> NDArray[np
     means = np.stack([np.bincount(back, channel) for channel in points.T], axis=1) / counts[:, None]
     grid = Grid.of(cells, shape)
     strokes, ignored = grid.pieces(np.ones(len(cells), dtype=bool)), np.zeros(len(cells), dtype=bool)
-    parts, middles = list[tuple[Cells, Colours]](), list[Colours]()
+    parts, middles = list[tuple[Cells, int]](), list[Colours]()
     for stroke in range(1, strokes.max() + 1):
         own = np.flatnonzero(strokes == stroke)
-        drawn = len(own) <= MOST * shape[0] * shape[1] and grid.elongation(own) >= ELONGATED
-        smaller = smaller_part(means[own]) if drawn else None
-        if smaller is not None and grid.is_compact(own[smaller]):
-            parts.append((own[smaller], means[own[smaller]].mean(0)))
-            own = own[~smaller]
-        middles.append(means[own].mean(0))
-    for cells_of_part, colour in parts:  # what another stroke is meant for is not stray
-        if min(np.linalg.norm(colour - middle) for middle in middles) > DISTANCE / 2:
-            ignored[cells_of_part] = True
+        kept = own
+        if len(own) <= MOST * shape[0] * shape[1] and grid.elongation(own) >= ELONGATED:
+            for stray_part in (stray_runs, compact_part):
+                part = stray_part(means[kept], grid.rows[kept], grid.columns[kept])
+                if part.any() and 2 * (~part).sum() >= len(own):
+                    parts.append((kept[part], stroke))
+                    kept = kept[~part]
+        middles.append(np.median(means[kept], axis=0))
+    for places, stroke in parts:  # what another stroke is meant for is not stray
+        others = np.array(middles[: stroke - 1] + middles[stroke:]).reshape(-1, 3)
+        distances = np.linalg.norm(np.median(means[places], axis=0) - others, axis=1)
+        ignored[places] = (distances > DISTANCE / 2).all()
     stray: NDArray[np.bool_] = ignored[back]
     return stray
+
+
+def compact_part(colours: Colours, rows: Cells, columns: Cells) -> NDArray[np.bool_]:
+    """Which cells (m,) of a stroke are the smaller of two parts, if these differ strongly and it lies in few pieces."""
+    part = smaller_part(colours)
+    if part is None or not Grid(rows - rows.min(), columns - columns.min()).is_compact(np.flatnonzero(part)):
+        return np.zeros(len(colours), dtype=bool)
+    return part
 
 
 def smaller_part(colours: Colours) -> NDArray[np.bool_] | None:
