@@ -28,8 +28,8 @@ class Painted(Protocol):
     def crop(self) -> Sequence[float]:
         """Left, top, right and bottom edge of what is kept of it."""
 
-    def shown(self, edit: str) -> Step:
-        """The last step of an edit, with its strokes where they are in the preview."""
+    def step_in_view(self, edit: str) -> Step:
+        """The chosen step of an edit, with its strokes where they are in the preview."""
 
     def render(self, moving: int | None = None) -> Tensor:
         """The preview under the edit, (1, C, h, w) in [0, 1], quickly while a slider of a step moves."""
@@ -276,7 +276,7 @@ class Canvas:
             return
         strokes: tuple[Stroke, ...] = ()
         if self._show_strokes.value:
-            strokes = self._session.shown(self._step).strokes if self._step in BRUSHES else ()
+            strokes = self._session.step_in_view(self._step).strokes if self._step in BRUSHES else ()
             if self._line:
                 height, width = self._preview_size
                 points = tuple((x / width, y / height) for x, y in self._line)

@@ -8,7 +8,6 @@ from torch import Tensor
 from nlfilter_torch.photo.app.preview import Preview
 from nlfilter_torch.photo.declared.development import AS_IT_IS, Development, Frame
 from nlfilter_torch.photo.declared.presets import DEVELOPING_BYTES
-from nlfilter_torch.photo.declared.strokes import Stroke
 from nlfilter_torch.photo.io.developed import cut_photograph, lit_photograph
 from nlfilter_torch.photo.io.photographs import Photograph, check_memory
 from nlfilter_torch.photo.picture.developing import develop_image, in_light, limits_of, turned_canvas
@@ -74,10 +73,6 @@ class Developed:
         """A part before the edit, (1, C, h, w) in [0, 1]."""
         rows, columns = place.rows, place.columns
         return self.cut.pixels[..., rows.start : rows.stop, columns.start : columns.stop].clamp(0, 1)
-
-    def inward(self, strokes: tuple[Stroke, ...]) -> tuple[Stroke, ...]:
-        """Strokes in coordinates of the original, in those of the developed photograph."""
-        return tuple(map(self.frame.stroke_inward, strokes))
 
     def approximate(self, development: Development, original: Preview) -> Tensor:
         """The preview, quickly, as it would be developed in another way, from the preview of the photograph itself."""

@@ -18,7 +18,7 @@ from nlfilter_torch.photo.app.sidecar import Sidecar
 from nlfilter_torch.photo.declared.development import Crop, Development
 from nlfilter_torch.photo.declared.json_values import Value
 from nlfilter_torch.photo.declared.parameters import EDITS
-from nlfilter_torch.photo.declared.presets import Recipe
+from nlfilter_torch.photo.declared.presets import Recipe, on_frame
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.declared.strokes import Stroke, thin
 from nlfilter_torch.photo.edits.applying import apply_recipe
@@ -200,10 +200,10 @@ class Session:
             return developed
         return developed.changed(opened.photograph, opened.name, self._pixels, development)
 
-    def shown(self, edit: str) -> Step:
-        """The last step of an edit, whose strokes are where they are in the developed photograph."""
+    def step_in_view(self, edit: str) -> Step:
+        """The chosen step of an edit, whose strokes are where they are in the developed photograph, if they are."""
         step = self.recipe.current(edit)
-        return step.changed(strokes=self.developed.inward(step.strokes)) if step.strokes else step
+        return on_frame(step, self.developed.frame, self.preview.size) if step.strokes else step
 
     @property
     def crop(self) -> Crop:
@@ -227,11 +227,13 @@ class Session:
         return self.preview.stride > 1
 
     def set(self, edit: str, *, strokes: tuple[Stroke, ...] | None = None, **values: Value) -> None:
-        """Change the last step with that edit, or add such a step, and let it be seen.
+        """Change the chosen step with that edit, or add such a step, and let it be seen.
 
         :meth:`commit` completes the change.
         """
-        self.recipe = self.recipe.with_current(self.recipe.current(edit).changed(strokes=strokes, **values).shown())
+        self.recipe = self.recipe.with_current(
+            self.recipe.current(edit).changed(strokes=strokes, **values).switched_on()
+        )
 
     def developing(self, values: Mapping[str, Value]) -> Recipe:
         """The edit with other values of how the photograph is developed.
@@ -308,7 +310,7 @@ class Session:
             raise ValueError(f"{step} takes no strokes: it holds for the whole photograph")
         stroke = self.developed.frame.stroke_outward(Stroke.from_entries(entries, words, step))
         last = self.recipe.current(step)
-        painted = last.changed(strokes=(*last.strokes, stroke)).shown()
+        painted = last.changed(strokes=(*last.strokes, stroke)).switched_on()
         if painted.has_region() and not last.has_region():  # it begins with the sliders of the rest
             painted = painted.changed(inside=last["alpha"])
         self.recipe = self.recipe.with_current(painted)
@@ -329,11 +331,12 @@ class Session:
                 if developed is not self.developed:
                     self._outdated.append(self.developed.parts)
                     self._developed = developed
-            return developed.preview.render(self._on(developed, recipe), moving, start)
+            steps = self._on(developed, recipe, developed.preview.size)
+            return developed.preview.render(steps, moving, start)
 
-    def _on(self, developed: Developed, recipe: Recipe) -> Recipe:
-        """The steps of a recipe for the developed photograph."""
-        return replace(recipe, develop=developed.development).on_developed(developed.frame.original)
+    def _on(self, developed: Developed, recipe: Recipe, seen: tuple[int, int] | None = None) -> Recipe:
+        """The steps of a recipe for the developed photograph, or for that reduced to a size."""
+        return replace(recipe, develop=developed.development).on_developed(developed.frame.original, seen)
 
     def eigenvalues(self, detail: Step) -> Tensor:
         """Eigenvalues (R,) of the filter of a step of detail, which its layers belong to."""
@@ -341,8 +344,8 @@ class Session:
             return self.preview.layers(detail).eigenvalues
 
     def mask(self, edit: str) -> Tensor | None:
-        """The mask (1, 1, h, w) of what the scribbles of the last step of an edit select, or None."""
-        step, preview = self.shown(edit), self.preview
+        """The mask (1, 1, h, w) of what the scribbles of the chosen step of an edit select, or None."""
+        step, preview = self.step_in_view(edit), self.preview
         with self._drawing:
             if step.declared.regional is not None:
                 return preview.mask(step)
@@ -350,7 +353,7 @@ class Session:
 
     def ignored(self, edit: str) -> Tensor | None:
         """Which pixels (1, 1, h, w) under these scribbles do not count, or None."""
-        step = self.shown(edit)
+        step = self.step_in_view(edit)
         with self._drawing:
             return self._overlays.ignored(step, self.preview.before(step))
 

@@ -76,6 +76,10 @@ class EditJob:
         """Nothing comes before the edit."""
         return AS_IT_IS
 
+    def cropped_away(self, size: tuple[int, int]) -> list[tuple[int, Step]]:
+        """No step, as nothing is cropped."""
+        return []
+
     def on_developed(self, size: tuple[int, int]) -> "EditJob":
         """The same edit."""
         return self

@@ -243,6 +243,14 @@ def note_grey(develop: Development, name: str, channels: int) -> None:
         options.note(f"{name} is grey: temperature and tint change nothing")
 
 
+def note_cropped(develop: Development, steps: Iterable[tuple[int, Step]]) -> None:
+    """Print a note for each step, with its number, whose strokes of objects are all outside the crop."""
+    crop = ",".join(f"{edge:g}" for edge in develop.crop)
+    for number, step in steps:
+        effect = "its region is left out" if step.declared.regional is not None else "it changes nothing"
+        options.note(f"{step.edit}, step {number}, has no strokes within the crop {crop}: {effect}")
+
+
 class FileEdit(Protocol):
     """An edit of a photograph in a file, in memory or by rows."""
 
@@ -257,6 +265,9 @@ class FileEdit(Protocol):
     @property
     def develop(self) -> Development:
         """What comes before the edit."""
+
+    def cropped_away(self, size: tuple[int, int]) -> Iterable[tuple[int, Step]]:
+        """The steps, with their numbers, whose objects in a photograph (H, W) are all outside the crop."""
 
     def on_developed(self, size: tuple[int, int]) -> "FileEdit":
         """The edit for a photograph, once (H, W), that is developed already."""
@@ -308,6 +319,7 @@ def edit_file(
             output = photograph if kind is None else replace(photograph, depth=kind)
             check_output(target, output)
             note_grey(edit.develop, source, photograph.pixels.shape[1])
+            note_cropped(edit.develop, edit.cropped_away(size))
             begin("Editing")
             output = output.with_pixels(edit.on_developed(size).edited(photograph))
             begin("Writing")
@@ -318,6 +330,7 @@ def edit_file(
         own_depth = check_depth(source, picture.rows.dtype)  # refuses other dtypes whatever the output is
         stored = kind or own_depth
         note_grey(edit.develop, source, picture.shape[2])
+        note_cropped(edit.develop, edit.cropped_away(picture.shape[:2]))
         part = picture.of_part(edit.develop.frame(picture.shape[:2]).size)
         like = part.in_colour() if edit.coloured else part
         check_place(Path(target), stored, like, allowed)

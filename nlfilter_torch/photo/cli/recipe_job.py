@@ -13,6 +13,7 @@ from nlfilter_torch.photo.cli import editing, options
 from nlfilter_torch.photo.cli.editing import Job, pixels_of, rows_of
 from nlfilter_torch.photo.declared.development import Development
 from nlfilter_torch.photo.declared.presets import Recipe
+from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.edits.applying import apply_recipe, edit_of
 from nlfilter_torch.photo.io.photographs import Photograph
 from nlfilter_torch.photo.picture.changes import blend_edited
@@ -56,6 +57,10 @@ class RecipeJob:
     def develop(self) -> Development:
         """How the photograph is developed, which no recipe for a region does."""
         return self.recipes[0].develop
+
+    def cropped_away(self, size: tuple[int, int]) -> list[tuple[int, Step]]:
+        """The steps, with their numbers, whose objects in a photograph (H, W) are all outside the crop."""
+        return [] if self.develop.is_idle else self.recipes[0].cropped_away(size)
 
     def on_developed(self, size: tuple[int, int]) -> "RecipeJob":
         """The recipes for a photograph, once (H, W), that is developed already."""

@@ -24,11 +24,12 @@ from typing import TYPE_CHECKING
 
 from nlfilter_torch.core.warning import warn
 from nlfilter_torch.photo.declared.colour_tables import step_of_cube, step_of_hald
-from nlfilter_torch.photo.declared.development import AS_IT_IS, Development
+from nlfilter_torch.photo.declared.development import AS_IT_IS, Development, Frame
 from nlfilter_torch.photo.declared.json_values import Value, parse_json, shown
 from nlfilter_torch.photo.declared.looks import LOOKS
 from nlfilter_torch.photo.declared.parameters import EDITS
 from nlfilter_torch.photo.declared.steps import VERSION, Step, acting_steps, json_of
+from nlfilter_torch.photo.declared.strokes import reaches
 
 if TYPE_CHECKING:
     from nlfilter_torch.photo.declared.colour_tables import Values
@@ -73,13 +74,25 @@ class Recipe:
         """All that the result depends on; recipes of the same effect give the same picture."""
         return self.develop, self.acting
 
-    def on_developed(self, size: tuple[int, int]) -> "Recipe":
-        """The steps for the picture (H, W) that has been developed: their strokes are mapped to what it shows."""
+    def on_developed(self, size: tuple[int, int], seen: tuple[int, int] | None = None) -> "Recipe":
+        """The steps for the picture (H, W) that has been developed: their strokes are mapped to what it shows.
+
+        Strokes that the crop leaves out are dropped; a step without others of the objects that it changes has no
+        effect, or no region. ``seen`` is the size of the developed picture where it is reduced.
+        """
         frame = self.develop.frame(size)
         if frame.is_whole:
             return Recipe(self.steps)
-        steps = (step.changed(strokes=tuple(map(frame.stroke_inward, step.strokes))) for step in self.steps)
-        return Recipe(tuple(steps))
+        return Recipe(tuple(on_frame(step, frame, seen) for step in self.steps))
+
+    def cropped_away(self, size: tuple[int, int]) -> list[tuple[int, Step]]:
+        """The steps, by their numbers from 1, that have no effect or no region on a picture (H, W) due to the crop."""
+        steps = zip(self.steps, self.on_developed(size).steps, strict=True)
+        return [
+            (number, step)
+            for number, (step, mapped) in enumerate(steps, 1)
+            if step.changes() and step.is_drawn() and not mapped.marks_object()
+        ]
 
     @property
     def drawn(self) -> "Recipe":
@@ -209,6 +222,20 @@ class Recipe:
                 f"{name} must be a preset, a .cube file or a Hald, got a file of another kind; save a Hald as PNG"
             )
         return Recipe.from_json(content, name)
+
+
+def on_frame(step: Step, frame: Frame, seen: tuple[int, int] | None = None) -> Step:
+    """A step with its strokes in coordinates of the developed picture, without those that it does not show.
+
+    ``seen`` is the size (h, w) of that picture where it is reduced. Strokes of a step whose objects miss the original
+    itself remain, so that they are reported.
+    """
+    if frame.is_whole or not step.strokes:
+        return step
+    objects = step.painted_as("object", "added")
+    misses = bool(objects) and not any(reaches(stroke, frame.original) for stroke in objects)
+    strokes = map(frame.stroke_inward, step.strokes)
+    return step.changed(strokes=tuple(stroke for stroke in strokes if misses or reaches(stroke, seen or frame.size)))
 
 
 def _decoded(content: bytes, name: str) -> "Values":

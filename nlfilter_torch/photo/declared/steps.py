@@ -86,7 +86,7 @@ class Step:
                 object.__setattr__(step, name, value)
         return step
 
-    def shown(self) -> "Step":
+    def switched_on(self) -> "Step":
         """Return a copy whose changes are seen: switched on, and at full opacity if it had none."""
         return self.mixed(on=True, opacity=self.opacity or 1.0)
 

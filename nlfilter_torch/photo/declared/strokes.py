@@ -4,15 +4,20 @@ Coordinates are relative to the picture, so that strokes cover the same part of 
 not import torch.
 """
 
+import math
 import re
 import reprlib
 from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import TypeGuard
 
 from nlfilter_torch.photo.declared.json_values import is_within, shown
 
 COLOUR = "#[0-9a-f]{6}"
+MIN_RADIUS = 0.75  # minimum radius in pixels, at which a dot always covers a pixel
+TO_CENTRE = 0.71  # pixels from any point of a picture to the nearest centre of a pixel, at most
+Point = tuple[float, float]
 
 
 @dataclass(frozen=True)
@@ -75,6 +80,55 @@ class Stroke:
                 f"paint of a stroke in {place} must be one of {wanted}, got {reprlib.repr(paint)}; correct it"
             )
         return stroke
+
+
+def radius_in_pixels(stroke: Stroke, size: tuple[int, int]) -> float:
+    """The radius of a stroke on a picture (H, W)."""
+    return max(stroke.radius * min(size), MIN_RADIUS)
+
+
+def reaches(stroke: Stroke, size: tuple[int, int]) -> bool:
+    """Whether a stroke is sure to cover a pixel of a picture (H, W); one that grazes its border from outside is not.
+
+    >>> [reaches(Stroke(((x, 0.5),), 0.1, "in"), (100, 100)) for x in (-0.05, -0.15)]
+    [True, False]
+    """
+    height, width = size
+    reach = radius_in_pixels(stroke, size) - TO_CENTRE
+    points = [(x * width, y * height) for x, y in stroke.points]
+    lines = pairwise(points if len(points) > 1 else points * 2)
+    return any(_crosses(*line, (width, height)) or _is_near(*line, (width, height), reach) for line in lines)
+
+
+def _is_near(start: Point, end: Point, corner: Point, reach: float) -> bool:
+    """Whether a line outside a picture comes within ``reach`` of the rectangle of its pixels' centres."""
+    sides = [(0.5, most - 0.5) for most in corner]
+    nearest = [
+        math.dist(point, [min(max(v, low), high) for v, (low, high) in zip(point, sides, strict=True)])
+        for point in (start, end)
+    ]
+    corners = [(x, y) for x in sides[0] for y in sides[1]]
+    return min(*nearest, *(_distance(point, start, end) for point in corners)) <= reach
+
+
+def _crosses(start: Point, end: Point, corner: Point) -> bool:
+    """Whether a line meets a picture, whose last corner is given."""
+    first, last = 0.0, 1.0  # shares of the line between which it is within
+    for a, b, most in zip(start, end, corner, strict=True):
+        if a == b:
+            if not 0 <= a <= most:
+                return False
+            continue
+        there = sorted((-a / (b - a), (most - a) / (b - a)))
+        first, last = max(first, there[0]), min(last, there[1])
+    return first <= last
+
+
+def _distance(point: Point, start: Point, end: Point) -> float:
+    """The distance of a point from a line."""
+    (x, y), (dx, dy) = (point[0] - start[0], point[1] - start[1]), (end[0] - start[0], end[1] - start[1])
+    along = min(max((x * dx + y * dy) / max(dx * dx + dy * dy, 1e-12), 0), 1)
+    return math.hypot(x - along * dx, y - along * dy)
 
 
 def _described(word: str) -> str:

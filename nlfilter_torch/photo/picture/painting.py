@@ -7,9 +7,8 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
-from nlfilter_torch.photo.declared.strokes import Stroke
+from nlfilter_torch.photo.declared.strokes import Stroke, radius_in_pixels
 
-MIN_RADIUS = 0.75  # minimum radius in pixels, at which a dot always covers a pixel
 BORDER = 1.0  # width in pixels of the border of a brush that paints on a mask
 
 
@@ -23,7 +22,7 @@ def cover(stroke: Stroke, size: tuple[int, int], rows: slice | None = None) -> T
             [0, 0, 0, 0, 0],
             [0, 0, 0, 0, 0]], dtype=torch.int32)
     """
-    radius = _radius(stroke, size)
+    radius = radius_in_pixels(stroke, size)
     covered = torch.zeros(_shape(size, rows), dtype=torch.bool)
     for part, squared in _squared_distances(stroke, size, rows, radius):
         covered[part] |= squared <= radius * radius
@@ -43,7 +42,7 @@ def soft_cover(stroke: Stroke, size: tuple[int, int], rows: slice | None = None)
 
 def _soft_part(stroke: Stroke, size: tuple[int, int], rows: slice | None) -> tuple[tuple[slice, slice], Tensor]:
     """The part of a picture that holds all of a stroke, and :func:`soft_cover` of it."""
-    radius = _radius(stroke, size) + BORDER / 2
+    radius = radius_in_pixels(stroke, size) + BORDER / 2
     lines = list(_squared_distances(stroke, size, rows, radius))
     if not lines:
         return (slice(0, 0), slice(0, 0)), torch.zeros(0, 0)
@@ -54,11 +53,6 @@ def _soft_part(stroke: Stroke, size: tuple[int, int], rows: slice | None) -> tup
         near = covered[down.start - top : down.stop - top, across.start - left : across.stop - left]
         near.copy_(near.maximum(((radius - squared.sqrt()) / BORDER).clamp(0.0, 1.0)))
     return (slice(top, bottom), slice(left, right)), covered
-
-
-def _radius(stroke: Stroke, size: tuple[int, int]) -> float:
-    """Radius of a stroke in pixels."""
-    return max(stroke.radius * min(size), MIN_RADIUS)
 
 
 def _squared_distances(

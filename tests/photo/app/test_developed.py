@@ -64,12 +64,27 @@ def test_strokes_are_stored_in_coordinates_of_the_original(session: Session) -> 
     frame = session.developed.frame
     assert stroke.points[0] == pytest.approx(frame.outward(0.25, 0.5))
     assert stroke.radius == pytest.approx(0.05 / frame.scale)
-    (shown,) = session.shown("recolor").strokes
+    (shown,) = session.step_in_view("recolor").strokes
     assert shown.points[0] == pytest.approx((0.25, 0.5))
     assert shown.radius == pytest.approx(0.05)
     session.load(replace(session.recipe, develop=Development()))
     session.render()
-    assert session.shown("recolor").strokes == (stroke,)  # another crop moves none
+    assert session.step_in_view("recolor").strokes == (stroke,)  # another crop moves none
+
+
+def test_strokes_that_are_cropped_away_select_nothing(session: Session, tiled: bool) -> None:
+    region = Step("detail", (replace(BLUE, paint="in"),), alpha=(1.0, 1.0), inside=(3.0, 1.0))
+    recipe = Recipe((Step("recolor", (BLUE,)), region), Development(crop=(0.6, 0.6, 1.0, 1.0)))
+    session.load(recipe)
+    wanted = develop_image(cat(), recipe.develop)
+    assert difference(session.render(), wanted) == 0
+    assert session.mask("recolor") is session.mask("detail") is session.ignored("recolor") is None
+    assert session.step_in_view("recolor").strokes == ()
+    assert session.recipe == recipe  # no stroke is lost
+    assert torch.equal(session.at_rest(recipe), wanted)
+    assert torch.equal(session.part(Rectangle(range(5), range(9)), recipe), wanted[..., :5, :9])
+    assert difference(read_photograph(session.save("out.png")).pixels, wanted) < 0.51
+    assert torch.equal(apply_recipe(recipe, cat()), wanted)
 
 
 def test_a_moving_slider_is_followed_and_later_steps_stay(session: Session) -> None:

@@ -123,6 +123,24 @@ def test_notes(tmp_path: Path, tiled: bool, capsys: pytest.CaptureFixture[str]) 
     assert "no option changes anything" in capsys.readouterr().err
 
 
+def test_steps_outside_the_crop_are_named(photo: Path, tiled: bool, capsys: pytest.CaptureFixture[str]) -> None:
+    away = Step("recolor", (Stroke(((0.2, 0.2),), 0.05, "#2040e0"),))
+    region = Step("detail", (Stroke(((0.2, 0.2),), 0.05, "in"),), alpha=(1.0, 1.0), inside=(3.0, 1.0))
+    edit, out = photo.with_name("edit.json"), photo.with_name("out.png")
+    crop = Development(crop=(0.6, 0.6, 1.0, 1.0))
+    edit.write_text(Recipe((Step("tone"), away, region), crop).to_json())
+    assert main(["apply", str(photo), str(out), "--preset", str(edit)]) == 0
+    notes = [line for line in capsys.readouterr().err.splitlines() if "crop" in line]
+    assert notes == [
+        "nlfilter-torch: note: recolor, step 2, has no strokes within the crop 0.6,0.6,1,1: it changes nothing",
+        "nlfilter-torch: note: detail, step 3, has no strokes within the crop 0.6,0.6,1,1: its region is left out",
+    ]
+    alone = photo.with_name("alone.png")
+    edit.write_text(Recipe((Step("tone"),), crop).to_json())
+    assert main(["apply", str(photo), str(alone), "--preset", str(edit)]) == 0
+    assert imagecodecs.png_decode(out.read_bytes()).tolist() == imagecodecs.png_decode(alone.read_bytes()).tolist()
+
+
 def test_regions_and_films_are_not_developed(photo: Path, capsys: pytest.CaptureFixture[str]) -> None:
     edit = photo.with_name("edit.json")
     edit.write_text(Recipe((), Development(exposure=1.0)).to_json())

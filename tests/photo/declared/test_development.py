@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 
 import pytest
 from hypothesis import given
@@ -88,6 +89,20 @@ def test_strokes_of_steps_are_mapped() -> None:
     assert mapped.steps[1] == Step("tone")
     assert recipe.replaced(0).develop == recipe.with_current(Step("sharpen")).drawn.develop == recipe.develop
     assert recipe.moved(0, 1).effect != recipe.effect
+
+
+def test_steps_whose_strokes_are_cropped_away_change_nothing() -> None:
+    corner, out = Stroke(((0.1, 0.1),), 0.02, "in"), Stroke(((0.9, 0.9),), 0.02, "out")
+    recolor = Step("recolor", (replace(corner, paint="#2040e0"), replace(out, paint="keep")))
+    region = Step("detail", (corner,), alpha=(2.0, 1.0), inside=(4.0, 1.0))
+    recipe = Recipe((recolor, region, Step("tone")), Development(crop=(0.5, 0.5, 1.0, 1.0)))
+    mapped = recipe.on_developed((100, 200)).steps
+    assert [step.changes() for step in mapped] == [False, True, True]
+    assert not mapped[1].has_region()
+    assert recipe.cropped_away((100, 200)) == [(1, recolor), (2, region)]
+    assert replace(recipe, develop=Development(exposure=1.0)).cropped_away((100, 200)) == []
+    astray = Recipe((Step("detail", (replace(corner, points=((-1.0, 0.1),)),), inside=(4.0, 1.0)),), recipe.develop)
+    assert astray.on_developed((100, 200)).steps[0].has_region()  # which is refused where it is painted
 
 
 def test_there_and_back_through_a_file() -> None:

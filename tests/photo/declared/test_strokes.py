@@ -8,8 +8,8 @@ import torch
 
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.declared.steps import Step
-from nlfilter_torch.photo.declared.strokes import Stroke, thin
-from nlfilter_torch.photo.picture.painting import paint
+from nlfilter_torch.photo.declared.strokes import Stroke, reaches, thin
+from nlfilter_torch.photo.picture.painting import cover, paint
 from tests.recipes import BLUE
 
 
@@ -19,6 +19,25 @@ def test_thinning_keeps_the_ends() -> None:
     assert kept[0] == (0.0, 0.0)
     assert kept[-1] == (0.5, 0.0)
     assert len(kept) == 6
+
+
+def test_what_reaches_a_picture_covers_a_pixel() -> None:
+    """All that begins inside does, and from outside all that does not just graze the border."""
+    generator = torch.Generator().manual_seed(0)
+    size = (7, 11)
+    for points in (torch.rand(400, 2, 2, generator=generator) * 3 - 1).tolist():
+        stroke = Stroke(tuple(map(tuple, points)), 0.15, "in")
+        wider = replace(stroke, radius=0.15 + 0.8 / 7)
+        if reaches(stroke, size):
+            assert cover(stroke, size).any()
+        elif cover(stroke, size).any():  # only at the border
+            assert reaches(wider, size)
+            assert not cover(stroke, size)[1:-1, 1:-1].any()
+
+
+def test_a_dot_reaches_a_picture_of_a_pixel() -> None:
+    assert reaches(Stroke(((0.0, 1.0),), 0.001, "in"), (1, 1))
+    assert not reaches(Stroke(((-1.0, 1.0), (0.5, 3.0)), 0.001, "in"), (1, 1))
 
 
 def test_colours_may_be_written_in_capitals() -> None:
