@@ -6,7 +6,7 @@ region; points on a grid count as scribbled if an even area, such as a sky, link
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 
@@ -46,6 +46,8 @@ COLOUR_SHARE = (0.65, 1.0)
 AROUND_SIGMA, AROUND_GRID, ENOUGH_AROUND = 0.1, 40, 0.5
 FRAME_PIXELS = 112 * 160  # in larger pictures points of the frame count more, as scribbles have more pixels there
 EPSILON = 1e-6
+
+ScribbledPoints = tuple[Callable[[], Iterable[Tensor]], Tensor, Tensor]  # columns, weights and values of pixels
 
 
 def region_guide(image: Tensor) -> Tensor:
@@ -123,8 +125,8 @@ class RoughMasks:
         unlike = 1 - likeness(colours, weights[:, :1], self.frame.colours, self.photometric_bandwidth)
         linked = linked_evenly(self.evenness, planes)
         frame_links, grid_links = self.frame.values(linked), self.grid.values(linked)
-        regression = self.regression(scribbles, unlike, frame_links, grid_links)
-        likely = sharpened(regression(self.picture))
+        outside = self.outside(scribbles, unlike)
+        likely = sharpened(self.regression(scribbles, outside, frame_links, grid_links)(self.picture))
         likely_frame = torch.maximum(self.frame.values(likely * self.evenness), frame_links)
         compared = [unlike, likely_frame, self.grid.colours, grid_links, self.photometric_bandwidth, trimap]
         by_colour = self.picture.kept(
@@ -136,29 +138,56 @@ class RoughMasks:
         nearby = 1.0 if self.everywhere else (around(likely) / ENOUGH_AROUND).clamp(max=1.0)
         return likely + (by_colour - likely) * share * nearby
 
-    def regression(self, scribbles: Scribbles, unlike: Tensor, frame_links: Tensor, grid_links: Tensor) -> Planes:
-        """Likelihood that a pixel belongs to a region: about 1 inside and about 0 outside; not clamped.
+    def fit(self, known: Sequence[ScribbledPoints], strength: float) -> Callable[[Tensor], Tensor]:
+        """The regression on scribbled pixels and points."""
+        pixels = self.picture.size[0] * self.picture.size[1]
+        return fit_strokes(
+            partial(scribbled_blocks, known),
+            pairs=self.operator.pairs,
+            pixels=pixels,
+            reach=self.reach,
+            smoothness=SMOOTHNESS,
+            strength=strength,
+        )
+
+    def scribbled(self, scribbles: Scribbles) -> ScribbledPoints:
+        """The pixels of scribbles, with their weights and the share of the region in these."""
+        total = scribbles.weights.sum(1, keepdim=True)
+        values = scribbles.weights[:, :1] / total.clamp(min=EPSILON)
+        return self.operator.at(scribbles.places), total.clamp(max=1.0), values
+
+    def outside(self, scribbles: Scribbles, unlike: Tensor) -> Tensor:
+        """How much points of the frame count as background, (B, 1, n).
+
+        All that are unlike the region but those that a regression on the scribbles alone assigns to it. This fades to
+        0 where nothing similar is scribbled, so that scribbles on the background take nothing from what the frame says
+        elsewhere.
 
         Args:
             scribbles: on the region and on its background.
             unlike: dissimilarity of the frame to the scribbles on the region, (B, 1, n).
+        """
+        alone = self.fit([self.scribbled(scribbles)], strength=0.0)
+        return unlike * torch.cat(
+            [(1 - alone(block)).clamp(0.0, 1.0).square() for block in self.frame.columns()], dim=2
+        )
+
+    def regression(self, scribbles: Scribbles, outside: Tensor, frame_links: Tensor, grid_links: Tensor) -> Planes:
+        """Likelihood that a pixel belongs to a region: about 1 inside and about 0 outside; not clamped.
+
+        Args:
+            scribbles: on the region and on its background.
+            outside: :meth:`outside` of the frame, (B, 1, n).
             frame_links: :func:`linked_evenly` of the frame to these, (B, 1, n).
             grid_links: the same of the grid, (B, 1, m).
         """
-        columns, weights = self.operator.at(scribbles.places), scribbles.weights
-        total = weights.sum(1, keepdim=True).clamp(max=1.0)
-        values = weights[:, :1] / weights.sum(1, keepdim=True).clamp(min=EPSILON)
         pixels = self.picture.size[0] * self.picture.size[1]
-        fit = partial(fit_strokes, pairs=self.operator.pairs, pixels=pixels, reach=self.reach, smoothness=SMOOTHNESS)
-        known = [(columns, total, values)]
-        opposed = (weights[:, 1].detach() > 0).any(1).to(weights)  # 1 for images with scribbles on the background
-        first = fit(partial(scribbled_blocks, tuple(known)), strength=opposed)
-        unlike = unlike * torch.cat(
-            [(1 - first(block)).clamp(0.0, 1.0).square() for block in self.frame.columns()], dim=2
-        )
-        known.append((self.frame.columns, unlike * max(1.0, pixels / FRAME_PIXELS), frame_links))
-        known.append((self.grid.columns, grid_links, torch.ones_like(grid_links)))
-        return self.operator.of_columns(partial(_of_columns, fit(partial(scribbled_blocks, known), strength=1.0)))
+        known = [
+            self.scribbled(scribbles),
+            (self.frame.columns, outside * max(1.0, pixels / FRAME_PIXELS), frame_links),
+            (self.grid.columns, grid_links, torch.ones_like(grid_links)),
+        ]
+        return self.operator.of_columns(partial(_of_columns, self.fit(known, strength=1.0)))
 
 
 def _of_columns(regression: Callable[[Tensor], Tensor], columns: Columns) -> Tensor:
