@@ -12,7 +12,7 @@ KNOWN_OF_JOB = 0.1  # fraction of a job, likewise
 TRUST_IN_PLAN = 0.4
 MOST_SKIPPED = 0.5  # of a job; expected stages that do not occur are skipped, up to this share at once
 CAUTION = 0.1  # share by which the first estimate is longer
-MOST_RISE = 1.1  # a later estimate exceeds the least earlier one by this factor at most
+MOST_RISE = 1.1  # a later estimate exceeds the least earlier one by this factor at most, unless the job overran that
 
 
 @dataclass(frozen=True)
@@ -35,8 +35,23 @@ class Stage:
         return self.seconds + self.rest
 
 
+@dataclass(frozen=True)
+class _Estimate:
+    """Seconds left at the time of a report: of the current stage, which are counted down, and of the later ones."""
+
+    now: float
+    own: float
+    later: float
+
+    def at(self, now: float) -> float:
+        """Seconds left at a later time without another report; while the stage takes too long, they wait."""
+        return max(0.0, self.own - (now - self.now)) + self.later
+
+
 class _Job:
     """Time left of a job, from the stages that it is expected to have; stages that do not occur are skipped.
+
+    Only reports change it: to ask for the time left does not.
 
     Attributes:
         place: number of the current stage, or of the last one before it, if it was not expected.
@@ -46,25 +61,34 @@ class _Job:
 
     def __init__(self, stages: Sequence[Stage], now: float) -> None:
         self._stages, self.place, self.expected, self.share = list(stages), -1, False, 0.0
-        self._begun = self._last = now
+        self._begun = now
         self._taken, self._worked = 0.0, 0.0  # seconds that stages took, and those that were expected
+        self._estimate: _Estimate | None = None
+        self._least, self._least_at = float("inf"), now  # the least time left until the last report, and when it held
 
     def report(self, name: str, share: float, now: float) -> None:
         """Take note of the share of a stage that is done."""
         if not self.expected or name != self._stages[self.place].name:
             self._begin(self._following(name), share, now)
         elif share > self.share:
-            self.share, self._last = share, now
-        elif share < self.share and name in (stage.name for stage in self._stages[self.place + 1 : self.place + 2]):
-            self._begin(self.place + 1, share, now)  # otherwise it goes on: it has more passes than expected
+            self.share = share
+        elif share < self.share and self._comes_next(name):
+            self._begin(self.place + 1, share, now)
+        else:  # it goes on: nothing is new, or it has more passes than expected
+            return
+        self._estimate_again(now)
 
     def _begin(self, place: int | None, share: float, now: float) -> None:
         if self.expected:
             self._taken += now - self._begun
             self._worked += self._stages[self.place].total
-        self.expected, self.share, self._begun, self._last = place is not None, share, now, now
+        self.expected, self.share, self._begun = place is not None, share, now
         if place is not None:
             self.place = place
+
+    def _comes_next(self, name: str) -> bool:
+        """Whether the stage after the current one has that name."""
+        return self.place + 1 < len(self._stages) and self._stages[self.place + 1].name == name
 
     def _following(self, name: str) -> int | None:
         """Number of the next stage of that name; None if too much would be skipped before it."""
@@ -84,13 +108,34 @@ class _Job:
         return done / max(sum(stage.total for stage in self._stages), 1e-9)
 
     def left(self, now: float) -> float | None:
-        """Estimated seconds until the job ends, or None if unknown."""
+        """Estimated seconds until the job ends; None if unknown, and once the least earlier estimate is over."""
+        if self._estimate is None or now > self._least_at + self._least:
+            return None
+        return min(self._estimate.at(now), MOST_RISE * self._least)
+
+    def _estimate_again(self, now: float) -> None:
+        """Estimate the time left at a report."""
+        if self._estimate is not None:
+            left = self.left(now)
+            if left is None:  # it was wrong, and limits the next one no longer
+                self._least = float("inf")
+            self._lower(left, now)
+        self._estimate = self._estimated(now)
+        self._lower(self.left(now), now)
+
+    def _lower(self, left: float | None, now: float) -> None:
+        """Take note of a time left if it is the least."""
+        if left is not None and left < self._least:
+            self._least, self._least_at = left, now
+
+    def _estimated(self, now: float) -> _Estimate | None:
+        """The time left by what is known at a report."""
         later = sum(stage.total for stage in self._stages[self.place + 1 :])
         if self.fraction < KNOWN_OF_JOB or not (self.expected or later):
             return None
         if not self.expected:
-            return self._cautious(later * self._taken / self._worked) if self._worked else None
-        stage, taken = self._stages[self.place], self._last - self._begun
+            return _Estimate(now, 0.0, self._cautious(later * self._taken / self._worked)) if self._worked else None
+        stage, taken = self._stages[self.place], now - self._begun
         done, before = self.share * stage.seconds, 0.0  # of this stage, and what it counts that others were slower
         if self._worked:
             trusted = min(TRUST_IN_PLAN * stage.total, self._worked)
@@ -99,7 +144,7 @@ class _Job:
             return None
         own = (taken + before) / done * (stage.total - self.share * stage.seconds)
         slowness = (self._taken + taken + own) / (self._worked + stage.total)
-        return self._cautious(max(0.0, own - (now - self._last)) + slowness * later)
+        return _Estimate(now, self._cautious(own), self._cautious(slowness * later))
 
     def _cautious(self, left: float) -> float:
         """A longer time as long as little is known, since an estimate may fall, but not rise."""
@@ -111,7 +156,8 @@ class Progress:
 
     The time left is that of the job if its stages are known in advance, and otherwise that of the stage, from the time
     that the second half of the part done has taken. It is counted down between reports. That of a job does not rise by
-    more than a tenth: if an estimate turns out too low, it waits.
+    more than a tenth: if an estimate turns out too low, it waits. Once the time has passed without an end, no time left
+    is told until the next report, which estimates it anew.
 
     Args:
         clock: returns the time in seconds.
@@ -132,7 +178,7 @@ class Progress:
         self._stage, self._share, self._begun, self._first = "", 0.0, clock(), 0.0
         self._reports = [(self._first, self._begun)]  # shares done, with their times
         self._job = _Job(stages, self._begun) if stages else None
-        self._least, self._lock = float("inf"), Lock()  # reports and texts come from different threads
+        self._lock = Lock()  # reports and texts come from different threads
 
     def __call__(self, stage: str, done: int, total: int) -> None:
         """Report that ``done`` of ``total`` units of a stage are complete."""
@@ -165,17 +211,9 @@ class Progress:
 
     @property
     def seconds_left(self) -> float | None:
-        """Estimated seconds until the job ends, or the stage if the job's are not known; None if unknown."""
+        """Estimated seconds until the job ends, or the stage if the job's are not known; None if unknown or overrun."""
         with self._lock:
-            return self._left_of_stage() if self._job is None else self._left_of_job(self._job)
-
-    def _left_of_job(self, job: _Job) -> float | None:
-        left = job.left(self._clock())
-        if left is None:
-            return None
-        left = min(left, MOST_RISE * self._least)
-        self._least = min(left, self._least)
-        return left
+            return self._left_of_stage() if self._job is None else self._job.left(self._clock())
 
     def _left_of_stage(self) -> float | None:
         done = self._share - self._first
@@ -183,8 +221,8 @@ class Progress:
             return None
         share, then = max(report for report in self._reports if report[0] <= self._first + done / 2)
         last = self._reports[-1][1]
-        estimate = (last - then) * (1 - self._share) / (self._share - share)
-        return max(0.0, estimate - (self._clock() - last))
+        left = (last - then) * (1 - self._share) / (self._share - share) - (self._clock() - last)
+        return left if left >= 0 else None
 
     def __str__(self) -> str:
         """The stage with the fraction done and the time left, or with the elapsed time if that is unknown."""

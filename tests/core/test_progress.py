@@ -144,8 +144,9 @@ def test_time_left_is_counted_down_between_reports() -> None:
     told("Averaging", 5, 10)
     clock.now = 8.0
     assert told.seconds_left == pytest.approx(2)
-    clock.now = 20.0
-    assert told.seconds_left == 0
+    clock.now = 20.0  # it is overrun
+    assert told.seconds_left is None
+    assert str(told) == "Averaging, 20 s so far"
 
 
 @pytest.mark.parametrize("run", list(RUNS))
@@ -195,14 +196,47 @@ def test_time_left_of_a_job_does_not_rise() -> None:
     told("Looking", 5, 10)
     first = told.seconds_left
     assert first is not None
-    clock.now = 50.0  # something slows it down
+    clock.now = 3.0  # something slows it down
+    waiting = told.seconds_left
+    assert waiting is not None
     told("Looking", 6, 10)
-    assert told.seconds_left == pytest.approx(1.1 * first)
-    clock.now = 51.0
+    assert told.seconds_left == pytest.approx(1.1 * waiting)
+    clock.now = 3.1
     told("Filtering", 9, 10)
     left = told.seconds_left
     assert left is not None
-    assert left <= 1.1 * first
+    assert left <= 1.1 * waiting
+
+
+def test_time_left_of_a_job_does_not_depend_on_who_asks() -> None:
+    clock, told_often, told_once = Clock(), [], []
+    often, once = (Progress(clock, [Stage("Looking", 1.0), Stage("Filtering", 10.0)]) for _ in range(2))
+    reports = [(0.2 * i, i / 10) for i in range(11)] + [(5.0, 0.5), (5.1, 0.51), (40.0, 0.6), (50.0, 0.7)]
+    for (now, share), (later, _) in zip(reports, [*reports[1:], (60.0, 1.0)], strict=True):
+        for progress in (often, once):
+            progress("Looking" if now <= 2.0 else "Filtering", round(100 * share), 100)
+        told_once.append(once.seconds_left)
+        told_often.append(often.seconds_left)
+        for _ in range(20):  # a display
+            clock.now += (later - now) / 20
+            str(often)
+    assert told_often == told_once
+
+
+def test_an_overrun_job_has_no_time_left_until_it_is_estimated_anew() -> None:
+    clock = Clock()
+    told = Progress(clock, [Stage("Filtering", 10.0)])
+    told("Filtering", 0, 10)
+    clock.now = 1.0
+    told("Filtering", 5, 10)
+    assert told.seconds_left == pytest.approx(1, rel=0.03)
+    for clock.now in (2.5, 4.0, 50.0):
+        assert told.seconds_left is None
+    assert str(told) == "Filtering, 50 s so far"
+    told("Filtering", 6, 10)
+    assert told.seconds_left == pytest.approx(50 / 6 * 4, rel=0.02)
+    clock.now = 60.0
+    assert told.seconds_left == pytest.approx(50 / 6 * 4 - 10, rel=0.03)
 
 
 def test_stages_of_a_job_that_were_not_expected() -> None:
