@@ -299,16 +299,18 @@ def fit_regions(
 ) -> Regions:
     """Compute the masks of regions from scribbles on each, and on the background: none, for all, or for each.
 
-    Masks of regions without scribbles are 0, except for what is painted by hand.
+    Masks of regions without scribbles in an image are 0, except for what is painted by hand.
     """
     if by_hand is None:
         return _computed_regions(source, inside, background, settings)
     MASK.check(source.batch, reach=settings.reach, extent=settings.extent)
     count = len(inside) or by_hand.count
-    numbers = [k for k, drawn in enumerate(inside) if bool((drawn.weights.detach() > 0).any())]
+    marked = [(drawn.weights.detach() > 0).flatten(1).any(1) for drawn in inside]  # images with scribbles on a region
+    numbers = [k for k, images in enumerate(marked) if bool(images.any())]
     if numbers:
         opposed = [background[k] for k in numbers] if len(background) > 1 else background
-        regions = _computed_regions(source, [inside[k] for k in numbers], opposed, settings)
+        images = torch.stack([marked[k] for k in numbers], dim=1)
+        regions = _computed_regions(source, [inside[k] for k in numbers], opposed, settings, images)
         reduced, steps = regions.reduced, regions.steps
     else:
         small, steps = _reduced(source, FLOATS_PER_PIXEL)
@@ -322,9 +324,16 @@ def fit_regions(
 
 
 def _computed_regions(
-    source: Source[M], inside: list[Scribbles], background: list[Scribbles], settings: RegionMask
+    source: Source[M],
+    inside: list[Scribbles],
+    background: list[Scribbles],
+    settings: RegionMask,
+    marked: Tensor | None = None,
 ) -> Regions:
-    """:func:`fit_regions` without what is painted by hand."""
+    """:func:`fit_regions` without what is painted by hand.
+
+    ``marked`` (B, K) tells which images have scribbles on each region; None is all of them.
+    """
     MASK.check(source.batch, reach=settings.reach, extent=settings.extent)
     inside, background = ([without_strays(drawn, source.size) for drawn in side] for side in (inside, background))
     several = len(background) > 1
@@ -345,17 +354,26 @@ def _computed_regions(
         generator=settings.generator,
     )
     rough = RoughMasks.of(small, options, settings.reach, everywhere)
-    reduced = [blocks_of(drawn, small, source.size, steps) for drawn in scribbles]
+    counted = scribbles if marked is None else list(map(_filled, scribbles, marked.unbind(1)))
+    reduced = [blocks_of(drawn, small, source.size, steps) for drawn in counted]
     image = small.image.clamp(0.0, 1.0)  # a far brighter pixel of a float file would upset the linear functions
     masks = torch.cat([rough.mask(number, drawn) for number, drawn in enumerate(reduced)], dim=1)
     front, back = torch.stack([drawn.planes(small) for drawn in reduced], dim=2).unbind(1)
     functions = small.kept("borders", [masks, front, back], partial(_fit_borders, small, image, masks, front, back))
+    if marked is not None:
+        functions = functions * marked[:, :, None, None, None]
     regions = Regions(image, steps, functions, scribbles)
     if everywhere:
         return regions
     belonging = connected if settings.extent == "object" else without_specks
     belongs = belonging(regions.reduced_masks(), front)
     return replace(regions, functions=functions * belongs.unsqueeze(2))
+
+
+def _filled(scribbles: Scribbles, marked: Tensor) -> Scribbles:
+    """Two planes of scribbles, with some on the region in images (B,) that have none: means of none are undefined."""
+    everywhere = scribbles.weights.new_tensor((1.0, 0.0)).view(1, 2, 1)
+    return scribbles.weighted(torch.where(marked.view(-1, 1, 1), scribbles.weights, everywhere))
 
 
 def _reduced(source: Source[M], floats: int) -> tuple[Reduced, tuple[float, float]]:

@@ -78,6 +78,40 @@ def test_several_colours_are_painted_on_several_pictures(image: torch.Tensor) ->
     assert torch.equal(erased, image)
 
 
+def test_pictures_of_a_batch_may_have_scribbles_or_a_brush(image: torch.Tensor) -> None:
+    pictures = torch.cat([image, image.flip(3)])
+    scribbles, brush = torch.cat([SCRIBBLE, NOTHING]), torch.cat([NOTHING, BRUSH])
+    blue, sliders = paint(0, 0, 1, torch.ones_like(BRUSH)), torch.tensor([3.0, 1.0])
+    colour = torch.cat([blue.expand(2, -1, -1, -1), brush], dim=1)
+    batches = (
+        region_mask(pictures, scribbles, added=brush, num_landmarks=20),
+        defocus(pictures, scribbles, added=brush, radius=2.0, num_landmarks=20),
+        enhance(pictures, sliders, scribbles, added=brush, num_landmarks=20),
+        recolor(pictures, blue, scribbles, added=colour, num_landmarks=20),
+    )
+    for number, (drawn, added, shown) in enumerate(
+        zip(scribbles.split(1), brush.split(1), colour.split(1), strict=True)
+    ):
+        picture = pictures[number : number + 1]
+        alone = (
+            region_mask(picture, drawn, added=added, num_landmarks=20),
+            defocus(picture, drawn, added=added, radius=2.0, num_landmarks=20),
+            enhance(picture, sliders, drawn, added=added, num_landmarks=20),
+            recolor(picture, blue, drawn, added=shown, num_landmarks=20),
+        )
+        for batch, single in zip(batches, alone, strict=True):
+            torch.testing.assert_close(batch[number : number + 1], single, atol=1e-5, rtol=0)
+
+
+def test_gradients_of_a_batch_are_finite_where_a_picture_has_no_scribble(image: torch.Tensor) -> None:
+    tensors = [torch.cat(pair) for pair in ((image, image), (SCRIBBLE, NOTHING), (NOTHING, BRUSH))]
+    pictures, scribbles, brush = (tensor.requires_grad_() for tensor in tensors)
+    region_mask(pictures, scribbles, added=brush, num_landmarks=20).square().sum().backward()
+    for tensor in (pictures, scribbles, brush):
+        assert tensor.grad is not None
+        assert tensor.grad.isfinite().all()
+
+
 def test_painting_ignores_how_opaque_the_picture_is(image: torch.Tensor) -> None:
     source = InMemory(image, weights=torch.full_like(BRUSH, 0.25))
     scribbles = source.scribbles(BRUSH / 2, None, "added")
