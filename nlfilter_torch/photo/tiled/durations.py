@@ -2,7 +2,7 @@
 
 ``durations.json`` has for each stage the seconds on a core until all of it is reported, those for each megapixel in
 addition, and both for what follows until the next stage; for pictures up to the viewing size, and for larger ones, that
-filters look at in that size. ``python -m benchmarks.durations`` measures them.
+filters look at in that size. ``python -m benchmarks.durations`` measures them, with the defaults of ``MEASURED``.
 """
 
 import json
@@ -11,6 +11,7 @@ from dataclasses import replace
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
+from typing import NamedTuple
 
 from nlfilter_torch.core.progress import Stage
 from nlfilter_torch.photo.declared.shared_parameters import VIEWING_SIZE
@@ -19,17 +20,33 @@ from nlfilter_torch.photo.declared.steps import Step, acting_steps
 USUAL = 5.0  # seconds
 WRITING = {".png": 0.25}  # seconds of writing a megapixel, by the suffix of the file
 QUICK_WRITING = 0.02  # of other files
-Durations = dict[
-    str, dict[str, list[tuple[str, float, float, float, float]]]
-]  # of "small" and "large" pictures, by edit
+#: Parameters that change how long an edit takes; it is known for their defaults only.
+MEASURED = ("method", "viewing_size", "landmarks", "sampling", "patch_size")
+
+
+class Line(NamedTuple):
+    """A stage in the file: seconds until all of it is reported, and those after that, with those of a megapixel."""
+
+    name: str
+    seconds: float
+    more_seconds: float
+    rest: float
+    more_rest: float
+
+    def stage(self, megapixels: float) -> Stage:
+        """The stage on a picture of that size."""
+        seconds, rest = self.seconds + self.more_seconds * megapixels, self.rest + self.more_rest * megapixels
+        return Stage(self.name, seconds, rest)
 
 
 @cache
-def _durations() -> Durations:
-    """What the file says."""
+def _durations() -> dict[str, dict[str, list[Line]]]:
+    """What the file says of "small" and "large" pictures, by edit."""
     text = files("nlfilter_torch.photo.tiled").joinpath("durations.json").read_text()
-    durations: Durations = json.loads(text)
-    return durations
+    return {
+        edit: {kind: [Line(*line) for line in lines] for kind, lines in kinds.items()}
+        for edit, kinds in json.loads(text).items()
+    }
 
 
 def expected_stages(steps: Iterable[Step], size: tuple[int, int]) -> list[Stage]:
@@ -56,13 +73,8 @@ def written(stages: list[Stage], size: tuple[int, int], path: Path) -> list[Stag
 def stages_of(step: Step, size: tuple[int, int], *, regional: bool) -> list[Stage]:
     """The stages of a step on a photograph (H, W), in a region or everywhere; none if they are not known."""
     name = f"{step.edit} of a region" if regional else step.edit
-    methods = [parameter for parameter in step.declared if parameter.name == "method"]
-    if name not in _durations() or any(step["method"] != method.default for method in methods):
+    if name not in _durations() or any(step[p.name] != p.default for p in step.declared if p.name in MEASURED):
         return []
     megapixels = size[0] * size[1] / 1e6
     kind = "small" if megapixels <= VIEWING_SIZE.default_number else "large"
-    lines = _durations()[name][kind]
-    return [
-        Stage(stage, seconds + more_seconds * megapixels, rest + more_rest * megapixels)
-        for stage, seconds, more_seconds, rest, more_rest in lines
-    ]
+    return [line.stage(megapixels) for line in _durations()[name][kind]]

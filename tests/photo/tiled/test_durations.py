@@ -8,6 +8,7 @@ import pytest
 
 from nlfilter_torch.core.progress import Progress
 from nlfilter_torch.photo import Step, Stroke
+from nlfilter_torch.photo.declared.json_values import Value
 from nlfilter_torch.photo.tiled.durations import duration, expected_stages, stages_of, writing, written
 from tests.recipes import IN, RECOLOR
 
@@ -63,9 +64,21 @@ def test_the_last_stage_writes_the_file() -> None:
     assert written([], SIZE, path) == [] != rest
 
 
-def test_durations_are_those_of_the_default_method() -> None:
-    assert expected_stages([Step("denoise")], SIZE)
-    assert expected_stages([Step("denoise", method="rule")], SIZE) == []
+@pytest.mark.parametrize(
+    ("edit", "values"),
+    [
+        ("denoise", {"method": "rule"}),
+        ("detail", {"viewing_size": 0.0}),
+        ("tone", {"landmarks": 20}),
+        ("sharpen", {"patch_size": 3}),
+        ("detail", {"sampling": "uniform"}),
+    ],
+)
+def test_durations_are_not_known_for_other_parameters_that_change_them(edit: str, values: dict[str, Value]) -> None:
+    step = Step(edit, **values)
+    assert step.values
+    assert expected_stages([Step(edit).changed(bandwidth=12.0)], SIZE)  # takes as long
+    assert expected_stages([step], SIZE) == []
 
 
 @pytest.mark.parametrize("run", RUNS, ids=[" ".join((*run["edits"], str(run["size"][0]))) for run in RUNS])
