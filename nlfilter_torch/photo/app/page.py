@@ -200,6 +200,7 @@ class Editor:
         if self.session.opened is None:
             self._tasks.show_error("open a photograph first; there is nothing grey to point at")
             return
+        self._end_crop()
         self._canvas.await_click(None if self._canvas.pick is not None else self._balance)
         self._panel.follow()
 
@@ -218,11 +219,18 @@ class Editor:
         if self.session.opened is None:
             self._tasks.show_error("open a photograph first; there is nothing to crop")
             return
-        self._is_cropping = not self._is_cropping
-        self._panel.follow()
         if self._is_cropping:
-            self._tasks.start(self._show_crop())
+            self._end_crop()
         else:
+            self._is_cropping = True
+            self._canvas.await_click(None)
+            self._tasks.start(self._show_crop())
+        self._panel.follow()
+
+    def _end_crop(self) -> None:
+        """Hide the frame of the crop."""
+        if self._is_cropping:
+            self._is_cropping = False
             self._canvas.hide_crop()
 
     async def _show_crop(self) -> None:
@@ -392,7 +400,11 @@ class Editor:
     def _switch(self, tab: str) -> None:
         """Show what belongs to a tab that was opened."""
         self._tab = tab
+        was_pointing = self._is_cropping or self._canvas.pick is not None
+        self._end_crop()
         self._canvas.switch(tab)
+        if was_pointing:
+            self._panel.follow()
         if tab == DETAIL.name and self.session.opened is not None:
             self._tasks.start(self._respond())
 
@@ -429,6 +441,8 @@ class Editor:
         self._closeup.open(self.session)
         self._framed = framed(self.session)
         with self._client:
+            self._end_crop()
+            self._canvas.await_click(None)
             self._canvas.open(self.session, self.session.developed.before, self.session.size)
         pictures = await self._tasks.run("Opening", partial(thumbnails, opened.preview.pixels))
         if self.session.opened is not opened or self._client.is_deleted:  # meanwhile

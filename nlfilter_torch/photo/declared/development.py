@@ -15,6 +15,8 @@ from nlfilter_torch.photo.declared.strokes import Stroke
 
 Crop = tuple[float, float, float, float]
 WHOLE: Crop = (0.0, 0.0, 1.0, 1.0)
+Point = tuple[float, float]
+EXACT = 1e-9  # pixels, within which an edge is that of a pixel
 
 #: Declared as an edit is, though it is no step: it comes first, and once.
 DEVELOP = Edit(
@@ -135,6 +137,8 @@ class Development:
         """Check all values."""
         for name, value in vars(self).items():
             check_value(name, value)
+        left, top, right, bottom = map(float, self.crop)
+        object.__setattr__(self, "crop", (left, top, right, bottom))
 
     @property
     def is_idle(self) -> bool:
@@ -178,6 +182,8 @@ class Development:
                 f"{', '.join(f'{edge:g}' for edge in self.crop)}; move it inwards"
             )
         columns, rows = (_inside(m + n / 2, share * h) for m, n, h in zip(middle, (width, height), half, strict=True))
+        if not (columns and rows):
+            columns, rows = _thin(columns, rows, middle, angle, size)
         return Frame(size, angle, rows.start, columns.start, len(rows), len(columns))
 
     def to_json(self, indent: str = "", *, complete: bool = False) -> str:
@@ -312,6 +318,51 @@ def _reach(middle: tuple[float, float], corner: tuple[float, float], angle: floa
 
 
 def _inside(middle: float, half: float) -> range:
-    """The whole pixels between the ends of an interval, or that in its middle if there are none."""
-    pixels = range(math.ceil(middle - half - 1e-9), math.floor(middle + half + 1e-9))
-    return pixels if len(pixels) else range(math.floor(middle), math.floor(middle) + 1)
+    """The whole pixels between the ends of an interval."""
+    return range(math.ceil(middle - half - EXACT), math.floor(middle + half + EXACT))
+
+
+def _thin(columns: range, rows: range, middle: Point, angle: float, size: tuple[int, int]) -> tuple[range, range]:
+    """Columns and rows of a crop that holds no whole pixel on one axis or on both, but has one there.
+
+    It has no empty corners, or is a single pixel whose centre is within the turned picture (H, W). ``middle`` is that
+    of the crop, from that of the picture.
+    """
+    height, width = size
+    x, y = middle
+    if rows:
+        column = math.floor(x + width / 2)
+        rows = _kept(rows, column - width / 2, height, ((1, 0), (0, 1)), angle, size)
+        if rows:
+            return range(column, column + 1), rows
+    elif columns:
+        row = math.floor(y + height / 2)
+        columns = _kept(columns, row - height / 2, width, ((0, 1), (1, 0)), angle, size)
+        if columns:
+            return columns, range(row, row + 1)
+    steps = math.ceil(2 * math.hypot(x, y)) + 1
+    for step in range(steps + 1):  # to the middle of the picture, around which all pixels are within
+        share = 1 - step / steps
+        column, row = math.floor(share * x + width / 2), math.floor(share * y + height / 2)
+        across, down = turned(column + 0.5 - width / 2, row + 0.5 - height / 2, -angle)
+        if abs(across) < width / 2 - EXACT and abs(down) < height / 2 - EXACT:
+            break
+    return range(column, column + 1), range(row, row + 1)
+
+
+def _kept(
+    pixels: range, first: float, length: int, axes: tuple[Point, Point], angle: float, size: tuple[int, int]
+) -> range:
+    """The pixels of a line, one pixel wide and ``first`` its border, that are within the turned picture (H, W).
+
+    ``axes`` are the direction across the line and that along it, ``length`` that of the picture along it.
+    """
+    across, along = (turned(*axis, -angle) for axis in axes)
+    low, high = -math.inf, math.inf
+    for border in (first, first + 1):
+        for a, b, side in zip(across, along, size[::-1], strict=True):
+            ends = sorted((sign * side / 2 - a * border) / b for sign in (-1, 1))
+            low, high = max(low, ends[0]), min(high, ends[1])
+    start = max(pixels.start, math.ceil(low + length / 2 + EXACT)) if low < length else pixels.stop
+    stop = min(pixels.stop, math.floor(high + length / 2 - EXACT)) if high > -length else pixels.start
+    return range(start, max(start, stop))

@@ -4,7 +4,7 @@ import asyncio
 import shutil
 import subprocess
 import zipfile
-from collections.abc import Awaitable, Iterator
+from collections.abc import Awaitable, Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -89,6 +89,32 @@ def test_a_photograph_is_opened(opened: Page, photo: Path, scripts: list[str]) -
     assert scripts[-1] != "page.isUnsaved = true"
     editor._begin(photo, "")  # a browser that reconnects keeps its edit
     assert opened.works == []
+
+
+def test_the_frame_of_the_crop_ends_with_its_tab_and_its_photograph(opened: Page, photo: Path) -> None:
+    editor = opened.editor
+    tool = editor._canvas._crop_tool._tool
+
+    def crop() -> None:
+        editor._toggle_crop()
+        opened.finish()
+        assert editor._is_cropping
+        assert tool.visible
+        assert editor._canvas.pick is None
+
+    ends: list[Callable[[], None]] = [
+        editor._toggle_crop,
+        editor._toggle_pick,
+        lambda: editor._switch("tone"),
+        lambda: editor._tasks.start(editor._open(lambda: editor._photographs.open(photo))),
+    ]
+    for end in ends:
+        crop()
+        end()
+        opened.finish()
+        assert not editor._is_cropping
+        assert not tool.visible
+    assert editor._canvas.pick is None
 
 
 def test_a_file_that_cannot_be_opened(page: Page, photo: Path) -> None:
@@ -211,7 +237,7 @@ def test_functions_of_the_script() -> None:
     done = subprocess.run([program, "--test", *files], cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "# fail 0" in done.stdout
-    assert len(files) == 3
+    assert len(files) == 4
 
 
 def test_scripts_of_the_page_are_files() -> None:

@@ -2,6 +2,8 @@
 
 import json
 import math
+import random
+from contextlib import suppress
 from dataclasses import replace
 
 import pytest
@@ -72,6 +74,33 @@ def test_a_crop_alone_is_of_whole_pixels() -> None:
     assert (frame.top, frame.left, frame.size, frame.angle) == (0, 2, (9, 18), 0)
     assert Development(crop=(0.999, 0.0, 1.0, 0.001)).frame((3, 4)).size == (1, 1)
     assert Development(exposure=1.0).frame((3, 4)).is_whole
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_edges_of_a_frame_give_it_again(seed: int) -> None:
+    """Also of a crop that is thinner than a pixel, whose frame is within the turned picture."""
+    draw = random.Random(seed)
+    frames = []
+    while len(frames) < 500:
+        size = draw.randint(1, 300), draw.randint(1, 300)
+        left, top = draw.random(), draw.random()
+        thin = draw.choice([1e-6, 1.0]), draw.choice([1e-6, 1.0])
+        crop = left, top, left + thin[0] * (1 - left), top + thin[1] * (1 - top)
+        development = Development(straighten=draw.choice([0.0, draw.uniform(-45, 45)]), crop=crop)
+        with suppress(ValueError):  # its middle is outside
+            frame = development.frame(size)
+            frames.append(frame)
+            assert replace(development, crop=frame.edges).frame(size) == frame
+            x, y = frame.outward(0.5, 0.5)
+            assert 0 < x < 1
+            assert 0 < y < 1
+
+
+def test_edges_may_be_a_list() -> None:
+    entries = [0, 0, 1, 1]
+    development = Development(crop=entries)  # type: ignore[arg-type]
+    assert development.is_idle
+    assert hash(development) == hash(Development())
 
 
 def test_a_crop_whose_middle_is_outside_is_refused() -> None:

@@ -29,8 +29,8 @@ class Cropper {
     picture.querySelector("img").src = address;
     picture.style.width = `min(100cqw, calc(100cqh * ${width / height}))`;
     picture.style.aspectRatio = `${width} / ${height}`;
-    if (!this.#drag) {
-      this.#place(edges);
+    if (!this.#drag && !this.#timer) {
+      this.#place(edges); // else it is an answer to edges of before
     }
   }
 
@@ -38,7 +38,7 @@ class Cropper {
   hide() {
     document.documentElement.classList.remove("cropping");
     this.#drag = null;
-    clearTimeout(this.#timer);
+    this.#stopTimer();
   }
 
   #listen() {
@@ -100,7 +100,13 @@ class Cropper {
   }
 
   #tell() {
+    this.#stopTimer();
     emitEvent("crop", atLeast(this.#edges));
+  }
+
+  #stopTimer() {
+    clearTimeout(this.#timer);
+    this.#timer = 0;
   }
 
   #key(event) {
@@ -115,6 +121,9 @@ class Cropper {
       clearTimeout(this.#timer);
       this.#timer = setTimeout(() => this.#tell(), REST);
     } else if (event.key === "Escape" || (event.key === "Enter" && edge)) {
+      if (this.#timer) {
+        this.#tell();
+      }
       emitEvent("crop_done");
     } else {
       return;
