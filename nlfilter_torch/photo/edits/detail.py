@@ -1,7 +1,7 @@
 """Detail sliders for the whole image, or for everything similar to painted regions. Paper: Figs. 12, 13."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import ClassVar, Literal, Self
 
@@ -35,9 +35,11 @@ from nlfilter_torch.photo.picture.drawn import Drawn, M
 from nlfilter_torch.photo.picture.edit import FilteredEdit
 from nlfilter_torch.photo.picture.in_memory import edit_image
 from nlfilter_torch.photo.picture.limits import Limits
-from nlfilter_torch.photo.picture.pixels import whole_image
+from nlfilter_torch.photo.picture.pixels import corner, whole_image
+from nlfilter_torch.photo.picture.resizing import enlarged
 from nlfilter_torch.photo.picture.source import Fitted, Guide, Pixels, Planes, Source, luminance
-from nlfilter_torch.photo.picture.viewing import fit_change
+from nlfilter_torch.photo.picture.viewing import balance, enlarged_change, fit_change, viewed_size, within_limits
+from nlfilter_torch.photo.selections.by_hand import ByHand
 from nlfilter_torch.photo.selections.connected import Extent
 from nlfilter_torch.photo.selections.mask import RegionMask, Regions
 
@@ -239,33 +241,49 @@ class Detail(FilteredEdit):
         change = DetailChange(self._filtered(viewed, order), sliders)
         if not isinstance(self.threshold, Tensor) and self.threshold == 0:
             return Fitted(change.total)
-        return Fitted(change, self._limited, blur_margin(VARIANCE_SIGMA))
+        return self._fitted(change)
 
     def _fit_regions(
         self, source: Source[M], masks: Mapping[str, M], sliders: Tensor, outside: Tensor | None
     ) -> Fitted:
         elsewhere = torch.zeros_like(sliders[0]) if outside is None else outside - 1
         brighter = None if outside is None else change_of_mean(torch.cat([sliders, outside[None] - 1]))
-        return fit_change(
-            source,
-            partial(self._change_of_regions, source, masks, [*sliders, elsewhere]),
-            self.planes,
-            self.viewing_size,
-            self.limits,
-            brighter=None if brighter is None else brighter.to(source.dtype),
-        )
+        brighter = None if brighter is None else brighter.to(source.dtype)
+        size, rows = viewed_size(source.size, self.viewing_size), [*sliders, elsewhere]
+        viewed = source if size == source.size else source.resized(size)
+        regional = self._change_of_regions(source, masks, rows, viewed)
+        change = self._fitted(regional)
+        if size == source.size:
+            return within_limits(source, change, self.limits, brighter)
+        by_hand = ByHand.of(source, masks.get("added"), masks.get("removed"), len(sliders))
+        if by_hand is None:
+            return enlarged_change(source, viewed, change, self.planes, self.limits, brighter=brighter)
+        corrected = None if brighter is None else balance(viewed, change, self.limits, brighter)
+        computed = replace(regional, regions=replace(regional.regions, by_hand=None))
+        versions: list[Planes] = [*(regional.changes if outside is not None else regional.changes[:-1]), computed]
+        edited = [
+            enlarged_change(source, viewed, self._fitted(version), self.planes, self.limits, brighter=corrected).pixels
+            for version in versions
+        ]
+        if outside is None:
+            edited.insert(-1, whole_image)
+        steps = source.size[0] / size[0], source.size[1] / size[1]
+        return Fitted(BlendedByHand(edited, viewed.all(Fitted(computed.regions.masks)), steps, by_hand))
+
+    def _fitted(self, change: Planes) -> Fitted:
+        """A change of detail at the viewing size."""
+        return Fitted(change, self._limited, blur_margin(VARIANCE_SIGMA))
 
     def _change_of_regions(
         self, source: Source[M], masks: Mapping[str, M], sliders: list[Tensor], viewed: Source[M]
-    ) -> Fitted:
+    ) -> "RegionalChange":
         """The change of the regions of a picture at the viewing size, by a row of sliders for each and for the rest."""
         selector = self.selection()  # takes the state of the generator before the filter draws from it
         filtered = self._filtered(viewed, sliders[0].shape[-1] - 1)
         if viewed.size != source.size:
             masks = {name: source.resized_weights(mask, viewed.size, name) for name, mask in masks.items()}
         regions = selector.select(viewed, self.marks(Drawn(masks)))
-        changes = [DetailChange(filtered, row) for row in sliders]
-        return Fitted(RegionalChange(changes, regions), self._limited, blur_margin(VARIANCE_SIGMA))
+        return RegionalChange([DetailChange(filtered, row) for row in sliders], regions)
 
     def _limited(self, image: Tensor, changes: Tensor, _: Inner) -> Tensor:
         return limit_by_activity(changes, activity(image), self.threshold)
@@ -314,3 +332,29 @@ class RegionalChange:
     def __call__(self, pixels: Pixels) -> Tensor:
         """Added detail and the rest of the change at the given pixels."""
         return blend_changes(torch.cat([change(pixels) for change in self.changes], dim=1), self.regions.masks(pixels))
+
+
+@dataclass(frozen=True, eq=False)
+class BlendedByHand:
+    """Versions of a picture, blended by what is painted on the masks of its regions by hand.
+
+    So this is not reduced to the viewing size and enlarged again, which would blur it.
+
+    Attributes:
+        versions: the picture edited as inside each of K regions, as outside them, and by the computed masks.
+        masks: the computed masks, (B, K, h, w), in the reduced picture.
+        steps: height and width of one of its pixels, in pixels of the picture.
+        by_hand: what is painted.
+    """
+
+    versions: list[Planes]
+    masks: Tensor
+    steps: tuple[float, float]
+    by_hand: ByHand
+
+    def __call__(self, pixels: Pixels) -> Tensor:
+        """The edited pixels."""
+        height, width = pixels.image.shape[-2:]
+        masks = enlarged(self.masks, self.steps, corner(pixels), (height, width))
+        parts = self.by_hand.parts(masks, pixels).unsqueeze(2)
+        return (parts * torch.stack([version(pixels) for version in self.versions], dim=1)).sum(1)

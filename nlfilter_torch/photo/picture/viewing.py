@@ -72,7 +72,20 @@ def fit_change(
     if small == source.size:
         return within_limits(source, change(source), limits, brighter)
     reduced = source.resized(small)
-    fitted, balance = _limited(reduced, change(reduced), limits, brighter)
+    return enlarged_change(source, reduced, change(reduced), planes, limits, brighter=brighter)
+
+
+def enlarged_change(
+    source: Source[M],
+    reduced: Source[M],
+    change: Fitted,
+    planes: Planes,
+    limits: Limits,
+    *,
+    brighter: float | Tensor | Balance | None = 0.0,
+) -> Fitted:
+    """The edit of a picture by a change of its reduction to a smaller size; arguments as in :func:`fit_change`."""
+    fitted, balance = _limited(reduced, change, limits, brighter)
     before, image = reduced.all(Fitted(planes)), reduced.all(Fitted(lambda pixels: pixels.image))
     after, saturation = balanced(image, reduced.all(fitted), balance, limits)
     coarse = Coarse.of(before, after, saturation, limits)

@@ -60,6 +60,24 @@ class ByHand:
 
     def over(self, masks: Tensor, pixels: Pixels) -> Tensor:
         """Masks (B, K, h, w) of the given pixels, with what is painted over them."""
+        added, removed = self._weights(masks, pixels)
+        return masks * (1 - added - removed) + added
+
+    def parts(self, masks: Tensor, pixels: Pixels) -> Tensor:
+        """Parts (B, K + 2, h, w) of the given pixels, which sum to 1.
+
+        They are what is painted and belongs to each region, what is painted and belongs to none, and what is not
+        painted. Masks (B, K, h, w) count where only some of the regions are removed.
+        """
+        added, removed = self._weights(masks, pixels)
+        painted = (added + removed).amax(1, keepdim=True)
+        inside = masks * (painted - added - removed) + added
+        total = inside.sum(1, keepdim=True)
+        inside = inside * torch.where(total > painted, painted / torch.where(total > painted, total, 1.0), 1.0)
+        return torch.cat([inside, painted - inside.sum(1, keepdim=True), 1 - painted], dim=1)
+
+    def _weights(self, masks: Tensor, pixels: Pixels) -> tuple[Tensor, Tensor]:
+        """What is added to masks and removed from them, like them (B, K, h, w); the sum is at most 1."""
         added, removed = (
             torch.zeros_like(masks) if planes is None else planes(pixels).to(masks)
             for planes in (self.added, self.removed)
@@ -67,8 +85,7 @@ class ByHand:
         if masks.shape[1] > 1:
             others = [_without(added, k).amax(1, keepdim=True) for k in range(masks.shape[1])]
             removed = removed.maximum(torch.cat(others, dim=1) * (1 - added))
-        added = added.minimum(1 - removed)
-        return masks * (1 - added - removed) + added
+        return added.minimum(1 - removed), removed
 
 
 def opaque(source: Source[M], painted: Scribbles) -> Scribbles:

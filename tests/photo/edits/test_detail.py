@@ -97,3 +97,23 @@ def test_distance_counts_unless_told_otherwise(tmp_path: Any, capsys: pytest.Cap
     assert (read_photograph(tmp_path / "out.png").pixels - wanted.clamp(0, 1)).abs().max() < 0.6 / 255
     assert main([*arguments, "--spatial-bandwidth", "far"]) == 2
     assert "--spatial-bandwidth must be a positive number of pixels, such as 20, or none" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("outside", [None, torch.tensor([0.5, 1.0, 1.0])])
+def test_what_is_painted_by_hand_is_not_blurred_above_the_viewing_size(outside: torch.Tensor | None) -> None:
+    image, shown = colour("astronaut"), {"viewing_size": 0.001, "limits": "none", "num_landmarks": 50}
+    sliders = torch.tensor([[4.0, 3.0, 1.0], [0.0, 2.0, 1.0]])
+    scribbles, none = torch.cat([box(37, 8), box(4, 42)], dim=1), torch.zeros(1, 1, 64, 64)
+    brush, eraser = box(21, 21, 13, 15), box(24, 31, 21, 9)
+    added, removed = torch.cat([brush, none], dim=1), torch.cat([none, eraser], dim=1)
+    unchanged = image if outside is None else enhance(image, outside, **shown)
+    inside = enhance(image, sliders[0], **shown)
+    edited = enhance(image, sliders, scribbles, added=added, removed=removed, outside=outside, **shown)
+    torch.testing.assert_close(edited * brush, inside * brush, atol=2e-6, rtol=0)
+    plain = enhance(image, sliders, scribbles, outside=outside, **shown)
+    assert torch.equal(torch.where((brush + eraser) > 0, 0.0, edited), torch.where((brush + eraser) > 0, 0.0, plain))
+    erased = enhance(image, sliders, scribbles, added=added, removed=eraser, outside=outside, **shown)
+    torch.testing.assert_close(erased * eraser, unchanged * eraser, atol=2e-6, rtol=0)
+    half = enhance(image, sliders[0], added=brush / 2, outside=outside, **shown)
+    wanted = torch.where(brush > 0, (inside + unchanged) / 2, unchanged)
+    torch.testing.assert_close(half, wanted, atol=2e-6, rtol=0)
