@@ -142,15 +142,19 @@ class Session:
     def keep_in(self, sidecar: Sidecar) -> None:
         """Load the edit that is kept in a file, and keep the edit there from now on."""
         self._sidecar = sidecar
-        self.recipe = self._shown = self.saved = self._kept = sidecar.read() or Recipe()
+        self.recipe = self._shown = self.saved = self._kept = self._read(sidecar)
 
     def restore(self) -> None:
         """Load the edit from its file again if another program has changed the file."""
         if self._sidecar is not None:
-            recipe = self._sidecar.read() or Recipe()
+            recipe = self._read(self._sidecar)
             if recipe != self._kept:
                 self._kept = recipe
                 self.load(recipe)
+
+    def _read(self, sidecar: Sidecar) -> Recipe:
+        """The edit that is kept in a file, or one that changes nothing."""
+        return sidecar.read(self._opened_to("edit").photograph.size) or Recipe()
 
     @property
     def trouble(self) -> str | None:
@@ -255,7 +259,7 @@ class Session:
             ValueError: if it is grey anyway, or too dark there.
         """
         before, reach = self.developed.before, POINTED
-        column, row = round(x), round(y)
+        column, row = (min(max(math.floor(at), 0), n - 1) for at, n in zip((x, y), before.shape[:1:-1], strict=True))
         part = before[..., max(0, row - reach) : row + reach + 1, max(0, column - reach) : column + reach + 1]
         temperature, tint = balance_of(part)
         return {"temperature": temperature, "tint": tint}
@@ -510,7 +514,7 @@ class Session:
     def load_preset(self, content: bytes, name: str) -> None:
         """Load an edit from the content of a file; raises ValueError if it has none, or if no photograph is open."""
         opened, recipe = self._opened_to("edit"), Recipe.from_file(content, name)
-        recipe.develop.frame(opened.photograph.size)  # refuses a crop that is outside
+        recipe.check_crop(opened.photograph.size, name)
         self.load(recipe)
 
 

@@ -49,11 +49,16 @@ class Sidecar:
                 return Sidecar(beside)
         return Sidecar(state_folder() / f"{digest[:16]}-{os.fsencode(name)[-80:].decode(errors='ignore')}{ENDING}")
 
-    def read(self) -> Recipe | None:
-        """The edit in the file, or None; an unreadable file is renamed, so that nothing in it is lost."""
+    def read(self, size: tuple[int, int]) -> Recipe | None:
+        """The edit in the file, or None; an unreadable file is renamed, so that nothing in it is lost.
+
+        A file whose crop is outside a photograph (H, W) counts as one.
+        """
         self.trouble = None
         try:
-            return Recipe.from_json(self.path.read_bytes(), str(self.path))
+            recipe = Recipe.from_json(self.path.read_bytes(), str(self.path))
+            recipe.check_crop(size, str(self.path))
+            return recipe
         except FileNotFoundError:
             return None
         except OSError as error:

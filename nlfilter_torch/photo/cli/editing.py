@@ -276,7 +276,7 @@ class FileEdit(Protocol):
         """New pixels (1, C, H, W) of a photograph in memory that is developed already."""
 
     def stages(self, size: tuple[int, int]) -> list[Stage]:
-        """The stages of the edit in tiles of a photograph (H, W), if they are known."""
+        """The stages of the edit in tiles of a photograph that is (H, W) before it is developed, if they are known."""
 
     def tiling(self, job: Job) -> AbstractContextManager[Tiling]:
         """The edited rows of a photograph that does not fit in memory, which are computed within the block."""
@@ -336,7 +336,7 @@ def edit_file(
         check_place(Path(target), stored, like, allowed)
         processes = processes_for(workers, cluster, stack)
         size = picture.shape[:2]
-        report = stack.enter_context(stages(written(edit.stages(size), size, Path(target))))
+        report = stack.enter_context(stages(written(edit.stages(size), edit.develop.frame(size).size, Path(target))))
         job = Job(picture, stored, allowed - picture.cached, allowed_memory(memory, TILED), report, stack, processes)
         with edit.tiling(job) as tiling:
             write_picture(Path(target), tiling, stored, like, quality)

@@ -19,7 +19,7 @@ from nlfilter_torch.photo.io.photographs import Photograph
 from nlfilter_torch.photo.picture.changes import blend_edited
 from nlfilter_torch.photo.picture.edit import Rows
 from nlfilter_torch.photo.tiled.developed import developed_rows
-from nlfilter_torch.photo.tiled.durations import expected_stages
+from nlfilter_torch.photo.tiled.durations import expected_stages, straightening
 from nlfilter_torch.photo.tiled.pictures import Picture, RowSource
 from nlfilter_torch.photo.tiled.recipe import edit_regions, edit_tiling
 from nlfilter_torch.photo.tiled.tiles import Passes, Tiling
@@ -76,8 +76,10 @@ class RecipeJob:
         return blend_edited(photograph.pixels, pixels, editing.read_masks(self.masks, self.source, photograph.size))
 
     def stages(self, size: tuple[int, int]) -> list[Stage]:
-        """The stages of the recipes in tiles of a photograph (H, W), if they are known."""
-        return [] if self.full else expected_stages((step for recipe in self.recipes for step in recipe.steps), size)
+        """The stages in tiles of a photograph that is (H, W) before it is developed, if they are known."""
+        framed, recipes = self.develop.frame(size).size, self.on_developed(size).recipes
+        stages = [] if self.full else expected_stages((step for recipe in recipes for step in recipe.steps), framed)
+        return [straightening(framed), *stages] if stages and self.develop.straighten else stages
 
     @contextmanager
     def tiling(self, job: Job) -> Iterator[Tiling]:

@@ -20,7 +20,7 @@ from nlfilter_torch.photo.edits.look import LookEdit
 from nlfilter_torch.photo.edits.recolor import Recolor
 from nlfilter_torch.photo.edits.sharpen import Sharpen
 from nlfilter_torch.photo.edits.tone import Tone
-from nlfilter_torch.photo.picture.developing import develop_image, develop_planes
+from nlfilter_torch.photo.picture.developing import develop_image, develop_planes, limits_of
 from nlfilter_torch.photo.picture.drawn import Drawn, M, Painter
 from nlfilter_torch.photo.picture.edit import PhotoEdit
 from nlfilter_torch.photo.picture.in_memory import InMemory, fit_edit
@@ -214,13 +214,6 @@ def apply_recipe(
     for done, step in enumerate(steps):
         if report is not None:
             report(done, len(steps))
-        before = image if result is image else _limited(result, image)
+        before = image if result is image else result.clamp(*limits_of(image))
         result = apply_step(step, before, weights=weights, generator=generator)
     return result
-
-
-def _limited(result: Tensor, image: Tensor) -> Tensor:
-    """Limit the result of a step to [0, 1], or to the range of the image (B, C, H, W) if that is larger."""
-    values = image.detach()
-    least, most = values.amin((1, 2, 3), keepdim=True), values.amax((1, 2, 3), keepdim=True)
-    return result.clamp(least.clamp(max=0), most.clamp(min=1))

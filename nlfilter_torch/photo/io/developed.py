@@ -24,10 +24,9 @@ def develop_photograph(photograph: Photograph, development: Development) -> Phot
     Raises:
         ValueError: if the middle of the crop is outside the turned picture.
     """
-    limits = limits_of(photograph.pixels) if not development.is_idle else None
-    return (
-        photograph if limits is None else lit_photograph(cut_photograph(photograph, development), development, limits)
-    )
+    if development.is_idle:
+        return photograph
+    return lit_photograph(cut_photograph(photograph, development), development, limits_of(photograph.pixels))
 
 
 def cut_photograph(photograph: Photograph, development: Development) -> Photograph:

@@ -13,6 +13,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from nlfilter_torch.core.checks import check_dtype, check_tensor
 from nlfilter_torch.core.workers import in_order, threads_for
 from nlfilter_torch.photo.declared.development import Development, Frame, turned
 
@@ -43,7 +44,8 @@ def develop_image(image: Tensor, development: Development) -> Tensor:
         (B, C, h, w); the image itself if nothing changes. Differentiable.
 
     Raises:
-        ValueError: if the middle of the crop is outside the turned picture.
+        TypeError: if ``image`` is not a floating-point tensor.
+        ValueError: if it has another shape, or the middle of the crop is outside the turned picture.
 
     Example:
         >>> grey = torch.full((1, 1, 4, 6), 0.5)
@@ -53,6 +55,12 @@ def develop_image(image: Tensor, development: Development) -> Tensor:
     """
     if development.is_idle:
         return image
+    check_tensor(image, "image", "convert it with torch.as_tensor")
+    check_dtype(image, "image", "divide integer pixels by the value of white, such as 255")
+    if image.ndim != 4 or image.shape[1] not in (1, 3):
+        raise ValueError(
+            f"image must have shape (B, C, H, W) with 1 or 3 channels, got {tuple(image.shape)}; pass grey or RGB"
+        )
     least, most = limits_of(image)
     framed = develop_planes(image, development.frame((image.shape[-2], image.shape[-1])))
     return in_light(framed.clamp(least, most), development, (least, most))

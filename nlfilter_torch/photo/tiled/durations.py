@@ -20,6 +20,7 @@ from nlfilter_torch.photo.declared.steps import Step, acting_steps
 USUAL = 5.0  # seconds
 WRITING = {".png": 0.25}  # seconds of writing a megapixel, by the suffix of the file
 QUICK_WRITING = 0.02  # of other files
+STRAIGHTENING = 0.1  # seconds of straightening a megapixel
 #: Parameters that change how long an edit takes; it is known for their defaults only.
 MEASURED = ("method", "viewing_size", "landmarks", "sampling", "patch_size")
 
@@ -63,6 +64,11 @@ def duration(step: Step, size: tuple[int, int]) -> float:
 def writing(size: tuple[int, int], path: Path) -> float:
     """How long it takes to write a photograph (H, W) to a file."""
     return WRITING.get(path.suffix.lower(), QUICK_WRITING) * size[0] * size[1] / 1e6
+
+
+def straightening(size: tuple[int, int]) -> Stage:
+    """The stage in which a photograph is straightened, before all steps; (H, W) is its size afterwards."""
+    return Stage("Straightening", STRAIGHTENING * size[0] * size[1] / 1e6)
 
 
 def written(stages: list[Stage], size: tuple[int, int], path: Path) -> list[Stage]:

@@ -109,6 +109,8 @@ def test_a_point_becomes_grey(session: Session) -> None:
     place = session.render()[..., row : row + 5, column : column + 5].mean((0, 2, 3))
     assert place.amax() - place.amin() < 0.01
     assert session.recipe.develop.temperature > -0.4
+    assert session.balance(-5, -5) == session.balance(0.9, 0.9)
+    assert session.balance(1e4, 1e4) == session.balance(149.5, 99.5)
     with pytest.raises(ValueError, match="a grey point must have red, green and blue light"):
         balance_of(torch.zeros(1, 3, 5, 5))
     with pytest.raises(ValueError, match="must have colours to balance, got a grey one"):

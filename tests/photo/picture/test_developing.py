@@ -92,6 +92,17 @@ def test_what_changes_nothing_returns_the_image() -> None:
     assert torch.equal(develop_image(image, Development(crop=(0.2, 0.0, 1.0, 0.5))), image[..., :2, 1:])
 
 
+@pytest.mark.parametrize("channels", [2, 4])
+def test_only_grey_and_rgb_are_developed(channels: int) -> None:
+    sentence = (
+        rf"image must have shape \(B, C, H, W\) with 1 or 3 channels, got \(1, {channels}, 5, 6\); pass grey or RGB"
+    )
+    with pytest.raises(ValueError, match=sentence):
+        develop_image(torch.zeros(1, channels, 5, 6), Development(temperature=1.0))
+    with pytest.raises(TypeError, match="image must have a floating-point dtype"):
+        develop_image(torch.zeros(1, 3, 5, 6, dtype=torch.uint8), Development(exposure=1.0))
+
+
 def test_gradients() -> None:
     image = torch.rand(1, 3, 5, 6, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     for development in (Development(-0.5, 0.3, 0.1), Development(straighten=5.0)):
