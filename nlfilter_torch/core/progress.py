@@ -13,6 +13,7 @@ TRUST_IN_PLAN = 0.4
 MOST_SKIPPED = 0.5  # of a job; expected stages that do not occur are skipped, up to this share at once
 CAUTION = 0.1  # share by which the first estimate is longer
 MOST_RISE = 1.1  # a later estimate exceeds the least earlier one by this factor at most, unless the job overran that
+GRACE = 1.0  # seconds by which an estimate may be overrun, as long as the least time that is told
 
 
 @dataclass(frozen=True)
@@ -108,8 +109,8 @@ class _Job:
         return done / max(sum(stage.total for stage in self._stages), 1e-9)
 
     def left(self, now: float) -> float | None:
-        """Estimated seconds until the job ends; None if unknown, and once the least earlier estimate is over."""
-        if self._estimate is None or now > self._least_at + self._least:
+        """Estimated seconds until the job ends; None if unknown, and once the least earlier estimate is overrun."""
+        if self._estimate is None or now > self._least_at + self._least + GRACE:
             return None
         return min(self._estimate.at(now), MOST_RISE * self._least)
 
@@ -156,8 +157,8 @@ class Progress:
 
     The time left is that of the job if its stages are known in advance, and otherwise that of the stage, from the time
     that the second half of the part done has taken. It is counted down between reports. That of a job does not rise by
-    more than a tenth: if an estimate turns out too low, it waits. Once the time has passed without an end, no time left
-    is told until the next report, which estimates it anew.
+    more than a tenth: if an estimate turns out too low, it waits. A second after the time has passed, none is told
+    until the next report, which estimates it anew.
 
     Args:
         clock: returns the time in seconds.
@@ -222,7 +223,7 @@ class Progress:
         share, then = max(report for report in self._reports if report[0] <= self._first + done / 2)
         last = self._reports[-1][1]
         left = (last - then) * (1 - self._share) / (self._share - share) - (self._clock() - last)
-        return left if left >= 0 else None
+        return max(0.0, left) if left >= -GRACE else None
 
     def __str__(self) -> str:
         """The stage with the fraction done and the time left, or with the elapsed time if that is unknown."""

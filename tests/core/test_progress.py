@@ -144,6 +144,8 @@ def test_time_left_is_counted_down_between_reports() -> None:
     told("Averaging", 5, 10)
     clock.now = 8.0
     assert told.seconds_left == pytest.approx(2)
+    clock.now = 10.5
+    assert told.seconds_left == 0
     clock.now = 20.0  # it is overrun
     assert told.seconds_left is None
     assert str(told) == "Averaging, 20 s so far"
@@ -230,7 +232,9 @@ def test_an_overrun_job_has_no_time_left_until_it_is_estimated_anew() -> None:
     clock.now = 1.0
     told("Filtering", 5, 10)
     assert told.seconds_left == pytest.approx(1, rel=0.03)
-    for clock.now in (2.5, 4.0, 50.0):
+    clock.now = 2.5
+    assert told.seconds_left == 0
+    for clock.now in (3.5, 4.0, 50.0):
         assert told.seconds_left is None
     assert str(told) == "Filtering, 50 s so far"
     told("Filtering", 6, 10)
