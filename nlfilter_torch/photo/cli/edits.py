@@ -46,8 +46,8 @@ def other_recipe(context: typer.Context, preset: str, names: Iterable[str]) -> R
         return None
     if typed := typed_options(context, names):
         raise ValueError(
-            f"--{typed[0].replace('_', '-')} must not be given with a --preset of edits other than detail, got "
-            f"{preset}; leave it out, or set it in that file"
+            f"--{typed[0].replace('_', '-')} must not be given with a --preset of edits other than detail or with "
+            f"develop, got {preset}; leave it out, or set it in that file"
         )
     return recipe
 
@@ -70,8 +70,8 @@ def preset_option(help: str, *, plain: bool = True) -> object:
             context.default_map = {entry: option_value(step.declared[entry], value) for entry, value in step.values}
         elif plain and name is not None and preset_step(find_recipe(name), DETAIL) is None:
             raise ValueError(
-                "--preset must hold a look or a single detail step, without strokes, switched on and at full opacity, "
-                f"got {name}; use nlfilter-torch apply, which accepts any edit"
+                "--preset must hold a look or a single detail step, without develop or strokes, switched on and at "
+                f"full opacity, got {name}; use nlfilter-torch apply, which accepts any edit"
             )
         return name
 

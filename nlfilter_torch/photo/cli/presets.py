@@ -10,7 +10,7 @@ from nlfilter_torch.photo.declared.presets import PRESETS, PURPOSES, find_recipe
 Name = Annotated[
     str | None,
     typer.Argument(
-        metavar="NAME", help="Print this preset or look as JSON, to be edited and passed to `detail --preset`."
+        metavar="NAME", help="Print this preset or look as JSON, to be edited and passed to `apply --preset`."
     ),
 ]
 

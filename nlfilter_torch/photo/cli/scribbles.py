@@ -220,6 +220,7 @@ def of_edit(
 
     ``alpha`` are the sliders of regions without their own, if the edit takes regions that have sliders.
     """
+    _check_region(edit, options)
     masks: dict[str, Overlay | None] = {}
     colours, sliders = None, SliderRegions(size, alpha or ())
     is_added = bool(options.of(edit, "added"))
@@ -240,6 +241,19 @@ def of_edit(
                 raise ValueError(scribble.advice)
     drawn = Drawn.of(masks | sliders.masks(), colours)
     return replace(drawn, sliders=sliders.rows)
+
+
+def _check_region(edit: Edit, options: ScribbleOptions) -> None:
+    """Raise ValueError if an option limits a region that no other option marks."""
+    if edit.regional is None or options.marks_objects(edit):
+        return
+    for scribble in edit.with_options:
+        if options.rectangles.get(scribble.option):
+            added = "".join(f", {other.option}" for other in edit.with_role("added"))
+            raise ValueError(
+                f"{scribble.option} must come with --region{added} or --mask, got none of them; mark the region to "
+                "edit, such as by --region 190,60,60,60"
+            )
 
 
 def at_once(edit: Edit, drawn: Drawn[Overlay]) -> Drawn[Tensor]:

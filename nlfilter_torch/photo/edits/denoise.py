@@ -3,7 +3,7 @@
 Paper: Sec. III, Fig. 6(c), (d); Sec. V.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import ClassVar, Literal, Self
@@ -29,7 +29,7 @@ from nlfilter_torch.photo.edits.noise import noise_of, profile_of
 from nlfilter_torch.photo.edits.synthesis import remainder
 from nlfilter_torch.photo.picture.changes import change_in_parts
 from nlfilter_torch.photo.picture.drawn import Drawn, M
-from nlfilter_torch.photo.picture.edit import FilteredEdit
+from nlfilter_torch.photo.picture.edit import FilteredEdit, Rows
 from nlfilter_torch.photo.picture.in_memory import edit_image
 from nlfilter_torch.photo.picture.pixels import whole_image
 from nlfilter_torch.photo.picture.seen import Seen, range_of
@@ -223,6 +223,15 @@ class Denoise(FilteredEdit):
             return noise_of(source)
         return profile_of(source, None if hot_pixels is None else hot_pixels.removed_at)
 
+    def notes(self, rows: Rows) -> Iterator[str]:
+        """Which of both parts a grey photograph does not have."""
+        if rows.channels == 3 or _are(0, self.brightness, self.colour):  # the command tells so already
+            return
+        if _are(0, self.brightness):
+            yield f"{rows.name} is grey: with brightness 0 all of its noise is left"
+        elif not _are(1, self.colour):
+            yield f"{rows.name} is grey: colour changes nothing"
+
     def map_of(self, image: Tensor) -> Tensor:
         """Levels (B, 3, H, W) of the noise at scales 4, 2 and 1 as red, green and blue, 1 at :data:`WHITE_LEVELS`."""
         seen = image if self.working is None else self.working.seen(image)
@@ -256,7 +265,9 @@ class Denoise(FilteredEdit):
         weak = "" if change >= VISIBLE_LEVELS else ", which is barely visible"
         remedy = ""
         if weak and estimated and 0 < float(self.strength) < 2:  # a clean photograph has nothing more to lose
-            remedy = "; --strength 2 removes more" if level >= VISIBLE_LEVELS else ", as is the noise"
+            keeps = _are(0, self.brightness) or _are(0, self.colour)  # the noise that is left
+            remedy = "" if keeps else "; --strength 2 removes more"
+            remedy = remedy if level >= VISIBLE_LEVELS else ", as is the noise"
         return f"{text}; {changed}{weak}{remedy}"
 
 

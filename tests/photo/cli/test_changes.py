@@ -82,6 +82,26 @@ def test_denoise_recommends_only_more_strength(tmp_path: Path, capsys: pytest.Ca
         assert ("--strength 2 removes more" in printed) == recommended
 
 
+@pytest.mark.parametrize(
+    ("arguments", "note"),
+    [
+        (["--brightness", "0"], "in.png is grey: with brightness 0 all of its noise is left"),
+        (["--colour", "0.5"], "in.png is grey: colour changes nothing"),
+        (["--brightness", "0.5"], None),
+    ],
+)
+def test_a_grey_photograph_has_no_coloured_noise(
+    arguments: list[str], note: str | None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    source = tmp_path / "in.png"
+    grey = torch.linspace(0.1, 0.9, 96) + torch.randn(1, 1, 64, 96, generator=torch.Generator().manual_seed(0)) / 50
+    write_photograph(Photograph(grey.clamp(0, 1)), source)
+    assert main(["denoise", str(source), str(tmp_path / "out.png"), *arguments]) == 0
+    printed = capsys.readouterr()
+    assert "removes more" not in printed.out
+    assert printed.err == ("" if note is None else f"nlfilter-torch: note: {tmp_path}/{note}\n")
+
+
 def test_the_change_is_a_root_mean_square_in_grey_levels() -> None:
     meter = ChangeMeter()
     assert meter.change == 0

@@ -150,4 +150,4 @@ def test_regions_and_films_are_not_developed(photo: Path, capsys: pytest.Capture
     assert main(["frames", str(photo.parent), str(photo.with_name("f")), "--preset", str(edit)]) == 2
     assert "--preset must not develop the photographs of a film" in capsys.readouterr().err
     assert main(["detail", str(photo), out, "--preset", str(edit)]) == 2
-    assert "use nlfilter-torch apply" in capsys.readouterr().err
+    assert "without develop or strokes, switched on and at full opacity, got" in capsys.readouterr().err

@@ -130,6 +130,11 @@ def test_strokes_that_cover_the_photograph_are_refused(
         ("recolor", ["--region", "1,2,5,4:red", "--keep", "9,9,9,9:red"], "--keep must be X,Y,W,H only, got"),
         ("defocus", ["--region", "1,2,5,4:red"], "--region must be X,Y,W,H only, got"),
         ("detail", ["--region", "1,2,5,4:1,2"], "--region must have as many sliders as --alpha, 4, got 2"),
+        (
+            "detail",
+            ["--remove", "1,2,5,4"],
+            "--remove must come with --region, --add or --mask, got none of them; mark",
+        ),
         ("detail", ["--region", "1,2,5,4:1,x,1,1"], "--region must be numbers separated by commas"),
     ],
 )
