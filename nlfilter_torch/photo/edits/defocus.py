@@ -17,7 +17,7 @@ from nlfilter_torch.photo.picture.drawn import Drawn, M
 from nlfilter_torch.photo.picture.in_memory import edit_image
 from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles
 from nlfilter_torch.photo.picture.source import Fitted, Source
-from nlfilter_torch.photo.selections.by_hand import ByHand
+from nlfilter_torch.photo.selections.by_hand import ByHand, check_drawn
 from nlfilter_torch.photo.selections.connected import Extent
 from nlfilter_torch.photo.selections.mask import ObjectEdit, background_of, fit_regions
 
@@ -127,6 +127,7 @@ class Defocus(ObjectEdit):
         radius = float(DEFOCUS["radius"].pixels(self.radius, source.size))
         check_reach(radius, "radius", source.size)
         region, added = drawn.masks.get("focus_region"), drawn.masks.get("added")
+        check_drawn(region, added, "focus_region")
         by_hand = ByHand.of(source, added, drawn.masks.get("removed"), 1)
         inside, background = [], list[Scribbles]()
         if region is not None or added is None:

@@ -16,9 +16,7 @@ from nlfilter_torch.photo.declared.parameters import RECOLOR
 from nlfilter_torch.photo.looks.look_filter import acts
 from nlfilter_torch.photo.picture.colour import (
     dot,
-    group_colours,
     merge_luminance,
-    region_means,
     split_luminance,
 )
 from nlfilter_torch.photo.picture.drawn import Drawn, M
@@ -27,10 +25,9 @@ from nlfilter_torch.photo.picture.pixels import whole_image
 from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles
 from nlfilter_torch.photo.picture.source import Fitted, Pixels, Source
 from nlfilter_torch.photo.selections.border_colours import Sides, colours_beside, refine_mask
-from nlfilter_torch.photo.selections.by_hand import ByHand, opaque
 from nlfilter_torch.photo.selections.connected import Extent
 from nlfilter_torch.photo.selections.mask import ObjectEdit, Regions, background_of, fit_regions
-from nlfilter_torch.photo.selections.stray import without_strays
+from nlfilter_torch.photo.selections.painted_colours import Painted
 
 EPSILON = 1e-12  # keeps the derivative of a root finite
 END_MARGIN = 0.1  # masks closer to 0 or 1 are set to 0 or 1: a faint tint far away is visible, a less soft edge is not
@@ -150,7 +147,9 @@ class Recolor(ObjectEdit):
             brightness = brightening.new
         colours = with_room(split_colours(shown)[1] if matches else shown, brightness)
         by_hand = groups.by_hand(source, drawn.masks.get("removed"))
-        kept = painted.background(source, drawn.masks.get("keep"))
+        kept = list[Scribbles]()
+        if painted.strokes is not None:
+            kept = background_of(source, drawn.masks.get("keep"), painted.strokes, "keep")
         objects = fit_regions(source, groups.inside, kept, self.selection_in(source.size), by_hand)
         change = Recoloring(colours, old, valid, brightening)
         reduced = change.compared(objects.reduced)
@@ -195,99 +194,6 @@ def split_colours(colours: Tensor) -> tuple[Tensor, Tensor]:
     """Split RGB colours (B, K, 3) into luminance (B, K, 1) and chroma (B, K, 3)."""
     luminance, chroma = split_luminance(colours.mT.unsqueeze(3))
     return luminance.squeeze(3).mT, chroma.squeeze(3).mT
-
-
-@dataclass(frozen=True, eq=False)
-class Painted:
-    """What is painted on a picture: strokes on objects, and on the mask by hand; there may be one of them only.
-
-    Attributes:
-        strokes: with their colours, or None.
-        on_mask: likewise.
-    """
-
-    strokes: Scribbles | None
-    on_mask: Scribbles | None
-
-    @staticmethod
-    def of(source: Source[M], drawn: Drawn[M]) -> "Painted | None":
-        """Read what is painted; None if nothing is left of what was added by hand to a single picture.
-
-        Raises:
-            TypeError, ValueError: if it does not suit the picture, or there is nothing.
-        """
-        mask, added = drawn.masks.get("stroke_mask"), drawn.masks.get("added")
-        strokes, on_mask = None, None
-        if added is not None:
-            on_mask = opaque(source, source.scribbles(None, added, "added", needed=False))
-        if added is None or mask is not None or drawn.colours is not None:
-            strokes = source.scribbles(mask, drawn.colours, "stroke_mask", needed=added is None)
-        marks = [marks for marks in (strokes, on_mask) if marks is not None and len(marks.places)]
-        if not marks:
-            return None
-        is_painted = torch.cat([drawn.weights.detach() > 0 for drawn in marks], dim=2).flatten(1).any(1)
-        if not bool(is_painted.all()):
-            raise ValueError(
-                "stroke_mask or added must hold a painted pixel in every image, got some without; paint one"
-            )
-        return Painted(*(part if part is not None and len(part.places) else None for part in (strokes, on_mask)))
-
-    def grouped(self, matches: bool) -> tuple[Tensor, Tensor, "Groups"]:
-        """Return the colours (B, K, 3), which of them are valid, (B, K), and the pixels of each.
-
-        Colours are chroma, or RGB if their brightness counts.
-        """
-        marks = [marks for marks in (self.strokes, self.on_mask) if marks is not None]
-        shown = torch.cat([drawn.shown for drawn in marks], dim=2).unsqueeze(2)
-        weights = torch.cat([drawn.weights for drawn in marks], dim=2).unsqueeze(2)
-        regions, colours, valid = group_colours(shown if matches else split_luminance(shown)[1], weights)
-        parts = regions.squeeze(2).split([len(drawn.places) for drawn in marks], dim=2)
-        weighted = [drawn.weighted(part) for drawn, part in zip(marks, parts, strict=True)]
-        strokes = None if self.strokes is None else weighted[0]
-        return colours, valid, Groups(strokes, None if self.on_mask is None else weighted[-1])
-
-    def background(self, source: Source[M], keep: M | None) -> list[Scribbles]:
-        """Read background scribbles; there are none without strokes on objects."""
-        return [] if self.strokes is None else background_of(source, keep, self.strokes, "keep")
-
-
-@dataclass(frozen=True, eq=False)
-class Groups:
-    """What is painted in each of K colours: the weights of strokes on objects, and on the mask, are (B, K, n)."""
-
-    strokes: Scribbles | None
-    on_mask: Scribbles | None
-
-    @property
-    def inside(self) -> list[Scribbles]:
-        """The strokes of each colour on objects; none if there are no strokes."""
-        if self.strokes is None:
-            return []
-        return [self.strokes.weighted(part) for part in self.strokes.weights.split(1, dim=1)]
-
-    def means(self, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
-        """Mean luminance (B, K, 1) and chroma (B, K, 3) of a picture (H, W) under each colour.
-
-        What is painted on the mask counts for colours without strokes on an object.
-        """
-        weights, images = list[Tensor](), list[Tensor]()
-        if self.strokes is not None:
-            weights.append(without_strays(self.strokes, size).weights)
-            images.append(self.strokes.image)
-        if self.on_mask is not None:
-            alone = 1.0 if not weights else (weights[0] <= 0).all(2, keepdim=True).to(weights[0])
-            weights.append(self.on_mask.weights * alone)
-            images.append(self.on_mask.image)
-        counted, image = torch.cat(weights, dim=2).unsqueeze(2), torch.cat(images, dim=2).unsqueeze(2)
-        luminance, chroma = (region_means(part, counted) for part in split_luminance(image))
-        return luminance, chroma
-
-    def by_hand(self, source: Source[M], removed: M | None) -> ByHand | None:
-        """What is painted on the mask of each colour."""
-        less = ByHand.of(source, None, removed, 1)
-        if self.on_mask is None:
-            return less
-        return ByHand(self.on_mask.weights.shape[1], self.on_mask.planes, None if less is None else less.removed)
 
 
 @dataclass(frozen=True, eq=False)

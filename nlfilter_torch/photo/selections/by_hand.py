@@ -38,14 +38,8 @@ class ByHand:
         """
         if added is None and removed is None:
             return None
-        more, less = (
-            None if masks is None else source.weights_of(masks, name)
-            for masks, name in ((added, "added"), (removed, "removed"))
-        )
-        of_added, of_removed = (
-            0 if masks is None else source.num_regions(masks, name)
-            for masks, name in ((added, "added"), (removed, "removed"))
-        )
+        more, of_added = _planes_of(source, added, "added")
+        less, of_removed = _planes_of(source, removed, "removed")
         count = of_added if count is None else count
         if of_added not in (0, count):
             raise ValueError(
@@ -86,6 +80,17 @@ class ByHand:
             others = [_without(added, k).amax(1, keepdim=True) for k in range(masks.shape[1])]
             removed = removed.maximum(torch.cat(others, dim=1) * (1 - added))
         return added.minimum(1 - removed), removed
+
+
+def _planes_of(source: Source[M], masks: M | None, name: str) -> tuple[Planes | None, int]:
+    """What is painted on masks, and the number of their regions; None and 0 if there are none."""
+    return (None, 0) if masks is None else (source.weights_of(masks, name), source.num_regions(masks, name))
+
+
+def check_drawn(scribbles: object, added: object, name: str) -> None:
+    """Raise TypeError if there are neither scribbles, which errors call ``name``, nor what is added by hand."""
+    if scribbles is None and added is None:
+        raise TypeError(f"{name} must be a torch.Tensor, got NoneType; paint some, or pass added")
 
 
 def opaque(source: Source[M], painted: Scribbles) -> Scribbles:

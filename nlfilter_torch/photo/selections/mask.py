@@ -31,7 +31,7 @@ from nlfilter_torch.photo.picture.resizing import enlarged
 from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles, parts_in_blocks
 from nlfilter_torch.photo.picture.source import Fitted, Reduced, Source
 from nlfilter_torch.photo.picture.viewing import viewed_size
-from nlfilter_torch.photo.selections.by_hand import ByHand
+from nlfilter_torch.photo.selections.by_hand import ByHand, check_drawn
 from nlfilter_torch.photo.selections.closed_form import LinearMasks, linear_mask, linear_models, solve_linear
 from nlfilter_torch.photo.selections.connected import Extent, connected, without_specks
 from nlfilter_torch.photo.selections.random_walker import solve_mask
@@ -163,8 +163,7 @@ class RegionMask(PhotoEdit):
         if source.channels not in (1, 3):
             raise ValueError(f"image must have 1 or 3 channels, got {source.channels}; select 1 or 3")
         scribbles, background, added = (drawn.masks.get(name) for name in ("scribbles", "background", "added"))
-        if scribbles is None and added is None:
-            raise TypeError(f"{self.names[0]} must be a torch.Tensor, got NoneType; paint some, or pass added")
+        check_drawn(scribbles, added, self.names[0])
         inside = [] if scribbles is None else source.regions(scribbles, self.names[0], needed=added is None)
         by_hand = ByHand.of(source, added, drawn.masks.get("removed"), len(inside) or None)
         outside = [] if background is None else source.regions(background, self.names[1])

@@ -151,16 +151,13 @@ def test_errors(image: torch.Tensor, arguments: dict[str, torch.Tensor], message
 def test_an_edit_needs_something_that_is_painted(image: torch.Tensor) -> None:
     with pytest.raises(TypeError, match=r"scribbles must be a torch.Tensor, got NoneType; paint some, or pass added"):
         region_mask(image, None)
-    with pytest.raises(TypeError, match=r"stroke_mask must be a torch.Tensor, got NoneType"):
-        recolor(image, None, None)
+    with pytest.raises(
+        TypeError, match=r"focus_region must be a torch.Tensor, got NoneType; paint some, or pass added"
+    ):
+        defocus(image, None, removed=ERASER)
+    with pytest.raises(TypeError, match=r"stroke_mask must be a torch.Tensor, got NoneType; paint some, or pass added"):
+        recolor(image, None, None, removed=ERASER)
     with pytest.raises(ValueError, match=r"added must have 4 channel\(s\), got 1"):
         recolor(image, image, SCRIBBLE, added=BRUSH)
-    with pytest.raises(ValueError, match="stroke_mask or added must hold a painted pixel in every image"):
-        recolor(
-            torch.cat([image, image]),
-            None,
-            None,
-            added=torch.cat([image, BRUSH], dim=1) * torch.tensor([1, 0]).view(2, 1, 1, 1),
-        )
     with pytest.raises(ValueError, match="removed must be given together with regions"):
         enhance(image, torch.ones(3), removed=ERASER)
