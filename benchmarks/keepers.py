@@ -159,7 +159,7 @@ def contact_sheet(pictures: Sequence[Tensor]) -> Tensor:
 def counted(listed: Sequence[Job]) -> str:
     """A table of the judgements, by set and kind of edit."""
     lines = []
-    for name in ("choosing", "reporting"):
+    for name in sorted({job.set for job in listed}):
         for kind in ("recolouring", "masks and defocus", "other edits"):
             own = [job for job in listed if job.set == name and KINDS.get(job.edit, "other edits") == kind]
             lines.append(f"{name:12}{kind:20}{sum(job.keeper is True for job in own):4} of {len(own)}")
@@ -177,20 +177,19 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.keepers", description=__doc__)
     parser.add_argument("--pictures", type=Path, help="folder of free photographs; default: only scikit-image's")
     parser.add_argument("--out", type=Path, default=Path("out/keepers"), help="folder for the results")
-    parser.add_argument("--only", type=int, nargs="+", help="numbers of jobs")
-    parser.add_argument("--set", choices=("choosing", "reporting"), help="jobs of one set only")
+    parser.add_argument("--only", type=int, nargs="+", metavar="NUMBER", help="edit and count these jobs only")
+    parser.add_argument("--set", choices=("choosing", "reporting"), help="edit and count jobs of this set only")
     parser.add_argument("--count", action="store_true", help="only count the judgements")
     options = parser.parse_args(arguments)
-    listed = jobs()
-    chosen = [
-        job
-        for job in listed
-        if (options.pictures is not None or job.photograph in CHOOSING)
-        and job.number in (options.only or range(1, len(listed) + 1))
-        and options.set in (None, job.set)
+    listed = [
+        job for job in jobs() if (options.only is None or job.number in options.only) and options.set in (None, job.set)
     ]
+    if not listed:
+        parser.error("no job has one of the numbers of --only in the set of --set; use others")
     results = []
-    for job in [] if options.count else chosen:
+    for job in [] if options.count else listed:
+        if options.pictures is None and job.photograph not in CHOOSING:
+            continue
         picture = panels(job, options.pictures)
         options.out.mkdir(parents=True, exist_ok=True)
         write_photograph(Photograph(picture), options.out / f"{job.name}.png")

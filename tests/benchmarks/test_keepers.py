@@ -54,8 +54,26 @@ def test_count_names_what_is_not_kept(capsys):
     assert "kept 1 of 2, at least 85%: FALLS SHORT" in counted([kept, lost])
     assert "02-coffee-recolor: a rim" in counted([kept, lost])
     assert "kept 1 of 1, at least 85%: holds" in counted([kept])
-    assert main(["--count"]) in (0, 1)
-    assert "of 40" in capsys.readouterr().out
+    few = sum(job.keeper for job in jobs()) < 0.85 * 40
+    assert main(["--count"]) == few
+    assert f"of 40, at least 85%: {'FALLS SHORT' if few else 'holds'}" in capsys.readouterr().out
+
+
+def test_only_the_jobs_that_are_asked_for_are_counted(capsys):
+    listed = jobs()
+    kept, lost = (next(job for job in listed if job.keeper is keeper) for keeper in (True, False))
+    assert main(["--count", "--only", str(kept.number)]) == 0
+    assert "kept 1 of 1, at least 85%: holds" in capsys.readouterr().out
+    assert main(["--count", "--only", str(lost.number)]) == 1
+    assert f"kept 0 of 1, at least 85%: FALLS SHORT\n\n{lost.name}: {lost.why}\n" in capsys.readouterr().out
+    own = [job for job in listed if job.set == "reporting"]
+    main(["--count", "--set", "reporting"])
+    out = capsys.readouterr().out
+    assert f"kept {sum(job.keeper for job in own)} of {len(own)}" in out
+    assert "choosing" not in out
+    with pytest.raises(SystemExit):
+        main(["--count", "--only", "41"])
+    assert "no job" in capsys.readouterr().err
 
 
 def test_contact_sheet_has_a_tile_for_every_result():
