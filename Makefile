@@ -96,7 +96,7 @@ QUICK := \
 	'busy --quick sharpen' \
 	'durations --quick sharpen' \
 	'scribbles --quick' \
-	'app --side 96 --megapixels 0.05 --repeats 3 --saved denoise' \
+	'app --side 96 --megapixels 0.05 --repeats 3 --quick' \
 	'denoising --quick --megapixel' \
 	'denoising --quick --patterns --methods noisy ours' \
 	'real_noise --quick' \
