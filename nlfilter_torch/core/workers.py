@@ -21,7 +21,9 @@ Result = TypeVar("Result")
 _setting = Lock()  # torch's default for new threads is shared by the process, and is changed temporarily
 
 
-def in_order(function: Callable[[Item], Result], items: Iterable[Item], workers: int) -> Iterator[Result]:
+def in_order(
+    function: Callable[[Item], Result], items: Iterable[Item], workers: int, *, divided: bool = True
+) -> Iterator[Result]:
     """Apply a function to items without gradients, and yield the results in order; items are consumed as needed.
 
     Args:
@@ -29,6 +31,7 @@ def in_order(function: Callable[[Item], Result], items: Iterable[Item], workers:
         items: up to twice as many as there are workers, plus one, are in memory at once, so that no worker waits for
             a slower one.
         workers: number of threads, which share torch's threads for operations; 1 runs in the calling thread.
+        divided: whether workers divide operations among several threads, if there are fewer workers than threads.
     """
     call = torch.no_grad()(function)
     if workers == 1:
@@ -38,7 +41,7 @@ def in_order(function: Callable[[Item], Result], items: Iterable[Item], workers:
     with ThreadPoolExecutor(workers) as pool:
         with _for_new_threads() as threads:
             for _ in range(workers):
-                pool.submit(_begin, max(1, threads // workers), started)
+                pool.submit(_begin, max(1, threads // workers) if divided else 1, started)
             started.wait()
         waiting: deque[Future[Result]] = deque()
         for item in items:

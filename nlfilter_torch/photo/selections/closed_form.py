@@ -4,13 +4,14 @@ In every small window the mask is a linear function of the colour, which models 
 also give the mask of any pixel of a larger picture (:class:`LinearMasks`).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from nlfilter_torch.core.workers import single_threaded, threads_for
+from nlfilter_torch.core.workers import in_order, single_threaded, threads_for
 from nlfilter_torch.photo.picture.colour import dot
 from nlfilter_torch.photo.selections.pyramid import doubled, halved, pyramid_levels
 from nlfilter_torch.photo.selections.trimap import by_trimap
@@ -19,6 +20,7 @@ WINDOW_RADIUS, NOISE = 2, 1e-6  # radius of the windows in which masks are linea
 LINEAR_LEVELS, LINEAR_STEPS = 2, 24  # levels of the pyramid, steps on each
 # Mask values closer than this to 0 or 1 are set to 0 or 1: of a few scribbles, and of a trimap.
 END_MARGIN = (0.1, 0.05)
+FEWEST_WORKERS = 3  # that solve for one mask each; each takes more than 1.5 times as long as the calling thread alone
 SLOWEST = 0.005  # smallest eigenvalue that the steps damp
 # Confidence in a rough mask of 0 or 1, and in scribbles.
 LINEAR_ROUGH_CONFIDENCE, LINEAR_SCRIBBLE_CONFIDENCE = 3e-3, 10.0
@@ -77,16 +79,22 @@ def linear_mask(image: Tensor, functions: Tensor) -> Tensor:
 
 
 def window_sums(planes: Tensor) -> Tensor:
-    """Sums over the window around each pixel, cut off at the borders of the picture: five pixels as two pairs and one.
+    """Sums over the window around each pixel, cut off at the borders of the picture.
 
     ``F.avg_pool2d`` takes several times as long.
     """
-    height, width = planes.shape[-2:]
-    planes = F.pad(planes, [WINDOW_RADIUS] * 4)
-    pairs = planes[:, :, :-1] + planes[:, :, 1:]
-    planes = (pairs[:, :, :height] + pairs[:, :, 2 : height + 2]).add_(planes[:, :, 4:])
-    pairs = planes[..., :-1] + planes[..., 1:]
-    return (pairs[..., :width] + pairs[..., 2 : width + 2]).add_(planes[..., 4:])
+    return _sums_along(_sums_along(F.pad(planes, [WINDOW_RADIUS] * 4), 2), 3)
+
+
+def _sums_along(planes: Tensor, dim: int) -> Tensor:
+    """Sums over windows along an axis, of padded planes: of five pixels as two pairs and one."""
+    count = planes.shape[dim]
+    length, last = count - 2 * WINDOW_RADIUS, planes.narrow(dim, 2 * WINDOW_RADIUS, count - 2 * WINDOW_RADIUS)
+    pairs = planes.narrow(dim, 0, count - 1) + planes.narrow(dim, 1, count - 1)
+    total = pairs.narrow(dim, 0, length)
+    for pair in range(1, WINDOW_RADIUS):
+        total = total + pairs.narrow(dim, 2 * pair, length)
+    return total.add_(last)
 
 
 def linear_models(image: Tensor) -> list[LinearMasks]:
@@ -111,8 +119,22 @@ def solve_linear(
     trust = LINEAR_ROUGH_CONFIDENCE * ((2 * rough - 1).square() + 0.01)
     certain = LINEAR_SCRIBBLE_CONFIDENCE * (front + back)
     planes = torch.cat([trust * rough + LINEAR_SCRIBBLE_CONFIDENCE * front, trust + certain, start], dim=1)
-    with single_threaded(threads_for(planes)):  # so few pixels that a second thread would wait most of the time
-        return _solve_levels(models, planes, trimap).to(start)
+    threads = threads_for(planes, models[0].image)
+    masks = [(image, region) for image in range(len(rough)) for region in range(rough.shape[1])]
+    workers = min(threads, len(masks))
+    if workers < FEWEST_WORKERS:
+        with single_threaded(threads):  # so few pixels that a second thread would wait most of the time
+            return _solve_levels(models, planes, trimap).to(start)
+    solve = partial(_solve_mask, models, planes, trimap)
+    functions = list(in_order(solve, masks, workers, divided=False))
+    return torch.cat(functions).unflatten(0, rough.shape[:2]).squeeze(2).to(start)
+
+
+def _solve_mask(models: list[LinearMasks], planes: Tensor, trimap: Tensor, mask: tuple[int, int]) -> Tensor:
+    """:func:`_solve_levels` of one mask, given by the numbers of image and region: (1, 1, C+1, H, W)."""
+    image, region = (slice(number, number + 1) for number in mask)
+    own = [replace(m, image=m.image[image], mean=m.mean[image], inverse=m.inverse[image]) for m in models]
+    return _solve_levels(own, planes[image, mask[1] :: trimap.shape[1]], trimap[image, region])
 
 
 def _solve_levels(models: list[LinearMasks], planes: Tensor, trimap: Tensor) -> Tensor:

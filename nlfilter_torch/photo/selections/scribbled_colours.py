@@ -11,7 +11,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from nlfilter_torch.core.blocks import order_by, pixel_blocks
+from nlfilter_torch.core.blocks import CACHED, order_by, pixel_blocks
 from nlfilter_torch.core.precision import per_image
 from nlfilter_torch.core.workers import in_order, threads_for
 from nlfilter_torch.operator.features import blur
@@ -225,8 +225,10 @@ def density(places: Tensor, points: Tensor, weights: Tensor, bandwidth: Tensor) 
     places, points = (t / (bandwidth * math.sqrt(t.shape[1])) for t in (places, points))
     squares = points.square().sum(1, keepdim=True)
     left = torch.cat([2 * points, -torch.ones_like(squares), -squares], dim=1)  # (B, C+2, m)
-    part, blocks = partial(_density, places, left, weights), pixel_blocks(places.shape[2], len(places), places.device)
-    workers = threads_for(places, left, weights)
+    part, workers = partial(_density, places, left, weights), threads_for(places, left, weights)
+    # A worker computes a whole block, so that each has to fit the cache of one core.
+    blocks = list(pixel_blocks(places.shape[2], len(places), places.device, length=CACHED // workers))
+    workers = min(workers, len(blocks))
     sums = map(part, blocks) if workers == 1 else in_order(part, blocks, workers)
     return torch.cat(list(sums), dim=1).mT
 

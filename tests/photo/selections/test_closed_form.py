@@ -9,6 +9,24 @@ from nlfilter_torch.photo.selections import closed_form
 from tests.problems import box, colour, noise
 
 
+@pytest.mark.parametrize("radius", [1, 2, 3])
+def test_window_sums_follow_the_radius(monkeypatch: pytest.MonkeyPatch, radius: int) -> None:
+    monkeypatch.setattr(closed_form, "WINDOW_RADIUS", radius)
+    planes, width = noise(2, 3, 5, 9), 2 * radius + 1
+    wanted = torch.nn.functional.avg_pool2d(planes, width, 1, radius) * width**2
+    torch.testing.assert_close(closed_form.window_sums(planes), wanted)
+
+
+def test_masks_are_solved_by_several_workers(monkeypatch: pytest.MonkeyPatch) -> None:
+    image, rough = noise(2, 3, 12, 14), noise(2, 3, 12, 14, seed=1)
+    front, back = rough > 0.9, rough < 0.1
+    models, trimap = closed_form.linear_models(image), torch.linspace(0, 1, 6, dtype=torch.float64).view(2, 3)
+    arguments = (models, rough, rough, front.double(), back.double(), trimap)
+    alone = closed_form.solve_linear(*arguments)
+    monkeypatch.setattr(closed_form, "threads_for", lambda *_: 4)
+    torch.testing.assert_close(closed_form.solve_linear(*arguments), alone, atol=1e-9, rtol=1e-9)
+
+
 def test_the_solve_is_that_of_the_linear_system(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(closed_form, "LINEAR_LEVELS", 1)
     monkeypatch.setattr(closed_form, "LINEAR_STEPS", 3000)

@@ -1,10 +1,12 @@
 """Colours of scribbles: densities, evenness, links by even areas, and the points that are compared."""
 
 import heapq
+from collections.abc import Callable, Iterator
 
 import pytest
 import torch
 
+from nlfilter_torch.core.blocks import CACHED
 from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles
 from nlfilter_torch.photo.selections import scribbled_colours
 from nlfilter_torch.photo.selections.scribbled_colours import (
@@ -115,3 +117,27 @@ def test_pixels_to_compare_do_not_depend_on_other_images() -> None:
         assert 8 <= own.shape[2] <= 16
         assert torch.equal(together[k][:, kept[k, 0] > 0], alone[0])
         assert torch.equal(kept[k][kept[k] > 0], own[0, 0])
+
+
+@pytest.mark.parametrize(("count", "lengths"), [(4 * CACHED + 8, [CACHED] * 4 + [8]), (CACHED, [CACHED])])
+def test_each_worker_sums_densities_over_blocks_of_its_own(
+    monkeypatch: pytest.MonkeyPatch, count: int, lengths: list[int]
+) -> None:
+    places, points, weights = noise(1, 3, count), noise(1, 3, 5, seed=1), noise(1, 2, 5, seed=2)
+    bandwidth = torch.full((1, 1, 1), 0.3, dtype=torch.float64)
+    alone = density(places, points, weights, bandwidth)
+    shared = list[list[slice]]()
+
+    def record(part: Callable[[slice], torch.Tensor], blocks: list[slice], workers: int) -> Iterator[torch.Tensor]:
+        assert workers == min(16, len(blocks))
+        shared.append(blocks)
+        return map(part, blocks)
+
+    monkeypatch.setattr(scribbled_colours, "threads_for", lambda *_: 16)
+    monkeypatch.setattr("nlfilter_torch.core.blocks.cores", lambda: 16)
+    monkeypatch.setattr(scribbled_colours, "in_order", record)
+    torch.testing.assert_close(density(places, points, weights, bandwidth), alone)
+    if len(lengths) == 1:
+        assert shared == []  # no threads are started for a single block
+    else:
+        assert [block.stop - block.start for block in shared[0]] == lengths
