@@ -82,7 +82,7 @@ export function wheelFactor({ deltaY, deltaMode, ctrlKey }) {
 
 /** What a key asks for, as the name of an action with its arguments, or null; `width` is that of the canvas. */
 export function actionOfKey(key, width) {
-  switch (key) {
+  switch (key.toLowerCase()) {
     case "+":
     case "=":
       return ["step", 1];
@@ -96,7 +96,6 @@ export function actionOfKey(key, width) {
     case " ":
       return ["hand", true];
     case "o":
-    case "O":
     case "\\":
       return ["original", true];
     default:
