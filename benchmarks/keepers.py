@@ -5,7 +5,8 @@ abstraction. The strokes of ``keepers.json`` were drawn once, with the editor's 
 For every job a picture ``OUT/NUMBER-PHOTOGRAPH-EDIT.png`` is written: the photograph, with strokes, and the result (of
 a mask, the object on grey); ``OUT/all.png`` shows the results together. A person looks at each result in full size
 and says in ``keepers.json`` whether it would be kept and published as it is ("keeper"), or "why" not; this command
-counts these judgements.
+counts these judgements. ``keepers_judged.json`` has the digests of the results that were judged; results that differ
+are named, and ``--judged`` stores the digests of those that have been looked at.
 
 ``--pictures`` is the folder of :mod:`benchmarks.denoiser_training.free_photographs`; without it only scikit-image's
 photographs are edited. Jobs on photographs of the choosing set may guide changes of the edits, those on the reporting
@@ -13,6 +14,7 @@ set are counted only.
 """
 
 import argparse
+import base64
 import json
 import sys
 from collections.abc import Sequence
@@ -40,6 +42,8 @@ from nlfilter_torch.photo.picture.painting import colour_of, mask_of
 from nlfilter_torch.photo.picture.resizing import resize
 
 STORED = Path(__file__).with_suffix(".json")
+JUDGED = Path(__file__).with_name("keepers_judged.json")  # digests of the results that were judged, by name of the job
+CELLS = 8  # of a digest, across and down
 SIDE = 600  # short side of photographs, at most
 GREY = 0.6  # behind an object that is cut out
 TILE, ACROSS = (200, 300), 5  # of the contact sheet
@@ -156,6 +160,48 @@ def contact_sheet(pictures: Sequence[Tensor]) -> Tensor:
     return torch.cat(rows, dim=2)
 
 
+def digest(result: Tensor) -> str:
+    """Mean colours of the cells of a picture (1, 3, H, W), in grey levels."""
+    means = F.adaptive_avg_pool2d(result, CELLS).mul(255).round().clamp(0, 255)
+    return base64.b64encode(bytes(means.flatten().int().tolist())).decode()
+
+
+def is_same(digest: str, other: str) -> bool:
+    """Whether two digests differ by rounding at most."""
+    pairs = zip(base64.b64decode(digest), base64.b64decode(other), strict=True)
+    return all(abs(mean - other_mean) <= 1 for mean, other_mean in pairs)
+
+
+def changed(digests: dict[str, str], judged: dict[str, str]) -> list[str]:
+    """Names of the results, by their digests, that are not those that were judged."""
+    return [name for name, new in digests.items() if name not in judged or not is_same(new, judged[name])]
+
+
+def results(listed: Sequence[Job], pictures: Path | None, out: Path) -> dict[str, Tensor]:
+    """Write the pictures of the jobs whose photographs are there; the results, by name of the job."""
+    written = {}
+    for job in listed:
+        if pictures is None and job.photograph not in CHOOSING:
+            continue
+        picture = panels(job, pictures)
+        out.mkdir(parents=True, exist_ok=True)
+        write_photograph(Photograph(picture), out / f"{job.name}.png")
+        written[job.name] = picture[..., -picture.shape[-1] // (3 if job.strokes else 2) :]
+    if written:
+        write_photograph(Photograph(contact_sheet(list(written.values()))), out / "all.png")
+    return written
+
+
+def compare_with_judged(digests: dict[str, str], file: Path, *, store: bool) -> None:
+    """Name the results that are not those that were judged, or ``store`` the digests as those of judged ones."""
+    judged: dict[str, str] = json.loads(file.read_text(encoding="utf-8"))
+    if store:
+        file.write_text(json.dumps(dict(sorted((judged | digests).items())), indent=0) + "\n", encoding="utf-8")
+    else:
+        for name in changed(digests, judged):
+            print(f"{name}: the result has changed since it was judged: look again")
+
+
 def counted(listed: Sequence[Job]) -> str:
     """A table of the judgements, by set and kind of edit."""
     lines = []
@@ -179,6 +225,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, default=Path("out/keepers"), help="folder for the results")
     parser.add_argument("--only", type=int, nargs="+", metavar="NUMBER", help="edit and count these jobs only")
     parser.add_argument("--set", choices=("choosing", "reporting"), help="edit and count jobs of this set only")
+    parser.add_argument("--judged", action="store_true", help="the results have been judged: store their digests")
     parser.add_argument("--count", action="store_true", help="only count the judgements")
     options = parser.parse_args(arguments)
     listed = [
@@ -186,16 +233,10 @@ def main(arguments: list[str] | None = None) -> int:
     ]
     if not listed:
         parser.error("no job has one of the numbers of --only in the set of --set; use others")
-    results = []
-    for job in [] if options.count else listed:
-        if options.pictures is None and job.photograph not in CHOOSING:
-            continue
-        picture = panels(job, options.pictures)
-        options.out.mkdir(parents=True, exist_ok=True)
-        write_photograph(Photograph(picture), options.out / f"{job.name}.png")
-        results.append(picture[..., -picture.shape[-1] // (3 if job.strokes else 2) :])
-    if results:
-        write_photograph(Photograph(contact_sheet(results)), options.out / "all.png")
+    if not options.count:
+        pictures = results(listed, options.pictures, options.out)
+        digests = {name: digest(result) for name, result in pictures.items()}
+        compare_with_judged(digests, JUDGED, store=options.judged)
     print(counted(listed))
     return int(sum(job.keeper is True for job in listed) < AIM * len(listed))
 

@@ -1,12 +1,13 @@
 """Jobs of a retoucher: what is stored, a result of each kind, and the count of judgements."""
 
+import json
 from collections import Counter
 
 import pytest
 import torch
 
 from benchmarks.composites import CHOOSING
-from benchmarks.keepers import Job, contact_sheet, counted, jobs, main
+from benchmarks.keepers import JUDGED, Job, compare_with_judged, contact_sheet, counted, digest, is_same, jobs, main
 
 RECOLOURED = {
     "photograph": "coffee",
@@ -85,3 +86,17 @@ def test_contact_sheet_has_a_tile_for_every_result():
 def test_photographs_of_scikit_image_need_no_folder():
     job = next(job for job in jobs() if job.photograph in CHOOSING)
     assert job.before(None).shape[1] == 3
+
+
+def test_results_that_have_changed_since_they_were_judged_are_named(tmp_path, capsys):
+    assert {job.name for job in jobs()} == json.loads(JUDGED.read_text()).keys()
+    result, file = torch.rand(1, 3, 60, 90, generator=torch.Generator().manual_seed(0)), tmp_path / "judged.json"
+    file.write_text("{}")
+    compare_with_judged({"a": digest(result)}, file, store=False)
+    assert capsys.readouterr().out == "a: the result has changed since it was judged: look again\n"
+    compare_with_judged({"a": digest(result)}, file, store=True)
+    compare_with_judged({"a": digest((result * 255).round() / 255)}, file, store=False)
+    assert capsys.readouterr().out == ""
+    tinted = result.clone()
+    tinted[:, 2, 10:14, 20:24] += 0.3
+    assert not is_same(digest(tinted), digest(result))
