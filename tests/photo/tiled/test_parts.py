@@ -11,15 +11,17 @@ from numpy.typing import NDArray
 
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.declared.steps import Step
+from nlfilter_torch.photo.declared.strokes import Stroke
 from nlfilter_torch.photo.edits.applying import fit_step
 from nlfilter_torch.photo.selections.local_values import ABSOLUTE, RELATIVE
 from nlfilter_torch.photo.tiled import recipe as whole_edit
 from nlfilter_torch.photo.tiled.parts import Parts, Rectangle
 from nlfilter_torch.photo.tiled.tiles import Passes
 from tests.problems import cat
-from tests.recipes import COLORIZE, DETAIL, IN, RECOLOR, rows_of
+from tests.recipes import ALPHA, COLORIZE, DETAIL, IN, INSIDE, RECOLOR, rows_of
 
 SMALL = 0.002  # megapixels, fewer than the cat has
+BRUSH, ERASER = Stroke(((0.6, 0.7), (0.8, 0.3)), 0.08, "add"), Stroke(((0.3, 0.3), (0.6, 0.7)), 0.06, "remove")
 PLACES = [
     Rectangle(range(60), range(90)),
     Rectangle(range(8, 36), range(19, 58)),
@@ -32,6 +34,9 @@ EDITS = {
     "detail, reduced": Recipe((Step("detail", alpha=(3.0, 2.0, 1.0), landmarks=60, viewing_size=SMALL),)),
     "detail of a region": Recipe((DETAIL,)),
     "detail of a region, reduced": Recipe((DETAIL.changed(viewing_size=SMALL),)),
+    "detail by hand, reduced": Recipe(
+        (Step("detail", (IN, BRUSH, ERASER), alpha=ALPHA, inside=INSIDE, landmarks=40, viewing_size=SMALL),)
+    ),
     "all channels": Recipe((DETAIL.changed(channels="all", residual=0.5),)),
     "colorize": Recipe((COLORIZE,)),
     "recolor": Recipe((RECOLOR,)),
