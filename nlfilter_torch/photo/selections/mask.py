@@ -33,7 +33,7 @@ from nlfilter_torch.photo.picture.source import Fitted, Reduced, Source
 from nlfilter_torch.photo.picture.viewing import viewed_size
 from nlfilter_torch.photo.selections.by_hand import ByHand, check_drawn
 from nlfilter_torch.photo.selections.closed_form import LinearMasks, linear_mask, linear_models, solve_linear
-from nlfilter_torch.photo.selections.connected import Extent, connected, without_specks
+from nlfilter_torch.photo.selections.connected import Extent, connected
 from nlfilter_torch.photo.selections.random_walker import solve_mask
 from nlfilter_torch.photo.selections.rough_mask import RoughMasks
 from nlfilter_torch.photo.selections.stray import without_strays
@@ -86,8 +86,8 @@ def region_mask(
         removed: (B, 1 or K, H, W) in [0, 1], likewise: where it is 1, masks are 0. It takes precedence over ``added``.
         reach: in [0, 1), probability that a random walk over similar pixels continues after each step; larger values
             include less similar pixels.
-        extent: ``"near"`` selects what is similar and nearby, without specks far from the rest, ``"object"`` only what
-            is connected with a scribble of it, ``"everywhere"`` what is similar at any distance.
+        extent: ``"near"`` selects what is similar and nearby, ``"object"`` only what is connected with a scribble of
+            it, ``"everywhere"`` what is similar at any distance.
         photometric_bandwidth: in hundredths of Lab: 0.08 is 8 units.
         spatial_bandwidth: in pixels; None is 0.3 of the short side, ``math.inf`` no limit: similar pixels anywhere.
         patch_size: width of the compared patches.
@@ -362,11 +362,9 @@ def _computed_regions(
     if marked is not None:
         functions = functions * marked[:, :, None, None, None]
     regions = Regions(image, steps, functions, scribbles)
-    if everywhere:
+    if settings.extent != "object":
         return regions
-    belonging = connected if settings.extent == "object" else without_specks
-    belongs = belonging(regions.reduced_masks(), front)
-    return replace(regions, functions=functions * belongs.unsqueeze(2))
+    return replace(regions, functions=functions * connected(regions.reduced_masks(), front).unsqueeze(2))
 
 
 def _filled(scribbles: Scribbles, marked: Tensor) -> Scribbles:

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from nlfilter_torch import defocus, enhance, recolor, region_mask
-from nlfilter_torch.photo.selections.connected import BORDER, connected, without_specks
+from nlfilter_torch.photo.selections.connected import BORDER, connected
 from tests.problems import box, inverse, noise, oriented, paint
 
 SIZE = (48, 64)
@@ -43,22 +43,6 @@ def test_only_what_is_connected_belongs_to_the_object() -> None:
     for number in range(8):
         turned = connected(oriented(masks.clamp(max=1), number), oriented(STROKE, number))
         assert torch.equal(inverse(turned.float(), number) > 0, belongs)
-
-
-def test_specks_far_from_other_pieces_are_left_out_and_other_pieces_stay(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("nlfilter_torch.photo.selections.connected.SPECK", 0.03)
-    specks = box(44, 60, 1, 1, size=SIZE) + box(20, 18, 1, 1, size=SIZE)
-    masks = LEFT + box(18, 50, 3, 3, size=SIZE) + specks
-    left = without_specks(masks, STROKE)
-    assert left[LEFT + box(18, 50, 3, 3, size=SIZE) > 0].min() == 1  # smaller, but no speck
-    assert left[..., 44, 60] == 0
-    assert left[..., 44, 60 - BORDER - 1] == 1
-    assert 0 < left[..., 44, 60 - BORDER // 2] < 1
-    assert left[..., 20, 18] == 1  # beside an object, such as hair
-    assert torch.equal(without_specks(0 * masks, STROKE), torch.ones_like(masks))
-    for number in range(8):
-        turned = without_specks(oriented(masks, number), oriented(STROKE, number))
-        assert torch.equal(inverse(turned, number), left)
 
 
 def test_each_region_is_connected_by_itself() -> None:
