@@ -11,6 +11,7 @@ from its own colour; results in tiles are therefore exact.
 """
 
 import math
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import ClassVar
@@ -19,6 +20,7 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.core.checks import check_count, check_positive
+from nlfilter_torch.core.workers import single_threaded, threads_for
 from nlfilter_torch.operator.options import Completion, OperatorOptions, Sampling, SpatialBandwidth
 from nlfilter_torch.photo.declared.declaration import Edit
 from nlfilter_torch.photo.declared.parameters import MASK
@@ -32,7 +34,13 @@ from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles, parts_in_bl
 from nlfilter_torch.photo.picture.source import Fitted, Reduced, Source
 from nlfilter_torch.photo.picture.viewing import viewed_size
 from nlfilter_torch.photo.selections.by_hand import ByHand, check_drawn
-from nlfilter_torch.photo.selections.closed_form import LinearMasks, linear_mask, linear_models, solve_linear
+from nlfilter_torch.photo.selections.closed_form import (
+    FEWEST_WORKERS,
+    LinearMasks,
+    linear_mask,
+    linear_models,
+    solve_linear,
+)
 from nlfilter_torch.photo.selections.connected import Extent, connected
 from nlfilter_torch.photo.selections.random_walker import solve_mask
 from nlfilter_torch.photo.selections.rough_mask import RoughMasks
@@ -352,13 +360,16 @@ def _computed_regions(
         guide_channels="all",
         generator=settings.generator,
     )
-    rough = RoughMasks.of(small, options, settings.reach, everywhere)
-    counted = scribbles if marked is None else list(map(_filled, scribbles, marked.unbind(1)))
-    reduced = [blocks_of(drawn, small, source.size, steps) for drawn in counted]
-    image = small.image.clamp(0.0, 1.0)  # a far brighter pixel of a float file would upset the linear functions
-    masks = torch.cat([rough.mask(number, drawn) for number, drawn in enumerate(reduced)], dim=1)
-    front, back = torch.stack([drawn.planes(small) for drawn in reduced], dim=2).unbind(1)
-    functions = small.kept("borders", [masks, front, back], partial(_fit_borders, small, image, masks, front, back))
+    threads = threads_for(small.image)
+    # So few pixels that a second thread would wait most of the time.
+    with single_threaded(threads) if threads < FEWEST_WORKERS else nullcontext():
+        rough = RoughMasks.of(small, options, settings.reach, everywhere)
+        counted = scribbles if marked is None else list(map(_filled, scribbles, marked.unbind(1)))
+        reduced = [blocks_of(drawn, small, source.size, steps) for drawn in counted]
+        image = small.image.clamp(0.0, 1.0)  # a far brighter pixel of a float file would upset the linear functions
+        masks = torch.cat([rough.mask(number, drawn) for number, drawn in enumerate(reduced)], dim=1)
+        front, back = torch.stack([drawn.planes(small) for drawn in reduced], dim=2).unbind(1)
+        functions = small.kept("borders", [masks, front, back], partial(_fit_borders, small, image, masks, front, back))
     if marked is not None:
         functions = functions * marked[:, :, None, None, None]
     regions = Regions(image, steps, functions, scribbles)
