@@ -10,7 +10,13 @@ from nlfilter_torch.photo.declared.development import AS_IT_IS, Development, Fra
 from nlfilter_torch.photo.declared.presets import DEVELOPING_BYTES
 from nlfilter_torch.photo.io.developed import cut_photograph, lit_photograph
 from nlfilter_torch.photo.io.photographs import Photograph, check_memory
-from nlfilter_torch.photo.picture.developing import develop_image, in_light, limits_of, turned_canvas
+from nlfilter_torch.photo.picture.developing import (
+    develop_image,
+    in_light,
+    limits_of,
+    part_of_planes,
+    turned_canvas,
+)
 from nlfilter_torch.photo.picture.resizing import resize
 from nlfilter_torch.photo.tiled.parts import Parts, Rectangle
 
@@ -55,30 +61,26 @@ class Developed:
         """
         frame = development.frame(original.size)
         check_memory(Path(name), original.size[1], original.size[0], DEVELOPING_BYTES)
-        is_cut = development.geometry == self.geometry
+        is_cut = development.geometry == self.development.geometry
         cut = self.cut if is_cut else cut_photograph(original, development)
-        edited = lit_photograph(cut, development, limits_of(original.pixels))
+        edited = lit_photograph(cut, development, original)
         preview = Preview(edited.pixels, pixels)
-        before = (
-            self.before if is_cut else preview.pixels if cut is edited else resize(cut.pixels.float(), preview.size)
-        )
+        if is_cut:
+            before = self.before
+        elif cut is edited:
+            before = preview.pixels
+        else:
+            before = resize(cut.pixels.float(), preview.size)
         return Developed(development, frame, edited, cut, before, preview, parts_of(edited, name))
-
-    @property
-    def geometry(self) -> Development:
-        """How it is straightened and cropped."""
-        return self.development.geometry
 
     def original(self, place: Rectangle) -> Tensor:
         """A part before the edit, (1, C, h, w) in [0, 1]."""
-        rows, columns = place.rows, place.columns
-        return self.cut.pixels[..., rows.start : rows.stop, columns.start : columns.stop].clamp(0, 1)
+        return part_of_planes(self.cut.pixels, place.rows, place.columns).clamp(0, 1)
 
     def approximate(self, development: Development, original: Preview) -> Tensor:
         """The preview, quickly, as it would be developed in another way, from the preview of the photograph itself."""
-        limits = limits_of(original.pixels)
         if development.geometry == self.development.geometry:
-            return in_light(self.before, development, limits)
+            return in_light(self.before, development, limits_of(original.pixels))
         return develop_image(original.pixels, development)
 
 

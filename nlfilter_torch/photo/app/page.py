@@ -29,6 +29,7 @@ from nlfilter_torch.photo.app.session import Session
 from nlfilter_torch.photo.app.tabs import Link, PhotoLink
 from nlfilter_torch.photo.app.tasks import EXPECTED, Tasks
 from nlfilter_torch.photo.app.uploads import Upload
+from nlfilter_torch.photo.declared.development import Development
 from nlfilter_torch.photo.declared.json_values import Value
 from nlfilter_torch.photo.declared.parameters import DETAIL, EDITS
 from nlfilter_torch.photo.declared.presets import Recipe
@@ -73,7 +74,6 @@ class Editor:
         self._wanted: list[int | None] = []  # at most one picture to draw next: the place of a step that moves, or None
         self._drawing = False
         self._framed: object = None  # what canvas and closeup show
-        self._tab = DETAIL.name
         self._is_cropping = False
 
     def build(self, image: Path | None, address: str = "") -> None:
@@ -287,7 +287,7 @@ class Editor:
         self._panel.follow()
         self._show_state()
         self._redraw()
-        if self._framed == (self.session.opened, self.session.recipe.develop.geometry):
+        if self._framed == framed(self.session, self.session.recipe.develop):
             self._closeup.follow()
         else:
             self._closeup.hold()  # until the photograph is cut anew
@@ -344,7 +344,7 @@ class Editor:
                 if moving is None:
                     self._frame()
                 self._show()
-                if self._tab == DETAIL.name:
+                if self._panel.tab == DETAIL.name:
                     await self._respond()
                 self._canvas.draw_mask(moving=moving is not None)
                 self._canvas.draw_strokes()
@@ -383,8 +383,9 @@ class Editor:
 
     def _frame(self) -> None:
         """Show the photograph as it is straightened and cropped now, if that has changed."""
-        if self._framed != framed(self.session):
-            self._framed = framed(self.session)
+        now = framed(self.session, self.session.developed.development)
+        if self._framed != now:
+            self._framed = now
             self._closeup.open(self.session)
             with self._client:
                 self._canvas.frame(self.session.developed.before, self.session.size)
@@ -399,7 +400,6 @@ class Editor:
 
     def _switch(self, tab: str) -> None:
         """Show what belongs to a tab that was opened."""
-        self._tab = tab
         was_pointing = self._is_cropping or self._canvas.pick is not None
         self._end_crop()
         self._canvas.switch(tab)
@@ -439,7 +439,7 @@ class Editor:
         self._title.set_text(opened.name)
         self._tasks.clear_error()
         self._closeup.open(self.session)
-        self._framed = framed(self.session)
+        self._framed = framed(self.session, self.session.developed.development)
         with self._client:
             self._end_crop()
             self._canvas.await_click(None)
@@ -497,9 +497,9 @@ class Editor:
             ui.notify(f"Saved {path.resolve()}", type="positive", position="bottom-left", timeout=6000)
 
 
-def framed(session: Session) -> object:
-    """What decides where the pixels of the developed photograph of a session are."""
-    return session.opened, session.developed.geometry
+def framed(session: Session, development: Development) -> object:
+    """What decides where the pixels of the photograph of a session are under a development."""
+    return session.opened, development.geometry
 
 
 @dataclass(frozen=True)

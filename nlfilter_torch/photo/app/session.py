@@ -194,7 +194,7 @@ class Session:
         return self.developed.photograph.size
 
     def _develop(self, development: Development) -> Developed:
-        """The photograph developed in a way, which takes a second for each ten megapixels unless it is shown so.
+        """The photograph under a development; takes a second per ten megapixels unless it is the one shown.
 
         Raises:
             ValueError, MemoryError: if nothing is open, or the photograph cannot be developed.
@@ -205,7 +205,7 @@ class Session:
         return developed.changed(opened.photograph, opened.name, self._pixels, development)
 
     def step_in_view(self, edit: str) -> Step:
-        """The chosen step of an edit, whose strokes are where they are in the developed photograph, if they are."""
+        """The chosen step of an edit, with its strokes in coordinates of the developed photograph."""
         step = self.recipe.current(edit)
         return on_frame(step, self.developed.frame, self.preview.size) if step.strokes else step
 
@@ -313,10 +313,10 @@ class Session:
         if not words:
             raise ValueError(f"{step} takes no strokes: it holds for the whole photograph")
         stroke = self.developed.frame.stroke_outward(Stroke.from_entries(entries, words, step))
-        last = self.recipe.current(step)
-        painted = last.changed(strokes=(*last.strokes, stroke)).switched_on()
-        if painted.has_region() and not last.has_region():  # it begins with the sliders of the rest
-            painted = painted.changed(inside=last["alpha"])
+        current = self.recipe.current(step)
+        painted = current.changed(strokes=(*current.strokes, stroke)).switched_on()
+        if painted.has_region() and not current.has_region():  # it begins with the sliders of the rest
+            painted = painted.changed(inside=current["alpha"])
         self.recipe = self.recipe.with_current(painted)
         self.commit()
 
@@ -340,7 +340,7 @@ class Session:
 
     def _on(self, developed: Developed, recipe: Recipe, seen: tuple[int, int] | None = None) -> Recipe:
         """The steps of a recipe for the developed photograph, or for that reduced to a size."""
-        return replace(recipe, develop=developed.development).on_developed(developed.frame.original, seen)
+        return Recipe(tuple(on_frame(step, developed.frame, seen) for step in recipe.steps))
 
     def eigenvalues(self, detail: Step) -> Tensor:
         """Eigenvalues (R,) of the filter of a step of detail, which its layers belong to."""

@@ -237,6 +237,12 @@ def rows_of(photograph: Photograph, name: str) -> Rows:
     return Rows(name, photograph.size, pixels.shape[1], lambda rows: pixels[..., rows, :])
 
 
+def note_developing(edit: "FileEdit", source: str, size: tuple[int, int], channels: int) -> None:
+    """Print the notes about how a photograph (H, W) with that number of channels is developed."""
+    note_grey(edit.develop, source, channels)
+    note_cropped(edit.develop, edit.cropped_away(size))
+
+
 def note_grey(develop: Development, name: str, channels: int) -> None:
     """Print a note if a photograph with that number of channels has no colours to balance."""
     if develop.balances and channels < 3:
@@ -270,7 +276,7 @@ class FileEdit(Protocol):
         """The steps, with their numbers, whose objects in a photograph (H, W) are all outside the crop."""
 
     def on_developed(self, size: tuple[int, int]) -> "FileEdit":
-        """The edit for a photograph, once (H, W), that is developed already."""
+        """The edit for a developed photograph that was (H, W) before."""
 
     def edited(self, photograph: Photograph) -> Tensor:
         """New pixels (1, C, H, W) of a photograph in memory that is developed already."""
@@ -318,8 +324,7 @@ def edit_file(
             size, photograph = photograph.size, develop_photograph(photograph, edit.develop)
             output = photograph if kind is None else replace(photograph, depth=kind)
             check_output(target, output)
-            note_grey(edit.develop, source, photograph.pixels.shape[1])
-            note_cropped(edit.develop, edit.cropped_away(size))
+            note_developing(edit, source, size, photograph.pixels.shape[1])
             begin("Editing")
             output = output.with_pixels(edit.on_developed(size).edited(photograph))
             begin("Writing")
@@ -329,14 +334,14 @@ def edit_file(
         picture = stack.enter_context(open_picture(Path(source), allowed))
         own_depth = check_depth(source, picture.rows.dtype)  # refuses other dtypes whatever the output is
         stored = kind or own_depth
-        note_grey(edit.develop, source, picture.shape[2])
-        note_cropped(edit.develop, edit.cropped_away(picture.shape[:2]))
-        part = picture.of_part(edit.develop.frame(picture.shape[:2]).size)
+        size = picture.shape[:2]
+        note_developing(edit, source, size, picture.shape[2])
+        framed = edit.develop.frame(size).size
+        part = picture.of_part(framed)
         like = part.in_colour() if edit.coloured else part
         check_place(Path(target), stored, like, allowed)
         processes = processes_for(workers, cluster, stack)
-        size = picture.shape[:2]
-        report = stack.enter_context(stages(written(edit.stages(size), edit.develop.frame(size).size, Path(target))))
+        report = stack.enter_context(stages(written(edit.stages(size), framed, Path(target))))
         job = Job(picture, stored, allowed - picture.cached, allowed_memory(memory, TILED), report, stack, processes)
         with edit.tiling(job) as tiling:
             write_picture(Path(target), tiling, stored, like, quality)

@@ -200,14 +200,12 @@ def with_options(*names: str, more: Iterable[Edit] = ()) -> Callable[[Command], 
     """Replace the ``**values`` of a command by the named options of detail and all options of the edits in ``more``."""
 
     def decorate(function: Command) -> Command:
-        parameters = inspect.signature(function, eval_str=True).parameters.values()
-        own = [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in parameters if p.kind != p.VAR_KEYWORD]
         added = {name: _declared(EDITS["detail"][name]) for name in names}
         for edit in more:
             for parameter in edit:
                 if parameter.is_option and parameter.name not in added:
                     added[parameter.name] = _declared(parameter, f"Options of {edit.name}")
-        signature = inspect.Signature([*own, *added.values()])
+        signature = inspect.Signature([*_own_parameters(function), *added.values()])
         return with_signature(function, signature)
 
     return decorate
@@ -217,12 +215,17 @@ def with_declared(edit: Edit) -> Callable[[Command], Command]:
     """Replace the ``**values`` of a command by the options of an edit, and its help by that of the edit."""
 
     def decorate(function: Command) -> Command:
-        parameters = inspect.signature(function, eval_str=True).parameters.values()
-        source, target, *own = (p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in parameters)
+        source, target, *own = _own_parameters(function)
         function.__doc__ = edit.help
-        return with_signature(function, inspect.Signature([source, target, *map(_declared, edit), *own[:-1]]))
+        return with_signature(function, inspect.Signature([source, target, *map(_declared, edit), *own]))
 
     return decorate
+
+
+def _own_parameters(function: Command) -> list[inspect.Parameter]:
+    """The parameters of a command but its ``**values``, to be passed by name."""
+    parameters = inspect.signature(function, eval_str=True).parameters.values()
+    return [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in parameters if p.kind != p.VAR_KEYWORD]
 
 
 def with_signature(function: Command, signature: inspect.Signature) -> Command:

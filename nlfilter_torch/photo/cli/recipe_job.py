@@ -60,7 +60,7 @@ class RecipeJob:
 
     def cropped_away(self, size: tuple[int, int]) -> list[tuple[int, Step]]:
         """The steps, with their numbers, whose objects in a photograph (H, W) are all outside the crop."""
-        return [] if self.develop.is_idle else self.recipes[0].cropped_away(size)
+        return self.recipes[0].cropped_away(size)
 
     def on_developed(self, size: tuple[int, int]) -> "RecipeJob":
         """The recipes for a photograph, once (H, W), that is developed already."""

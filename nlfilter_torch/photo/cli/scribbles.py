@@ -266,7 +266,7 @@ def at_once(edit: Edit, drawn: Drawn[Overlay]) -> Drawn[Tensor]:
 
 
 def overlays(edit: Edit, drawn: Drawn[Overlay]) -> Iterator[tuple[Scribble, str, Overlay]]:
-    """Yield the scribbles of an edit, with the option that they come from."""
+    """Yield the scribbles of an edit with their option and overlay."""
     for scribble in edit.scribbles:
         option = scribble.option or "--region"
         if scribble.kind == "colours" and scribble.role == "object" and drawn.colours is not None:

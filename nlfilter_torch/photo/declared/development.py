@@ -11,11 +11,10 @@ from dataclasses import dataclass, replace
 
 from nlfilter_torch.photo.declared.declaration import Edit, Parameter, Slider
 from nlfilter_torch.photo.declared.json_values import is_within, shown
-from nlfilter_torch.photo.declared.strokes import Stroke
+from nlfilter_torch.photo.declared.strokes import Point, Stroke
 
 Crop = tuple[float, float, float, float]
 WHOLE: Crop = (0.0, 0.0, 1.0, 1.0)
-Point = tuple[float, float]
 EXACT = 1e-9  # pixels, within which an edge is that of a pixel
 
 #: Declared as an edit is, though it is no step: it comes first, and once.
@@ -43,8 +42,8 @@ DEVELOP = Edit(
             "temperature",
             "number",
             0.0,
-            "White balance from blue, -1, to amber, 1: a cold photograph becomes warmer above 0. Grey photographs stay "
-            "grey.",
+            "White balance from blue, -1, to amber, 1: values above 0 make a cold photograph warmer. Grey photographs "
+            "stay grey.",
             -1,
             1,
             idle=0.0,
@@ -64,8 +63,8 @@ DEVELOP = Edit(
             "straighten",
             "number",
             0.0,
-            "Degrees by which the photograph is turned, clockwise above 0, counter-clockwise below. Corners that get "
-            "empty are cut off, at the same proportions.",
+            "Degrees by which the photograph is turned, clockwise above 0, counter-clockwise below. Empty corners are "
+            "cut off, and the proportions kept.",
             -45,
             45,
             idle=0.0,
@@ -134,11 +133,10 @@ class Development:
     crop: Crop = WHOLE
 
     def __post_init__(self) -> None:
-        """Check all values."""
+        """Check all values, and make them numbers of the declared type."""
         for name, value in vars(self).items():
             check_value(name, value)
-        left, top, right, bottom = map(float, self.crop)
-        object.__setattr__(self, "crop", (left, top, right, bottom))
+            object.__setattr__(self, name, tuple(map(float, value)) if name == "crop" else float(value))
 
     @property
     def is_idle(self) -> bool:
@@ -208,9 +206,7 @@ class Development:
                     f"develop in {place} must have no entries other than {', '.join(names)}, got {name}; remove it"
                 )
             check_value(name, value, f" of develop in {place}")
-        numbers = {name: float(value) for name, value in entries.items() if name != "crop"}
-        left, top, right, bottom = map(float, entries.get("crop", WHOLE))
-        return Development(**numbers, crop=(left, top, right, bottom))
+        return Development(**entries)
 
 
 AS_IT_IS = Development()
@@ -285,15 +281,11 @@ class Frame:
 
     def stroke_inward(self, stroke: Stroke) -> Stroke:
         """A stroke in coordinates of the original, in those of the developed picture."""
-        if self.is_whole:
-            return stroke
         points = tuple(self.inward(*point) for point in stroke.points)
         return replace(stroke, points=points, radius=stroke.radius * self.scale)
 
     def stroke_outward(self, stroke: Stroke) -> Stroke:
         """A stroke in coordinates of the developed picture, in those of the original."""
-        if self.is_whole:
-            return stroke
         points = tuple(self.outward(*point) for point in stroke.points)
         return replace(stroke, points=points, radius=stroke.radius / self.scale)
 

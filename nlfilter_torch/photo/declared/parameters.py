@@ -40,7 +40,7 @@ ADD = Scribble(
     "Brush",
     role="added",
     option="--add",
-    option_help="A rectangle that is selected as it is, as by a brush, on top of what is found. May be repeated.",
+    option_help="A rectangle to add to the mask, as with a brush, whatever is found. May be repeated.",
 )
 REMOVE = Scribble(
     "removed",

@@ -52,7 +52,7 @@ class Recipe:
         develop: exposure, white balance, straightening and crop, which come before all steps. Strokes are in
             coordinates of the picture before that.
         chosen: place of the step that the editor's controls show where there are several of its edit; None is the last
-            of them. It is no part of the edit: recipes are equal without it.
+            of them. It is not part of the edit; comparisons ignore it.
     """
 
     steps: tuple[Step, ...] = ()
@@ -81,8 +81,6 @@ class Recipe:
         effect, or no region. ``seen`` is the size of the developed picture where it is reduced.
         """
         frame = self.develop.frame(size)
-        if frame.is_whole:
-            return Recipe(self.steps)
         return Recipe(tuple(on_frame(step, frame, seen) for step in self.steps))
 
     def cropped_away(self, size: tuple[int, int]) -> list[tuple[int, Step]]:
@@ -131,9 +129,8 @@ class Recipe:
 
     def replaced(self, place: int, *steps: Step) -> "Recipe":
         """Replace the step at a place by others, or by none."""
-        chosen = self.chosen if steps or self.chosen != place else None
-        moved = replace(self, chosen=chosen)._after(place + 1, len(steps) - 1)
-        return self._of((*self.steps[:place], *steps, *self.steps[place + 1 :]), moved)
+        chosen = self._after(place + 1, len(steps) - 1) if steps or self.chosen != place else None
+        return self._of((*self.steps[:place], *steps, *self.steps[place + 1 :]), chosen)
 
     def _after(self, place: int, by: int) -> int | None:
         """The place of the chosen step if the steps from a place on move."""

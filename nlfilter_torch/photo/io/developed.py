@@ -26,7 +26,7 @@ def develop_photograph(photograph: Photograph, development: Development) -> Phot
     """
     if development.is_idle:
         return photograph
-    return lit_photograph(cut_photograph(photograph, development), development, limits_of(photograph.pixels))
+    return lit_photograph(cut_photograph(photograph, development), development, photograph)
 
 
 def cut_photograph(photograph: Photograph, development: Development) -> Photograph:
@@ -38,9 +38,11 @@ def cut_photograph(photograph: Photograph, development: Development) -> Photogra
     return replace(cut, exif=of_part(photograph.exif, frame.size[::-1]))
 
 
-def lit_photograph(cut: Photograph, development: Development, limits: tuple[Tensor, Tensor]) -> Photograph:
-    """Change exposure and white balance of a photograph; ``limits`` are those of its pixels before it was cut."""
-    return replace(cut, pixels=in_light(cut.pixels, development, limits)) if development.changes_tones else cut
+def lit_photograph(cut: Photograph, development: Development, original: Photograph) -> Photograph:
+    """Change exposure and white balance of a photograph that was cut from the original."""
+    if not development.changes_tones:
+        return cut
+    return replace(cut, pixels=in_light(cut.pixels, development, limits_of(original.pixels)))
 
 
 def _cropped(photograph: Photograph, frame: Frame) -> Photograph:

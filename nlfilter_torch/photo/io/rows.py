@@ -94,16 +94,19 @@ class StoredPicture:
         height, width, samples = self.shape
         if samples > 2:
             return self
-        shape = (height, width, 3 + self.alpha)
-        rows = np.broadcast_to(np.zeros((), self.rows.dtype), shape)
+        rows = self._empty((height, width, 3 + self.alpha))
         return replace(self, rows=rows, metadata=replace(self.metadata, icc=None))
 
     def of_part(self, size: tuple[int, int]) -> "StoredPicture":
         """Return shape and metadata of a part (H, W), without pixels."""
         if size == self.shape[:2]:
             return self
-        rows = np.broadcast_to(np.zeros((), self.rows.dtype), (*size, *self.rows.shape[2:]))
+        rows = self._empty((*size, *self.rows.shape[2:]))
         return replace(self, rows=rows, metadata=replace(self.metadata, exif=of_part(self.metadata.exif, size[::-1])))
+
+    def _empty(self, shape: tuple[int, ...]) -> Channels:
+        """Rows of a shape and the same dtype, which take no memory."""
+        return np.broadcast_to(np.zeros((), self.rows.dtype), shape)
 
 
 def is_zarr(path: Path) -> bool:

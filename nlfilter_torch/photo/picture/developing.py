@@ -190,12 +190,16 @@ def _times(image: Tensor, gains: Sequence[float], limits: tuple[Tensor, Tensor])
     crossing = torch.nonzero((image > LINEAR) != (edited > LINEAR), as_tuple=True)
     if len(crossing[0]):
         before, factors = image[crossing].double(), light.expand_as(image)[crossing].double()  # rounded alike anywhere
-        linear = ((before.clamp(min=LINEAR) + OFFSET) / (1 + OFFSET)) ** GAMMA
-        values = torch.where(before > LINEAR, linear, before / SLOPE) * factors
+        values = _linear(before) * factors
         curved = (1 + OFFSET) * values.clamp(min=LINEAR / SLOPE) ** (1 / GAMMA) - OFFSET
         edited = edited.index_put(crossing, torch.where(before > LINEAR, SLOPE * values, curved).to(edited))
     is_wide = (limits[0] < 0) | (limits[1] > 1)
     return torch.where(is_wide, edited, edited.clamp(0, 1))
+
+
+def _linear(values: Tensor) -> Tensor:
+    """The linear light of values with the tone curve of sRGB."""
+    return torch.where(values > LINEAR, ((values.clamp(min=LINEAR) + OFFSET) / (1 + OFFSET)) ** GAMMA, values / SLOPE)
 
 
 def _divided(function: Callable[[Item], Tensor], items: Iterable[Item], image: Tensor) -> list[Tensor]:
@@ -229,10 +233,7 @@ def balance_of(part: Tensor) -> tuple[float, float]:
     """
     if part.shape[1] != 3 or part.numel() == 0:
         raise ValueError("the photograph must have colours to balance, got a grey one; choose another")
-    values = part.double()
-    light = torch.where(
-        values > LINEAR, ((values.clamp(min=LINEAR) + OFFSET) / (1 + OFFSET)) ** GAMMA, values / SLOPE
-    ).mean((0, 2, 3))
+    light = _linear(part.double()).mean((0, 2, 3))
     if float(light.min()) < DARK:
         raise ValueError(
             "a grey point must have red, green and blue light, got one that is nearly black; choose another"

@@ -29,19 +29,11 @@ def cover(stroke: Stroke, size: tuple[int, int], rows: slice | None = None) -> T
     return covered
 
 
-def soft_cover(stroke: Stroke, size: tuple[int, int], rows: slice | None = None) -> Tensor:
-    """The share of each pixel that a stroke covers, (H, W): 1 inside, 0 outside, with a border of one pixel.
-
-    ``rows`` as in :func:`cover`.
-    """
-    covered = torch.zeros(_shape(size, rows))
-    place, shares = _soft_part(stroke, size, rows)
-    covered[place] = shares
-    return covered
-
-
 def _soft_part(stroke: Stroke, size: tuple[int, int], rows: slice | None) -> tuple[tuple[slice, slice], Tensor]:
-    """The part of a picture that holds all of a stroke, and :func:`soft_cover` of it."""
+    """The part of a picture that holds all of a stroke, and the share of each of its pixels that the stroke covers.
+
+    The share is 1 inside and 0 outside, with a border of one pixel. ``rows`` as in :func:`cover`.
+    """
     radius = radius_in_pixels(stroke, size) + BORDER / 2
     lines = list(_squared_distances(stroke, size, rows, radius))
     if not lines:

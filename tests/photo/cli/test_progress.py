@@ -2,6 +2,7 @@
 
 import os
 import time
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 
@@ -10,6 +11,15 @@ from rich.console import Console
 
 from nlfilter_torch.core.progress import Progress, Stage
 from nlfilter_torch.photo.cli import progress
+
+
+@pytest.fixture
+def terminal(monkeypatch: pytest.MonkeyPatch) -> Iterator[Console]:
+    """A terminal that records what is drawn on it."""
+    with open(os.devnull, "w") as nowhere:
+        shown = Console(force_terminal=True, width=80, record=True, file=nowhere)
+        monkeypatch.setattr(progress, "Console", lambda stderr: shown)
+        yield shown
 
 
 def test_lines_where_there_is_no_terminal(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
@@ -35,21 +45,16 @@ def test_quick_work_says_nothing(tmp_path: Path, capfd: pytest.CaptureFixture[st
     assert capfd.readouterr() == ("", "")
 
 
-def test_report_of_progress_is_drawn_on_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
-    shown = Console(force_terminal=True, width=80, record=True, file=open(os.devnull, "w"))  # noqa: SIM115
-    monkeypatch.setattr(progress, "Console", lambda stderr: shown)
+def test_report_of_progress_is_drawn_on_a_terminal(terminal: Console) -> None:
     with progress.stages() as report:
         report("Looking", 1, 4)
         report("Filtering", 3, 4)
-    text = shown.export_text()
-    shown.file.close()
+    text = terminal.export_text()
     assert "Filtering" in text
     assert "75%" in text
 
 
-def test_a_bar_of_the_whole_job_if_its_stages_are_known(monkeypatch: pytest.MonkeyPatch) -> None:
-    shown = Console(force_terminal=True, width=80, record=True, file=open(os.devnull, "w"))  # noqa: SIM115
-    monkeypatch.setattr(progress, "Console", lambda stderr: shown)
+def test_a_bar_of_the_whole_job_if_its_stages_are_known(monkeypatch: pytest.MonkeyPatch, terminal: Console) -> None:
     now = [0.0]  # without a clock of its own, a job as quick as this is over before it is shown
     monkeypatch.setattr(progress.progress, "Progress", partial(Progress, lambda: now[0]))
     with progress.stages([Stage("Looking", 1.0), Stage("Filtering", 4.0)]) as report:
@@ -58,7 +63,6 @@ def test_a_bar_of_the_whole_job_if_its_stages_are_known(monkeypatch: pytest.Monk
         report("Looking", 1, 1)
         report("Filtering", 0, 4)
         report("Filtering", 1, 4)
-    text = shown.export_text()
-    shown.file.close()
+    text = terminal.export_text()
     assert "40%" in text
     assert "about 1 s left" in text

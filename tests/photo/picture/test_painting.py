@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from nlfilter_torch.photo.declared.strokes import Stroke
-from nlfilter_torch.photo.picture.painting import colour_of, cover, mask_of, paint, painted_on_mask, soft_cover
+from nlfilter_torch.photo.picture.painting import colour_of, cover, mask_of, paint, painted_on_mask
 
 SIZE = (40, 60)
 HORIZONTAL = Stroke(((0.25, 0.25), (0.5, 0.25)), 0.05, "in")
@@ -46,23 +46,23 @@ def test_rows_are_those_of_the_whole(rows: slice) -> None:
 
 def test_what_is_painted_on_a_mask_has_a_border_of_a_pixel() -> None:
     line = replace(LINE, radius=2.12 / 40)
-    soft = soft_cover(line, SIZE)
+    soft = painted_on_mask([line], "in", SIZE)[0, 0]
     inner, outer = (cover(replace(LINE, radius=radius / 40), SIZE) for radius in (1.62, 2.62))
     assert torch.equal(soft == 1, inner)
     assert torch.equal(soft > 0, outer)
     rows = slice(5, 13)
-    assert torch.equal(soft_cover(line, SIZE, rows), soft[rows])
     assert torch.equal(painted_on_mask([line], "in", SIZE, rows), soft[None, None, rows])
 
 
 def test_brush_and_eraser_act_in_the_order_drawn() -> None:
     brush, eraser = replace(LINE, paint="add #ff0033"), replace(HORIZONTAL, paint="remove")
     planes = painted_on_mask([eraser, brush, eraser], "add colour", SIZE)[0]
-    soft = soft_cover(brush, SIZE)
-    torch.testing.assert_close(planes[3], soft * (1 - soft_cover(eraser, SIZE)))
+    soft = painted_on_mask([brush], "add colour", SIZE)[0, 3]
+    erased = painted_on_mask([eraser], "remove", SIZE)[0, 0]
+    torch.testing.assert_close(planes[3], soft * (1 - erased))
     assert torch.equal(planes[:3, soft > 0], colour_of("#ff0033").unsqueeze(1).expand(-1, int((soft > 0).sum())))
     removed = painted_on_mask([eraser, brush], "remove", SIZE)[0, 0]
-    torch.testing.assert_close(removed, soft_cover(eraser, SIZE) * (1 - soft))
+    torch.testing.assert_close(removed, erased * (1 - soft))
 
 
 def test_strokes_above_hide_those_below() -> None:
