@@ -165,13 +165,9 @@ class Canvas:
         self._crop_tool.hide()
 
     def await_click(self, pick: Callable[[float, float], None] | None) -> None:
-        """Call a function with the next point that is clicked, in place of drawing; None does so no longer."""
+        """Call a function with the next point that is clicked, in place of drawing; None ends this."""
         self.pick = pick
-        self._let_draw()
-
-    def _let_draw(self) -> None:
-        """Tell the page whether a pointer draws or chooses a point, and does not move the photograph."""
-        draws = self._step in BRUSHES or self.pick is not None
+        draws = self._step in BRUSHES or pick is not None  # or picks a point, rather than moving the photograph
         ui.run_javascript(f"closeup.brush({'true' if draws else 'false'})")
 
     def switch(self, step: str) -> None:
@@ -181,8 +177,7 @@ class Canvas:
         self._step = step
         self._show_mask.set_enabled(step in BRUSHES and not EDITS[step].coloured)  # others select nothing
         self._lay()
-        self.pick = None
-        self._let_draw()
+        self.await_click(None)
         self.draw_strokes()
         self.draw_mask()
 

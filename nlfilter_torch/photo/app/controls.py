@@ -114,6 +114,11 @@ OF_EDIT: dict[str, tuple[Control, ...]] = {
 }
 
 
+def show_pressed(button: ui.button, on: bool) -> None:
+    """Show whether a button that switches something is pressed, as screen readers and the style sheet read it."""
+    button.props(f'aria-pressed="{str(on).lower()}"')
+
+
 RESETTING = ("dblclick", "keydown.home.prevent", "keydown.delete", "keydown.backspace")
 
 

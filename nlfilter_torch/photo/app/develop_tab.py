@@ -5,9 +5,8 @@ from dataclasses import dataclass
 
 from nicegui import ui
 
-from nlfilter_torch.photo.app.controls import Control, Slider
+from nlfilter_torch.photo.app.controls import Control, Slider, show_pressed
 from nlfilter_torch.photo.app.tabs import EditTab
-from nlfilter_torch.photo.declared.declaration import ScribbleRole
 from nlfilter_torch.photo.declared.development import DEVELOP, WHOLE
 from nlfilter_torch.photo.declared.json_values import Value
 from nlfilter_torch.photo.declared.presets import Recipe
@@ -27,10 +26,6 @@ class DevelopControl(Control):
         """The slider's value at the start."""
         return self.parameter.default_number
 
-    def entries(self, recipe: Recipe, value: float) -> dict[str, Value]:
-        """The changed value."""
-        return {self.parameter.name: round(value, 4)}
-
     def show(self, value: float) -> str:
         """The value as text."""
         return super().show(value) + UNITS.get(self.parameter.name, "")
@@ -47,22 +42,18 @@ class DevelopTab(EditTab):
         super().follow()
         photo = self._link.photo
         for button, is_on in ((self._crop, photo.is_cropping()), (self._pick, photo.is_picking())):
-            button.props(f'aria-pressed="{str(is_on).lower()}"')
-            button.classes(add="chosen" if is_on else "", remove="" if is_on else "chosen")
+            show_pressed(button, is_on)
         self._whole.set_enabled(self._link.recipe().develop.crop != WHOLE)
-
-    def take(self, role: ScribbleRole) -> None:
-        """There are no tools that draw."""
 
     def _build(self) -> None:
         ui.label(DEVELOP.hint).classes("hint")
         self._sliders = [Slider(control, self._link.recipe, self._develop) for control in CONTROLS]
         photo = self._link.photo
-        self._pick = ui.button("Grey point", icon="colorize", on_click=lambda: photo.pick()).props("flat dense no-caps")
+        self._pick = ui.button("Grey point", icon="colorize", on_click=photo.pick).props("flat dense no-caps")
         self._pick.tooltip("Click on something that is grey or white: the white balance makes it so")
         ui.label("Crop").classes("group")
         with ui.row().classes("w-full items-center no-wrap gap-2 q-mt-xs"):
-            self._crop = ui.button("Crop", icon="crop", on_click=lambda: photo.crop()).props("flat dense no-caps")
+            self._crop = ui.button("Crop", icon="crop", on_click=photo.crop).props("flat dense no-caps")
             self._crop.tooltip("Drag a frame over the whole photograph; Escape ends it")
             ui.space()
             self._whole = ui.button("Whole picture", on_click=self._uncrop).props("flat dense no-caps")

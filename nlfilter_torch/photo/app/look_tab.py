@@ -6,6 +6,7 @@ from nicegui import ui
 from torch import Tensor
 
 from nlfilter_torch.photo.app import drawing
+from nlfilter_torch.photo.app.controls import show_pressed
 from nlfilter_torch.photo.app.tabs import EditTab, Link
 from nlfilter_torch.photo.declared.json_values import Value
 from nlfilter_torch.photo.declared.looks import LOOKS
@@ -51,9 +52,7 @@ class LookTab(EditTab):
             if address:
                 self._pictures[name].props(f'src="{address}"')
             self._pictures[name].set_visibility(bool(address))
-            is_chosen = has_look and entries_of(look) == entries_of(LOOKS[name])
-            button.props(f'aria-pressed="{str(is_chosen).lower()}"')
-            button.classes(add="chosen" if is_chosen else "", remove="" if is_chosen else "chosen")
+            show_pressed(button, has_look and entries_of(look) == entries_of(LOOKS[name]))
 
     def _build(self) -> None:
         with ui.element("div").classes("looks w-full").props('role="group" aria-label="Looks"'):

@@ -37,20 +37,25 @@ class Panel:
             self._titles = {edit: ui.tab(edit, label=TITLES[edit]) for edit in TABS}
         panels = ui.tab_panels(bar, value=DETAIL.name, animated=False, keep_alive=True)
         self._bar = bar
-        self._tabs: list[EditTab] = []
+        self._tabs: dict[str, EditTab] = {}
         with panels.classes("w-full bg-transparent"):
             for edit, kind in TABS.items():
                 with ui.tab_panel(edit).classes("gap-1"):
-                    self._tabs.append(kind(edit, link))
+                    self._tabs[edit] = kind(edit, link)
         self._steps = StepList(link.recipe, link.replace, bar.set_value)
         ui.label("Histogram").classes("group q-px-sm")
         self._histogram = ui.html("", sanitize=False).classes("w-full q-px-sm")
         self._clipped = ui.label("").classes("hint q-px-sm")
         self.follow()
 
+    @property
+    def tab(self) -> str:
+        """The edit whose tab is open."""
+        return str(self._bar.value)
+
     def follow(self) -> None:
         """Show the current edit."""
-        for tab in self._tabs:
+        for tab in self._tabs.values():
             tab.follow()
         self._steps.follow()
         recipe = self._recipe()
@@ -61,7 +66,7 @@ class Panel:
 
     def take(self, role: ScribbleRole) -> None:
         """Take the tool that draws scribbles with a role, in the open tab."""
-        self._tabs[list(TABS).index(self._bar.value)].take(role)
+        self._tabs[self.tab].take(role)
 
     def draw_levels(self, histogram: str, clipped: tuple[float, float], before: tuple[float, float]) -> None:
         """Show the histogram, and how much of the picture is white or black, now and before the edit."""
@@ -74,5 +79,5 @@ class Panel:
 
     def draw_response(self, svg: str) -> None:
         """Show the response of the sliders for the layers."""
-        for tab in self._tabs:
+        for tab in self._tabs.values():
             tab.draw_response(svg)

@@ -26,7 +26,7 @@ class PhotoLink:
         develop: is called with changes, and whether they are complete.
         crop: is called to show the frame of the crop, or to hide it.
         is_cropping: returns whether it is shown.
-        pick: is called to let a person point at something grey, or no longer.
+        pick: is called to let a person point at something grey, or to stop that.
         is_picking: returns whether the next click does that.
     """
 
@@ -48,7 +48,7 @@ class Link:
         clear: is called with a step whose strokes are to be removed.
         replace: is called with another edit, and the place of the step whose slider moves, or None.
         thumbnail: returns the address of a picture of the photograph under a look, or "" if there is none.
-        photo: the same for how the photograph is developed.
+        photo: what the tab of the photograph itself calls.
     """
 
     recipe: Callable[[], Recipe]
@@ -78,8 +78,9 @@ class EditTab:
 
     def take(self, role: ScribbleRole) -> None:
         """Take the tool that draws scribbles with a role, if the edit has one."""
-        for scribble in EDITS[self._edit].with_role(role):
-            self._tools.set_value(scribble.word)
+        if self._edit in BRUSHES:
+            for scribble in EDITS[self._edit].with_role(role):
+                self._tools.set_value(scribble.word)
 
     def draw_response(self, svg: str) -> None:
         """Show the response of the sliders, in a tab that has a place for it."""

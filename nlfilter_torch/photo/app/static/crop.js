@@ -7,9 +7,8 @@
 
 /* global emitEvent -- of NiceGUI: sends an event to the server */
 
-import { atLeast, moved } from "./frames.js";
+import { EDGES, atLeast, moved } from "./frames.js";
 
-const EDGES = ["left", "top", "right", "bottom"];
 const REST = 400; // milliseconds after the last key
 const STEP = 0.01; // of an arrow key
 const KEYS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] };
