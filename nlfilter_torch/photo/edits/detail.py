@@ -38,7 +38,7 @@ from nlfilter_torch.photo.picture.limits import Limits
 from nlfilter_torch.photo.picture.pixels import corner, whole_image
 from nlfilter_torch.photo.picture.resizing import enlarged
 from nlfilter_torch.photo.picture.source import Fitted, Guide, Pixels, Planes, Source, luminance
-from nlfilter_torch.photo.picture.viewing import balance, enlarged_change, fit_change, viewed_size, within_limits
+from nlfilter_torch.photo.picture.viewing import balance, enlarged_change, fit_change, viewed_size
 from nlfilter_torch.photo.selections.by_hand import ByHand
 from nlfilter_torch.photo.selections.connected import Extent
 from nlfilter_torch.photo.selections.mask import RegionMask, Regions
@@ -249,25 +249,39 @@ class Detail(FilteredEdit):
         elsewhere = torch.zeros_like(sliders[0]) if outside is None else outside - 1
         brighter = None if outside is None else change_of_mean(torch.cat([sliders, outside[None] - 1]))
         brighter = None if brighter is None else brighter.to(source.dtype)
-        size, rows = viewed_size(source.size, self.viewing_size), [*sliders, elsewhere]
-        viewed = source if size == source.size else source.resized(size)
-        regional = self._change_of_regions(source, masks, rows, viewed)
-        change = self._fitted(regional)
-        if size == source.size:
-            return within_limits(source, change, self.limits, brighter)
-        by_hand = ByHand.of(source, masks.get("added"), masks.get("removed"), len(sliders))
-        if by_hand is None:
-            return enlarged_change(source, viewed, change, self.planes, self.limits, brighter=brighter)
-        corrected = None if brighter is None else balance(viewed, change, self.limits, brighter)
+        regional = partial(self._change_of_regions, source, masks, [*sliders, elsewhere])
+        size = viewed_size(source.size, self.viewing_size)
+        if size != source.size:
+            by_hand = ByHand.of(source, masks.get("added"), masks.get("removed"), len(sliders))
+            if by_hand is not None:
+                viewed = source.resized(size)
+                return self._fit_by_hand(source, viewed, regional(viewed), by_hand, brighter)
+        return fit_change(
+            source,
+            lambda viewed: self._fitted(regional(viewed)),
+            self.planes,
+            self.viewing_size,
+            self.limits,
+            brighter=brighter,
+        )
+
+    def _fit_by_hand(
+        self, source: Source[M], viewed: Source[M], regional: "RegionalChange", by_hand: ByHand, brighter: Tensor | None
+    ) -> Fitted:
+        """Fit the change of regions that are painted by hand on a picture larger than the viewing size.
+
+        ``brighter`` is None if pixels outside all regions stay as they are.
+        """
+        corrected = None if brighter is None else balance(viewed, self._fitted(regional), self.limits, brighter)
         computed = replace(regional, regions=replace(regional.regions, by_hand=None))
-        versions: list[Planes] = [*(regional.changes if outside is not None else regional.changes[:-1]), computed]
+        versions: list[Planes] = [*(regional.changes if brighter is not None else regional.changes[:-1]), computed]
         edited = [
             enlarged_change(source, viewed, self._fitted(version), self.planes, self.limits, brighter=corrected).pixels
             for version in versions
         ]
-        if outside is None:
+        if brighter is None:
             edited.insert(-1, whole_image)
-        steps = source.size[0] / size[0], source.size[1] / size[1]
+        steps = source.size[0] / viewed.size[0], source.size[1] / viewed.size[1]
         return Fitted(BlendedByHand(edited, viewed.all(Fitted(computed.regions.masks)), steps, by_hand))
 
     def _fitted(self, change: Planes) -> Fitted:

@@ -279,11 +279,11 @@ class Recoloring:
 
         ``by_hand`` paints on the shares (B, K, H, W) of the colours.
         """
-        shares = self.refined(pixels, masks, beside)
+        luminance, chroma = split_luminance(pixels)
+        compared = chroma if self.brightening is None else pixels  # :meth:`compared`
+        shares = self.refined(compared, masks, beside)
         if by_hand is not None:
             shares = by_hand(shares) * self.valid[..., None, None]
-        luminance, chroma = split_luminance(pixels)
-        compared = self.compared(pixels)
         brightness, changed, total = luminance, chroma, torch.zeros_like(luminance)
         for k in range(shares.shape[1]):
             sides, share = beside[k], shares[:, k : k + 1]
@@ -304,10 +304,12 @@ class Recoloring:
         untouched = (total == 0).expand_as(pixels)
         return torch.where(untouched, pixels, merge_luminance(brightness.clamp(0.0, 1.0), changed))
 
-    def refined(self, pixels: Tensor, masks: Tensor, beside: list[Sides]) -> Tensor:
-        """:meth:`shares` of masks, corrected along borders by the mixing ratio of the colours on both sides."""
-        shares, compared = self.shares(masks), self.compared(pixels)
-        refined = []
+    def refined(self, compared: Tensor, masks: Tensor, beside: list[Sides]) -> Tensor:
+        """:meth:`shares` of masks, corrected along borders by the mixing ratio of the colours on both sides.
+
+        ``compared`` is :meth:`compared` of the pixels.
+        """
+        shares, refined = self.shares(masks), []
         for k, sides in enumerate(beside):
             share = shares[:, k : k + 1]
             if self.brightening is not None:

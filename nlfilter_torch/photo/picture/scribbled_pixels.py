@@ -36,6 +36,11 @@ class Scribbles:
             raise TypeError("strokes must be a torch.Tensor, got NoneType; pass the colours of the scribbles")
         return self.colours
 
+    @property
+    def painted(self) -> Tensor:
+        """Which images have any scribbles, (B,)."""
+        return (self.weights.detach() > 0).flatten(1).any(1)
+
     def joined(self, other: "Scribbles") -> "Scribbles":
         """Append the regions of other scribbles; where both cover a pixel, the other scribbles have weight 0."""
         places, back = torch.cat([self.places, other.places]).unique(return_inverse=True)

@@ -11,7 +11,6 @@ from its own colour; results in tiles are therefore exact.
 """
 
 import math
-from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import ClassVar
@@ -34,13 +33,7 @@ from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles, parts_in_bl
 from nlfilter_torch.photo.picture.source import Fitted, Reduced, Source
 from nlfilter_torch.photo.picture.viewing import viewed_size
 from nlfilter_torch.photo.selections.by_hand import ByHand, check_drawn
-from nlfilter_torch.photo.selections.closed_form import (
-    FEWEST_WORKERS,
-    LinearMasks,
-    linear_mask,
-    linear_models,
-    solve_linear,
-)
+from nlfilter_torch.photo.selections.closed_form import LinearMasks, linear_mask, linear_models, solve_linear
 from nlfilter_torch.photo.selections.connected import Extent, connected
 from nlfilter_torch.photo.selections.random_walker import solve_mask
 from nlfilter_torch.photo.selections.rough_mask import RoughMasks
@@ -52,6 +45,7 @@ VIEWED = VIEWING_SIZE.default_number  # megapixels; larger pictures are first re
 FLOATS_PER_PIXEL = 80  # estimated working memory per pixel of the reduced picture, in addition to its operator
 ROUGH_CONFIDENCE, SCRIBBLE_CONFIDENCE = 0.02, 1000.0  # confidence in the rough mask, and in scribbles
 ODDS, STEEPNESS = 1.5, 1.4  # of the curve from the solution along borders, too low halfway, to masks
+MOST_WAITING = 2  # threads: operations on so few pixels are not worth dividing between two
 EPSILON = 1e-6
 
 
@@ -287,9 +281,8 @@ def background_of(source: Source[M], mask: M | None, inside: Scribbles, name: st
     if mask is None:
         return []
     background = source.scribbles(mask, None, name, needed=False)
-    painted = (background.weights > 0).flatten(1).any(1)
     free = (inside.joined(background).weights[:, -1] > 0).any(1)
-    if bool((painted & ~free).any()):
+    if bool((background.painted & ~free).any()):
         raise ValueError(
             f"{name} must hold a painted pixel outside the scribbles on the object, got only pixels under them; "
             "paint outside them, or omit it"
@@ -308,11 +301,11 @@ def fit_regions(
 
     Masks of regions without scribbles in an image are 0, except for what is painted by hand.
     """
+    MASK.check(source.batch, reach=settings.reach, extent=settings.extent)
     if by_hand is None:
         return _computed_regions(source, inside, background, settings)
-    MASK.check(source.batch, reach=settings.reach, extent=settings.extent)
-    count = len(inside) or by_hand.count
-    marked = [(drawn.weights.detach() > 0).flatten(1).any(1) for drawn in inside]  # images with scribbles on a region
+    count = by_hand.count
+    marked = [drawn.painted for drawn in inside]
     numbers = [k for k, images in enumerate(marked) if bool(images.any())]
     if numbers:
         opposed = [background[k] for k in numbers] if len(background) > 1 else background
@@ -341,7 +334,6 @@ def _computed_regions(
 
     ``marked`` (B, K) tells which images have scribbles on each region; None is all of them.
     """
-    MASK.check(source.batch, reach=settings.reach, extent=settings.extent)
     inside, background = ([without_strays(drawn, source.size) for drawn in side] for side in (inside, background))
     several = len(background) > 1
     scribbles = [_against(inside, k, background[k : k + 1] if several else background) for k in range(len(inside))]
@@ -361,8 +353,7 @@ def _computed_regions(
         generator=settings.generator,
     )
     threads = threads_for(small.image)
-    # So few pixels that a second thread would wait most of the time.
-    with single_threaded(threads) if threads < FEWEST_WORKERS else nullcontext():
+    with single_threaded(threads if threads <= MOST_WAITING else 1):
         rough = RoughMasks.of(small, options, settings.reach, everywhere)
         counted = scribbles if marked is None else list(map(_filled, scribbles, marked.unbind(1)))
         reduced = [blocks_of(drawn, small, source.size, steps) for drawn in counted]

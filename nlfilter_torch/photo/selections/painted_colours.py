@@ -1,6 +1,6 @@
 """What is painted on a picture in colours: strokes on objects, and on their masks by hand, grouped by colour."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -56,7 +56,7 @@ class Painted:
         Colours are chroma, or RGB if their brightness counts.
         """
         marks = self.marks
-        painted = torch.stack([(drawn.weights.detach() > 0).flatten(1).any(1) for drawn in marks]).any(0)
+        painted = torch.stack([drawn.painted for drawn in marks]).any(0)
         if not bool(painted.all()):  # means of nothing are undefined; these colours are not valid
             marks = [drawn.weighted(torch.where(painted.view(-1, 1, 1), drawn.weights, 1.0)) for drawn in marks]
         shown = torch.cat([drawn.shown for drawn in marks], dim=2).unsqueeze(2)
@@ -103,10 +103,10 @@ class Groups:
         """What is painted on the mask of each colour."""
         less = ByHand.of(source, None, removed, 1)
         if self.on_mask is None:
-            return less
+            return None if less is None else replace(less, count=len(self.inside))
         return ByHand(self.on_mask.weights.shape[1], self.on_mask.planes, None if less is None else less.removed)
 
 
 def _if_any(scribbles: Scribbles | None) -> Scribbles | None:
     """Scribbles, or None if no weight of theirs is above 0."""
-    return scribbles if scribbles is not None and bool((scribbles.weights.detach() > 0).any()) else None
+    return scribbles if scribbles is not None and bool(scribbles.painted.any()) else None

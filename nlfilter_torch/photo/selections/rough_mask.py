@@ -125,8 +125,9 @@ class RoughMasks:
         unlike = 1 - likeness(colours, weights[:, :1], self.frame.colours, self.photometric_bandwidth)
         linked = linked_evenly(self.evenness, planes)
         frame_links, grid_links = self.frame.values(linked), self.grid.values(linked)
-        outside = self.outside(scribbles, unlike)
-        likely = sharpened(self.regression(scribbles, outside, frame_links, grid_links)(self.picture))
+        known = self.scribbled(scribbles)
+        outside = self.outside(known, unlike)
+        likely = sharpened(self.regression(known, outside, frame_links, grid_links)(self.picture))
         likely_frame = torch.maximum(self.frame.values(likely * self.evenness), frame_links)
         compared = [unlike, likely_frame, self.grid.colours, grid_links, self.photometric_bandwidth, trimap]
         by_colour = self.picture.kept(
@@ -138,13 +139,17 @@ class RoughMasks:
         nearby = 1.0 if self.everywhere else (around(likely) / ENOUGH_AROUND).clamp(max=1.0)
         return likely + (by_colour - likely) * share * nearby
 
+    @property
+    def pixels(self) -> int:
+        """Number of pixels of the picture."""
+        return self.picture.size[0] * self.picture.size[1]
+
     def fit(self, known: Sequence[ScribbledPoints], strength: float) -> Callable[[Tensor], Tensor]:
         """The regression on scribbled pixels and points."""
-        pixels = self.picture.size[0] * self.picture.size[1]
         return fit_strokes(
             partial(scribbled_blocks, known),
             pairs=self.operator.pairs,
-            pixels=pixels,
+            pixels=self.pixels,
             reach=self.reach,
             smoothness=SMOOTHNESS,
             strength=strength,
@@ -156,38 +161,37 @@ class RoughMasks:
         values = scribbles.weights[:, :1] / total.clamp(min=EPSILON)
         return self.operator.at(scribbles.places), total.clamp(max=1.0), values
 
-    def outside(self, scribbles: Scribbles, unlike: Tensor) -> Tensor:
+    def outside(self, known: ScribbledPoints, unlike: Tensor) -> Tensor:
         """How much points of the frame count as background, (B, 1, n).
 
-        All that are unlike the region but those that a regression on the scribbles alone assigns to it. This fades to
-        0 where nothing similar is scribbled, so that scribbles on the background take nothing from what the frame says
-        elsewhere.
+        All that are unlike the region but those that a regression on the scribbles alone assigns to it. The regression
+        fades to 0 where nothing similar is scribbled, so that scribbles on the background take nothing from what the
+        frame says elsewhere.
 
         Args:
-            scribbles: on the region and on its background.
+            known: :meth:`scribbled` pixels, on the region and on its background.
             unlike: dissimilarity of the frame to the scribbles on the region, (B, 1, n).
         """
-        alone = self.fit([self.scribbled(scribbles)], strength=0.0)
+        alone = self.fit([known], strength=0.0)
         return unlike * torch.cat(
             [(1 - alone(block)).clamp(0.0, 1.0).square() for block in self.frame.columns()], dim=2
         )
 
-    def regression(self, scribbles: Scribbles, outside: Tensor, frame_links: Tensor, grid_links: Tensor) -> Planes:
+    def regression(self, known: ScribbledPoints, outside: Tensor, frame_links: Tensor, grid_links: Tensor) -> Planes:
         """Likelihood that a pixel belongs to a region: about 1 inside and about 0 outside; not clamped.
 
         Args:
-            scribbles: on the region and on its background.
+            known: :meth:`scribbled` pixels, on the region and on its background.
             outside: :meth:`outside` of the frame, (B, 1, n).
             frame_links: :func:`linked_evenly` of the frame to these, (B, 1, n).
             grid_links: the same of the grid, (B, 1, m).
         """
-        pixels = self.picture.size[0] * self.picture.size[1]
-        known = [
-            self.scribbled(scribbles),
-            (self.frame.columns, outside * max(1.0, pixels / FRAME_PIXELS), frame_links),
+        points = [
+            known,
+            (self.frame.columns, outside * max(1.0, self.pixels / FRAME_PIXELS), frame_links),
             (self.grid.columns, grid_links, torch.ones_like(grid_links)),
         ]
-        return self.operator.of_columns(partial(_of_columns, self.fit(known, strength=1.0)))
+        return self.operator.of_columns(partial(_of_columns, self.fit(points, strength=1.0)))
 
 
 def _of_columns(regression: Callable[[Tensor], Tensor], columns: Columns) -> Tensor:

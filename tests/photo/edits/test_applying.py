@@ -205,11 +205,13 @@ def test_a_step_has_a_mask_painted_by_hand(
     assert edited.isfinite().all()
     assert not torch.equal(edited, pixels)
     erased = painted.changed(strokes=(*strokes, replace(REMOVE, points=((0.0, 0.5), (1.0, 0.5)), radius=1.0)))
-    wanted = (
-        pixels
-        if step is RECOLOR
-        else apply_recipe(Recipe((erased.changed(strokes=(ADD, *erased.strokes[-1:])),)), pixels)
-    )
+    if step is RECOLOR:
+        wanted = pixels
+    elif step is DETAIL:  # as outside the region
+        outside = Step("detail", alpha=ALPHA, bandwidth=30.0)
+        wanted = apply_recipe(Recipe((outside,)), pixels)
+    else:
+        wanted = defocus(pixels, None, added=torch.zeros(1, 1, *SIZE), radius=0.04 * 48, generator=seeded())
     assert torch.equal(apply_recipe(Recipe((erased,)), pixels), wanted)
 
 

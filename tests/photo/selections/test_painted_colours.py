@@ -1,5 +1,7 @@
 """Strokes of colour on objects and on their masks: what is painted, in which colours, and over which pixels."""
 
+from dataclasses import replace
+
 import torch
 
 from nlfilter_torch import recolor
@@ -36,6 +38,9 @@ def test_each_colour_has_its_pixels_and_the_mean_under_its_strokes() -> None:
     assert by_hand is not None
     masks = by_hand.over(torch.zeros(1, 2, *SIZE), InMemory(IMAGE))
     assert torch.equal(masks[:, order], torch.cat([STROKE, BRUSH], dim=1))
+    erased = replace(groups, on_mask=None).by_hand(InMemory(IMAGE), BRUSH)  # an eraser alone, for both colours
+    assert erased is not None
+    assert erased.count == 2
 
 
 def test_what_is_painted_depends_on_the_weights_alone() -> None:

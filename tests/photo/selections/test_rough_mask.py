@@ -30,8 +30,9 @@ def test_the_regression_is_the_best_estimate_from_scribbles_frame_and_grid(
     unlike, linked, within = (noise(1, 1, n, seed=k) for k, n in ((4, len(places)), (5, len(places)), (6, len(grid))))
     points = [Points.of(source, held, at) for at in (places, grid)]
     rough = RoughMasks(source, held, *points, torch.tensor(0.2), reach=0.6)
-    outside = rough.outside(scribbles, unlike)
-    estimated = rough.regression(scribbles, outside, linked, within)(source)
+    known = rough.scribbled(scribbles)
+    outside = rough.outside(known, unlike)
+    estimated = rough.regression(known, outside, linked, within)(source)
 
     def estimate(values: torch.Tensor, weights: torch.Tensor, strength: float = 1.0) -> np.ndarray:
         flat = (values.flatten().numpy(), weights.flatten().numpy())
@@ -59,5 +60,5 @@ def test_scribbles_on_the_background_take_nothing_from_what_the_frame_says_elsew
     frame = Points.of(source, held, frame_places((24, 40)))
     rough = RoughMasks(source, held, frame, frame, torch.tensor(0.05), reach=0.6)
     strokes = [source.regions(box(10, left, 3, 4, size=(24, 40)), "a")[0] for left in (14, 28)]
-    outside = rough.outside(strokes[0].joined(strokes[1]), torch.ones(1, 1, len(frame.places)))
+    outside = rough.outside(rough.scribbled(strokes[0].joined(strokes[1])), torch.ones(1, 1, len(frame.places)))
     assert outside.min() > 0.8
