@@ -45,7 +45,7 @@ class _Estimate:
     later: float
 
     def at(self, now: float) -> float:
-        """Seconds left at a later time without another report; while the stage takes too long, they wait."""
+        """Seconds left at a later time without another report; the later stages do not count down."""
         return max(0.0, self.own - (now - self.now)) + self.later
 
 

@@ -52,6 +52,11 @@ def in_order(
             yield waiting.popleft().result()
 
 
+def divided_among(workers: int, function: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
+    """:func:`in_order`, but one worker keeps gradients."""
+    return map(function, items) if workers == 1 else in_order(function, items, workers)
+
+
 def threads_for(*tensors: Tensor) -> int:
     """Number of threads that may compute parts of a result from these tensors, each by itself: for :func:`in_order`.
 

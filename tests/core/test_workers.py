@@ -11,7 +11,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from nlfilter_torch.core.kernels import library
 from nlfilter_torch.core.kernels.tall_skinny import moment, spread
-from nlfilter_torch.core.workers import in_order, single_threaded, threads_for
+from nlfilter_torch.core.workers import divided_among, in_order, single_threaded, threads_for
 
 
 @pytest.fixture(autouse=True)
@@ -34,6 +34,16 @@ def test_workers_share_the_threads_and_leave_those_of_others(workers: int, threa
     assert (torch.get_num_threads(), of_new_thread()) == (6, 6)
     assert list(results) == [(k, threads, False) for k in range(1, 20)]
     assert (torch.get_num_threads(), of_new_thread()) == (6, 6)
+
+
+def test_workers_may_not_divide_operations() -> None:
+    assert list(in_order(lambda _: torch.get_num_threads(), range(3), 2, divided=False)) == [1, 1, 1]
+    assert (torch.get_num_threads(), of_new_thread()) == (6, 6)
+
+
+def test_one_worker_keeps_gradients_where_work_is_divided() -> None:
+    kept = {workers: list(divided_among(workers, lambda _: torch.is_grad_enabled(), range(2))) for workers in (1, 2)}
+    assert kept == {1: [True, True], 2: [False, False]}
 
 
 def test_single_threaded_holds_for_the_calling_thread_and_its_workers() -> None:

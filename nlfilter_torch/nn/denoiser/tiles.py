@@ -9,7 +9,7 @@ from torch import Tensor
 
 from nlfilter_torch.core.blocks import reflected
 from nlfilter_torch.core.inner import EVERYWHERE, Inner
-from nlfilter_torch.core.workers import in_order
+from nlfilter_torch.core.workers import divided_among
 
 SIDE, STEP = 96, 80  # size and spacing of tiles, in pixels
 SMALLEST = 56  # size of the last tile of a row or column, at least
@@ -44,8 +44,7 @@ def in_tiles(
     computed = partial(_computed, function, image, noise)
     workers = min(workers, len(groups), MOST_WORKERS)
     total, weight = torch.zeros_like(image), image.new_zeros(image.shape[-2:])
-    results = map(computed, groups) if workers == 1 else in_order(computed, groups, workers)
-    for group, result in zip(groups, results, strict=True):
+    for group, result in zip(groups, divided_among(workers, computed, groups), strict=True):
         fade = torch.outer(*map(_profile, _size(group[0]))).to(image)
         for tile, part in zip(group, result.split(len(image)), strict=True):
             total[(..., *tile)] += fade * part

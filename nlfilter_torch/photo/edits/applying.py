@@ -204,11 +204,9 @@ def apply_recipe(
     if not recipe.develop.is_idle:
         check_photograph(image, "image")
         size = image.shape[-2], image.shape[-1]
-        image, recipe, frame = (
-            develop_image(image, recipe.develop),
-            recipe.on_developed(size),
-            recipe.develop.frame(size),
-        )
+        image = develop_image(image, recipe.develop)
+        frame = recipe.develop.frame(size)
+        recipe = recipe.on_developed(size)
         weights = None if weights is None else develop_planes(weights, frame).clamp(0, 1)
     result, steps = image, recipe.acting
     for done, step in enumerate(steps):

@@ -265,9 +265,10 @@ class Denoise(FilteredEdit):
         weak = "" if change >= VISIBLE_LEVELS else ", which is barely visible"
         remedy = ""
         if weak and estimated and 0 < float(self.strength) < 2:  # a clean photograph has nothing more to lose
-            keeps = _are(0, self.brightness) or _are(0, self.colour)  # the noise that is left
-            remedy = "" if keeps else "; --strength 2 removes more"
-            remedy = remedy if level >= VISIBLE_LEVELS else ", as is the noise"
+            if level < VISIBLE_LEVELS:
+                remedy = ", as is the noise"
+            elif not (_are(0, self.brightness) or _are(0, self.colour)):  # these keep the noise that is left
+                remedy = "; --strength 2 removes more"
         return f"{text}; {changed}{weak}{remedy}"
 
 

@@ -195,7 +195,8 @@ class StepSearch:
         self.shown += 1
         if len(self.pairs) < MOST_PAIRS:
             pair = ViewedPair(before, after, self.viewing_size, len(self.pairs))
-            self.pairs += [pair] if pair.is_changed() else []
+            if pair.is_changed():
+                self.pairs.append(pair)
 
     def watching(self, pairs: Iterable[tuple[Tensor, ...]]) -> Iterator[tuple[Tensor, ...]]:
         """Yield pairs, (B, C, H, W) each, that are added on the way."""

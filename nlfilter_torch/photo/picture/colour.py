@@ -6,7 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from nlfilter_torch.operator.features import reduce_channels
+from nlfilter_torch.operator.features import LUMINANCE, reduce_channels
 
 LIGHTNESS = 0.3  # weight of lightness relative to hue and saturation: a fold in a red cloth is still red
 CHUNK = 8192  # pixels converted at once by one thread
@@ -54,7 +54,8 @@ def split_luminance(image: Tensor) -> tuple[Tensor, Tensor]:
 def with_green(chroma: Tensor) -> Tensor:
     """Complete chroma (B, 3, H, W) from its red and blue, (B, 2, H, W): its luminance is 0."""
     red, blue = chroma.split(1, dim=1)
-    return torch.cat([red, (0.299 * red + 0.114 * blue) / -0.587, blue], dim=1)
+    of_red, of_green, of_blue = LUMINANCE
+    return torch.cat([red, (of_red * red + of_blue * blue) / -of_green, blue], dim=1)
 
 
 def merge_luminance(luminance: Tensor, chroma: Tensor) -> Tensor:

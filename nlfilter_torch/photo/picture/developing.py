@@ -14,7 +14,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from nlfilter_torch.core.checks import check_dtype, check_tensor
-from nlfilter_torch.core.workers import in_order, threads_for
+from nlfilter_torch.core.workers import divided_among, threads_for
 from nlfilter_torch.photo.declared.development import Development, Frame, turned
 
 BLOCK = 256  # side in pixels of the squares that are turned at once
@@ -204,8 +204,7 @@ def _linear(values: Tensor) -> Tensor:
 
 def _divided(function: Callable[[Item], Tensor], items: Iterable[Item], image: Tensor) -> list[Tensor]:
     """Results of a function of parts of an image, each in a thread of its own unless derivatives are wanted."""
-    workers = threads_for(image)
-    return list(map(function, items) if workers == 1 else in_order(function, items, workers))
+    return list(divided_among(threads_for(image), function, items))
 
 
 def gains_of(development: Development, *, coloured: bool = True) -> list[float]:

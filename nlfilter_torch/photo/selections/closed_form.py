@@ -87,9 +87,10 @@ def window_sums(planes: Tensor) -> Tensor:
 
 
 def _sums_along(planes: Tensor, dim: int) -> Tensor:
-    """Sums over windows along an axis, of padded planes: of five pixels as two pairs and one."""
+    """Sums over windows of 2r+1 pixels along an axis, of padded planes: as r pairs and one pixel."""
     count = planes.shape[dim]
-    length, last = count - 2 * WINDOW_RADIUS, planes.narrow(dim, 2 * WINDOW_RADIUS, count - 2 * WINDOW_RADIUS)
+    length = count - 2 * WINDOW_RADIUS
+    last = planes.narrow(dim, 2 * WINDOW_RADIUS, length)
     pairs = planes.narrow(dim, 0, count - 1) + planes.narrow(dim, 1, count - 1)
     total = pairs.narrow(dim, 0, length)
     for pair in range(1, WINDOW_RADIUS):

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from nlfilter_torch.core.blocks import CACHED, order_by, pixel_blocks
 from nlfilter_torch.core.precision import per_image
-from nlfilter_torch.core.workers import in_order, threads_for
+from nlfilter_torch.core.workers import divided_among, threads_for
 from nlfilter_torch.operator.features import blur
 from nlfilter_torch.photo.picture.colour import hundredths_of_lab
 from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles
@@ -228,9 +228,7 @@ def density(places: Tensor, points: Tensor, weights: Tensor, bandwidth: Tensor) 
     part, workers = partial(_density, places, left, weights), threads_for(places, left, weights)
     # A worker computes a whole block, so that each has to fit the cache of one core.
     blocks = list(pixel_blocks(places.shape[2], len(places), places.device, length=CACHED // workers))
-    workers = min(workers, len(blocks))
-    sums = map(part, blocks) if workers == 1 else in_order(part, blocks, workers)
-    return torch.cat(list(sums), dim=1).mT
+    return torch.cat(list(divided_among(min(workers, len(blocks)), part, blocks)), dim=1).mT
 
 
 def _density(places: Tensor, left: Tensor, weights: Tensor, block: slice) -> Tensor:

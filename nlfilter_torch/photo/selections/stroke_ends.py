@@ -17,8 +17,8 @@ SLICES = 6, 48  # least and largest number of them
 BLUR = 1  # slices on either side of the border of a run that may hold colours of both sides
 LARGEST, SLACK = 0.3, 0.05  # share of a stroke that may be stray, and with its beginning
 END, GAP = 0.12, 0.18  # least mean distance of a run from the nearest colours of the rest, in hundredths of Lab
-NARROWEST = 2  # slices of a gap that hold no other colours
 SELF = 2.0  # the same, relative to the mean distance of slices of the rest from the nearest other ones
+NARROWEST = 2  # slices of a gap that hold no other colours
 BEGINNING = 0.35  # share of a run's distance at which it begins
 APART = 3  # slices of the rest that are nearer to each other are not compared
 ROUNDS = 2  # so many runs may be stray
@@ -152,17 +152,19 @@ class Slices:
         rest = self._rest(run)
         spread = _spread(self.distances[np.ix_(rest, rest)])
         least = max(BEGINNING * distance, spread)
-        while run.first > BLUR + 1 and self._nearest(run, run.first, run.first + 1)[0] > least:
-            wider = Run(run.first - 1, run.last)
-            if self.share(wider) > LARGEST + SLACK:
-                break
-            run = wider
-        while run.last < count - BLUR - 1 and self._nearest(run, run.last - 1, run.last)[0] > least:
-            wider = Run(run.first, run.last + 1)
-            if self.share(wider) > LARGEST + SLACK:
-                break
-            run = wider
+        run = self._widened(run, run.first - BLUR - 1, least, before=1)
+        run = self._widened(run, count - BLUR - 1 - run.last, least, after=1)
         return Run(run.first, run.last, distance, spread)
+
+    def _widened(self, run: Run, most: int, least: float, *, before: int = 0, after: int = 0) -> Run:
+        """Add up to so many slices before or after a run, as long as its outermost one there is far from the rest."""
+        for _ in range(most):
+            wider = Run(run.first - before, run.last + after)
+            end = run.first if before else run.last - 1
+            if self._nearest(run, end, end + 1)[0] <= least or self.share(wider) > LARGEST + SLACK:
+                break
+            run = wider
+        return run
 
     def _nearest(self, run: Run, first: int, last: int) -> Numbers:
         """Distances of slices from the nearest colours outside a run."""

@@ -10,6 +10,7 @@ from collections.abc import Iterable
 from dataclasses import replace
 from functools import cache
 from importlib.resources import files
+from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
 
@@ -53,7 +54,7 @@ def _durations() -> dict[str, dict[str, list[Line]]]:
 def expected_stages(steps: Iterable[Step], size: tuple[int, int]) -> list[Stage]:
     """The stages of an edit of a photograph (H, W) in tiles; none if those of a step are not known."""
     stages = [stages_of(step, size, regional=step.has_region()) for step in acting_steps(steps)]
-    return [stage for stages_of_step in stages for stage in stages_of_step] if all(stages) else []
+    return list(chain.from_iterable(stages)) if all(stages) else []
 
 
 def duration(step: Step, size: tuple[int, int]) -> float:

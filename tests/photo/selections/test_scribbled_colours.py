@@ -135,7 +135,7 @@ def test_each_worker_sums_densities_over_blocks_of_its_own(
 
     monkeypatch.setattr(scribbled_colours, "threads_for", lambda *_: 16)
     monkeypatch.setattr("nlfilter_torch.core.blocks.cores", lambda: 16)
-    monkeypatch.setattr(scribbled_colours, "in_order", record)
+    monkeypatch.setattr("nlfilter_torch.core.workers.in_order", record)
     torch.testing.assert_close(density(places, points, weights, bandwidth), alone)
     if len(lengths) == 1:
         assert shared == []  # no threads are started for a single block
