@@ -26,10 +26,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from benchmarks.composites import CHOOSING
-from benchmarks.denoiser_training.free_photographs import photographs
+from benchmarks.edited_photographs import edited_photographs
 from benchmarks.figures.scenes import luminance, scribbled
-from benchmarks.photographs import photograph, reduced_to
+from benchmarks.photographs import reduced_to
 from nlfilter_torch import region_mask
 from nlfilter_torch.photo.app.brush import RADIUS
 from nlfilter_torch.photo.declared.parameters import EDITS, MASK
@@ -37,7 +36,7 @@ from nlfilter_torch.photo.declared.presets import Recipe, find_recipe
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.declared.strokes import Stroke
 from nlfilter_torch.photo.edits.applying import apply_recipe
-from nlfilter_torch.photo.io.photographs import Photograph, read_photograph, write_photograph
+from nlfilter_torch.photo.io.photographs import Photograph, write_photograph
 from nlfilter_torch.photo.picture.painting import colour_of, mask_of
 from nlfilter_torch.photo.picture.resizing import resize
 
@@ -47,7 +46,6 @@ CELLS = 8  # of a digest, across and down
 SIDE = 600  # short side of photographs, at most
 GREY = 0.6  # behind an object that is cut out
 TILE, ACROSS = (200, 300), 5  # of the contact sheet
-SET_OF = {entry.name: entry.set for entry in photographs()}
 PAINTS = {"in": "#ffd91a", "out": "#e02020", "keep": "#20d0e0"}
 AIM = 0.85  # share of the results to keep
 KINDS = {"recolor": "recolouring", "mask": "masks and defocus", "defocus": "masks and defocus"}
@@ -101,15 +99,11 @@ class Job:
     @property
     def set(self) -> str:
         """The set of its photograph: choosing or reporting."""
-        return "choosing" if self.photograph in CHOOSING else SET_OF[self.photograph]
+        return edited_photographs()[self.photograph].set
 
     def before(self, folder: Path | None) -> Tensor:
         """The photograph before the edit, (1, 3, H, W), or grey, (1, 1, H, W)."""
-        if self.photograph in CHOOSING:
-            image = photograph(self.photograph)[:, :3]
-        else:
-            image = read_photograph((folder or Path()) / self.set / f"{self.photograph}.png").pixels[:, :3].float()
-        image = reduced_to(image, SIDE)
+        image = reduced_to(edited_photographs()[self.photograph].pixels(folder), SIDE)
         if self.noise:
             noise = torch.randn(image.shape, generator=torch.Generator().manual_seed(self.number))
             image = (image + noise * self.noise / 255).clamp(0, 1)
@@ -181,7 +175,7 @@ def results(listed: Sequence[Job], pictures: Path | None, out: Path) -> dict[str
     """Write the pictures of the jobs whose photographs are there; the results, by name of the job."""
     written = {}
     for job in listed:
-        if pictures is None and job.photograph not in CHOOSING:
+        if pictures is None and not edited_photographs()[job.photograph].is_shipped:
             continue
         picture = panels(job, pictures)
         out.mkdir(parents=True, exist_ok=True)

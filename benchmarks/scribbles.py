@@ -30,13 +30,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from benchmarks.composites import CHOOSING, FIRST_SEED, RADIUS, REPORTING, SIZE, composites, sources
-from benchmarks.denoiser_training.free_photographs import photographs
-from benchmarks.photographs import photograph, reduced_to
+from benchmarks.composites import FIRST_SEED, RADIUS, SIZE, composites, sources
+from benchmarks.edited_photographs import edited_photographs
+from benchmarks.photographs import reduced_to
 from benchmarks.recolor import CHANGED, COLOURS, recoloured, tinted
 from benchmarks.training.figures import Figure, table
 from nlfilter_torch import recolor
-from nlfilter_torch.photo.io.photographs import Photograph, read_photograph, write_photograph
+from nlfilter_torch.photo.io.photographs import Photograph, write_photograph
 from nlfilter_torch.photo.picture.in_memory import InMemory
 from nlfilter_torch.photo.selections.stray_parts import stray_parts
 
@@ -129,31 +129,21 @@ def on_composites(count: int, first: int, images: dict[str, Tensor]) -> Iterator
         yield shares
 
 
-def sources_of_photographs() -> dict[str, tuple[str, str]]:
-    """Set, choosing or reporting, and package of every free photograph, by name."""
-    listed = {entry.name: (entry.set, entry.package) for entry in photographs()}
-    names = {"choosing": CHOOSING, "reporting": REPORTING}
-    return listed | {name: (kind, "scikit-image") for kind, shipped in names.items() for name in shipped}
-
-
 def jobs(kind: str, folder: Path | None = None) -> Iterator[Job]:
     """The recolourings that are stored for photographs of a set, of which a folder holds those of Debian's packages."""
-    listed = sources_of_photographs()
     for entry in json.loads(STORED.read_text(encoding="utf-8")):
-        name = entry["photograph"]
-        own, package = listed[name]
-        shipped = package == "scikit-image"
-        if own != kind or (folder is None and not shipped):
+        edited = edited_photographs()[entry["photograph"]]
+        if edited.set != kind or (folder is None and not edited.is_shipped):
             continue
-        picture = photograph(name) if shipped else read_photograph((folder or Path()) / own / f"{name}.png").pixels
-        image = reduced_to(picture[:, :3], SIDE)
+        image = reduced_to(edited.pixels(folder), SIDE)
         size = (image.shape[-2], image.shape[-1])
         points = np.array(entry["points"], dtype=np.float64)[:, ::-1] * size  # of columns and rows, from 0 to 1
         width = max(1, round(2 * RADIUS * min(size)))
         clean = line(points[: -entry["stray"]], size, width)
         whole = line(points, size, width)
         colour = torch.tensor(entry["colour"]).view(1, 3, 1, 1)
-        yield Job(f"{name}: {entry['what']}", package, image, colour, as_mask(clean), as_mask(whole))
+        name = f"{edited.name}: {entry['what']}"
+        yield Job(name, edited.package, image, colour, as_mask(clean), as_mask(whole))
 
 
 def on_photograph(job: Job, out: Path | None) -> list[float]:

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks.edited_photographs import edited_photographs
 from benchmarks.photographs import photograph, reduced_to
 from benchmarks.recolor import CHANGED, HATS, hat_scene
-from benchmarks.scribbles import STORED, Job, as_mask, jobs, line, sources_of_photographs
+from benchmarks.scribbles import STORED, Job, as_mask, jobs, line
 from nlfilter_torch import recolor, region_mask
 from nlfilter_torch.photo.picture.in_memory import InMemory
 from nlfilter_torch.photo.selections.stray import strays
@@ -144,10 +145,9 @@ def test_an_object_of_several_colours_with_a_stroke_on_each_stays_whole() -> Non
 
 def test_strokes_are_stored_for_thirty_free_photographs() -> None:
     entries = json.loads(STORED.read_text(encoding="utf-8"))
-    listed = sources_of_photographs()
     names = {entry["photograph"] for entry in entries}
     assert len(names) >= 30
-    assert names <= listed.keys()
+    assert names <= edited_photographs().keys()
     for entry in entries:
         assert 0 < entry["stray"] < len(entry["points"]) - 1
         assert all(0 <= value <= 1 for point in entry["points"] for value in point)
