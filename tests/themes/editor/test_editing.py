@@ -282,6 +282,7 @@ def test_a_grey_point_sets_the_white_balance(opened: Tab) -> None:
     before = opened.source()
     button.click()
     expect(button).to_have_attribute("aria-pressed", "true")
+    expect(button).to_have_css("background-color", "rgb(47, 111, 174)")  # as that of a chosen tool
     opened.paint((0.5, 0.5))
     opened.wait_for_picture(before)
     expect(button).to_have_attribute("aria-pressed", "false")
