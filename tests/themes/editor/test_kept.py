@@ -30,6 +30,7 @@ def shown(tab: Tab) -> None:
 
 def leaving_is_asked_for(page: Page) -> None:
     """Try to leave a page, and stay."""
+    page.wait_for_function("page.isUnsaved")  # the server says so after it has enabled Undo
     dialogs: list[str] = []
 
     def stay(dialog: Dialog) -> None:
@@ -37,8 +38,8 @@ def leaving_is_asked_for(page: Page) -> None:
         dialog.dismiss()
 
     page.on("dialog", stay)
-    page.evaluate("() => { location.href = 'about:blank'; }")
-    page.wait_for_timeout(500)
+    with page.expect_event("dialog"):
+        page.evaluate("() => { location.href = 'about:blank'; }")
     assert dialogs == ["beforeunload"]
     assert page.url.endswith("?photo=cat.png")
     page.remove_listener("dialog", stay)
