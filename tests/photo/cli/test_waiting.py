@@ -1,4 +1,4 @@
-"""Threads of the program sleep while they wait for each other, unless the user decided how they wait."""
+"""Threads of the program soon sleep while they wait for each other, unless the user decided how they wait."""
 
 import os
 import subprocess
@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from nlfilter_torch.photo.cli.waiting import VARIABLES, sleep_while_waiting
+from nlfilter_torch.photo.cli.waiting import SPINS, VARIABLES, sleep_while_waiting
 from tests.commands import small_photo
 
 
@@ -21,10 +21,12 @@ def undecided(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.usefixtures("undecided")
 def test_threads_sleep_unless_the_user_decided(monkeypatch: pytest.MonkeyPatch) -> None:
     sleep_while_waiting()
-    assert os.environ["OMP_WAIT_POLICY"] == "passive"
+    assert (os.environ["OMP_WAIT_POLICY"], os.environ["GOMP_SPINCOUNT"]) == ("passive", str(SPINS))
+    monkeypatch.delenv("GOMP_SPINCOUNT")
     monkeypatch.setenv("OMP_WAIT_POLICY", "active")
     sleep_while_waiting()
     assert os.environ["OMP_WAIT_POLICY"] == "active"
+    assert "GOMP_SPINCOUNT" not in os.environ
 
 
 @pytest.mark.usefixtures("undecided")
@@ -37,10 +39,13 @@ def test_users_may_decide_by_the_variables_of_compilers(name: str, monkeypatch: 
 
 @pytest.mark.usefixtures("undecided")
 @pytest.mark.skipif(sys.platform != "linux", reason="another OpenMP prints other lines")
-@pytest.mark.parametrize(("policy", "wanted"), [(None, "PASSIVE"), ("active", "ACTIVE")])
-def test_openmp_of_torch_reads_it(policy: str | None, wanted: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("policy", "wanted", "spins"), [(None, "PASSIVE", str(SPINS)), ("active", "ACTIVE", "30000000000")]
+)
+def test_openmp_of_torch_reads_it(policy: str | None, wanted: str, spins: str, tmp_path: Path) -> None:
     """What OpenMP prints when it is loaded, which is after the program has begun."""
-    environment = os.environ | {"OMP_DISPLAY_ENV": "true"} | ({} if policy is None else {"OMP_WAIT_POLICY": policy})
+    environment = os.environ | {"OMP_DISPLAY_ENV": "verbose"} | ({} if policy is None else {"OMP_WAIT_POLICY": policy})
     arguments = [sys.executable, "-m", "nlfilter_torch", "sharpen", small_photo(tmp_path), tmp_path / "out.png"]
     done = subprocess.run(arguments, env=environment, capture_output=True, text=True, check=True)
     assert f"OMP_WAIT_POLICY = '{wanted}'" in done.stderr
+    assert f"GOMP_SPINCOUNT = '{spins}'" in done.stderr
