@@ -171,14 +171,16 @@ def measure(name: str, options: argparse.Namespace) -> Iterator[Figure]:
     with ExitStack() as stack:
         runner = stack.enter_context(Runner(name, options.side, spinning=options.spinning))
         other = stack.enter_context(Runner(name, options.side, spinning=True))
+        for _ in range(options.repeats):  # before there are neighbours: the scheduler needs a while to forget them
+            single, double = runner.seconds(1), runner.seconds(2)
+            alone.append(single)
+            ratios[0].append(double / single)
+            losses.append(double / other.seconds(2))
         for _ in range(options.repeats):
-            for count in NEIGHBOURS:
+            for count in NEIGHBOURS[1:]:
                 with neighbours(count):
                     single, double = runner.seconds(1), runner.seconds(2)
                 ratios[count].append(double / single)
-                if count == 0:
-                    alone.append(single)
-                    losses.append(double / other.seconds(2))
     yield Figure(f"{name}: alone with one thread", median(alone), unit="s")
     for count in NEIGHBOURS:
         where = "alone" if count == 0 else f"beside {count}"
