@@ -108,6 +108,7 @@ QUICK := \
 	'distributed --ranks 2 --widths 64 --landmarks 20' \
 	'tables --long-side 32' \
 	'masks --quick' \
+	'outlines --quick' \
 	'recolor --quick' \
 	'colorize --quick' \
 	'colorize --quick --lines' \

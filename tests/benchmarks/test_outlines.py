@@ -1,0 +1,82 @@
+"""Outlines of objects drawn by hand: what is stored, and how selections are scored by them."""
+
+import numpy as np
+import pytest
+import torch
+
+from benchmarks.keepers import Job
+from benchmarks.outlines import Outline, Score, by_peer, outlines, overlay, score, selected
+
+SQUARE = ((0.25, 0.25), (0.75, 0.25), (0.75, 0.75), (0.25, 0.75))
+STROKE = {"paint": "in", "points": [[0.4, 0.5], [0.6, 0.5]], "radius": 0.05}
+
+
+def job(edit: str, **entries: object) -> Job:
+    return Job.of(1, {"photograph": "coffee", "what": "a square", "edit": edit, "strokes": [STROKE]} | entries)
+
+
+def scene() -> torch.Tensor:
+    image = torch.rand(1, 3, 40, 60, generator=torch.Generator().manual_seed(0)) * 0.2
+    image[:, 0, 10:30, 15:45] += 0.6
+    return image
+
+
+def test_stored_outlines_are_of_different_jobs_and_of_polygons_inside_their_pictures():
+    stored = outlines()
+    assert len({outline.job.name for outline in stored}) == len(stored) >= 10
+    for outline in stored:
+        assert outline.job.edit in ("recolor", "mask", "defocus", "detail")
+        for polygon in (*outline.outlines, *outline.holes):
+            assert len(polygon) > 3
+            assert all(0 <= coordinate <= 1 for point in polygon for coordinate in point)
+        assert 0.005 < outline.object((90, 120)).mean() < 0.7
+
+
+def test_object_is_the_union_of_its_outlines_without_its_holes():
+    apart = Outline(job("mask"), (SQUARE, ((0.0, 0.0), (0.1, 0.0), (0.1, 0.1), (0.0, 0.1))))
+    filled = apart.object((100, 200))
+    assert filled[26:74, 51:149].all()
+    assert filled[1:9, 1:18].all()
+    assert filled.sum() == pytest.approx(100 * 200 * 0.26, rel=0.06)
+    hollow = Outline(apart.job, (SQUARE,), (((0.4, 0.4), (0.6, 0.4), (0.6, 0.6), (0.4, 0.6)),)).object((100, 200))
+    assert not hollow[42:58, 82:118].any()
+    assert hollow[30, 100]
+
+
+def test_score_does_not_count_a_band_around_the_outline():
+    wanted = np.zeros((100, 100), bool)
+    wanted[20:60, 20:60] = True
+    assert score(wanted, wanted) == Score(1.0, 0.0, 0.0)
+    wider = np.zeros_like(wanted)
+    wider[19:61, 20:60] = True
+    assert score(wider, wanted) == Score(1.0, 0.0, 0.0)
+    half = wanted.copy()
+    half[40:, :] = False
+    half[:19, :76] = True
+    inside, beside = 38 * 38, 19 * 76
+    scored = score(half, wanted)
+    assert scored.missed == pytest.approx(0.5, abs=0.03)
+    assert scored.outside == pytest.approx(beside / inside, rel=0.01)
+    assert scored.overlap == pytest.approx((1 - scored.missed) / (1 + scored.outside))
+
+
+def test_masks_of_every_kind_of_job_and_of_peers_select_the_object():
+    image, wanted = scene(), Outline(job("mask"), (SQUARE,))
+    recoloured = job(
+        "recolor", strokes=[STROKE | {"paint": "#0040c0"}, STROKE | {"paint": "keep", "points": [[0.1, 0.5]]}]
+    )
+    masks = [selected(each, image) for each in (job("mask"), job("defocus"), recoloured)]
+    masks += [by_peer("GrabCut", wanted, image)]
+    for mask in masks:
+        assert mask.shape == (1, 1, 40, 60)
+        assert score(mask[0, 0].numpy() > 0.5, wanted.object((40, 60))).overlap > 0.95
+
+
+def test_overlay_tints_what_is_missed_and_what_is_beside_the_object():
+    image, wanted, mask = torch.full((1, 3, 4, 4), 0.5), np.zeros((4, 4), bool), np.zeros((4, 4), bool)
+    wanted[0], mask[0, :2], mask[3, 3] = True, True, True
+    shown = overlay(image, mask, wanted)[0]
+    assert torch.equal(shown[:, 0, 0], image[0, :, 0, 0])
+    assert shown[0, 0, 3] > shown[2, 0, 3]
+    assert shown[2, 3, 3] > shown[0, 3, 3]
+    assert shown[0, 2, 0] < 0.2
