@@ -1,10 +1,11 @@
 """Objects selected on photographs, against outlines drawn by hand: ``python -m benchmarks.outlines [--quick]``.
 
 The outlines of ``outlines.json`` are of objects in :mod:`benchmarks.keepers`, as polygons whose points are fractions of
-width and height, with holes; they were drawn without looking at results. The mask of each job is computed from its
-strokes, with the settings of its edit. "IoU" is the intersection over union of the pixels above 0.5 and the object,
-"missed" the share of the object that is not selected, and "outside" what is selected beside it, as a share of the
-object; pixels within 1 % of the short side of an outline do not count.
+width and height, with holes; they were drawn without looking at results. Parts that may or may not be meant, such as
+the orange tips of red legs or a shadow that hides feet, are "either" and do not count. The mask of each job is computed
+from its strokes, with the settings of its edit. "IoU" is the intersection over union of the pixels above 0.5 and the
+object, "missed" the share of the object that is not selected, and "outside" what is selected beside it, as a share of
+the object; pixels within 1 % of the short side of an outline do not count.
 
 ``--pictures`` is the folder of :mod:`benchmarks.denoiser_training.free_photographs`; without it only scikit-image's
 photographs are measured. ``--peers`` adds GrabCut and closed-form matting, with the same strokes and, as they cannot do
@@ -60,20 +61,26 @@ class Outline:
         job: the job.
         outlines: polygons of (x, y) as fractions of width and height; the object is their union.
         holes: likewise, not part of it.
+        either: likewise, parts that do not count.
     """
 
     job: Job
     outlines: tuple[Polygon, ...]
     holes: tuple[Polygon, ...] = ()
+    either: tuple[Polygon, ...] = ()
 
     def object(self, size: tuple[int, int]) -> Mask:
         """The object in a picture (H, W)."""
-        filled = np.zeros(size, np.uint8)
-        for polygons, value in ((self.outlines, 1), (self.holes, 0)):
-            for polygon in polygons:
-                points = np.array(polygon) * size[::-1] - 0.5
-                cv2.fillPoly(filled, [np.round(points).astype(np.int32)], value)
-        return filled > 0
+        return filled(self.outlines, size) & ~filled(self.holes, size)
+
+
+def filled(polygons: Sequence[Polygon], size: tuple[int, int]) -> Mask:
+    """The union of polygons in a picture (H, W)."""
+    plane = np.zeros(size, np.uint8)
+    for polygon in polygons:
+        points = np.array(polygon) * size[::-1] - 0.5
+        cv2.fillPoly(plane, [np.round(points).astype(np.int32)], 1)
+    return plane > 0
 
 
 @dataclass(frozen=True)
@@ -89,16 +96,21 @@ def outlines(file: Path = STORED) -> list[Outline]:
     """The outlines that are stored."""
     by_name = {(job.photograph, job.what): job for job in jobs()}
     return [
-        Outline(by_name[entry["photograph"], entry["what"]], tuple(entry["outlines"]), tuple(entry.get("holes", ())))
+        Outline(
+            by_name[entry["photograph"], entry["what"]],
+            *(tuple(entry.get(name, ())) for name in ("outlines", "holes", "either")),
+        )
         for entry in json.loads(file.read_text(encoding="utf-8"))
     ]
 
 
-def score(selected: Mask, wanted: Mask) -> Score:
-    """Score a selection (H, W) of an object, without the band around its outline."""
+def score(selected: Mask, wanted: Mask, either: Mask | None = None) -> Score:
+    """Score a selection (H, W) of an object, without the band around its outline and parts that do not count."""
     radius = max(1, round(BAND * min(wanted.shape)))
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
     inside, outside = (cv2.erode(side.astype(np.uint8), disc) > 0 for side in (wanted, ~wanted))
+    if either is not None:
+        inside, outside = inside & ~either, outside & ~either
     covered, total, beside = (
         (side & part).sum() for side, part in ((inside, selected), (inside, inside), (outside, selected))
     )
@@ -156,13 +168,14 @@ def overlay(image: Tensor, mask: Mask, wanted: Mask) -> Tensor:
 
 def measure(outline: Outline, image: Tensor, peers: Sequence[str], out: Path | None) -> dict[str, Score]:
     """Scores of the methods, by name."""
-    wanted = outline.object((image.shape[-2], image.shape[-1]))
+    size = (image.shape[-2], image.shape[-1])
+    wanted, either = outline.object(size), filled(outline.either, size)
     masks = {OURS: selected(outline.job, image)} | {name: by_peer(name, outline, image) for name in peers}
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
         shown = overlay(image, masks[OURS][0, 0].numpy() > 0.5, wanted)
         write_photograph(Photograph(shown.clamp(0, 1)), out / f"{outline.job.name}.png")
-    return {name: score(mask[0, 0].numpy() > 0.5, wanted) for name, mask in masks.items()}
+    return {name: score(mask[0, 0].numpy() > 0.5, wanted, either) for name, mask in masks.items()}
 
 
 def line(name: str, scores: dict[str, Score]) -> str:

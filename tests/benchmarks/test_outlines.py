@@ -26,7 +26,7 @@ def test_stored_outlines_are_of_different_jobs_and_of_polygons_inside_their_pict
     assert len({outline.job.name for outline in stored}) == len(stored) >= 10
     for outline in stored:
         assert outline.job.edit in ("recolor", "mask", "defocus", "detail")
-        for polygon in (*outline.outlines, *outline.holes):
+        for polygon in (*outline.outlines, *outline.holes, *outline.either):
             assert len(polygon) > 3
             assert all(0 <= coordinate <= 1 for point in polygon for coordinate in point)
         assert 0.005 < outline.object((90, 120)).mean() < 0.7
@@ -58,6 +58,8 @@ def test_score_does_not_count_a_band_around_the_outline():
     assert scored.missed == pytest.approx(0.5, abs=0.03)
     assert scored.outside == pytest.approx(beside / inside, rel=0.01)
     assert scored.overlap == pytest.approx((1 - scored.missed) / (1 + scored.outside))
+    assert score(half, wanted, ~half & wanted).missed == 0
+    assert score(half, wanted, half & ~wanted).outside == 0
 
 
 def test_masks_of_every_kind_of_job_and_of_peers_select_the_object():
