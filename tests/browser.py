@@ -1,12 +1,14 @@
 """A headless Chromium and a separate editor process, for tests of the editor in a browser."""
 
 import io
+import math
 import os
 import re
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Self
@@ -15,7 +17,7 @@ from urllib.parse import urljoin
 import numpy as np
 import torch
 from PIL import Image
-from playwright.sync_api import Browser, CDPSession, FloatRect, Locator, Page, expect, sync_playwright
+from playwright.sync_api import APIResponse, Browser, CDPSession, FloatRect, Locator, Page, expect, sync_playwright
 from playwright.sync_api import TimeoutError as Expired
 
 CHROMIUM = next(
@@ -24,6 +26,7 @@ CHROMIUM = next(
 SCREENS = [(390, 844), (800, 600), (1280, 800), (1920, 1080)]  # width and height
 TOUCHED, POINTED = SCREENS[::2], SCREENS[1::2]  # long tests take two of them by finger, and two by mouse
 TIMEOUT = 60_000  # milliseconds, of everything that is waited for; a machine may be busy
+FLASHES = re.compile("flash-[01]")  # the class of what is shown for a moment, which a busy machine may look at too late
 
 
 @contextmanager
@@ -139,11 +142,24 @@ class Tab:
         )
         return {"x": left, "y": top, "width": width, "height": height}
 
+    def answer(self, address: str) -> APIResponse:
+        """What the editor answers to a request for an address."""
+        return self.page.request.get(urljoin(self.page.url, address))
+
     def picture(self, address: str = "") -> torch.Tensor:
         """The picture shown, or that at another address of the editor; (1, 3, H, W) in [0, 1]."""
-        answer = self.page.request.get(urljoin(self.page.url, address or self.source()))
-        pixels = np.array(Image.open(io.BytesIO(answer.body())))
-        return torch.from_numpy(pixels).permute(2, 0, 1)[None] / 255
+        return pixels_of(self.answer(address or self.source()))
+
+    def wait_until(self, measure: Callable[[], float], *, least: float = 0.0, most: float = math.inf) -> None:
+        """Wait until a value that is measured again and again is in a range."""
+        deadline = time.monotonic() + TIMEOUT / 1000
+        while not least <= (value := measure()) <= most:
+            assert time.monotonic() < deadline, value
+            self.page.wait_for_timeout(100)
+
+    def expect_picture(self, other: torch.Tensor, *, least: float = 0.0, most: float = math.inf) -> None:
+        """Wait until the difference of the picture shown from another one is in a range, see :func:`difference`."""
+        self.wait_until(lambda: difference(self.picture(), other), least=least, most=most)
 
     def open(self, path: Path) -> None:
         """Choose a photograph."""
@@ -225,6 +241,11 @@ def by_finger(tab: Tab, *points: tuple[float, float]) -> None:
         fingers.to(kind, (box["x"] + x * box["width"], box["y"] + y * box["height"]))
         kind = "Move"
     fingers.to("End")
+
+
+def pixels_of(answer: APIResponse) -> torch.Tensor:
+    """The picture (1, 3, H, W) in [0, 1] that the editor has answered with."""
+    return torch.from_numpy(np.array(Image.open(io.BytesIO(answer.body())))).permute(2, 0, 1)[None] / 255
 
 
 def difference(a: torch.Tensor, b: torch.Tensor) -> float:

@@ -1,6 +1,5 @@
 """The picture of a page at rest in a real browser."""
 
-import time
 from pathlib import Path
 
 from playwright.sync_api import Browser
@@ -11,7 +10,7 @@ from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.edits.applying import apply_recipe
 from nlfilter_torch.photo.io.photographs import Photograph, read_photograph, write_photograph
 from nlfilter_torch.photo.picture.resizing import resize
-from tests.browser import TIMEOUT, Tab, difference, running
+from tests.browser import Tab, running
 from tests.problems import cat
 
 LINES = Recipe((Step("abstract", edges=0.8, tones=6, landmarks=40, patch_size=1),))
@@ -30,8 +29,5 @@ def test_the_preview_is_replaced_by_what_a_file_holds(browser: Browser, tmp_path
         tab.load_edit(tmp_path / "lines.json")
         size = (tab.picture().shape[-2], tab.picture().shape[-1])
         saved = resize(apply_recipe(LINES, photograph.pixels).clamp(0, 1), size)
-        deadline = time.monotonic() + TIMEOUT / 1000
-        while (left := difference(tab.picture(), saved)) > 1.5:  # pictures of the page are JPEGs
-            assert time.monotonic() < deadline, left
-            tab.page.wait_for_timeout(300)
+        tab.expect_picture(saved, most=1.5)  # pictures of the page are JPEGs
         tab.close()

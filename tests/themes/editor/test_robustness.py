@@ -162,8 +162,9 @@ def test_a_tab_that_is_closed_with_a_dialog_open(opened: Tab, browser: Browser, 
     other.wait_for_picture()
     other.page.get_by_role("button", name="Save photo").click()
     expect(other.page.get_by_label("Name")).to_be_visible()
+    address = other.source()
     other.close()
-    opened.page.wait_for_timeout(5000)  # after three seconds a page is considered closed
+    opened.wait_until(lambda: opened.answer(address).status, least=404)  # when the page is considered closed
     assert editor.log.read_text() == ""
 
 
