@@ -155,10 +155,10 @@ class Canvas:
             self._whole_size = (whole.shape[-2], whole.shape[-1])
             self.pictures["whole"] = drawing.picture(whole)
 
-    def show_crop(self) -> None:
-        """Show this picture, and the frame of the crop over it."""
+    def show_crop(self, aspect: float | None = None) -> None:
+        """Show this picture, and the frame of the crop over it, which keeps an aspect, see :meth:`CropTool.show`."""
         if self._session is not None:
-            self._crop_tool.show(self._address("whole"), self._whole_size, self._session.crop)
+            self._crop_tool.show(self._address("whole"), self._whole_size, self._session.crop, aspect)
 
     def hide_crop(self) -> None:
         """Show the photograph as it is cropped."""

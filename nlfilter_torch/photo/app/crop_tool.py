@@ -2,11 +2,52 @@
 
 import json
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 from nicegui import ui
 
+from nlfilter_torch.photo.declared.development import WHOLE, Crop
+
+FREE, ORIGINAL = "Free", "Original"
+#: Width and height of the crops that a person may choose.
+SIDES = {f"{wide}:{high}": (wide, high) for wide, high in ((1, 1), (3, 2), (2, 3), (4, 3), (3, 4), (16, 9), (9, 16))}
+PROPORTIONS = (FREE, ORIGINAL, *SIDES)
 EDGES = ("left", "top", "right", "bottom")
 CORNERS = ("top left", "top right", "bottom right", "bottom left")
+
+
+@dataclass
+class Proportions:
+    """The proportions that a crop keeps while it is dragged.
+
+    A crop that is cut to them begins with the last one that a person has made, however often they are changed.
+
+    Attributes:
+        name: one of :data:`PROPORTIONS`.
+        cut: the last crop that was cut to them.
+        base: the one that it was cut from.
+    """
+
+    name: str = FREE
+    cut: Crop | None = None
+    base: Crop = WHOLE
+
+    def aspect(self, size: tuple[int, int]) -> float | None:
+        """The width of a crop of a photograph (H, W) by its height, or None for any.
+
+        >>> [Proportions(name).aspect((100, 150)) for name in ("Free", "Original", "16:9")]
+        [None, 1.5, 1.7777777777777777]
+        """
+        if self.name == FREE:
+            return None
+        wide, high = size[::-1] if self.name == ORIGINAL else SIDES[self.name]
+        return wide / high
+
+    def begin(self, crop: Crop) -> Crop:
+        """The crop to cut, where the photograph has the one given."""
+        if crop != self.cut:
+            self.base = crop
+        return self.base
 
 
 class CropTool:
@@ -24,10 +65,15 @@ class CropTool:
                     handle.props(f'aria-valuenow="0" data-edge="{edge}"')
         self._tool.set_visibility(False)
 
-    def show(self, address: str, size: tuple[int, int], edges: Sequence[float]) -> None:
-        """Show the picture at an address, (height, width) in size, and a frame."""
+    def show(self, address: str, size: tuple[int, int], edges: Sequence[float], aspect: float | None) -> None:
+        """Show the picture at an address, (height, width) in size, and a frame.
+
+        ``aspect`` is the width that the frame keeps by its height, each as a share of that of the picture, or None.
+        """
         self._tool.set_visibility(True)
-        ui.run_javascript(f"cropper.show('{address}', {size[1]}, {size[0]}, {json.dumps(list(edges))})")
+        ui.run_javascript(
+            f"cropper.show('{address}', {size[1]}, {size[0]}, {json.dumps(list(edges))}, {json.dumps(aspect)})"
+        )
 
     def hide(self) -> None:
         """Hide it."""

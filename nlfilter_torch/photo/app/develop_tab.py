@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from nicegui import ui
 
 from nlfilter_torch.photo.app.controls import Control, Slider, show_pressed
+from nlfilter_torch.photo.app.crop_tool import FREE, PROPORTIONS
 from nlfilter_torch.photo.app.tabs import EditTab
 from nlfilter_torch.photo.declared.development import DEVELOP, WHOLE
 from nlfilter_torch.photo.declared.json_values import Value
@@ -44,6 +45,7 @@ class DevelopTab(EditTab):
         for button, is_on in ((self._crop, photo.is_cropping()), (self._pick, photo.is_picking())):
             show_pressed(button, is_on)
         self._whole.set_enabled(self._link.recipe().develop.crop != WHOLE)
+        self._proportions.set_value(photo.held())
 
     def _build(self) -> None:
         ui.label(DEVELOP.hint).classes("hint")
@@ -55,12 +57,21 @@ class DevelopTab(EditTab):
         with ui.row().classes("w-full items-center no-wrap gap-2 q-mt-xs"):
             self._crop = ui.button("Crop", icon="crop", on_click=photo.crop).props("flat dense no-caps")
             self._crop.tooltip("Drag a frame over the whole photograph; Escape ends it")
-            ui.space()
+            self._proportions = ui.select(list(PROPORTIONS), value=photo.held(), label="Proportions")
+            self._proportions.props("dense outlined options-dense").classes("grow")
+            self._proportions.tooltip("Width to height of the crop, which it keeps while its frame is dragged")
+            self._proportions.on_value_change(lambda event: self._hold(event.value))
             self._whole = ui.button("Whole picture", on_click=self._uncrop).props("flat dense no-caps")
 
     def _develop(self, _: str, values: Mapping[str, Value], complete: bool) -> None:
         """Change some values."""
         self._link.photo.develop(values, complete)
 
+    def _hold(self, name: str) -> None:
+        """Let the crop keep proportions, if these are not those that it keeps already."""
+        if name != self._link.photo.held():
+            self._link.photo.hold(name)
+
     def _uncrop(self) -> None:
+        self._link.photo.hold(FREE)
         self._link.photo.develop({"crop": WHOLE}, True)

@@ -15,6 +15,7 @@ from nlfilter_torch.photo.picture.developing import (
     in_light,
     limits_of,
     part_of_planes,
+    reframed,
     turned_canvas,
 )
 from nlfilter_torch.photo.picture.resizing import resize
@@ -82,6 +83,14 @@ class Developed:
         if development.geometry == self.development.geometry:
             return in_light(self.before, development, limits_of(original.pixels))
         return develop_image(original.pixels, development)
+
+    def change_in(self, development: Development, original: Preview) -> Tensor:
+        """The change that the steps made to the preview, as another development shows it; only its geometry counts."""
+        preview = self.preview
+        if preview.edited is None:
+            return original.pixels.new_zeros(())
+        frame = development.frame(original.size)
+        return reframed(preview.edited - preview.pixels, self.frame, frame, frame.size)
 
 
 def parts_of(photograph: Photograph, name: str) -> Parts:

@@ -21,7 +21,8 @@ from nlfilter_torch.photo.app.at_rest import AtRest
 from nlfilter_torch.photo.app.brush import Brush
 from nlfilter_torch.photo.app.canvas import Canvas
 from nlfilter_torch.photo.app.closeup import Closeup
-from nlfilter_torch.photo.app.developed import DEVELOPING
+from nlfilter_torch.photo.app.crop_tool import FREE, Proportions
+from nlfilter_torch.photo.app.developed import DEVELOPING, Developed
 from nlfilter_torch.photo.app.dialogs import NameDialog, Question, SaveDialog
 from nlfilter_torch.photo.app.look_tab import thumbnails
 from nlfilter_torch.photo.app.panel import Panel
@@ -70,11 +71,13 @@ class Editor:
         self.session = photographs.new()
         self._told: str | None = None  # the last trouble of the session that was shown
         self._token = secrets.token_urlsafe(16)
-        self._openings = 0  # photographs that were opened, so that browsers do not show thumbnails of another
+        self._pictured: Developed | None = None  # what thumbnails of looks show
+        self._picturing = 0  # how often they were drawn, so that browsers do not show others
         self._wanted: list[int | None] = []  # at most one picture to draw next: the place of a step that moves, or None
         self._drawing = False
         self._framed: object = None  # what canvas and closeup show
         self._is_cropping = False
+        self._proportions = Proportions()
 
     def build(self, image: Path | None, address: str = "") -> None:
         """Lay the page out, and open the photograph of an address that the page had before, or an image."""
@@ -104,6 +107,8 @@ class Editor:
                         self._develop,
                         self._toggle_crop,
                         lambda: self._is_cropping,
+                        self._hold,
+                        lambda: self._proportions.name,
                         self._toggle_pick,
                         lambda: self._canvas.pick is not None,
                     ),
@@ -127,7 +132,7 @@ class Editor:
     def _thumbnail(self, look: str) -> str:
         """The address of a picture of the photograph under a look, or "" if there is none."""
         kind = f"look-{look}"
-        return f"/picture/{self._token}/{kind}?{self._openings}" if kind in self._canvas.pictures else ""
+        return f"/picture/{self._token}/{kind}?{self._picturing}" if kind in self._canvas.pictures else ""
 
     def _tell(self, script: str) -> None:
         if not self._client.is_deleted:
@@ -188,7 +193,7 @@ class Editor:
             self._panel.follow()
             return
         try:
-            recipe = session.developing(values)
+            recipe = session.developing(values, self._proportions.aspect(session.whole_size))
         except ValueError as error:  # the middle of the crop would be outside
             self._tasks.show_error(str(error))
             self._panel.follow()
@@ -237,8 +242,26 @@ class Editor:
         """Show the frame of the crop as it is now."""
         await self._tasks.run("Working", self._canvas.draw_whole)
         if self._is_cropping and not self._client.is_deleted:
+            height, width = self.session.whole_size
+            aspect = self._proportions.aspect((height, width))
             with self._client:
-                self._canvas.show_crop()
+                self._canvas.show_crop(None if aspect is None else aspect * height / width)
+
+    def _hold(self, name: str) -> None:
+        """Let the crop keep proportions from now on, and cut it to them."""
+        session = self.session
+        if session.opened is None:
+            self._tasks.show_error("open a photograph first; there is nothing to crop")
+        else:
+            self._proportions.name = name
+            if name != FREE:
+                self._develop({"crop": self._proportions.begin(session.crop)}, True)
+                self._proportions.cut = session.crop
+            if not self._is_cropping and name != FREE:
+                self._toggle_crop()
+            elif self._is_cropping and name == FREE:
+                self._tasks.start(self._show_crop())
+        self._panel.follow()
 
     def _crop(self, edges: Sequence[float]) -> None:
         """Take the edges that a person has set."""
@@ -344,6 +367,9 @@ class Editor:
                 if moving is None:
                     self._frame()
                 self._show()
+                if moving is None and self._pictured is not self.session.developed:
+                    await self._draw_looks()
+                    self._panel.follow()
                 if self._panel.tab == DETAIL.name:
                     await self._respond()
                 self._canvas.draw_mask(moving=moving is not None)
@@ -351,6 +377,14 @@ class Editor:
         finally:
             self._drawing = False
         self._at_rest.drawn(self.session)
+
+    async def _draw_looks(self) -> None:
+        """Draw thumbnails of the photograph, as it is developed, under each look."""
+        self._pictured = developed = self.session.developed
+        pictures = await self._tasks.run("Working", partial(thumbnails, developed.preview.pixels))
+        if self._pictured is developed:  # still
+            self._picturing += 1
+            self._canvas.pictures |= {f"look-{look}": content for look, content in pictures.items()}
 
     def _lay(self) -> None:
         """Show the mask and the strokes of the open tab."""
@@ -435,19 +469,18 @@ class Editor:
         opened = self.session.opened
         if opened is None or self._client.is_deleted:
             return
-        self._openings += 1
         self._title.set_text(opened.name)
         self._tasks.clear_error()
         self._closeup.open(self.session)
         self._framed = framed(self.session, self.session.developed.development)
         with self._client:
             self._end_crop()
+            self._proportions = Proportions()
             self._canvas.await_click(None)
             self._canvas.open(self.session, self.session.developed.before, self.session.size)
-        pictures = await self._tasks.run("Opening", partial(thumbnails, opened.preview.pixels))
+        await self._draw_looks()
         if self.session.opened is not opened or self._client.is_deleted:  # meanwhile
             return
-        self._canvas.pictures |= {f"look-{look}": content for look, content in pictures.items()}
         self.follow()
         with self._client:
             ui.navigate.history.replace(f"/?photo={quote(self.session.address)}")

@@ -71,9 +71,9 @@ class Panel:
     def draw_levels(self, histogram: str, clipped: tuple[float, float], before: tuple[float, float]) -> None:
         """Show the histogram, and how much of the picture is white or black, now and before the edit."""
         self._histogram.set_content(histogram)
-        texts = [f"{100 * now:.1f} % {name}" for now, name in zip(clipped, ("white", "black"), strict=True)]
+        texts = [f"{100 * now:.1f}\u00a0% {name}" for now, name in zip(clipped, ("white", "black"), strict=True)]
         worse = any(now > was + CLIPPED for now, was in zip(clipped, before, strict=True))
-        warning = f"; before the edit {100 * before[0]:.1f} % and {100 * before[1]:.1f} %" if worse else ""
+        warning = f"; before the edit {100 * before[0]:.1f}\u00a0% and {100 * before[1]:.1f}\u00a0%" if worse else ""
         self._clipped.set_text("Clipped: " + ", ".join(texts) + warning)
         self._clipped.classes(add="warning" if worse else "", remove="" if worse else "warning")
 

@@ -196,6 +196,7 @@ class Preview:
 
     Attributes:
         size: (height, width) of the preview.
+        edited: the picture after all steps when it was last complete, or None.
         stride: sampling step of the preview relative to the photograph.
     """
 
@@ -205,6 +206,7 @@ class Preview:
         self.stride = math.sqrt(whole[0] * whole[1] / (self.size[0] * self.size[1]))
         self.photograph = photograph
         self.pixels = resize(photograph.float(), self.size) if self.size != whole else photograph.float()
+        self.edited: Tensor | None = None
         self._layers: Layers | None = None
         self._working = range_of(InMemory(photograph.float()))
         self._source = InMemory(self.pixels, {})  # with the filter of the masks
@@ -309,8 +311,10 @@ class Preview:
                 computed = computed or bool(key) or not self._is_of_layers(step)
             used.append(picture)
             result, key = over(result, picture.after, step.opacity), (*key, step)
-        self._pictures = used
-        return result.clamp(0, 1)
+        self._pictures, result = used, result.clamp(0, 1)
+        if moving is None:
+            self.edited = result
+        return result
 
     def _computed(self, step: Step, image: Tensor, before: tuple[Step, ...], *, keep: bool) -> StepPicture:
         """Apply a step to the picture after the steps before it; ``keep`` says whether to cache its filter."""

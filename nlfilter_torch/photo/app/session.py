@@ -21,7 +21,7 @@ from nlfilter_torch.photo.declared.parameters import EDITS
 from nlfilter_torch.photo.declared.presets import Recipe, on_frame
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.declared.strokes import Stroke, thin
-from nlfilter_torch.photo.edits.applying import apply_recipe
+from nlfilter_torch.photo.edits.applying import apply_recipe, left_by_crop
 from nlfilter_torch.photo.io import tiff
 from nlfilter_torch.photo.io.exif import read_upright
 from nlfilter_torch.photo.io.photographs import (
@@ -38,6 +38,8 @@ from nlfilter_torch.photo.io.photographs import (
 from nlfilter_torch.photo.io.rows import TILED, WHOLE, usual_memory
 from nlfilter_torch.photo.io.writing import open_beside
 from nlfilter_torch.photo.picture.developing import balance_of
+from nlfilter_torch.photo.picture.in_memory import InMemory
+from nlfilter_torch.photo.picture.painting import TensorPainter
 from nlfilter_torch.photo.picture.resizing import resize
 from nlfilter_torch.photo.tiled.durations import duration, expected_stages, writing
 from nlfilter_torch.photo.tiled.parts import Parts, Rectangle
@@ -210,9 +212,14 @@ class Session:
         return on_frame(step, self.developed.frame, self.preview.size) if step.strokes else step
 
     @property
+    def whole_size(self) -> tuple[int, int]:
+        """(height, width) of the photograph before it is developed; raises ValueError if none is open."""
+        return self._opened_to("show").photograph.size
+
+    @property
     def crop(self) -> Crop:
         """The edges of what is kept of :attr:`uncropped`."""
-        return self.recipe.develop.frame(self._opened_to("show").photograph.size).edges
+        return self.recipe.develop.frame(self.whole_size).edges
 
     @property
     def uncropped(self) -> Tensor:
@@ -239,10 +246,11 @@ class Session:
             self.recipe.current(edit).changed(strokes=strokes, **values).switched_on()
         )
 
-    def developing(self, values: Mapping[str, Value]) -> Recipe:
+    def developing(self, values: Mapping[str, Value], aspect: float | None = None) -> Recipe:
         """The edit with other values of how the photograph is developed.
 
-        Edges of a crop are those of whole pixels that the straightened photograph has.
+        Edges of a crop are those of whole pixels that the straightened photograph has. They are moved inwards until the
+        width of the crop is ``aspect`` times its height, unless that is None.
 
         Raises:
             ValueError: if the middle of the crop is outside, or nothing is open.
@@ -250,7 +258,10 @@ class Session:
         size = self._opened_to("develop").photograph.size
         develop = Development(**{**vars(self.recipe.develop), **values})
         frame = develop.frame(size)
-        return replace(self.recipe, develop=replace(develop, crop=frame.edges) if "crop" in values else develop)
+        if "crop" in values:
+            frame = frame if aspect is None else frame.trimmed(aspect)
+            develop = replace(develop, crop=frame.edges)
+        return replace(self.recipe, develop=develop)
 
     def balance(self, x: float, y: float) -> dict[str, Value]:
         """The white balance that makes the photograph grey at a point (x, y) in pixels of the preview.
@@ -328,8 +339,10 @@ class Session:
         recipe = self.recipe
         with self._drawing:
             if moving == DEVELOPING:
-                developed = self.developed
-                start = developed.approximate(recipe.develop, self._opened_to("show").preview)
+                developed, original = self.developed, self._opened_to("show").preview
+                start = developed.approximate(recipe.develop, original)
+                if developed.development.geometry != recipe.develop.geometry:  # no step can be computed so fast
+                    return (start + developed.change_in(recipe.develop, original)).clamp(0, 1)
             else:
                 developed, start = self._develop(recipe.develop), None
                 if developed is not self.developed:
@@ -340,7 +353,12 @@ class Session:
 
     def _on(self, developed: Developed, recipe: Recipe, seen: tuple[int, int] | None = None) -> Recipe:
         """The steps of a recipe for the developed photograph, or for that reduced to a size."""
-        return Recipe(tuple(on_frame(step, developed.frame, seen) for step in recipe.steps))
+        photograph, weights = developed.photograph, developed.photograph.weights
+        steps = [on_frame(step, developed.frame, seen) for step in recipe.steps]
+        if weights is not None and not developed.frame.is_whole:
+            source, painter = InMemory(photograph.pixels, weights=weights), TensorPainter()
+            steps = [left_by_crop(step, source, painter) for step in steps]
+        return Recipe(tuple(steps))
 
     def eigenvalues(self, detail: Step) -> Tensor:
         """Eigenvalues (R,) of the filter of a step of detail, which its layers belong to."""

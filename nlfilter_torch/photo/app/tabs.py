@@ -26,6 +26,8 @@ class PhotoLink:
         develop: is called with changes, and whether they are complete.
         crop: is called to show the frame of the crop, or to hide it.
         is_cropping: returns whether it is shown.
+        hold: is called with the proportions that a crop is to keep.
+        held: returns these.
         pick: is called to let a person point at something grey, or to stop that.
         is_picking: returns whether the next click does that.
     """
@@ -33,6 +35,8 @@ class PhotoLink:
     develop: Callable[[Mapping[str, Value], bool], None]
     crop: Callable[[], None]
     is_cropping: Callable[[], bool]
+    hold: Callable[[str], None]
+    held: Callable[[], str]
     pick: Callable[[], None]
     is_picking: Callable[[], bool]
 

@@ -58,9 +58,8 @@ def apply(
     from nlfilter_torch.photo.cli.recipe_job import RecipeJob
 
     editing.check_apart("OUT", target, mask=masks, preset=preset)
-    for recipe, name in zip(recipes, preset, strict=True):
-        showing.note_idle(recipe, name)
-    job = RecipeJob(recipes, masks, source, target, full)
+    notes = [note for recipe, name in zip(recipes, preset, strict=True) for note in showing.notes_if_idle(recipe, name)]
+    job = RecipeJob(recipes, masks, source, target, full, notes)
     editing.edit_file(
         job, source, target, depth, memory=memory, workers=workers, cluster=cluster, quality=quality, force=force
     )

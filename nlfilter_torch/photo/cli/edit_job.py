@@ -1,6 +1,6 @@
 """One edit of one photograph, in memory or in tiles, with what the command prints about it."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -47,6 +47,7 @@ class EditJob:
         seed: of the random numbers.
         memory: gigabytes that may be used.
         full: whether statistics of tiles are of all pixels.
+        notes: what is to be said about the options, once the photograph has been read.
     """
 
     step: Step
@@ -59,6 +60,7 @@ class EditJob:
     seed: int
     memory: float | None
     full: bool
+    notes: Sequence[str] = ()
 
     @property
     def bytes_per_pixel(self) -> int:
@@ -75,6 +77,10 @@ class EditJob:
     def develop(self) -> Development:
         """Nothing comes before the edit."""
         return AS_IT_IS
+
+    def at_size(self, size: tuple[int, int]) -> "EditJob":
+        """The same edit."""
+        return self
 
     def cropped_away(self, size: tuple[int, int]) -> list[tuple[int, Step]]:
         """No step, as nothing is cropped."""
@@ -145,7 +151,7 @@ class EditJob:
         scribbled.tell_colours()
         if self.show is not None:
             scribbled.show(self.show, self._edit_at)
-        for note in edit.notes(rows):
+        for note in (*self.notes, *edit.notes(rows)):
             options.note(note)
 
     def _measured(self, picture: Source[M], rows: Rows) -> PhotoEdit:

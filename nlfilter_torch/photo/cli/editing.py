@@ -272,6 +272,9 @@ class FileEdit(Protocol):
     def develop(self) -> Development:
         """What comes before the edit."""
 
+    def at_size(self, size: tuple[int, int]) -> "FileEdit":
+        """The edit of a photograph (H, W), whose crop is known then."""
+
     def cropped_away(self, size: tuple[int, int]) -> Iterable[tuple[int, Step]]:
         """The steps, with their numbers, whose objects in a photograph (H, W) are all outside the crop."""
 
@@ -321,7 +324,9 @@ def edit_file(
         begin("Reading")
         photograph = read_if_it_fits(source, target, edit.bytes_per_pixel, memory)
         if photograph is not None:
-            size, photograph = photograph.size, develop_photograph(photograph, edit.develop)
+            size = photograph.size
+            edit = edit.at_size(size)
+            photograph = develop_photograph(photograph, edit.develop)
             output = photograph if kind is None else replace(photograph, depth=kind)
             check_output(target, output)
             note_developing(edit, source, size, photograph.pixels.shape[1])
@@ -335,6 +340,7 @@ def edit_file(
         own_depth = check_depth(source, picture.rows.dtype)  # refuses other dtypes whatever the output is
         stored = kind or own_depth
         size = picture.shape[:2]
+        edit = edit.at_size(size)
         note_developing(edit, source, size, picture.shape[2])
         framed = edit.develop.frame(size).size
         part = picture.of_part(framed)

@@ -310,9 +310,9 @@ def edit_photograph(
     others = [(s.option, values.get(s.option.removeprefix("--"))) for s in edit.with_options]
     rectangles = {option: texts for option, texts in others if isinstance(texts, list)}
     drawn = ScribbleOptions(region, strokes, mask, rectangles)
-    note_useless(step, typed, marked=drawn.marks_objects(edit))
     editing.check_written(source, target, show=show, map=map, mask=mask, strokes=strokes, preset=preset)
-    job = EditJob(step, source, target, drawn, show, map, depth, seed, memory, full)
+    notes = useless_options(step, typed, marked=drawn.marks_objects(edit))
+    job = EditJob(step, source, target, drawn, show, map, depth, seed, memory, full, notes)
     editing.edit_file(
         job, source, target, depth, memory=memory, workers=workers, cluster=cluster, quality=quality, force=force
     )
@@ -348,13 +348,13 @@ def _check_usual(option: str, value: Value, usual: tuple[float, float]) -> None:
     )
 
 
-def note_useless(step: Step, typed: Collection[str], *, marked: bool) -> None:
-    """Print notes if a step changes nothing, or options that the user typed have no effect."""
-    edit = step.declared
+def useless_options(step: Step, typed: Collection[str], *, marked: bool) -> list[str]:
+    """Notes if a step changes nothing, or options that the user typed have no effect."""
+    edit, notes = step.declared, list[str]()
     if not (edit.requires_strokes or marked or step.changes()):
-        options.note(f"{edit.name} changes nothing with these options: the photograph is written without an edit")
+        notes.append(f"{edit.name} changes nothing with these options: the photograph is written without an edit")
     condition = edit.filter_condition
     if condition is not None and step[condition.name] != condition.value:
-        for parameter in edit:
-            if parameter.panel == FILTER_PANEL and parameter.name in typed:
-                options.note(f"--{parameter.name.replace('_', '-')} {condition.note}")
+        useless = [p.name.replace("_", "-") for p in edit if p.panel == FILTER_PANEL and p.name in typed]
+        notes += [f"--{name} {condition.note}" for name in useless]
+    return notes

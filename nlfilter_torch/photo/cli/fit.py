@@ -107,6 +107,7 @@ def fit(
     results = [preset.with_stem(f"{preset.stem}-{i + 1}") for i in range(len(mask))] if mask else [preset]
     _check_results(results, preview, left, photographs=[*chain(*paths)], mask=[*chain(*regions)])
     tables.check(photographs=[*chain(*paths)], mask=[*chain(*regions)])
+    _note_left_out(Path(before), Path(after), paths)
     alone = len(paths) == 1
     judged = (alone and not mask) or preview is not None or left is not None
     with steps(len(paths) + 1) as begin:
@@ -223,9 +224,14 @@ def _paths(before: str, after: str) -> list[tuple[Path, Path]]:
             raise ValueError(
                 f"{before} must hold one photograph for {pair}, got {path.name} and {other.name}; remove one of them"
             )
-    _note_unpaired(first, {path.stem for _, path in pairs})
-    _note_unpaired(second, {path.stem for path, _ in pairs})
     return pairs
+
+
+def _note_left_out(before: Path, after: Path, pairs: list[tuple[Path, Path]]) -> None:
+    """Print a note on each of two folders that holds photographs without a counterpart."""
+    if before.is_dir():
+        _note_unpaired(before, {path.stem for _, path in pairs})
+        _note_unpaired(after, {path.stem for path, _ in pairs})
 
 
 def _note_unpaired(folder: Path, paired: set[str]) -> None:
@@ -291,13 +297,13 @@ def _read(before: Path, after: Path, step: "Step") -> "tuple[Tensor, Tensor]":
     channels = max(image.shape[1] for image in images)
     first, second = (image.expand(-1, channels, -1, -1) for image in images)
     image, edited, done = align(first, second, str(before), str(after))
+    if bool((image == edited).all()):
+        raise ValueError(f"{after} must differ from {before}, but they are the same; give an edited photograph")
+    check_belong(image[0].expand(3, -1, -1), edited[0].expand(3, -1, -1), str(before), str(after))
     if done:
         options.note(done)
     if bool((image == image[..., :1, :1]).all()):
         options.note(f"{before} has a single colour; what the look does to others is not known")
-    if bool((image == edited).all()):
-        raise ValueError(f"{after} must differ from {before}, but they are the same; give an edited photograph")
-    check_belong(image[0].expand(3, -1, -1), edited[0].expand(3, -1, -1), str(before), str(after))
     return image, edited
 
 

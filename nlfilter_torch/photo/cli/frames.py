@@ -1,6 +1,6 @@
 """``nlfilter-torch frames``: one edit for all frames of a film, without flicker."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -25,6 +25,7 @@ from nlfilter_torch.photo.declared.presets import PRESETS, Recipe
 if TYPE_CHECKING:
     from nlfilter_torch.photo.io.photographs import Photograph
     from nlfilter_torch.photo.tiled.film import FilmEdit, FrameArray
+    from nlfilter_torch.photo.tiled.tiles import Passes
 
 #: Edits without scribbles.
 EDITS_WITHOUT_STROKES = tuple(edit for edit in EDITS.values() if not edit.requires_strokes)
@@ -105,21 +106,32 @@ def frames(
         check_usual(recipe.steps[0], typed_options(context, values))
 
     from nlfilter_torch.photo.cli.editing import allowed_memory
-    from nlfilter_torch.photo.cli.showing import note_idle
+    from nlfilter_torch.photo.cli.showing import notes_if_idle
     from nlfilter_torch.photo.io.films import is_film
     from nlfilter_torch.photo.io.rows import TILED
-    from nlfilter_torch.photo.tiled.film import FilmEdit, film_steps
+    from nlfilter_torch.photo.tiled.film import film_steps
     from nlfilter_torch.photo.tiled.tiles import Passes
 
     film_steps(recipe.steps)
     film = is_film(source) and not source.is_dir()
     what = "the film is encoded again" if film else "the photographs are written"
-    note_idle(recipe, preset or f"--edit {edit}", what)
+    notes = notes_if_idle(recipe, preset or f"--edit {edit}", what)
     passes = Passes("float32", memory=allowed_memory(memory, TILED))
 
     work = edit_film if film else edit_folder
-    count = work(source, target, references, partial(FilmEdit, recipe.steps, passes=passes, seed=seed))
+    count = work(source, target, references, partial(fitted, recipe, passes, seed, notes))
     typer.echo(f"{count} frames in {target}")
+
+
+def fitted(
+    recipe: Recipe, passes: "Passes", seed: int, notes: Iterable[str], samples: "list[FrameArray]"
+) -> "FilmEdit":
+    """Print the notes on the options, and fit an edit to frames that have been read."""
+    from nlfilter_torch.photo.tiled.film import FilmEdit
+
+    for note in notes:
+        options.note(note)
+    return FilmEdit(recipe.steps, samples, passes=passes, seed=seed)
 
 
 def chosen_recipe(context: typer.Context, name: str, preset: str | None, values: dict[str, Value]) -> Recipe:

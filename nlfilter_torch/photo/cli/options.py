@@ -24,12 +24,30 @@ FileDepth = Literal["8", "16", "float"]  # what a channel of the output file hol
 DEPTHS: dict[FileDepth, "Depth"] = {"8": "uint8", "16": "uint16", "float": "float32"}
 
 
+SHARES = (0.01, 100_000.0)  # numbers of the proportions of a crop
 NOTE = "nlfilter-torch: note: "  # begins every note on standard error
 
 
 def note(sentence: str) -> None:
     """Print a note on standard error."""
     typer.echo(f"{NOTE}{sentence}", err=True)
+
+
+def parse_aspect(text: str) -> float:
+    """Parse the proportions of a crop: width by height.
+
+    >>> parse_aspect("3:2")
+    1.5
+    """
+    try:
+        wide, high = (float(part) for part in text.split(":"))
+    except ValueError:
+        wide = high = 0.0
+    if not (SHARES[0] <= wide <= SHARES[1] and SHARES[0] <= high <= SHARES[1]):
+        raise ValueError(
+            f"--aspect must be a width and a height from {SHARES[0]:g} to {SHARES[1]:g}, such as 3:2, got {text!r}"
+        )
+    return wide / high
 
 
 def parse_sliders(text: str, option: str) -> tuple[float, ...]:

@@ -4,6 +4,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import chain
 from pathlib import Path
 
 from torch import Tensor
@@ -14,14 +15,20 @@ from nlfilter_torch.photo.cli.editing import Job, pixels_of, rows_of
 from nlfilter_torch.photo.declared.development import Development
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.declared.steps import Step
-from nlfilter_torch.photo.edits.applying import apply_recipe, edit_of
+from nlfilter_torch.photo.edits.applying import apply_recipe, edit_of, left_by_crop
 from nlfilter_torch.photo.io.photographs import Photograph
 from nlfilter_torch.photo.picture.changes import blend_edited
+from nlfilter_torch.photo.picture.drawn import M, Painter
 from nlfilter_torch.photo.picture.edit import Rows
+from nlfilter_torch.photo.picture.in_memory import InMemory
+from nlfilter_torch.photo.picture.painting import TensorPainter
+from nlfilter_torch.photo.picture.source import Source
 from nlfilter_torch.photo.tiled.developed import developed_rows
 from nlfilter_torch.photo.tiled.durations import expected_stages, straightening
 from nlfilter_torch.photo.tiled.pictures import Picture, RowSource
 from nlfilter_torch.photo.tiled.recipe import edit_regions, edit_tiling
+from nlfilter_torch.photo.tiled.scribbles import RowPainter
+from nlfilter_torch.photo.tiled.source import Tiled
 from nlfilter_torch.photo.tiled.tiles import Passes, Tiling
 
 
@@ -35,6 +42,9 @@ class RecipeJob:
         source: the file to read.
         target: the file to write.
         full: whether statistics of tiles are of all pixels.
+        aspect: width by height of the crop, which is trimmed to it, or None.
+        cropped: how the photograph has been straightened and cropped already, if it has been.
+        notes: what is to be said about the options, once the photograph has been read.
     """
 
     recipes: Sequence[Recipe]
@@ -42,6 +52,9 @@ class RecipeJob:
     source: str
     target: str
     full: bool
+    notes: Sequence[str] = ()
+    aspect: float | None = None
+    cropped: Development | None = None
 
     @property
     def bytes_per_pixel(self) -> int:
@@ -58,19 +71,30 @@ class RecipeJob:
         """How the photograph is developed, which no recipe for a region does."""
         return self.recipes[0].develop
 
+    def at_size(self, size: tuple[int, int]) -> "RecipeJob":
+        """The same for a photograph (H, W), with the edges of its crop."""
+        if self.aspect is None:
+            return self
+        crop = self.develop.frame(size).trimmed(self.aspect).edges
+        recipes = [replace(recipe, develop=replace(recipe.develop, crop=crop)) for recipe in self.recipes]
+        return replace(self, recipes=recipes, aspect=None)
+
     def cropped_away(self, size: tuple[int, int]) -> list[tuple[int, Step]]:
         """The steps, with their numbers, whose objects in a photograph (H, W) are all outside the crop."""
         return self.recipes[0].cropped_away(size)
 
     def on_developed(self, size: tuple[int, int]) -> "RecipeJob":
         """The recipes for a photograph, once (H, W), that is developed already."""
-        return replace(self, recipes=[recipe.on_developed(size) for recipe in self.recipes])
+        cropped = None if self.develop.frame(size).is_whole else self.develop
+        return replace(self, recipes=[recipe.on_developed(size) for recipe in self.recipes], cropped=cropped)
 
     def edited(self, photograph: Photograph) -> Tensor:
         """The edited pixels of a developed photograph in memory, (1, C, H, W)."""
         self._tell(rows_of(photograph, self.source))
-        weights = photograph.weights
-        pixels = [apply_recipe(recipe, photograph.pixels, weights=weights) for recipe in self.recipes]
+        weights, recipes = photograph.weights, self.recipes
+        if weights is not None:
+            recipes = self._seen(InMemory(photograph.pixels, weights=weights), TensorPainter())
+        pixels = [apply_recipe(recipe, photograph.pixels, weights=weights) for recipe in recipes]
         if not self.masks:
             return pixels[0]
         return blend_edited(photograph.pixels, pixels, editing.read_masks(self.masks, self.source, photograph.size))
@@ -91,7 +115,9 @@ class RecipeJob:
             if self.masks:
                 whole = self._in_regions(passes, source, job)
             else:
-                whole = edit_tiling(passes, source, self.on_developed(job.size).recipes[0].steps, self.source)
+                developed, tiled = self.on_developed(job.size), Tiled(Picture(source, self.source), passes)
+                recipes = developed.recipes if tiled.counted is None else developed._seen(tiled, RowPainter())
+                whole = edit_tiling(passes, source, recipes[0].steps, self.source)
             with whole as tiling:
                 yield picture.unmarked(tiling)
 
@@ -107,8 +133,21 @@ class RecipeJob:
         edits = [recipe.steps for recipe in self.recipes]
         return edit_regions(passes, source, edits, [mask.rows for mask in masks], self.source)
 
+    def _seen(self, source: Source[M], painter: Painter[M]) -> Sequence[Recipe]:
+        """The recipes for a developed photograph, without strokes of which the crop leaves hidden pixels alone."""
+        if self.cropped is None:
+            return self.recipes
+        (recipe,) = self.recipes  # as a photograph with regions is not developed
+        steps = tuple(left_by_crop(step, source, painter) for step in recipe.steps)
+        pairs = enumerate(zip(recipe.steps, steps, strict=True), 1)
+        editing.note_cropped(
+            self.cropped, [(n, step) for n, (step, left) in pairs if left is not step and step.changes()]
+        )
+        return [Recipe(steps)]
+
     def _tell(self, rows: Rows) -> None:
-        """Print the notes of all steps, without repeating any."""
+        """Print the notes on the options and those of all steps, without repeating any."""
         steps = [step for recipe in self.recipes for step in recipe.acting]
-        for note in dict.fromkeys(note for step in steps for note in edit_of(step, rows.size).notes(rows)):
+        of_steps = (note for step in steps for note in edit_of(step, rows.size).notes(rows))
+        for note in dict.fromkeys(chain(self.notes, of_steps)):
             options.note(note)

@@ -166,10 +166,9 @@ def tell_selected(mask: Tensor, background: list[str] | None) -> None:
         note("nearly all of the picture's borders are selected; mark what is not part of the object with --background")
 
 
-def note_idle(recipe: Recipe, name: str, what: str = "the photograph is written") -> None:
-    """Print a note if an edit changes nothing; ``what`` says what is done all the same."""
-    if not recipe.changes:
-        note(f"{name} holds no step that changes anything: {what} without an edit")
+def notes_if_idle(recipe: Recipe, name: str, what: str = "the photograph is written") -> list[str]:
+    """A note if an edit changes nothing; ``what`` says what is done all the same."""
+    return [] if recipe.changes else [f"{name} holds no step that changes anything: {what} without an edit"]
 
 
 def unlike(pixels: Tensor, middle: Tensor) -> float:

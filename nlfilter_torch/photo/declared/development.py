@@ -248,6 +248,17 @@ class Frame:
         bottom, right = self.top + self.height, self.left + self.width
         return self.left / width, self.top / height, right / width, bottom / height
 
+    def trimmed(self, aspect: float) -> "Frame":
+        """The largest frame within it, about its middle, whose width is ``aspect`` times its height.
+
+        >>> AS_IT_IS.frame((100, 150)).trimmed(1.0).edges
+        (0.16666666666666666, 0.0, 0.8333333333333334, 1.0)
+        """
+        width = min(self.width, max(1, round(self.height * aspect)))
+        height = min(self.height, max(1, round(width / aspect)))
+        top, left = self.top + (self.height - height) // 2, self.left + (self.width - width) // 2
+        return replace(self, top=top, left=left, height=height, width=width)
+
     @property
     def is_whole(self) -> bool:
         """Whether it is the original itself."""

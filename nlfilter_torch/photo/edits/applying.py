@@ -67,6 +67,19 @@ def scribbles_of(step: Step, size: tuple[int, int], painter: Painter[M]) -> Draw
     return Drawn(masks, colours, torch.tensor(step.sliders_inside)[None], torch.tensor(step["alpha"]))
 
 
+def left_by_crop(step: Step, source: Source[M], painter: Painter[M]) -> Step:
+    """A step of a cropped picture, without its strokes if those of its objects cover only pixels that do not count.
+
+    These do as little as strokes outside the crop, see :meth:`Recipe.on_developed`.
+    """
+    objects = step.painted_as("object", "added")
+    if not objects:
+        return step
+    mask = painter.mask(objects, source.size)
+    is_seen = not painter.covers(mask) or len(source.scribbles(mask, None, "strokes", needed=False).places) > 0
+    return step if is_seen else step.changed(strokes=())
+
+
 def _check_covered(step: Step, covered: bool) -> None:
     if not covered:
         raise ValueError(f"strokes of {step.edit} must cover a pixel of the photograph, got none that do; move them")
@@ -208,6 +221,9 @@ def apply_recipe(
         frame = recipe.develop.frame(size)
         recipe = recipe.on_developed(size)
         weights = None if weights is None else develop_planes(weights, frame).clamp(0, 1)
+        if weights is not None and not frame.is_whole:
+            source, painter = InMemory(image, weights=weights), TensorPainter()
+            recipe = Recipe(tuple(left_by_crop(step, source, painter) for step in recipe.steps))
     result, steps = image, recipe.acting
     for done, step in enumerate(steps):
         if report is not None:

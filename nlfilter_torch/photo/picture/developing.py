@@ -82,6 +82,18 @@ def develop_planes(planes: Tensor, frame: Frame) -> Tensor:
     return torch.cat(_divided(turn, bands_of(frame), planes), dim=2)
 
 
+def reframed(planes: Tensor, frame: Frame, other: Frame, size: tuple[int, int]) -> Tensor:
+    """What planes (B, C, h, w) of a developed picture show in another frame of the same original, at a size (h, w).
+
+    Values are interpolated linearly; beyond the picture they are those of its border.
+    """
+    corners = [frame.inward(*other.outward(x, y)) for x, y in ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0))]
+    first, right, down = planes.new_tensor(corners)
+    to_planes = torch.stack([right - first, down - first, right + down - 1], dim=1)  # of places from -1 to 1
+    grid = F.affine_grid(to_planes.expand(len(planes), -1, -1), [len(planes), 1, *size], align_corners=False)
+    return F.grid_sample(planes, grid, padding_mode="border", align_corners=False)
+
+
 def turned_canvas(image: Tensor, development: Development) -> Tensor:
     """An image (B, C, H, W) in [0, 1] that is turned within its own size, without a crop; empty corners are black."""
     height, width = size = image.shape[-2], image.shape[-1]

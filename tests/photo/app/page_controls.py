@@ -24,6 +24,7 @@ class Controls:
         self.thumbnails: dict[str, str] = {}
         self.developed: list[object] = []
         self.is_cropping = self.is_picking = False
+        self.held = "Free"
         self.replaced: list[tuple[Recipe, int | None]] = []
         self.link = Link(
             lambda: self.recipe,
@@ -36,10 +37,17 @@ class Controls:
                 lambda *change: self.developed.append(change),
                 lambda: self.developed.append("crop"),
                 lambda: self.is_cropping,
+                self.hold,
+                lambda: self.held,
                 lambda: self.developed.append("pick"),
                 lambda: self.is_picking,
             ),
         )
+
+    def hold(self, proportions: str) -> None:
+        """Let the crop keep proportions."""
+        self.held = proportions
+        self.developed.append(proportions)
 
     def show(self, tab: EditTab, recipe: Recipe) -> None:
         """Let a tab show an edit."""

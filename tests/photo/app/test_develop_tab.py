@@ -1,9 +1,8 @@
-"""The tab of the photograph itself, and the frame of the crop, without a browser."""
+"""The tab of the photograph itself, without a browser."""
 
 import pytest
 from nicegui import Client, ui
 
-from nlfilter_torch.photo.app.crop_tool import CropTool
 from nlfilter_torch.photo.app.develop_tab import CONTROLS, DevelopTab
 from nlfilter_torch.photo.declared.development import WHOLE, Development
 from nlfilter_torch.photo.declared.presets import Recipe
@@ -32,25 +31,22 @@ def test_the_crop_is_shown_and_reset(client: Client) -> None:
     assert not whole.enabled
     assert crop.props["aria-pressed"] == "false"
     shown.click("Crop")
-    assert shown.developed == ["crop"]
     shown.click("Grey point")
-    assert shown.developed.pop() == "pick"
+    assert shown.developed == ["crop", "pick"]
+    shown.developed.clear()
     assert pick.props["aria-pressed"] == "false"
     shown.is_cropping = shown.is_picking = True
     shown.show(tab, Recipe((), Development(crop=(0.1, 0.0, 1.0, 1.0))))
     assert crop.props["aria-pressed"] == pick.props["aria-pressed"] == "true"
+    (select,) = shown.of(ui.select)
+    select.set_value("16:9")
+    assert shown.developed == ["16:9"]
+    shown.show(tab, shown.recipe)
+    assert shown.developed == ["16:9"]
     shown.click("Whole picture")
-    assert shown.developed[-1] == ({"crop": WHOLE}, True)
-
-
-def test_the_tool_tells_the_page_what_to_show(client: Client, scripts: list[str]) -> None:
-    tool = CropTool()
-    handles = [e for e in client.elements.values() if e.props.get("role") == "slider"]
-    assert [e.props["aria-label"] for e in handles] == ["Left edge", "Top edge", "Right edge", "Bottom edge"]
-    tool.show("/picture/token/whole?1", (100, 150), (0.1, 0.0, 1.0, 0.5))
-    assert scripts.pop() == "cropper.show('/picture/token/whole?1', 150, 100, [0.1, 0.0, 1.0, 0.5])"
-    tool.hide()
-    assert scripts == ["cropper.hide()"]
+    assert shown.developed[1:] == ["Free", ({"crop": WHOLE}, True)]
+    shown.show(tab, shown.recipe)
+    assert select.value == "Free"
 
 
 @pytest.mark.parametrize("name", ["exposure", "straighten"])

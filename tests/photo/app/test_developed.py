@@ -96,7 +96,10 @@ def test_a_moving_slider_is_followed_and_later_steps_stay(session: Session) -> N
     assert not session.developed.development.exposure  # until the slider is released
     assert difference(session.render(), wanted) < 1
     session.recipe = session.developing({"straighten": 3.0})
-    assert session.render(DEVELOPING).shape[-2:] == session.recipe.develop.frame((100, 150)).size
+    shown, wanted = session.render(DEVELOPING), apply_recipe(session.recipe, cat()).clamp(0, 1)
+    assert shown.shape[-2:] == session.recipe.develop.frame((100, 150)).size
+    assert difference(shown, wanted) < 3  # with the steps
+    assert difference(shown, develop_image(cat(), session.recipe.develop)) > 8
 
 
 def test_a_point_becomes_grey(session: Session) -> None:
@@ -134,6 +137,9 @@ def test_a_crop_is_what_the_photograph_can_have(session: Session) -> None:
     session.load(session.developing({"straighten": 10.0}))
     session.load(session.developing({"crop": (0.0, 0.0, 1.0, 1.0)}))
     assert session.crop == session.recipe.develop.crop == session.recipe.develop.frame((100, 150)).edges
+    session.load(session.developing({"crop": (0.0, 0.0, 1.0, 1.0)}, 1.0))
+    height, width = session.recipe.develop.frame((100, 150)).size
+    assert height == width > 75  # as large as it can be
     again = session.developing({"crop": session.crop})
     assert again == session.recipe  # it does not shrink any further
     whole = session.uncropped

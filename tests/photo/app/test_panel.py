@@ -70,10 +70,10 @@ def test_the_response_is_shown_in_the_tab_with_layers(shown: Controls, panel: Pa
 
 def test_levels(panel: Panel) -> None:
     panel.draw_levels("<svg></svg>", (0.0123, 0.0), (0.012, 0.0))
-    assert panel._clipped.text == "Clipped: 1.2 % white, 0.0 % black"
+    assert panel._clipped.text == "Clipped: 1.2\u00a0% white, 0.0\u00a0% black"
     assert "warning" not in panel._clipped.classes
     panel.draw_levels("<svg></svg>", (0.02, 0.0), (0.012, 0.0))
-    assert panel._clipped.text.endswith("; before the edit 1.2 % and 0.0 %")
+    assert panel._clipped.text.endswith("; before the edit 1.2\u00a0% and 0.0\u00a0%")
     assert "warning" in panel._clipped.classes
 
 

@@ -70,6 +70,15 @@ def test_tiles_give_the_same(kind: str, arguments: list[str], tmp_path: Path, mo
         assert (whole[..., 3] == 128).any()
 
 
+def test_a_crop_is_trimmed_to_proportions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    source = written(tmp_path / "in.tif", "plain")
+    for picture in by_both(monkeypatch, source, "develop", "--crop", "0.2,0,1,1", "--aspect", "1:1"):
+        assert np.array_equal(picture, tifffile.imread(source)[:, 102:402])
+    for picture in by_both(monkeypatch, source, "develop", "--straighten", "4", "--aspect", "16:9"):
+        assert picture.shape[1] == pytest.approx(picture.shape[0] * 16 / 9, abs=1)
+        assert picture.shape[1] > 340
+
+
 def test_strokes_stay_where_they_are(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What a stroke selects in the whole photograph, it selects in the developed one."""
     picture = np.full((*SIZE, 3), 60, np.uint8)
@@ -103,6 +112,7 @@ def test_the_file_keeps_its_depth_and_its_exif_tells_its_size(tmp_path: Path, ti
         (["--crop", "1,2"], "--crop must be the left, top, right and bottom edge as shares from 0 to 1"),
         (["--crop", "a,b"], 'got "a,b"; correct it'),
         (["--exposure", "9"], "--exposure"),
+        (["--aspect", "3/2"], "--aspect must be a width and a height from 0.01 to 100000, such as 3:2, got '3/2'"),
         (["--straighten", "45", "--crop", "0,0,0.1,0.1"], "crop must have its middle within the photograph turned"),
         (["--workers", "2"], "--workers takes zarr arrays"),
     ],
@@ -139,6 +149,20 @@ def test_steps_outside_the_crop_are_named(photo: Path, tiled: bool, capsys: pyte
     edit.write_text(Recipe((Step("tone"),), crop).to_json())
     assert main(["apply", str(photo), str(alone), "--preset", str(edit)]) == 0
     assert imagecodecs.png_decode(out.read_bytes()).tolist() == imagecodecs.png_decode(alone.read_bytes()).tolist()
+
+
+def test_strokes_of_which_a_crop_leaves_pixels_without_data(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    source, edit = written(tmp_path / "in.tif", "nodata"), tmp_path / "edit.json"
+    away = Step("recolor", (Stroke(((150 / 420, 0.4), (300 / 420, 0.4)), 0.02, "#2040e0"),))
+    crop = Development(crop=(0.0, 0.0, 0.5, 1.0))
+    edit.write_text(Recipe((away,), crop).to_json())
+    whole, tiled = by_both(monkeypatch, source, "apply", "--preset", str(edit))
+    note = "recolor, step 1, has no strokes within the crop 0,0,0.5,1: it changes nothing"
+    assert capsys.readouterr().err.count(note) == 2
+    for picture in (whole, tiled):
+        assert np.array_equal(picture, tifffile.imread(source)[:, :210])
 
 
 def test_regions_and_films_are_not_developed(photo: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -55,6 +55,20 @@ def test_an_edit_that_changes_nothing_says_so(
     assert "changes nothing" not in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    "arguments", ["tone --contrast 1", "denoise --patch-size 3", "develop", "apply --preset idle.json"]
+)
+def test_what_is_wrong_is_said_without_notes(
+    arguments: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("idle.json").write_text(Recipe().to_json())
+    verb, *options = arguments.split()
+    assert main([verb, "missing.png", "out.png", *options]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "missing.png does not exist" in line
+
+
 def test_options_without_effect_are_named(photo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "out.tif"
     assert main(["denoise", str(photo), str(out), "--patch-size", "3"]) == 0

@@ -13,7 +13,8 @@ from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.declared.strokes import Stroke
 from nlfilter_torch.photo.edits.applying import apply_recipe
-from nlfilter_torch.photo.picture.developing import develop_image, gains_of
+from nlfilter_torch.photo.picture.developing import develop_image, develop_planes, gains_of, reframed
+from nlfilter_torch.photo.picture.resizing import resize
 from tests.problems import colour
 
 
@@ -118,3 +119,13 @@ def test_a_recipe_develops_first() -> None:
     edited = apply_recipe(recipe, image)
     wanted = apply_recipe(recipe.on_developed((60, 80)), develop_image(image, development))
     assert torch.allclose(edited, wanted, atol=1e-6)
+
+
+def test_a_developed_picture_in_another_frame() -> None:
+    image = resize(colour("chelsea", 20, 30), (100, 150))  # smooth
+    before = Development(straighten=2.0).frame((100, 150))
+    after = Development(straighten=5.0, crop=(0.2, 0.2, 0.9, 0.8)).frame((100, 150))
+    shown = reframed(develop_planes(image, before), before, after, after.size)
+    assert (shown - develop_planes(image, after)).abs().max() < 0.02
+    same = develop_planes(image, before)
+    assert torch.allclose(reframed(same, before, before, before.size), same, atol=1e-5)

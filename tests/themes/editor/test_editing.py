@@ -215,8 +215,22 @@ def test_wipe_shows_what_was_before(opened: Tab) -> None:
     expect(opened.page.get_by_text("before", exact=True)).to_be_visible()
 
 
+def crop_to_a_square(tab: Tab) -> None:
+    """Show the frame of the crop as a square of 92 pixels, make it smaller, and then the whole photograph."""
+    page, left = tab.page, tab.slider("Left edge")
+    tab.choose("Proportions", "1:1")
+    expect(left).to_be_visible()
+    expect(page.get_by_text("92×92 pixels")).to_be_attached()
+    left.focus()
+    page.keyboard.press("ArrowRight")
+    expect(page.get_by_text("92×92 pixels")).to_have_count(0)
+    expect(page.get_by_text(re.compile(r"\b(\d+)×\1 pixels"))).to_be_attached()
+    page.get_by_role("button", name="Whole picture").click()
+    expect(page.get_by_text("138×92 pixels")).to_be_attached()
+
+
 def test_a_photograph_is_developed(opened: Tab, folder: Path) -> None:
-    """Exposure, straightening, a crop by keys and by pointer, and a stroke on what is left; the file as of `apply`."""
+    """Exposure, straightening, crops by several means, and a stroke on what is left; the file as of `apply`."""
     page = opened.page
     page.get_by_role("tab", name="Photo").click()
     before = opened.source()
@@ -228,9 +242,8 @@ def test_a_photograph_is_developed(opened: Tab, folder: Path) -> None:
     opened.wait_for_picture(before)
     expect(page.get_by_text("138×92 pixels")).to_be_visible()
 
-    page.get_by_role("button", name="Crop").click()
     left, bottom = opened.slider("Left edge"), opened.slider("Bottom edge")
-    expect(left).to_be_visible()
+    crop_to_a_square(opened)
     expect(left).to_have_attribute("aria-valuenow", "4.0")  # 6 of 150 pixels
     left.focus()
     for _ in range(10):

@@ -18,10 +18,12 @@ class Cropper {
   #edges = [0, 0, 1, 1];
   #drag = null; // `{ edges, x, y, names }` where a drag began, and which edges it moves
   #timer = 0;
+  #aspect = null; // that the frame keeps
   #isReady = false;
 
-  /** Show a picture of that size, and a frame. */
-  show(address, width, height, edges) {
+  /** Show a picture of that size, and a frame, which keeps an aspect unless that is null. */
+  show(address, width, height, edges, aspect = null) {
+    this.#aspect = aspect;
     document.documentElement.classList.add("cropping");
     this.#listen();
     const picture = document.querySelector(".crop-picture");
@@ -88,7 +90,7 @@ class Cropper {
     }
     const box = document.querySelector(".crop-picture").getBoundingClientRect();
     const { edges, x, y, names } = this.#drag;
-    this.#place(moved(edges, names, (event.clientX - x) / box.width, (event.clientY - y) / box.height));
+    this.#place(moved(edges, names, (event.clientX - x) / box.width, (event.clientY - y) / box.height, this.#aspect));
   }
 
   #end() {
@@ -116,7 +118,7 @@ class Cropper {
     const way = KEYS[event.key];
     if (edge && way) {
       const step = event.shiftKey ? STEP / 10 : STEP;
-      this.#place(moved(this.#edges, [edge], way[0] * step, way[1] * step));
+      this.#place(moved(this.#edges, [edge], way[0] * step, way[1] * step, this.#aspect));
       clearTimeout(this.#timer);
       this.#timer = setTimeout(() => this.#tell(), REST);
     } else if (event.key === "Escape" || (event.key === "Enter" && edge)) {

@@ -43,6 +43,14 @@ test("keys are told after a rest, or before the end", () => {
   }
 });
 
+test("a frame keeps the aspect that the server tells", () => {
+  cropper.show("whole", 100, 100, [0, 0, 1, 1], 2);
+  keys("ArrowRight");
+  mock.timers.tick(400);
+  assert.deepEqual(told(), ["crop 0.01,0.25,1.00,0.75"]);
+  cropper.show("whole", 100, 100, [0, 0, 1, 1]);
+});
+
 test("an answer does not undo keys that were pressed meanwhile", () => {
   cropper.show("whole", 100, 100, [0, 0, 1, 1]);
   keys("ArrowRight");

@@ -23,7 +23,18 @@ test("the whole frame keeps its size", () => {
   close(moved(frame, ALL, 5, -5), [0.4, 0, 1, 0.7]);
 });
 
+test("a frame keeps its aspect: the opposite edge or corner stays, and the middle across", () => {
+  const frame = [0.2, 0.3, 0.6, 0.7];
+  close(moved(frame, ["right"], 0.2, 0.5, 1), [0.2, 0.2, 0.8, 0.8]);
+  close(moved(frame, ["top"], 0.2, -0.2, 1), [0.1, 0.1, 0.7, 0.7]);
+  close(moved(frame, ["left", "top"], -0.1, -0.05, 1), [0.1, 0.2, 0.6, 0.7]);
+  close(moved(frame, ["bottom", "right"], 0.9, 0.9, 2), [0.2, 0.3, 1, 0.7]);
+  close(moved([0, 0, 0.2, 0.2], ["right"], 0.9, 0, 0.5), [0, 0, 0.5, 1]); // moved into the picture
+  close(moved(frame, ALL, 0.1, 0.1, 1), [0.3, 0.4, 0.7, 0.8]);
+});
+
 test("a frame is never empty", () => {
   close(atLeast([0.5, 0.5, 0.5, 0.5]), [0.5, 0.5, 0.505, 0.505]);
   close(atLeast([0, 0, 1, 1]), [0, 0, 1, 1]);
+  close(moved([0.2, 0.2, 0.6, 0.4], ["left"], 0.9, 0, 2), [0.58, 0.295, 0.6, 0.305]);
 });
