@@ -6,7 +6,7 @@ Invalid input of any kind is reported in one sentence on standard error, with ex
 import sys
 from collections.abc import Callable, Iterable
 
-from nlfilter_torch.photo.cli import interrupts, waiting
+from nlfilter_torch.photo.cli import collector, interrupts, waiting
 
 Commands = Callable[[], Iterable[Callable[..., None]]]
 
@@ -17,6 +17,7 @@ def main(arguments: list[str] | None = None, others: Commands = tuple) -> int:
     ``others`` imports and returns commands besides those of this package.
     """
     waiting.sleep_while_waiting()
+    collector.collect_seldom()
     try:
         with interrupts.handled():
             from nlfilter_torch.photo.cli.application import run
