@@ -6,7 +6,7 @@ Does not import torch, so that errors in options appear at once.
 import re
 from collections.abc import Collection, Mapping, Sequence
 
-DEVELOPING = "nlfilter-torch develop has --exposure, --temperature, --tint, --straighten and --crop"
+DEVELOPING = ("--exposure", "--temperature", "--tint", "--straighten", "--crop", "--aspect")  # options of develop
 #: What other programs call an option: our options, of which those of the command are named, or a sentence.
 OTHER_NAMES: Mapping[str, tuple[str, ...] | str] = {
     "--sigma": ("--noise-level", "--bandwidth", "--radius", "--tolerance"),
@@ -50,20 +50,47 @@ OTHER_NAMES: Mapping[str, tuple[str, ...] | str] = {
     "--input": "the photograph is the first argument: nlfilter-torch COMMAND IN OUT",
     "--overwrite": ("--force",),
     "--yes": ("--force",),
-    "--exposure": DEVELOPING,
-    "--brightness": DEVELOPING,
-    "--temperature": DEVELOPING,
-    "--tint": DEVELOPING,
-    "--wb": DEVELOPING,
-    "--white-balance": DEVELOPING,
-    "--straighten": DEVELOPING,
-    "--rotate": DEVELOPING,
-    "--crop": DEVELOPING,
+    **{option: (option,) for option in DEVELOPING},
+    "--brightness": ("--exposure",),
+    "--wb": ("--temperature", "--tint"),
+    "--white-balance": ("--temperature", "--tint"),
+    "--rotate": ("--straighten",),
+    "--ratio": ("--aspect",),
+    "--proportions": ("--aspect",),
     "--resize": "photographs keep their size",
     "--gpu": "the commands work on the processor; the functions of the library take tensors on any device",
     "--device": "the commands work on the processor; the functions of the library take tensors on any device",
     "--verbose": "progress is printed to standard error without an option",
     "--quiet": "redirect standard error to silence progress: 2>/dev/null",
+}
+#: What other programs call a command: ours, with an option if it has several purposes.
+OTHER_COMMANDS: Mapping[str, str] = {
+    "crop": "develop IN OUT --crop L,T,R,B",
+    "straighten": "develop IN OUT --straighten DEGREES",
+    "rotate": "develop IN OUT --straighten DEGREES",
+    "exposure": "develop IN OUT --exposure STOPS",
+    "brightness": "develop IN OUT --exposure STOPS",
+    "white-balance": "develop IN OUT --temperature T --tint T",
+    "contrast": "tone IN OUT --contrast FACTOR",
+    "enhance": "detail IN OUT --preset crisp",
+    "clarity": "detail IN OUT --preset crisp",
+    "noise": "denoise IN OUT",
+    "smooth": "denoise IN OUT",
+    "blur": "defocus IN OUT --region X,Y,W,H",
+    "bokeh": "defocus IN OUT --region X,Y,W,H",
+    "select": "mask IN OUT --region X,Y,W,H",
+    "segment": "mask IN OUT --region X,Y,W,H",
+    "color": "recolor IN OUT --region X,Y,W,H:COLOUR",
+    "colour": "recolor IN OUT --region X,Y,W,H:COLOUR",
+    "recolour": "recolor IN OUT --region X,Y,W,H:COLOUR",
+    "colourise": "colorize IN OUT --region X,Y,W,H:COLOUR",
+    "colourize": "colorize IN OUT --region X,Y,W,H:COLOUR",
+    "cartoon": "abstract IN OUT",
+    "lut": "apply IN OUT --preset FILE.cube",
+    "video": "frames FILM OUT",
+    "edit": "app IN",
+    "gui": "app IN",
+    "open": "app IN",
 }
 SHORT: Mapping[str, str] = {
     "-o": "--output",
@@ -107,7 +134,9 @@ def explained(message: str, arguments: Sequence[str], options: Collection[str]) 
             f"{command[1]} OUT --preset crisp, and nlfilter-torch --help lists all of them"
         )
     if command is not None:
-        return f"No such command '{command[1]}'; nlfilter-torch --help lists all of them"
+        meant = OTHER_COMMANDS.get(command[1].lower())
+        here = "" if meant is None else f"here it is nlfilter-torch {meant}, and "
+        return f"No such command '{command[1]}'; {here}nlfilter-torch --help lists all of them"
     if message.startswith("Got unexpected extra argument"):
         return message + _of_extra(arguments)
     return message
@@ -122,6 +151,8 @@ def _meant(option: str, options: Collection[str]) -> str:
     own = [meaning for meaning in ((name,) if name in options else meanings) if meaning.split()[0] in options]
     if own:
         return f"here it is {' or '.join(own[:2])}"
+    if any(meaning in DEVELOPING for meaning in meanings):
+        return f"nlfilter-torch develop has {', '.join(DEVELOPING[:-1])} and {DEVELOPING[-1]}"
     return "nlfilter-torch batch has --workers" if "--workers" in meanings else ""
 
 

@@ -38,15 +38,21 @@ DETAIL = ["--alpha", "--bandwidth", "--region", "--force", "--quality"]
         (["sharpen", "a.png", "b.png", "--strength", "3"], "No such option: --strength; here it is --amount"),
         (
             ["detail", "a.png", "b.png", "--rotate", "2"],
-            "No such option: --rotate; nlfilter-torch develop has --exposure, --temperature, --tint, --straighten and "
-            "--crop",
+            "No such option: --rotate; nlfilter-torch develop has --exposure, --temperature, --tint, --straighten, "
+            "--crop and --aspect",
         ),
+        (["develop", "a.png", "b.png", "--ratio", "1:1"], "No such option: --ratio; here it is --aspect"),
         (
             ["a.png", "b.png"],
             "No such command 'a.png'; the command comes first, such as nlfilter-torch detail a.png OUT --preset crisp, "
             "and nlfilter-torch --help lists all of them",
         ),
-        (["blur", "a.png", "b.png"], "No such command 'blur'; nlfilter-torch --help lists all of them"),
+        (
+            ["blur", "a.png", "b.png"],
+            "No such command 'blur'; here it is nlfilter-torch defocus IN OUT --region X,Y,W,H, and nlfilter-torch "
+            "--help lists all of them",
+        ),
+        (["fancy", "a.png", "b.png"], "No such command 'fancy'; nlfilter-torch --help lists all of them"),
         (
             ["detail", "a.png", "b.png", "--alpha", "2", "2", "2", "1"],
             "Got unexpected extra argument(s) (2 2 1); the numbers of --alpha are separated by commas: --alpha 2,2,2,1",
