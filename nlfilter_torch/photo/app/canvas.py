@@ -52,16 +52,14 @@ class Canvas:
         token: part of the addresses of the pictures.
         draw: is called with the step and the function that adds a complete stroke to it.
         lay: is called when :meth:`lay_over` is to be called, in a thread, and then :meth:`show_layers`.
-        show_error: is called with a sentence for the user.
+        choosing: JavaScript that lets a person choose a photograph.
 
     Attributes:
         pictures: image files, by their kind.
         pick: is called with the next point (x, y) that is clicked, in pixels of the preview, or None.
     """
 
-    def __init__(
-        self, brush: Brush, token: str, draw: Draw, lay: Callable[[], None], show_error: Callable[[str], None]
-    ) -> None:
+    def __init__(self, brush: Brush, token: str, draw: Draw, lay: Callable[[], None], choosing: str) -> None:
         self.pictures: dict[str, bytes] = {}
         self.histogram = ""
         self.clipped = self.clipped_before = (0.0, 0.0)  # shares of white and of black, after and before the edit
@@ -75,18 +73,19 @@ class Canvas:
         self._step = DETAIL.name  # the step whose strokes are shown
         self._line: list[tuple[float, float]] = []  # of the stroke that is being drawn
         with ui.element("div").classes("canvas"):
-            self._build_welcome(show_error)
+            self._build_welcome(choosing)
             self._build_photo()
             self._crop_tool = CropTool()
             _build_zoom()
         self._build_bar()
 
-    def _build_welcome(self, show_error: Callable[[str], None]) -> None:
-        with ui.element("div").classes("welcome") as self._welcome:
+    def _build_welcome(self, choosing: str) -> None:
+        with ui.element("button").classes("welcome").props('type="button"') as self._welcome:
             ui.icon("photo", size="64px")
             ui.label("Open a photograph to begin").classes("text-h6 q-mt-sm")
-            ui.label("PNG, JPEG, TIFF, WebP or AVIF. It stays on this machine.").classes("hint")
-        self._welcome.on("pointerdown", lambda: show_error("open a photograph first; there is nothing to paint on"))
+            ui.label("Click here, or drop one: PNG, JPEG, TIFF, WebP or AVIF.").classes("hint")
+            ui.label("It stays on this machine.").classes("hint")
+        self._welcome.on("click", js_handler=choosing)
 
     def _build_photo(self) -> None:
         self._photo = ui.interactive_image(

@@ -92,7 +92,7 @@ class Editor:
         brush = Brush()
         with ui.element("div").classes("editor"):
             with ui.element("div").classes("viewer"):
-                self._canvas = Canvas(brush, self._token, self._draw, self._lay, self._tasks.show_error)
+                self._canvas = Canvas(brush, self._token, self._draw, self._lay, self._upload.choosing)
             with ui.column().classes("panel"):
                 handle = ui.button(icon="drag_handle").props('flat dense aria-label="Show or hide the controls"')
                 handle.classes("handle").on("click", js_handler="() => page.fold()")
@@ -151,10 +151,10 @@ class Editor:
             ui.space()
             self._tasks = Tasks()
             show_error = self._tasks.show_error
-            photographs = Upload(self._take_photograph, "image/*", LARGEST, show_error)
+            self._upload = Upload(self._take_photograph, "image/*", LARGEST, show_error)
             presets = Upload(self._take_preset, PRESET_KINDS, LARGEST_PRESET, show_error)
             kinds = f"A PNG, JPEG, TIFF, WebP or AVIF file of at most {LARGEST / 1e9:g} GB"
-            _button("Open", "folder_open", kinds, js=photographs.choosing)
+            _button("Open", "folder_open", kinds, js=self._upload.choosing)
             self._undo_button = _button("Undo", "undo", "Ctrl+Z", self._undo)
             self._redo_button = _button("Redo", "redo", "Ctrl+Shift+Z", self._redo)
             self._reset_button = _button(
@@ -445,7 +445,7 @@ class Editor:
     # Files
 
     def _begin(self, image: Path | None, address: str) -> None:
-        self._client.run_javascript("page.watchConnection()")
+        self._client.run_javascript(f"page.watchConnection(); {self._upload.dropping}")
         self._show_state()
         if self.session.opened is not None:  # a browser that reconnects keeps its edit
             return

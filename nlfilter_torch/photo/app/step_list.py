@@ -10,6 +10,8 @@ from nlfilter_torch.photo.app.controls import SteadySlider
 from nlfilter_torch.photo.declared.presets import Recipe
 
 Replace = Callable[[Recipe, int | None], None]  # a new edit, and the place of the step whose slider moves, or None
+NO_STEPS = "None yet. Move a slider, or paint."
+ONLY_PHOTO = 'None yet, but what "Photo" does, which comes first.'
 #: What the buttons of a step do.
 TIPS = {
     "up": "Apply this step earlier",
@@ -64,6 +66,7 @@ class StepList:
         self._rows: list[Row] = []
         ui.label("Steps, from first to last").classes("group q-px-sm")
         self._box = ui.column().classes("steps w-full q-px-sm gap-0").props('role="group" aria-label="Steps"')
+        self._none = ui.label("").classes("hint q-px-sm")
         self.follow()
 
     def follow(self) -> None:
@@ -73,6 +76,8 @@ class StepList:
         if listed(recipe) != self._shown:
             self._shown = listed(recipe)
             self._build(recipe)
+        self._none.set_text(NO_STEPS if recipe.develop.is_idle else ONLY_PHOTO)
+        self._none.set_visibility(not self._rows)
         for row in self._rows:
             step = recipe.steps[row.place]
             row.on.set_value(step.on)
@@ -89,8 +94,6 @@ class StepList:
         places = [place for place, _ in shown]
         with self._box:
             self._rows = [self._row(name, places, number, recipe) for number, (_, name) in enumerate(shown)]
-            if not self._rows:
-                ui.label("None yet. Move a slider, or paint.").classes("hint")
 
     def _row(self, name: str, places: list[int], number: int, recipe: Recipe) -> Row:
         place, step = places[number], recipe.steps[places[number]]

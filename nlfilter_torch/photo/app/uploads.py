@@ -36,6 +36,11 @@ class Upload:
         """JavaScript that lets the user choose a file."""
         return f"() => getElement({self._upload.id}).$refs.qRef.pickFiles()"
 
+    @property
+    def dropping(self) -> str:
+        """JavaScript after which the file that is dropped on the page is taken."""
+        return f"page.takeDropped((files) => getElement({self._upload.id}).$refs.qRef.addFiles(files))"
+
     def _refuse(self, reason: str, name: str) -> None:
         """Say why the browser did not send a file."""
         if reason == "max-file-size":

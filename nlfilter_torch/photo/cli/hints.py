@@ -134,8 +134,8 @@ def explained(message: str, arguments: Sequence[str], options: Collection[str]) 
             f"{command[1]} OUT --preset crisp, and nlfilter-torch --help lists all of them"
         )
     if command is not None:
-        meant = OTHER_COMMANDS.get(command[1].lower())
-        here = "" if meant is None else f"here it is nlfilter-torch {meant}, and "
+        ours = OTHER_COMMANDS.get(command[1].lower())
+        here = "" if ours is None else f"here it is nlfilter-torch {ours}, and "
         return f"No such command '{command[1]}'; {here}nlfilter-torch --help lists all of them"
     if message.startswith("Got unexpected extra argument"):
         return message + _of_extra(arguments)

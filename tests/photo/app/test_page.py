@@ -85,7 +85,7 @@ def test_a_photograph_is_opened(opened: Page, photo: Path, scripts: list[str]) -
     assert not opened.picture("mask")
     assert opened.picture("piece-1") is None
     assert "closeup.open(150, 100, '/picture/" in "".join(scripts)
-    assert "page.watchConnection()" in scripts
+    assert "page.watchConnection(); page.takeDropped(" in "".join(scripts)
     assert scripts[-1] != "page.isUnsaved = true"
     editor._begin(photo, "")  # a browser that reconnects keeps its edit
     assert opened.works == []

@@ -4,6 +4,7 @@ import pytest
 from nicegui import Client, ui
 
 from nlfilter_torch.photo.app.step_list import StepList, listed
+from nlfilter_torch.photo.declared.development import Development
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.declared.steps import Step
 from tests.photo.app.page_controls import IN, Controls
@@ -44,6 +45,9 @@ def test_steps_that_were_used_are_listed(shown: Controls, steps: StepList) -> No
     steps.follow()
     assert boxes(shown) == {}
     assert "None yet. Move a slider, or paint." in shown.texts()
+    shown.recipe = Recipe((), Development(exposure=1.0))
+    steps.follow()
+    assert 'None yet, but what "Photo" does, which comes first.' in shown.texts()
     assert shown.replaced == []
     assert listed(Recipe((Step("defocus", (IN,)), IDLE.mixed(on=False)))) == ((0, "Defocus"), (1, "Abstract"))
 

@@ -24,3 +24,4 @@ def test_a_file_that_is_refused(client: Client, largest: int, reason: str, sente
     upload._refuse(reason, "a.png")
     assert errors == [sentence]
     assert "pickFiles()" in upload.choosing
+    assert upload.dropping.startswith("page.takeDropped(")

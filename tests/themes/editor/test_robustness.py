@@ -33,11 +33,19 @@ def test_errors_leave_when_something_succeeds(opened: Tab, folder: Path) -> None
     expect(error).not_to_be_visible(timeout=5000)  # before it would disappear by itself
 
 
-def test_a_stroke_before_a_photograph(tab: Tab) -> None:
-    tab.page.get_by_text("Open a photograph to begin").click()
-    expect(tab.page.get_by_text("open a photograph first; there is nothing to paint on")).to_be_visible()
-    tab.page.get_by_role("button", name="Save photo").click()
-    expect(tab.page.get_by_text("open a photograph first; there is nothing to save")).to_be_visible()
+def test_before_a_photograph_one_is_chosen_or_dropped(tab: Tab, folder: Path) -> None:
+    page = tab.page
+    page.get_by_role("button", name="Save photo").click()
+    expect(page.get_by_text("open a photograph first; there is nothing to save")).to_be_visible()
+    with page.expect_file_chooser():
+        page.get_by_role("button", name="Open a photograph to begin").click()
+    drop = """bytes => { const files = new DataTransfer();
+        files.items.add(new File([new Uint8Array(bytes)], "dropped.png", { type: "image/png" }));
+        const how = { dataTransfer: files, bubbles: true, cancelable: true };
+        return document.querySelector(".panel").dispatchEvent(new DragEvent("drop", how)); }"""
+    assert not page.evaluate(drop, list((folder / "cat.png").read_bytes()))  # the page is not left for it
+    expect(page.get_by_text("dropped.png")).to_be_visible()
+    tab.wait_until_ready()
 
 
 def test_a_slider_before_a_photograph(tab: Tab, folder: Path) -> None:

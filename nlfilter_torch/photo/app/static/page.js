@@ -9,6 +9,23 @@ class Page {
   /** Whether the edit has changed since a file was written; the server sets it. */
   isUnsaved = false;
 
+  #takeFiles = null;
+
+  /** Let a function take the first file that is dropped on the page, which the browser would leave the page for. */
+  takeDropped(take) {
+    if (!this.#takeFiles) {
+      window.addEventListener("dragstart", (event) => event.target.matches?.("img") && event.preventDefault());
+      window.addEventListener("dragover", (event) => event.preventDefault());
+      window.addEventListener("drop", (event) => {
+        event.preventDefault();
+        if (event.dataTransfer.files.length && !document.querySelector(".q-dialog")) {
+          this.#takeFiles([event.dataTransfer.files[0]]);
+        }
+      });
+    }
+    this.#takeFiles = take;
+  }
+
   /** Leave without a question once the editor has ended: the edit is kept in a file. */
   watchConnection() {
     window.socket.on("disconnect", () => {
