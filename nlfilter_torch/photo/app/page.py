@@ -336,6 +336,7 @@ class Editor:
             self._changed()
 
     def _reset(self) -> None:
+        self._proportions = Proportions()
         self.session.load(Recipe())
         self._changed()
 

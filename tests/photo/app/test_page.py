@@ -117,6 +117,27 @@ def test_the_frame_of_the_crop_ends_with_its_tab_and_its_photograph(opened: Page
     assert editor._canvas.pick is None
 
 
+def test_proportions_of_the_crop_and_looks_of_what_it_leaves(opened: Page, scripts: list[str]) -> None:
+    editor, before = opened.editor, (opened.editor._thumbnail("warm"), opened.picture("look-warm"))
+    editor._hold("1:1")
+    opened.finish()
+    assert editor._is_cropping
+    assert editor.session.size == (100, 100)
+    assert any("cropper.show(" in script and script.endswith(f", {100 / 150})") for script in scripts)
+    after = editor._thumbnail("warm"), opened.picture("look-warm")
+    assert [old != new for old, new in zip(before, after, strict=True)] == [True, True]
+    editor._hold("3:2")  # of the whole photograph, and not of the square
+    opened.finish()
+    assert editor.session.size == (100, 150)
+    editor._reset()
+    opened.finish()
+    assert editor._proportions.name == "Free"
+    scripts.clear()
+    editor._hold("Free")
+    opened.finish()
+    assert any(script.endswith(", null)") for script in scripts)
+
+
 def test_a_file_that_cannot_be_opened(page: Page, photo: Path) -> None:
     photo.write_text("dear diary")
     page.open(photo)
