@@ -87,6 +87,22 @@ def test_strokes_that_are_cropped_away_select_nothing(session: Session, tiled: b
     assert torch.equal(apply_recipe(recipe, cat()), wanted)
 
 
+def test_strokes_of_which_a_crop_leaves_hidden_pixels_select_nothing(tmp_path: Path) -> None:
+    alpha = torch.ones_like(cat()[:, :1])
+    alpha[..., 30:90] = 0
+    write_photograph(Photograph(cat(), alpha=alpha), tmp_path / "holed.png")
+    across = replace(BLUE, points=((0.3, 0.35), (0.7, 0.35)))
+    session = Session(tmp_path)
+    session.open(tmp_path / "holed.png")
+    session.load(Recipe((Step("recolor", (across,)),), Development(crop=(0.0, 0.0, 0.7, 1.0))))
+    assert (session.render() - session.developed.before).abs().max() > 0.1  # some pixels are left
+    session.load(replace(session.recipe, develop=Development(crop=(0.0, 0.0, 0.5, 1.0))))
+    assert torch.equal(session.render(), session.developed.before)
+    saved = read_photograph(session.save("out.png")).pixels
+    assert difference(saved[..., :30], session.developed.before[..., :30]) < 0.51
+    assert len(session.step_in_view("recolor").strokes) == 1  # it is still shown
+
+
 def test_a_moving_slider_is_followed_and_later_steps_stay(session: Session) -> None:
     session.load(Recipe((Step("tone", contrast=1.5),), Development(crop=(0.1, 0.0, 1.0, 1.0))))
     session.render()
