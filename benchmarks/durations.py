@@ -1,16 +1,20 @@
-"""How long the stages of edits take in tiles: ``python -m benchmarks.durations``, about ten minutes on a core.
+"""How long the stages of edits take in tiles: ``python -m benchmarks.durations``, about half an hour on a core.
 
 Prints the content of ``nlfilter_torch/photo/tiled/durations.json``, in seconds of the processor with one thread, of
 which the time left of an edit is estimated. Each edit runs on ``benchmarks.streaming``'s mosaic in two sizes up to the
-viewing size, and two larger ones; what a stage takes is linear in between. ``--quick`` takes small pictures, to see
-that everything runs.
+viewing size, and two larger ones; what a stage takes is linear in between. Each run is in a process of its own, like a
+command, which loads what it needs, and memory that it never used before. ``--quick`` takes small pictures, to see that
+everything runs.
 """
 
 import argparse
 import json
 import sys
 import time
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
+from multiprocessing import get_context
+from statistics import median
 
 import numpy as np
 import torch
@@ -20,7 +24,8 @@ from nlfilter_torch.photo import Step, Stroke
 from nlfilter_torch.photo.tiled.recipe import edit_rows
 from nlfilter_torch.photo.tiled.tiles import Passes
 
-SIZES = {"small": (0.5, 1.4), "large": (2.0, 5.0)}  # megapixels
+SIZES = {"small": (0.5, 1.4), "large": (2.0, 12.0)}  # megapixels
+SLOW = {"denoise": {"small": (0.5, 1.4), "large": (2.0, 4.0)}}  # of edits that take many seconds for each
 QUICK = {"small": (0.005, 0.006), "large": (0.007, 0.008)}
 Timed = tuple[str, float, float]
 HALF = 0.5  # a stage of which less is reported is one of a few large tiles, of which the report comes at the end
@@ -75,17 +80,19 @@ class Recorder:
 
 
 def stages_of(step: Step, megapixels: float, repeats: int) -> list[Timed]:
-    """The stages of a step; of several runs, the least time of each stage counts."""
-    runs = [stages_of_run(step, megapixels) for _ in range(repeats)]
-    least = []
+    """The stages of a step; of several runs, the median of the times of each stage counts."""
+    with ProcessPoolExecutor(1, get_context("spawn"), max_tasks_per_child=1) as processes:
+        runs = [processes.submit(stages_of_run, step, megapixels).result() for _ in range(repeats)]
+    usual = []
     for stages in zip(*runs, strict=True):
         names, seconds, rest = zip(*stages, strict=True)
-        least.append((names[0], min(seconds), min(rest)))
-    return least
+        usual.append((names[0], median(seconds), median(rest)))
+    return usual
 
 
 def stages_of_run(step: Step, megapixels: float) -> list[Timed]:
     """Names of the stages of a step, the seconds until their last reports and those after them."""
+    torch.set_num_threads(1)
     side, record = round((megapixels * 1e6) ** 0.5), Recorder()
     rows = np.concatenate(list(mosaic(side, side)))
     for _ in edit_rows(Passes("uint8", report=record), rows, [step], "mosaic"):
@@ -120,7 +127,6 @@ def merged(stages: list[Timed]) -> list[Timed]:
 
 def lines(step: Step, sizes: tuple[float, float], repeats: int) -> list[list[str | float]]:
     """The lines of the file for a step and two sizes."""
-    stages_of_run(step, sizes[0] / 4)  # what is read or compiled when it is first needed
     less, more = (stages_of(step, size, repeats) for size in sizes)
     if [name for name, *_ in less] != [name for name, *_ in more]:
         less, more = merged(less), merged(more)
@@ -138,12 +144,12 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="small pictures, to see that everything runs")
     parser.add_argument("--repeats", type=int, default=3)
     options = parser.parse_args()
-    torch.set_num_threads(1)
+    repeats = 1 if options.quick else options.repeats
     entries = []
     for name in options.steps or STEPS:
         kinds = []
-        for kind, sizes in (QUICK if options.quick else SIZES).items():
-            rows = ",\n".join(f"      {json.dumps(row)}" for row in lines(STEPS[name], sizes, options.repeats))
+        for kind, sizes in (QUICK if options.quick else SLOW.get(name, SIZES)).items():
+            rows = ",\n".join(f"      {json.dumps(row)}" for row in lines(STEPS[name], sizes, repeats))
             kinds.append(f'    "{kind}": [\n{rows}\n    ]')
         entries.append(f'  "{name}": {{\n' + ",\n".join(kinds) + "\n  }")
         print(name, file=sys.stderr, flush=True)

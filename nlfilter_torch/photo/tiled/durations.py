@@ -2,7 +2,8 @@
 
 ``durations.json`` has for each stage the seconds on a core until all of it is reported, those for each megapixel in
 addition, and both for what follows until the next stage; for pictures up to the viewing size, and for larger ones, that
-filters look at in that size. ``python -m benchmarks.durations`` measures them, with the defaults of ``MEASURED``.
+filters look at in that size. ``python -m benchmarks.durations`` measures them, with the defaults of ``MEASURED``, in
+processes that do nothing else, since memory that a process uses for the first time takes up to a second.
 """
 
 import json
@@ -19,7 +20,7 @@ from nlfilter_torch.photo.declared.shared_parameters import VIEWING_SIZE
 from nlfilter_torch.photo.declared.steps import Step, acting_steps
 
 USUAL = 5.0  # seconds
-WRITING = {".png": 0.25}  # seconds of writing a megapixel, by the suffix of the file
+WRITING = {".png": 0.21}  # seconds of writing a megapixel of photographs, by the suffix of the file
 QUICK_WRITING = 0.02  # of other files
 STRAIGHTENING = 0.1  # seconds of straightening a megapixel
 #: Parameters that change how long an edit takes; it is known for their defaults only.
