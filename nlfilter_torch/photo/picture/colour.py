@@ -42,6 +42,7 @@ def edit_luminance(image: Tensor, edit: Callable[[Tensor], Tensor]) -> Tensor:
 
 MAX_COLOURS = 16
 SAME_COLOUR = 0.05  # chroma difference in units of RGB below which strokes have the same colour
+PIECE = 1 << 20  # pixels that are summed in float64 at once
 MOST_COMPARED = 2048  # colours of strokes that are compared with each other; more are painted in photographs only
 
 
@@ -104,8 +105,10 @@ def region_means(image: Tensor, regions: Tensor) -> Tensor:
 
     In float32, sums over megapixels would differ in the fifth digit from those over the painted pixels alone.
     """
-    weights = regions.flatten(2).double()
-    return (weights @ image.flatten(2).double().mT / weights.sum(2, keepdim=True)).to(image)
+    pieces = zip(regions.flatten(2).split(PIECE, 2), image.flatten(2).split(PIECE, 2), strict=True)
+    sums = [(w.double() @ part.double().mT, w.sum(2, keepdim=True, dtype=torch.float64)) for w, part in pieces]
+    products, weights = (torch.stack(parts).sum(0) for parts in zip(*sums, strict=True))
+    return (products / weights).to(image)
 
 
 def _label(chroma: Tensor, painted: Tensor) -> Tensor:
@@ -114,10 +117,16 @@ def _label(chroma: Tensor, painted: Tensor) -> Tensor:
     The groups depend on the painted colours alone, not on their places, so that they turn with the picture: each
     leader is the colour around which most pixels are left, and every pixel belongs to the nearest leader.
     """
-    paint = chroma[:, painted].double()  # (3, n)
-    cells, cell = (paint / (SAME_COLOUR / 2)).round().unique(dim=1, return_inverse=True)
-    counts = cell.bincount(minlength=cells.shape[1])
-    means = torch.zeros_like(cells).index_add(1, cell, paint) / counts
+    paint = chroma[:, painted]  # (3, n)
+    cell = torch.zeros_like(paint[0], dtype=torch.long)
+    for channel in paint:  # one after the other takes a fraction of the memory
+        values, number = (channel.double() / (SAME_COLOUR / 2)).round_().unique(return_inverse=True)
+        cell = (cell * len(values) + number).unique(return_inverse=True)[1]
+    counts = cell.bincount()
+    sums = counts.new_zeros(3, len(counts), dtype=torch.float64)
+    for numbers, part in zip(cell.split(PIECE), paint.split(PIECE, dim=1), strict=True):
+        sums.index_add_(1, numbers, part.double())
+    means = sums / counts
     common = counts.argsort(descending=True, stable=True)[:MOST_COMPARED]
     leaders = means[:, common[_densest(means[:, common], counts[common])]]
     nearest = (means.unsqueeze(2) - leaders.unsqueeze(1)).norm(dim=0).argmin(1)

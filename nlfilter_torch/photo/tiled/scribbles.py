@@ -15,6 +15,7 @@ from nlfilter_torch.photo.picture.pixels import Pixels, corner
 from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles
 from nlfilter_torch.photo.tiled.pictures import LazyRows, Picture, RowSource, stored_as, transparency
 
+READ_FLOATS = 32  # floats per scribbled pixel in memory while scribbles are read and grouped by colour
 ReadRows = Callable[[int, int], Tensor]  # (start, stop) to these rows
 
 
@@ -115,7 +116,7 @@ def read_scribbles(
             )
         chosen = plane.nonzero().squeeze(1)
         count += len(chosen)
-        check_scribble_memory(picture, count, 0, memory)
+        check_scribble_memory(picture, count, READ_FLOATS, memory)
         if len(chosen):
             places.append(chosen + start * width)
             values.append(plane[chosen].to(picture.dtype))
@@ -170,9 +171,9 @@ def floats_per_scribbled_pixel(num_features: int) -> int:
     return 2 * num_features + 40
 
 
-def check_scribble_memory(picture: Picture, count: int, num_features: int, memory: int) -> None:
-    """Raise MemoryError if ``count`` scribbled pixels with their features take more than ``memory`` bytes."""
-    needed = count * floats_per_scribbled_pixel(num_features) * picture.dtype.itemsize
+def check_scribble_memory(picture: Picture, count: int, floats: int, memory: int) -> None:
+    """Raise MemoryError if ``count`` scribbled pixels of so many floats take more than ``memory`` bytes."""
+    needed = count * floats * picture.dtype.itemsize
     if needed > memory:
         raise MemoryError(
             f"the strokes on {picture.name} cover at least {count} pixels and need {needed / 1e6:.0f} MB of memory, "

@@ -217,7 +217,8 @@ class Tiled:
         Raises:
             MemoryError: if not even one row fits, or the samples do not.
         """
-        check_scribble_memory(self.picture, self.scribbled_pixels, num_features, self.passes.memory)
+        floats = floats_per_scribbled_pixel(num_features)
+        check_scribble_memory(self.picture, self.scribbled_pixels, floats, self.passes.memory)
         floats, kept = self.tile_floats + num_features, self.cached_floats + self.stored_floats(num_features)
         return rows_that_fit(self.picture, self.passes, floats, num_features, num_landmarks, kept)
 

@@ -73,6 +73,9 @@ def test_strokes_of_more_than_sixteen_colours_join_the_nearest_group() -> None:
     weights = torch.ones(1, 1, 1, 20)
     weights[..., 19] = 0
     regions, means, valid = group_colours(chroma, weights)
+    double = chroma.double()
+    assert torch.equal(group_colours(double, weights.double())[0], regions.double())
+    assert torch.equal(double, chroma.double())  # it is only read
     assert regions.shape == (1, 16, 1, 20)
     assert valid.all()
     assert torch.equal(regions.sum(1), weights[:, 0])  # each painted pixel is in one of them
