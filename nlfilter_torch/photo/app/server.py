@@ -5,6 +5,7 @@ headless Chromium its change event took more than three seconds after a stroke. 
 of the picture, keeps the moves of a slider in order, and includes every script and font that it uses.
 """
 
+import gc
 import socket
 import sys
 import threading
@@ -21,6 +22,8 @@ from nlfilter_torch.photo.app.sidecar import state_folder
 
 TITLE = "nlfilter-torch"
 STARTING, PAUSE = 30.0, 0.05  # seconds for the server to accept connections, and between two attempts
+#: Objects, and multiples, after which Python looks for circles among the youngest, the younger and all: its defaults.
+COLLECTED = (700, 10, 10)
 
 
 class Pages(Protocol):
@@ -64,6 +67,7 @@ def serve(pages: Pages, *, host: str, port: int, open_page: bool) -> None:
     app.add_static_files(STATIC_ADDRESS, STATIC, max_cache_age=0)  # another version must not find old files
     app.get("/picture/{token}/{kind}")(Pictures(pages).answer)
     ui.page("/", title=TITLE, language="en-US")(pages.build)
+    free_closed_pages()
     app.on_startup(threading.Thread(target=_tell_when_ready, args=(host, port, token), daemon=True).start)
     ui.run(
         host=host,
@@ -78,6 +82,15 @@ def serve(pages: Pages, *, host: str, port: int, open_page: bool) -> None:
         favicon="\U0001f39a\ufe0f",
         uvicorn_logging_level="warning",
     )
+
+
+def free_closed_pages() -> None:
+    """Look as often as Python does by itself, not as seldom as commands do, for objects that refer to each other.
+
+    Pages that were closed are such objects, and hold their photographs. What is loaded by now stays, and is left alone.
+    """
+    gc.freeze()
+    gc.set_threshold(*COLLECTED)
 
 
 def _tell_when_ready(host: str, port: int, token: str) -> None:

@@ -1,7 +1,9 @@
 """The editor's server: its addresses, and what it answers."""
 
+import gc
 import socket
 import sys
+import weakref
 from pathlib import Path
 
 import pytest
@@ -63,3 +65,25 @@ def test_app_says_what_it_lacks(
     monkeypatch.setitem(sys.modules, "nicegui", None)
     assert main(["app", "--out", str(tmp_path), "--no-open"]) == 2
     assert "the editor needs nicegui, which is not installed" in capsys.readouterr().err
+
+
+class Page:
+    """A page that refers to itself."""
+
+    def __init__(self) -> None:
+        self.itself = self
+
+
+def test_closed_pages_are_freed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Commands look for circles seldom; the editor runs for days."""
+    usual = gc.get_threshold()
+    monkeypatch.setattr(gc, "freeze", gc.collect)  # for the other tests
+    gc.set_threshold(20_000, 20, 100)
+    try:
+        server.free_closed_pages()
+        closed = weakref.ref(Page())
+        kept = [[number] for number in range(2000)]
+        assert closed() is None
+        assert len(kept) == 2000
+    finally:
+        gc.set_threshold(*usual)
