@@ -79,7 +79,7 @@ def recoloured(composite: Composite, colour: Tensor, under: Tensor) -> Tensor:
     chroma = split_luminance(colour.expand_as(composite.image))[1]
     brightness, old = (((part * under).sum((2, 3)) / under.sum())[:, None] for part in split_luminance(composite.image))
     new = with_room(chroma[:, None, :, 0, 0], brightness)
-    change = Recoloring(new, old, torch.ones(1, 1, dtype=torch.bool))
+    change = Recoloring(new, old, torch.ones(1, 1, dtype=torch.bool), brightness)
     within = torch.ones_like(composite.alpha)
     thing = change(composite.object, within, [colours_beside(split_luminance(composite.object)[1], within)])
     mixed = composite.alpha * thing + (1 - composite.alpha) * composite.background

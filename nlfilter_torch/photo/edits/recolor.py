@@ -1,6 +1,6 @@
 """Recolouring of objects by strokes of colour. Paper: Sec. V-A, Figs. 14, 15."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import ClassVar
@@ -26,6 +26,7 @@ from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles
 from nlfilter_torch.photo.picture.source import Fitted, Pixels, Source
 from nlfilter_torch.photo.selections.border_colours import Sides, colours_beside, refine_mask
 from nlfilter_torch.photo.selections.connected import Extent
+from nlfilter_torch.photo.selections.hues import shade
 from nlfilter_torch.photo.selections.mask import ObjectEdit, Regions, background_of, fit_regions
 from nlfilter_torch.photo.selections.painted_colours import Painted
 
@@ -58,7 +59,9 @@ def recolor(
 ) -> Tensor:
     """Recolour the objects that strokes are painted on, and similar pixels around them.
 
-    Paper: Sec. V-A, with :func:`region_mask` in place of k-means, for any number of colours.
+    Paper: Sec. V-A, with :func:`region_mask` in place of k-means, for any number of colours. Where hues
+    and saturations around a pixel are not among those under the stroke, it stays unchanged even if its brightness and
+    texture are similar; dark shade of the object's hue that the object encloses takes the new colour, too.
 
     Args:
         image: (B, 3, H, W), RGB in [0, 1].
@@ -140,23 +143,21 @@ class Recolor(ObjectEdit):
             return Fitted(whole_image)
         matches = acts(torch.as_tensor(self.brightness), 0.0)
         shown, valid, groups = painted.grouped(matches)
-        brightness, old = groups.means(source.size)
-        brightening = None
-        if matches:
-            brightening = Brightening.of(brightness, shown, self.brightness)
-            brightness = brightening.new
+        under, old = groups.means(source.size)
+        brightening = Brightening.of(under, shown, self.brightness) if matches else None
+        brightness = under if brightening is None else brightening.new
         colours = with_room(split_colours(shown)[1] if matches else shown, brightness)
         by_hand = groups.by_hand(source, drawn.masks.get("removed"))
         kept = list[Scribbles]()
         if painted.strokes is not None:
             kept = background_of(source, drawn.masks.get("keep"), painted.strokes, "keep")
         objects = fit_regions(source, groups.inside, kept, self.selection_in(source.size), by_hand)
-        change = Recoloring(colours, old, valid, brightening)
-        reduced = change.compared(objects.reduced)
-        beside = []
-        for share in change.shares(objects.reduced_masks()).split(1, dim=1):
-            beside.append(colours_beside(reduced, refine_mask(reduced, share)).planes)
-        return Fitted(RecoloredPixels(change, objects, beside))
+        change = Recoloring(colours, old, valid, under, brightening)
+        reduced, masks = change.compared(objects.reduced), objects.reduced_masks()
+        shares = [refine_mask(reduced, share) for share in change.shares(masks).split(1, dim=1)]
+        beside = [colours_beside(reduced, share).planes for share in shares]
+        by_hue = groups.corrections(source.size, objects.reduced, masks, shares, kept)
+        return Fitted(RecoloredPixels(change, objects, beside, by_hue))
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,17 +168,24 @@ class RecoloredPixels:
         change: of the colours, given masks.
         objects: the masks.
         beside: for each object, what :func:`colours_beside` found, in the reduced picture.
+        by_hue: for each object, :func:`corrections`, likewise; none if there are no strokes on objects.
     """
 
     change: "Recoloring"
     objects: Regions
     beside: list[Tensor]
+    by_hue: list[Tensor]
 
     def __call__(self, pixels: Pixels) -> Tensor:
         """Recolour pixels."""
         sides = [Sides.of(self.objects.rows(planes, pixels)) for planes in self.beside]
         by_hand = None if self.objects.by_hand is None else partial(self.objects.by_hand.over, pixels=pixels)
-        return self.change(pixels.image, self.objects.computed(pixels), sides, by_hand)
+        by_hue = []
+        for planes, scribbles in zip(self.by_hue, self.objects.scribbles, strict=False):
+            factor, enclosed = self.objects.rows(planes, pixels).split(1, dim=1)
+            front, back = scribbles.planes(pixels).split(1, dim=1)
+            by_hue.append((torch.lerp(factor, torch.ones_like(factor), front), enclosed * (1 - back)))
+        return self.change(pixels.image, self.objects.computed(pixels), sides, by_hand, by_hue)
 
 
 def with_room(chroma: Tensor, brightness: Tensor) -> Tensor:
@@ -237,11 +245,6 @@ class Brightening:
         lighter = torch.where(gain > 1, towards_white, torch.lerp(along, new + left * place, highlight))
         return torch.where(beyond > 0, lighter, along).clamp(0.0, 1.0)
 
-    def shade(self, number: int, luminance: Tensor) -> Tensor:
-        """Relative saturation (B, 1, H, W) that a grey object takes: of pixels of the luminance under the stroke 1."""
-        ratio = luminance / self.old[:, number, :, None, None].clamp(min=EPSILON)
-        return torch.lerp(torch.ones_like(ratio), ratio, self.amount)
-
 
 @dataclass(frozen=True, eq=False)
 class Recoloring:
@@ -254,12 +257,14 @@ class Recoloring:
         colours: chroma of the strokes, (B, K, 3).
         old: mean chroma of the image under the strokes, (B, K, 3).
         valid: which of the K colours each image has, (B, K).
+        under: mean luminance of the image under the strokes, (B, K, 1).
         brightening: change of the objects' luminance; None keeps it.
     """
 
     colours: Tensor
     old: Tensor
     valid: Tensor
+    under: Tensor
     brightening: Brightening | None = None
 
     def compared(self, image: Tensor) -> Tensor:
@@ -273,15 +278,20 @@ class Recoloring:
         return shares if shares.shape[1] == 1 else shares / shares.sum(1, keepdim=True).clamp(min=1.0)
 
     def __call__(
-        self, pixels: Tensor, masks: Tensor, beside: list[Sides], by_hand: Callable[[Tensor], Tensor] | None = None
+        self,
+        pixels: Tensor,
+        masks: Tensor,
+        beside: list[Sides],
+        by_hand: Callable[[Tensor], Tensor] | None = None,
+        by_hue: Sequence[tuple[Tensor, Tensor]] = (),
     ) -> Tensor:
         """Recolour pixels (B, 3, H, W), given masks (B, K, H, W) and the colours on both sides of their borders.
 
-        ``by_hand`` paints on the shares (B, K, H, W) of the colours.
+        ``by_hand`` paints on the shares (B, K, H, W) of the colours; ``by_hue`` corrects each, see :meth:`corrected`.
         """
         luminance, chroma = split_luminance(pixels)
         compared = chroma if self.brightening is None else pixels  # :meth:`compared`
-        shares = self.refined(compared, masks, beside)
+        shares = self.corrected(luminance, chroma, self.refined(compared, masks, beside), by_hue)
         if by_hand is not None:
             shares = by_hand(shares) * self.valid[..., None, None]
         brightness, changed, total = luminance, chroma, torch.zeros_like(luminance)
@@ -289,12 +299,12 @@ class Recoloring:
             sides, share = beside[k], shares[:, k : k + 1]
             # Colour of the object's part of a mixed pixel; inside the object, that of the pixel.
             object_colour = torch.addcmul(compared, 1 - share, sides.across)
-            object_luminance, object_chroma = None, object_colour
+            object_luminance, object_chroma = luminance, object_colour
             if self.brightening is not None:
                 object_luminance, object_chroma = split_luminance(object_colour.clamp(0.0, 1.0))
             relative = self.relative(k, object_chroma, object_luminance)
             factor = share * relative.clamp(0.0, 1.5)
-            if self.brightening is not None and object_luminance is not None:
+            if self.brightening is not None:
                 new = self.brightening(k, object_luminance, relative)
                 brightness = torch.addcmul(brightness, share, new - object_luminance)
                 factor = factor * in_gamut(new, relative.clamp(0.0, 1.5) * self.colours[:, k, :, None, None])
@@ -318,19 +328,38 @@ class Recoloring:
             refined.append(sides.refine(compared, share))
         return torch.cat(refined, dim=1)
 
-    def relative(self, number: int, chroma: Tensor, luminance: Tensor | None) -> Tensor:
+    def corrected(
+        self, luminance: Tensor, chroma: Tensor, shares: Tensor, by_hue: Sequence[tuple[Tensor, Tensor]]
+    ) -> Tensor:
+        """Shares (B, K, H, W), each times a factor (B, 1, H, W), and of shade as much as they enclose, (B, 1, H, W)."""
+        if not by_hue:
+            return shares
+        shares = shares * torch.cat([factor for factor, _ in by_hue], dim=1)
+        shades = torch.cat(
+            [
+                enclosed * shade(luminance, chroma, self.under[:, k, :, None, None], self.old[:, k, :, None, None])
+                for k, (_, enclosed) in enumerate(by_hue)
+            ],
+            dim=1,
+        )
+        free = (1 - shares.sum(1, keepdim=True)).clamp(min=0.0)
+        return shares + free * self.valid[..., None, None] * shades / shades.sum(1, keepdim=True).clamp(min=1.0)
+
+    def relative(self, number: int, chroma: Tensor, luminance: Tensor) -> Tensor:
         """Saturation (B, 1, H, W) of an object's pixels relative to that under its stroke, which the new colour takes.
 
-        So a white highlight stays white. For a grey object it is 1, or follows the luminance if that is given.
+        So a white highlight stays white. For a grey object it follows the luminance: shade takes less of the colour.
         """
         old = squarable(self.old[:, number])
         squared_saturation = old.square().sum(1)[:, None, None, None]
         limited_chroma = squarable(chroma)
         product = (squared_saturation * dot(limited_chroma, limited_chroma)).clamp(min=EPSILON).sqrt()
+        lit = luminance / self.under[:, number, :, None, None].clamp(min=EPSILON)
+        shaded = lit.clamp(max=1.0)
+        if self.brightening is not None:  # then light parts take more of it, too
+            shaded = torch.lerp(shaded, lit, self.brightening.amount)
         grey = GREY_CHROMA**2
-        if self.brightening is None or luminance is None:
-            return (product + grey) / (squared_saturation + grey)
-        return (product + grey * self.brightening.shade(number, luminance)) / (squared_saturation + grey)
+        return (product + grey * shaded) / (squared_saturation + grey)
 
 
 def in_gamut(luminance: Tensor, chroma: Tensor) -> Tensor:

@@ -10,6 +10,8 @@ from nlfilter_torch.photo.picture.drawn import Drawn, M
 from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles
 from nlfilter_torch.photo.picture.source import Source
 from nlfilter_torch.photo.selections.by_hand import ByHand, check_drawn, opaque
+from nlfilter_torch.photo.selections.hues import HueSamples, corrections
+from nlfilter_torch.photo.selections.scribbled_colours import outwards
 from nlfilter_torch.photo.selections.stray import without_strays
 
 
@@ -98,6 +100,27 @@ class Groups:
         counted, image = torch.cat(weights, dim=2).unsqueeze(2), torch.cat(images, dim=2).unsqueeze(2)
         luminance, chroma = (region_means(part, counted) for part in split_luminance(image))
         return luminance, chroma
+
+    def corrections(
+        self, size: tuple[int, int], image: Tensor, masks: Tensor, shares: list[Tensor], kept: list[Scribbles]
+    ) -> list[Tensor]:
+        """Corrections of each share (B, 1, h, w), see :func:`corrections`; none if there are no strokes on objects.
+
+        Args:
+            size: (H, W) of the picture.
+            image: the reduced picture, (B, 3, h, w).
+            masks: of the objects, (B, K, h, w).
+            shares: of each colour.
+            kept: strokes on what stays as it is, or none.
+        """
+        if self.strokes is None:
+            return []
+        colours, weights = outwards(without_strays(self.strokes, size), size)
+        opposed = outwards(kept[0], size) if kept else None
+        samples = [HueSamples.of(colours, part) for part in weights.split(1, dim=1)]
+        return [
+            corrections(image, *parts, opposed) for parts in zip(masks.split(1, dim=1), shares, samples, strict=True)
+        ]
 
     def by_hand(self, source: Source[M], removed: M | None) -> ByHand | None:
         """What is painted on the mask of each colour."""

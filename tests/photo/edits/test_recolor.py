@@ -158,7 +158,7 @@ def changed(image: torch.Tensor, *stroke: float, brightness: float = 1.0) -> tor
     (before, chroma), whole = split_colours(old), torch.ones_like(image[:, :1])
     brightening = Brightening.of(before, new, brightness)
     colours = with_room(split_colours(new)[1], brightening.new)
-    change = Recoloring(colours, chroma, torch.ones(1, 1, dtype=torch.bool), brightening)
+    change = Recoloring(colours, chroma, torch.ones(1, 1, dtype=torch.bool), before, brightening)
     return change(image, whole, [colours_beside(image, whole)])
 
 

@@ -1,0 +1,96 @@
+"""Corrections of masks by hue and saturation."""
+
+import torch
+
+from nlfilter_torch.photo.picture.colour import split_luminance
+from nlfilter_torch.photo.selections.hues import HueSamples, corrections, enclosed, relative_chroma, shade, trusted
+
+RED, WOOD, GREY = (0.6, 0.1, 0.1), (0.5, 0.3, 0.15), (0.4, 0.4, 0.4)
+
+
+def colour(*channels: float) -> torch.Tensor:
+    return torch.tensor(channels, dtype=torch.float64).view(1, 3, 1)
+
+
+def filled(*channels: float, size: tuple[int, int] = (60, 80)) -> torch.Tensor:
+    return colour(*channels).unsqueeze(3).expand(1, 3, *size)
+
+
+def of_red() -> HueSamples:
+    shaded = torch.linspace(0.5, 1.2, 40, dtype=torch.float64)
+    return HueSamples.of(colour(*RED) * shaded, torch.ones(1, 1, 40, dtype=torch.float64))
+
+
+def test_light_and_shade_of_a_colour_are_nearly_the_same() -> None:
+    light, dark = relative_chroma(colour(*RED)), relative_chroma(0.3 * colour(*RED))
+    assert (light - dark).abs().max() < 0.06 < (light - relative_chroma(colour(*WOOD))).abs().max()
+    assert relative_chroma(colour(*GREY)).abs().max() < 1e-6
+
+
+def test_likeness_is_of_hue_and_saturation() -> None:
+    samples = of_red()
+    assert samples.likeness(0.6 * filled(*RED)).min() == 1
+    assert max(samples.likeness(filled(*other)).max() for other in (WOOD, GREY, RED[::-1])) < 0.15
+
+
+def test_doubtful_areas_of_another_hue_do_not_count() -> None:
+    alike = torch.ones(1, 1, 60, 80)
+    alike[..., 40:] = 0.5
+    mask = torch.full_like(alike, 0.4)
+    factor = trusted(mask, alike)
+    assert factor[..., :30].min() == 1
+    assert factor[..., 50:].max() < 0.2
+    assert trusted(torch.ones_like(mask), alike).min() == 1
+    assert trusted(torch.ones_like(mask), 0 * alike).max() == 0
+
+
+def test_a_highlight_belongs_to_the_paint_around_it() -> None:
+    image = filled(*RED).clone()
+    image[..., 30, 38:42] = 1.0
+    mask = torch.ones(1, 1, 60, 80, dtype=torch.float64)
+    assert corrections(image, mask, mask, of_red(), None)[:, 0].min() == 1
+
+
+def test_gaps_up_to_a_width_are_enclosed_and_none_at_the_border_of_the_picture() -> None:
+    share = torch.ones(1, 1, 200, 240)
+    share[..., 100:104], share[..., 150:170], share[..., :2] = 0, 0, 0
+    closed = enclosed(share)
+    assert closed.shape == share.shape
+    assert closed[..., 1:-1, 90:140].min() == 1
+    assert closed[..., 150:170].max() == closed[..., :2].max() == 0
+    assert closed[..., 0, :].max() == closed[..., 149].max() == 0  # nor along borders of the share
+
+
+def test_scribbles_to_keep_are_not_enclosed() -> None:
+    image, share = filled(*RED, size=(200, 240)).clone(), torch.ones(1, 1, 200, 240, dtype=torch.float64)
+    image[..., 100:104] *= 0.3
+    share[..., 100:104] = 0
+    kept = (0.3 * colour(*RED), torch.ones(1, 1, 1, dtype=torch.float64))
+    assert corrections(image, share, share, of_red(), None)[:, 1, 1:-1, 100:104].min() == 1
+    assert corrections(image, share, share, of_red(), kept)[:, 1, :, 100:104].max() == 0
+
+
+def test_shade_is_darker_of_a_similar_hue_and_no_less_saturated() -> None:
+    luminance, chroma = (part.view(1, -1, 1, 1) for part in split_luminance(filled(*RED)[..., :1, :1]))
+
+    def of(*channels: float) -> float:
+        return float(shade(*split_luminance(filled(*channels)[..., :1, :1]), luminance, chroma))
+
+    assert of(0.2, 0.03, 0.02) == 1
+    assert of(0.15, 0.02, 0.05) > 0.5
+    assert of(*RED) == of(0.1, 0.1, 0.1) == of(0.02, 0.05, 0.2) == of(0.15, 0.1, 0.02) == 0
+
+
+def test_corrections_are_differentiable() -> None:
+    generator = torch.Generator().manual_seed(0)
+    image, mask, share, colours = (
+        torch.rand(1, channels, 12, 9, generator=generator, dtype=torch.float64).requires_grad_()
+        for channels in (3, 1, 1, 3)
+    )
+
+    def corrected(*inputs: torch.Tensor) -> torch.Tensor:
+        scribbled = inputs[3].flatten(2)
+        samples = HueSamples.of(scribbled, torch.ones_like(scribbled[:, :1]))
+        return corrections(*inputs[:3], samples, (scribbled[..., :5], torch.ones_like(scribbled[:, :1, :5])))
+
+    assert torch.autograd.gradcheck(corrected, (image, mask, share, colours), fast_mode=True)
