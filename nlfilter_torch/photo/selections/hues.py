@@ -26,10 +26,8 @@ BANDWIDTH, PER_SATURATION = 0.06, 0.08  # of this comparison: for a grey object,
 SIMILAR_SHARE = 0.3  # share of the scribbled pixels that a pixel has to resemble
 AROUND_SIGMA, AROUND_GRID = 0.02, 60  # surroundings: standard deviation, share of the short side; rows or columns
 LEAST_SIGMA = 3.0  # the least of it, in pixels: wider than a soft border, whose pixels are mixtures
-UNLIKE, ALIKE = (
-    0.02,
-    0.2,
-)  # mean likeness up to which what a mask of 1 selects does not count, and from which on it does
+# Mean likeness of the surroundings up to which what a mask of 1 selects does not count, and from which on it does.
+UNLIKE, ALIKE = 0.02, 0.2
 DOUBT = 0.9  # by how much these grow as the mask approaches 0
 WIDEST = 0.03  # width of shade that is enclosed, as a share of the short side
 # What is shade: luminance and saturation relative to those under the stroke, and cosine of the angle between hues. The
