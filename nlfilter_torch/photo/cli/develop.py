@@ -41,8 +41,7 @@ def develop(
     from nlfilter_torch.photo.cli.recipe_job import RecipeJob
 
     notes = [f"no option changes anything: {target} is written without an edit"]
-    is_idle = recipe.develop.is_idle and sides is None
-    job = RecipeJob([recipe], [], source, target, False, notes if is_idle else [], aspect=sides)
+    job = RecipeJob([recipe], [], source, target, False, notes if recipe.develop.is_idle else [], aspect=sides)
     editing.edit_file(
         job, source, target, depth, memory=memory, workers=workers, cluster=cluster, quality=quality, force=force
     )

@@ -341,11 +341,11 @@ def edit_file(
         stored = kind or own_depth
         size = picture.shape[:2]
         edit = edit.at_size(size)
-        note_developing(edit, source, size, picture.shape[2])
         framed = edit.develop.frame(size).size
         part = picture.of_part(framed)
         like = part.in_colour() if edit.coloured else part
         check_place(Path(target), stored, like, allowed)
+        note_developing(edit, source, size, picture.shape[2])
         processes = processes_for(workers, cluster, stack)
         report = stack.enter_context(stages(written(edit.stages(size), framed, Path(target))))
         job = Job(picture, stored, allowed - picture.cached, allowed_memory(memory, TILED), report, stack, processes)

@@ -107,7 +107,6 @@ def fit(
     results = [preset.with_stem(f"{preset.stem}-{i + 1}") for i in range(len(mask))] if mask else [preset]
     _check_results(results, preview, left, photographs=[*chain(*paths)], mask=[*chain(*regions)])
     tables.check(photographs=[*chain(*paths)], mask=[*chain(*regions)])
-    _note_left_out(Path(before), Path(after), paths)
     alone = len(paths) == 1
     judged = (alone and not mask) or preview is not None or left is not None
     with steps(len(paths) + 1) as begin:
@@ -123,6 +122,7 @@ def fit(
             with open_beside(path) as stream:
                 stream.write(change.to_json().encode())
         tables.write(looks)
+    _note_left_out(Path(before), Path(after), paths)
     whole = judgement if alone and not mask else None
     _report_all(looks, own, results, whole, alone=alone)
     if whole is not None and pairs.first is not None:

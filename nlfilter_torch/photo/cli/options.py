@@ -24,7 +24,7 @@ FileDepth = Literal["8", "16", "float"]  # what a channel of the output file hol
 DEPTHS: dict[FileDepth, "Depth"] = {"8": "uint8", "16": "uint16", "float": "float32"}
 
 
-SHARES = (0.01, 100_000.0)  # numbers of the proportions of a crop
+SIDES = (0.01, 100_000.0)  # range of the two numbers in the proportions of a crop
 NOTE = "nlfilter-torch: note: "  # begins every note on standard error
 
 
@@ -43,9 +43,10 @@ def parse_aspect(text: str) -> float:
         wide, high = (float(part) for part in text.split(":"))
     except ValueError:
         wide = high = 0.0
-    if not (SHARES[0] <= wide <= SHARES[1] and SHARES[0] <= high <= SHARES[1]):
+    if not (SIDES[0] <= wide <= SIDES[1] and SIDES[0] <= high <= SIDES[1]):
         raise ValueError(
-            f"--aspect must be a width and a height from {SHARES[0]:g} to {SHARES[1]:g}, such as 3:2, got {text!r}"
+            f"--aspect must be a width and a height from {SIDES[0]:g} to {SIDES[1]:g}, such as 3:2, got {text!r}; "
+            "correct it"
         )
     return wide / high
 

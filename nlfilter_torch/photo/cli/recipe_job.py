@@ -1,7 +1,7 @@
 """Recipes that are applied to one photograph, each in a region of its own, in memory or in tiles."""
 
 from collections.abc import Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import chain
@@ -17,6 +17,7 @@ from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.edits.applying import apply_recipe, edit_of, left_by_crop
 from nlfilter_torch.photo.io.photographs import Photograph
+from nlfilter_torch.photo.io.rows import StoredPicture
 from nlfilter_torch.photo.picture.changes import blend_edited
 from nlfilter_torch.photo.picture.drawn import M, Painter
 from nlfilter_torch.photo.picture.edit import Rows
@@ -25,11 +26,11 @@ from nlfilter_torch.photo.picture.painting import TensorPainter
 from nlfilter_torch.photo.picture.source import Source
 from nlfilter_torch.photo.tiled.developed import developed_rows
 from nlfilter_torch.photo.tiled.durations import expected_stages, straightening
-from nlfilter_torch.photo.tiled.pictures import Picture, RowSource
+from nlfilter_torch.photo.tiled.pictures import Picture
 from nlfilter_torch.photo.tiled.recipe import edit_regions, edit_tiling
 from nlfilter_torch.photo.tiled.scribbles import RowPainter
 from nlfilter_torch.photo.tiled.source import Tiled
-from nlfilter_torch.photo.tiled.tiles import Passes, Tiling
+from nlfilter_torch.photo.tiled.tiles import Tiling
 
 
 @dataclass(frozen=True)
@@ -44,7 +45,8 @@ class RecipeJob:
         full: whether statistics of tiles are of all pixels.
         aspect: width by height of the crop, which is trimmed to it, or None.
         cropped: how the photograph has been straightened and cropped already, if it has been.
-        notes: what is to be said about the options, once the photograph has been read.
+        notes: what is to be said about the options, once the photograph has been read; with an aspect, only if
+            nothing is trimmed or developed.
     """
 
     recipes: Sequence[Recipe]
@@ -77,7 +79,7 @@ class RecipeJob:
             return self
         crop = self.develop.frame(size).trimmed(self.aspect).edges
         recipes = [replace(recipe, develop=replace(recipe.develop, crop=crop)) for recipe in self.recipes]
-        return replace(self, recipes=recipes, aspect=None)
+        return replace(self, recipes=recipes, aspect=None, notes=self.notes if recipes[0].develop.is_idle else ())
 
     def cropped_away(self, size: tuple[int, int]) -> list[tuple[int, Step]]:
         """The steps, with their numbers, whose objects in a photograph (H, W) are all outside the crop."""
@@ -90,14 +92,13 @@ class RecipeJob:
 
     def edited(self, photograph: Photograph) -> Tensor:
         """The edited pixels of a developed photograph in memory, (1, C, H, W)."""
+        masks = editing.read_masks(self.masks, self.source, photograph.size) if self.masks else None
         self._tell(rows_of(photograph, self.source))
         weights, recipes = photograph.weights, self.recipes
         if weights is not None:
             recipes = self._seen(InMemory(photograph.pixels, weights=weights), TensorPainter())
         pixels = [apply_recipe(recipe, photograph.pixels, weights=weights) for recipe in recipes]
-        if not self.masks:
-            return pixels[0]
-        return blend_edited(photograph.pixels, pixels, editing.read_masks(self.masks, self.source, photograph.size))
+        return pixels[0] if masks is None else blend_edited(photograph.pixels, pixels, masks)
 
     def stages(self, size: tuple[int, int]) -> list[Stage]:
         """The stages in tiles of a photograph that is (H, W) before it is developed, if they are known."""
@@ -109,11 +110,13 @@ class RecipeJob:
     def tiling(self, job: Job) -> Iterator[Tiling]:
         """The edited rows of a photograph that does not fit in memory."""
         passes, picture = job.passes(self.full, Path(self.target).parent), job.picture
+        masks = self._masks(job)
         with developed_rows(self.develop, passes, picture.marked, self.source, picture.nodata) as source:
             read = Picture(source, self.source)
             self._tell(Rows(self.source, read.size, read.colours, partial(pixels_of, read)))
-            if self.masks:
-                whole = self._in_regions(passes, source, job)
+            if masks:
+                edits = [recipe.steps for recipe in self.recipes]
+                whole = edit_regions(passes, source, edits, [mask.rows for mask in masks], self.source)
             else:
                 developed, tiled = self.on_developed(job.size), Tiled(Picture(source, self.source), passes)
                 recipes = developed.recipes if tiled.counted is None else developed._seen(tiled, RowPainter())
@@ -121,8 +124,8 @@ class RecipeJob:
             with whole as tiling:
                 yield picture.unmarked(tiling)
 
-    def _in_regions(self, passes: Passes, source: RowSource, job: Job) -> AbstractContextManager[Tiling]:
-        """The rows with a recipe for each mask."""
+    def _masks(self, job: Job) -> list[StoredPicture]:
+        """The masks, which are read by rows; raises ValueError if one has another size than the photograph."""
         masks = [job.open(path) for path in self.masks]
         for path, mask in zip(self.masks, masks, strict=True):
             if tuple(mask.shape[:2]) != job.size:
@@ -130,8 +133,7 @@ class RecipeJob:
                     f"{path} must have the size of {self.source}, {job.size[1]}x{job.size[0]}, got "
                     f"{mask.shape[1]}x{mask.shape[0]}; resize it"
                 )
-        edits = [recipe.steps for recipe in self.recipes]
-        return edit_regions(passes, source, edits, [mask.rows for mask in masks], self.source)
+        return masks
 
     def _seen(self, source: Source[M], painter: Painter[M]) -> Sequence[Recipe]:
         """The recipes for a developed photograph, without strokes of which the crop leaves hidden pixels alone."""

@@ -112,7 +112,10 @@ def test_the_file_keeps_its_depth_and_its_exif_tells_its_size(tmp_path: Path, ti
         (["--crop", "1,2"], "--crop must be the left, top, right and bottom edge as shares from 0 to 1"),
         (["--crop", "a,b"], 'got "a,b"; correct it'),
         (["--exposure", "9"], "--exposure"),
-        (["--aspect", "3/2"], "--aspect must be a width and a height from 0.01 to 100000, such as 3:2, got '3/2'"),
+        (
+            ["--aspect", "3/2"],
+            "--aspect must be a width and a height from 0.01 to 100000, such as 3:2, got '3/2'; correct it",
+        ),
         (["--straighten", "45", "--crop", "0,0,0.1,0.1"], "crop must have its middle within the photograph turned"),
         (["--workers", "2"], "--workers takes zarr arrays"),
     ],
@@ -129,8 +132,9 @@ def test_notes(tmp_path: Path, tiled: bool, capsys: pytest.CaptureFixture[str]) 
     assert main(["develop", str(source), str(target), "--temperature", "0.5"]) == 0
     assert "in.png is grey: temperature and tint change nothing" in capsys.readouterr().err
     assert (imagecodecs.png_decode(target.read_bytes()) == 90).all()
-    assert main(["develop", str(source), str(target)]) == 0
-    assert "no option changes anything" in capsys.readouterr().err
+    for options, is_idle in (([], True), (["--aspect", "3:2"], True), (["--aspect", "1:1"], False)):
+        assert main(["develop", str(source), str(target), *options]) == 0
+        assert ("no option changes anything" in capsys.readouterr().err) == is_idle
 
 
 def test_steps_outside_the_crop_are_named(photo: Path, tiled: bool, capsys: pytest.CaptureFixture[str]) -> None:

@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import get_args
 
 import pytest
+import torch
 
 from nlfilter_torch.photo.cli import main, options
 from nlfilter_torch.photo.cli.edits import option_value, plain_step, preset_step, scribble_options, signature, step_of
@@ -11,6 +12,7 @@ from nlfilter_torch.photo.declared.declaration import Edit, Scribble
 from nlfilter_torch.photo.declared.parameters import EDITS, MASK
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.declared.steps import Step
+from nlfilter_torch.photo.io.photographs import Photograph, write_photograph
 from tests.commands import refusal
 
 TECHNICAL = ["--bandwidth", "--spatial-bandwidth", "--patch-size", "--landmarks", "--sampling"]
@@ -67,6 +69,22 @@ def test_what_is_wrong_is_said_without_notes(
     assert main([verb, "missing.png", "out.png", *options]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert "missing.png does not exist" in line
+
+
+@pytest.mark.usefixtures("tiled")
+def test_a_mask_of_another_size_is_refused_without_notes(photo: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    edit, mask = photo.with_name("idle.json"), photo.with_name("mask.png")
+    edit.write_text(Recipe().to_json())
+    write_photograph(Photograph(torch.ones(1, 1, 9, 20)), mask)
+    sentence = refusal(capsys, "apply", photo, photo.with_name("out.png"), "--preset", edit, "--mask", mask)
+    assert sentence.startswith(f"{mask} must have the size of {photo}, 90x60, got 20x9; resize it")
+
+
+@pytest.mark.usefixtures("tiled")
+def test_what_a_file_cannot_hold_is_refused_without_notes(photo: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_photograph(Photograph(torch.full((1, 1, 9, 20), 0.4)), photo)
+    target = photo.with_name("out.jpg")
+    assert "out.jpg" in refusal(capsys, "develop", photo, target, "--temperature", "0.5", "--depth", "16")
 
 
 def test_options_without_effect_are_named(photo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

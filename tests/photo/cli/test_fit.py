@@ -14,6 +14,7 @@ from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.edits.applying import apply_step
 from nlfilter_torch.photo.io.photographs import Photograph, read_photograph, write_photograph
 from nlfilter_torch.photo.picture.resizing import resize
+from tests.commands import refusal
 from tests.looks import ALPHA, CAT, CUP, SEPIA, explained, in_bytes, rgb
 
 
@@ -335,6 +336,18 @@ def test_folders_of_masks_belong_to_folders_of_photographs(tmp_path: Path, capsy
         assert complaint.count("\n") == 1
     assert main(["fit", f"{before}/cat.png", f"{after}/cat.png", str(look), "--mask", first]) == 2
     assert "--mask must name pictures, as BEFORE and AFTER are, got" in capsys.readouterr().err
+
+
+def test_pairs_that_do_not_belong_together_are_refused_without_notes(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before, after = tmp_path / "before", tmp_path / "after"
+    for folder, names in ((before, "13"), (after, "1")):
+        folder.mkdir()
+        for name in names:
+            write_photograph(Photograph(CAT if folder == before else CUP), folder / f"{name}.png")
+    sentence = refusal(capsys, "fit", before, after, tmp_path / "look.json")
+    assert sentence.startswith(f"{after}/1.png must be an edit of {before}/1.png")
 
 
 def test_a_frame_is_told_and_left_out(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
