@@ -12,10 +12,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from matplotlib.axes import Axes
-from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
-from matplotlib.image import BboxImage
-from matplotlib.transforms import Bbox, TransformedBbox
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -27,7 +24,6 @@ DPI = 100
 POINTS = 72  # typographic points per inch
 SIDE = 512  # pixels along the longer side of a picture
 LABEL = 35  # pixels above a picture for its title
-TITLE_PAD = 6  # points between a picture and its title
 BREADTH, LINE = 0.6, 1.2  # width of a letter and height of a line, relative to the letter height
 GAP = 15  # pixels between pictures
 FAR = 0.995  # colour scales end at this quantile, so that one outlier does not compress the others
@@ -53,21 +49,21 @@ def show_images(
         width = shape[1] * side / max(shape[:2])
         titles = ["\n".join(textwrap.wrap(title, max(6, int(width / (letters * BREADTH))))) for title in pictures]
         label = round(letters * (0.8 + LINE * max(title.count("\n") + 1 for title in titles)))
-    figure, places = _panels(shape, len(pictures), columns, side, label)
-    for place, title, picture in zip(places, titles, pictures.values(), strict=True):
-        _draw(figure, place, title, picture, letters=letters)
+    figure, axes = _panels(shape, len(pictures), columns, side, label)
+    for axis, title, picture in zip(axes, titles, pictures.values(), strict=True):
+        _draw(axis, title, picture, letters=letters)
     return figure
 
 
 def show_layers(layers: Tensor, *, side: int = SIDE) -> Figure:
     """Draw detail layers (1, k+1, C, H, W) from fine to coarse, around mid-grey, and the last layer unchanged."""
     stack = layers[0].mean(1).numpy(force=True)  # (k+1, H, W)
-    figure, places = _panels(stack.shape[1:], len(stack), columns=math.ceil(math.sqrt(len(stack))), side=side)
-    for number, (place, layer) in enumerate(zip(places, stack[:-1], strict=False), start=1):
+    figure, axes = _panels(stack.shape[1:], len(stack), columns=math.ceil(math.sqrt(len(stack))), side=side)
+    for number, (axis, layer) in enumerate(zip(axes, stack[:-1], strict=False), start=1):
         limit = _limit(layer)
         name = {1: " (finest)", len(stack) - 1: " (coarsest)"}.get(number, "")
-        _draw(figure, place, f"Layer {number}{name}, ±{255 * limit:.0f} levels of 255", layer, limit=limit)
-    _draw(figure, places[-1], f"Layer {len(stack)}: the smooth rest", stack[-1].clip(0, 1))
+        _draw(axis, f"Layer {number}{name}, ±{255 * limit:.0f} levels of 255", layer, limit=limit)
+    _draw(axes[-1], f"Layer {len(stack)}: the smooth rest", stack[-1].clip(0, 1))
     return figure
 
 
@@ -80,10 +76,10 @@ def show_eigenvectors(
     """
     shown = [number for number in numbers if number <= spectrum.eigenvalues.shape[1]] or [1]
     vectors = spectrum.some_eigenvectors([number - 1 for number in shown])[0].numpy(force=True)
-    figure, places = _panels(vectors.shape[1:], len(shown), columns=math.ceil(math.sqrt(len(shown))), side=side)
-    for place, number, vector in zip(places, shown, vectors, strict=True):
+    figure, axes = _panels(vectors.shape[1:], len(shown), columns=math.ceil(math.sqrt(len(shown))), side=side)
+    for axis, number, vector in zip(axes, shown, vectors, strict=True):
         title = f"Eigenvector {number}, eigenvalue {float(spectrum.eigenvalues[0, number - 1]):.4f}"
-        _draw(figure, place, title, vector, limit=_limit(vector), colours="RdBu_r")
+        _draw(axis, title, vector, limit=_limit(vector), colours="RdBu_r")
     return figure
 
 
@@ -98,16 +94,13 @@ def show_mask(image: Tensor, region: Tensor, mask: Tensor, *, side: int = SIDE) 
     """
     picture = _picture(image)
     weight = mask[0, 0].numpy(force=True)[..., None]
-    figure, places = _panels(picture.shape, 3, columns=3, side=side)
-    _draw(figure, places[0], "The selected region", picture)
-    axis = figure.add_axes(places[0].bounds)
-    axis.imshow(np.zeros((*picture.shape[:2], 4)))  # transparent; sets the limits
-    axis.set_axis_off()
-    axis.contour(region[0, 0].numpy(force=True), levels=[0.5], colors=["white"], linewidths=3)
-    axis.contour(region[0, 0].numpy(force=True), levels=[0.5], colors=["black"], linewidths=1)
-    _draw(figure, places[1], "Similarity to the region (white: similar)", weight[..., 0])
+    figure, axes = _panels(picture.shape, 3, columns=3, side=side)
+    _draw(axes[0], "The selected region", picture)
+    axes[0].contour(region[0, 0].numpy(force=True), levels=[0.5], colors=["white"], linewidths=3)
+    axes[0].contour(region[0, 0].numpy(force=True), levels=[0.5], colors=["black"], linewidths=1)
+    _draw(axes[1], "Similarity to the region (white: similar)", weight[..., 0])
     faded = np.broadcast_to(0.6 + 0.25 * picture.mean(-1, keepdims=True), picture.shape)
-    _draw(figure, places[2], "Pixels that the mask selects", weight * picture + (1 - weight) * faded)
+    _draw(axes[2], "Pixels that the mask selects", weight * picture + (1 - weight) * faded)
     return figure
 
 
@@ -163,27 +156,23 @@ def _limit(values: NDArray[np.generic]) -> float:
 
 def _panels(
     shape: tuple[int, ...], count: int, columns: int | None, side: int, label: int = LABEL
-) -> tuple[Figure, list[Bbox]]:
-    """Create a figure with places for ``count`` pictures of that height and width, aligned to pixels, as shares of it.
-
-    Places are not axes, whose ticks would take longer than the pictures even if they are not drawn.
-    """
+) -> tuple[Figure, list[Axes]]:
+    """Create a figure of ``count`` panels for pictures of that height and width, aligned to pixels."""
     across = min(columns or count, count)
     down = math.ceil(count / across)
     height, width = (round(length * side / max(shape[:2])) for length in shape[:2])
     full = (across * (width + GAP) + GAP, down * (height + label) + GAP)  # width, height in pixels
     figure = Figure(figsize=(full[0] / DPI, full[1] / DPI), dpi=DPI)
-    places = []
+    axes = []
     for number in range(count):
         row, column = divmod(number, across)
         left, bottom = GAP + column * (width + GAP), full[1] - (row + 1) * (height + label)
-        places.append(Bbox.from_bounds(left / full[0], bottom / full[1], width / full[0], height / full[1]))
-    return figure, places
+        axes.append(figure.add_axes((left / full[0], bottom / full[1], width / full[0], height / full[1])))
+    return figure, axes
 
 
 def _draw(
-    figure: Figure,
-    place: Bbox,
+    axis: Axes,
     title: str,
     picture: NDArray[np.generic],
     *,
@@ -193,11 +182,7 @@ def _draw(
 ) -> None:
     """Draw a titled picture, with the colour scale ±limit if given and [0, 1] otherwise."""
     lowest, highest = (0.0, 1.0) if limit is None else (-limit, limit)
-    where, norm = TransformedBbox(place, figure.transFigure), Normalize(lowest, highest)
-    drawn = BboxImage(where, cmap=colours, norm=norm, resample=True)  # smoothed as axes do it
-    drawn.set_data(picture)
-    figure.add_artist(drawn)
-    width, height = figure.get_size_inches() * DPI
-    fitting = min(11.0, max(6.0, place.width * width / 28))  # fits 36 letters
-    size, above = fitting if letters is None else letters * POINTS / DPI, TITLE_PAD * DPI / POINTS / height
-    figure.text((place.x0 + place.x1) / 2, place.y1 + above, title, fontsize=size, ha="center", va="baseline")
+    axis.imshow(picture, cmap=colours, vmin=lowest, vmax=highest)
+    fitting = min(11.0, max(6.0, axis.get_window_extent().width / 28))  # fits 36 letters
+    axis.set_title(title, fontsize=fitting if letters is None else letters * POINTS / DPI)
+    axis.set_axis_off()
