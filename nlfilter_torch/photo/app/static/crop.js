@@ -111,7 +111,8 @@ class Cropper {
   }
 
   #key(event) {
-    if (!document.documentElement.classList.contains("cropping") || document.querySelector(".q-dialog")) {
+    const isElsewhere = document.querySelector(".q-dialog, .q-menu") !== null; // a question, or an open list
+    if (!document.documentElement.classList.contains("cropping") || isElsewhere) {
       return;
     }
     const edge = event.target.dataset?.edge;

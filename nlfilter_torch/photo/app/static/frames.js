@@ -32,7 +32,7 @@ function held(before, [left, top, right, bottom], names, aspect) {
   const width = clamp(followsWidth ? wide : high, Math.min(LEAST * Math.max(1, aspect), most), most);
   const [start, end] = placed(before, 0, names, width);
   const [first, last] = placed(before, 1, names, width / aspect);
-  return [start, first, end, last];
+  return [start, first, end, last].map((edge) => clamp(edge, 0, 1)); // rounding may lead beyond the border
 }
 
 /** Both edges along an axis, of that length: the one opposite to a dragged one stays, or the middle if none is dragged. */
@@ -47,5 +47,13 @@ function placed(edges, axis, names, length) {
 
 /** A frame without an edge that rounding has put beyond another. */
 export function atLeast([left, top, right, bottom]) {
-  return [left, top, Math.max(right, left + LEAST / 2), Math.max(bottom, top + LEAST / 2)];
+  const [start, end] = apart(left, right);
+  const [first, last] = apart(top, bottom);
+  return [start, first, end, last];
+}
+
+/** Both edges along an axis, with the first moved back where the border leaves no room for the second. */
+function apart(low, high) {
+  const end = Math.min(Math.max(high, low + LEAST / 2), 1);
+  return [Math.min(low, end - LEAST / 2), end];
 }

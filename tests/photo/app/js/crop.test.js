@@ -5,7 +5,8 @@ import { mock, test } from "node:test";
 
 const frame = { style: {}, querySelectorAll: () => [] };
 const picture = { style: {}, querySelector: () => ({}) };
-const parts = { ".crop-picture": picture, ".crop-frame": frame, ".cropper": { addEventListener() {} }, ".q-dialog": null };
+const OVER = ".q-dialog, .q-menu";
+const parts = { ".crop-picture": picture, ".crop-frame": frame, ".cropper": { addEventListener() {} }, [OVER]: null };
 const sent = [];
 let press;
 
@@ -41,6 +42,17 @@ test("keys are told after a rest, or before the end", () => {
     mock.timers.tick(400);
     assert.deepEqual(told(), ["crop 0.01,0.00,1.00,1.00", "crop_done"]);
   }
+});
+
+test("keys belong to an open list or dialog", () => {
+  cropper.show("whole", 100, 100, [0, 0, 1, 1]);
+  parts[OVER] = {};
+  keys("Escape", "ArrowRight", "Enter");
+  mock.timers.tick(400);
+  assert.deepEqual(told(), []);
+  parts[OVER] = null;
+  keys("Escape");
+  assert.deepEqual(told(), ["crop_done"]);
 });
 
 test("a frame keeps the aspect that the server tells", () => {

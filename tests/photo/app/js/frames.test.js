@@ -36,5 +36,23 @@ test("a frame keeps its aspect: the opposite edge or corner stays, and the middl
 test("a frame is never empty", () => {
   close(atLeast([0.5, 0.5, 0.5, 0.5]), [0.5, 0.5, 0.505, 0.505]);
   close(atLeast([0, 0, 1, 1]), [0, 0, 1, 1]);
+  close(atLeast([0.998, 0, 0.999, 1]), [0.995, 0, 1, 1]);
+  assert.ok(atLeast([0.9995, 0.9995, 1, 1]).every((edge) => edge >= 0 && edge <= 1));
   close(moved([0.2, 0.2, 0.6, 0.4], ["left"], 0.9, 0, 2), [0.58, 0.295, 0.6, 0.305]);
+});
+
+test("no edge is beyond the border, not by rounding either", () => {
+  const handles = [...ALL.map((name) => [name]), ["left", "top"], ["right", "top"], ["left", "bottom"], ["right", "bottom"]];
+  for (const aspect of [null, 1, 3 / 2, 2 / 3, 4 / 3, 3 / 4, 16 / 9, 9 / 16, 0.37]) {
+    for (let i = 1; i < 40; i++) {
+      const frame = [i / 97, i / 61, 1 - i / 83, 1 - i / 71];
+      for (const names of [...handles, ALL]) {
+        for (const [right, down] of [[2, 2], [-2, -2], [2, -2], [-2, 2], [i / 53, -i / 59]]) {
+          const edges = atLeast(moved(frame, names, right, down, aspect));
+          assert.ok(edges.every((edge) => edge >= 0 && edge <= 1), `${edges}`);
+          assert.ok(edges[0] < edges[2] && edges[1] < edges[3], `${edges}`);
+        }
+      }
+    }
+  }
 });
