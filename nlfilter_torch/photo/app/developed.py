@@ -90,7 +90,7 @@ class Developed:
         if preview.edited is None:
             return original.pixels.new_zeros(())
         frame = development.frame(original.size)
-        return reframed(preview.edited - preview.pixels, self.frame, frame, frame.size)
+        return reframed(preview.edited - preview.pixels.clamp(0, 1), self.frame, frame, frame.size)
 
 
 def parts_of(photograph: Photograph, name: str) -> Parts:

@@ -342,7 +342,7 @@ class Session:
                 developed, original = self.developed, self._opened_to("show").preview
                 start = developed.approximate(recipe.develop, original)
                 if developed.development.geometry != recipe.develop.geometry:  # no step can be computed so fast
-                    return (start + developed.change_in(recipe.develop, original)).clamp(0, 1)
+                    return (start.clamp(0, 1) + developed.change_in(recipe.develop, original)).clamp(0, 1)
             else:
                 developed, start = self._develop(recipe.develop), None
                 if developed is not self.developed:

@@ -118,6 +118,18 @@ def test_a_moving_slider_is_followed_and_later_steps_stay(session: Session) -> N
     assert difference(shown, develop_image(cat(), session.recipe.develop)) > 8
 
 
+def test_a_photograph_of_floats_is_straightened_in_its_own_light(tmp_path: Path) -> None:
+    write_photograph(Photograph(1.8 * cat(), depth="float32"), tmp_path / "bright.tif")
+    session = Session(tmp_path)
+    session.open(tmp_path / "bright.tif")
+    session.load(Recipe((Step("tone", contrast=1.3),)))
+    session.render()
+    for straighten in (0.5, 3.0):
+        session.recipe = session.developing({"straighten": straighten})
+        shown, wanted = session.render(DEVELOPING), apply_recipe(session.recipe, 1.8 * cat()).clamp(0, 1)
+        assert difference(shown, wanted) < 3
+
+
 def test_a_point_becomes_grey(session: Session) -> None:
     session.load(Recipe((), Development(temperature=-0.5, tint=0.3, crop=(0.2, 0.0, 1.0, 1.0))))
     session.render()
