@@ -26,11 +26,13 @@ class Proportions:
         name: one of :data:`PROPORTIONS`.
         cut: the last crop that was cut to them.
         base: the one that it was cut from.
+        kept: the crops that were made with them.
     """
 
     name: str = FREE
     cut: Crop | None = None
     base: Crop = WHOLE
+    kept: frozenset[Crop] = frozenset()
 
     def aspect(self, size: tuple[int, int]) -> float | None:
         """The width of a crop of a photograph (H, W) by its height, or None for any.
@@ -44,10 +46,15 @@ class Proportions:
         return wide / high
 
     def begin(self, crop: Crop) -> Crop:
-        """The crop to cut, where the photograph has the one given."""
+        """The crop to cut from, if the current one is ``crop``."""
         if crop != self.cut:
             self.base = crop
         return self.base
+
+    def follow(self, crop: Crop) -> None:
+        """Let any crop be dragged from now on if the current one, ``crop``, was not made with these proportions."""
+        if crop not in self.kept:
+            self.name = FREE
 
 
 class CropTool:

@@ -3,7 +3,7 @@
 import secrets
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Protocol
@@ -186,19 +186,24 @@ class Editor:
         self.session.recipe = recipe
         self._follow_change(moving)
 
-    def _develop(self, values: Mapping[str, Value], complete: bool) -> None:
-        """Change how the photograph is developed; ``complete`` when the pointer is released."""
+    def _develop(self, values: Mapping[str, Value], complete: bool) -> bool:
+        """Change how the photograph is developed; ``complete`` when the pointer is released. Returns if it can be."""
         session = self.session
         if session.opened is None:
             self._panel.follow()
-            return
+            return False
         try:
             recipe = session.developing(values, self._proportions.aspect(session.whole_size))
         except ValueError as error:  # the middle of the crop would be outside
             self._tasks.show_error(str(error))
             self._panel.follow()
-        else:
-            self._replace(recipe, None if complete else DEVELOPING)
+            if self._is_cropping:  # and back to the frame of before
+                self._tasks.start(self._show_crop())
+            return False
+        if "crop" in values:
+            self._proportions.kept |= {recipe.develop.crop}
+        self._replace(recipe, None if complete else DEVELOPING)
+        return True
 
     def _toggle_pick(self) -> None:
         """Let the next click on the photograph choose what is grey, or no longer."""
@@ -253,15 +258,24 @@ class Editor:
         if session.opened is None:
             self._tasks.show_error("open a photograph first; there is nothing to crop")
         else:
-            self._proportions.name = name
-            if name != FREE:
-                self._develop({"crop": self._proportions.begin(session.crop)}, True)
-                self._proportions.cut = session.crop
-            if not self._is_cropping and name != FREE:
-                self._toggle_crop()
-            elif self._is_cropping and name == FREE:
-                self._tasks.start(self._show_crop())
+            self._cut(name)
         self._panel.follow()
+
+    def _cut(self, name: str) -> None:
+        """Cut the crop to proportions, and show its frame; with :data:`FREE`, only let its frame be dragged freely."""
+        before, develop = self._proportions, self.session.recipe.develop
+        if name == FREE:
+            before.name = FREE
+            if self._is_cropping:
+                self._tasks.start(self._show_crop())
+            return
+        self._proportions = replace(before, name=name, kept=frozenset())
+        if not self._develop({"crop": self._proportions.begin(develop.crop)}, True):
+            self._proportions = replace(before, cut=None)  # the next begin with the crop as it is
+            return
+        self._proportions.cut = self.session.recipe.develop.crop
+        if not self._is_cropping:
+            self._toggle_crop()
 
     def _crop(self, edges: Sequence[float]) -> None:
         """Take the edges that a person has set."""
@@ -307,6 +321,7 @@ class Editor:
 
     def follow(self) -> None:
         """Show the edit."""
+        self._proportions.follow(self.session.recipe.develop.crop)
         self._panel.follow()
         self._show_state()
         self._redraw()

@@ -11,7 +11,7 @@ from nlfilter_torch.photo.declared.presets import Recipe
 
 Replace = Callable[[Recipe, int | None], None]  # a new edit, and the place of the step whose slider moves, or None
 NO_STEPS = "None yet. Move a slider, or paint."
-ONLY_PHOTO = 'None yet, but what "Photo" does, which comes first.'
+ONLY_PHOTO = 'No steps yet; the settings of "Photo" come first.'
 #: What the buttons of a step do.
 TIPS = {
     "up": "Apply this step earlier",

@@ -32,7 +32,7 @@ class PhotoLink:
         is_picking: returns whether the next click does that.
     """
 
-    develop: Callable[[Mapping[str, Value], bool], None]
+    develop: Callable[[Mapping[str, Value], bool], object]
     crop: Callable[[], None]
     is_cropping: Callable[[], bool]
     hold: Callable[[str], None]

@@ -22,4 +22,9 @@ def test_proportions_are_cut_from_what_a_person_has_made() -> None:
     proportions.cut = other
     assert proportions.begin(other) == mine  # so that it does not shrink from one choice to the next
     assert proportions.begin((0.3, 0.2, 0.7, 0.7)) == (0.3, 0.2, 0.7, 0.7)
+    proportions.kept = frozenset({mine})
+    proportions.follow(mine)
+    assert proportions.name == "3:2"
+    proportions.follow(other)
+    assert proportions.name == "Free"
     assert Proportions("3:4").aspect((100, 150)) == 0.75

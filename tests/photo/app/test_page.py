@@ -13,9 +13,11 @@ from nicegui import Client, background_tasks, ui
 from nlfilter_torch.core.progress import Progress
 from nlfilter_torch.photo.app import drawing
 from nlfilter_torch.photo.app.assets import SCRIPTS, STATIC, STATIC_ADDRESS
+from nlfilter_torch.photo.app.crop_tool import Proportions
 from nlfilter_torch.photo.app.dialogs import Question
 from nlfilter_torch.photo.app.library import Library
 from nlfilter_torch.photo.app.page import EDITORS, Editor
+from nlfilter_torch.photo.declared.development import WHOLE, Development
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.io.photographs import Photograph, write_photograph
 from tests.pages import ROOT
@@ -136,6 +138,61 @@ def test_proportions_of_the_crop_and_looks_of_what_it_leaves(opened: Page, scrip
     editor._hold("Free")
     opened.finish()
     assert any(script.endswith(", null)") for script in scripts)
+
+
+def test_proportions_end_with_a_crop_that_lacks_them(opened: Page) -> None:
+    editor, session = opened.editor, opened.editor.session
+    other = Editor(editor._photographs)  # a second tab, which shows the same photograph
+    other.build(None)
+    other.session = session
+    changes: list[Callable[[], object]] = [
+        lambda: (editor._undo(), editor._undo()),
+        lambda: session.load(Recipe()),
+        lambda: other._develop({"crop": (0.0, 0.0, 1.0, 0.5)}, True),
+    ]
+    for change in changes:
+        editor._hold("1:1")
+        editor._crop((0.0, 0.0, 0.3, 0.3))
+        editor._develop({"exposure": 1.0}, True)
+        editor._undo()
+        editor._crop((0.0, 0.0, 0.6, 0.3))
+        editor._undo()  # to a crop that has them, too
+        assert (editor._proportions.name, other._proportions.name) == ("1:1", "Free")
+        change()
+        editor._changed()
+        assert editor._proportions.name == "Free"
+        editor._reset()
+    opened.finish()
+
+
+def test_proportions_are_cut_from_the_crop_of_before_when_straightened(opened: Page) -> None:
+    editor, session = opened.editor, opened.editor.session
+    editor._hold("1:1")
+    editor._develop({"straighten": 3.0}, True)
+    width = session.recipe.develop.frame((100, 150)).size[1]
+    assert editor._proportions.name == "1:1"
+    editor._hold("3:2")
+    assert session.recipe.develop.frame((100, 150)).size[1] > width + 20  # of the whole photograph
+    opened.finish()
+
+
+def test_a_crop_that_is_refused_changes_nothing(opened: Page, scripts: list[str]) -> None:
+    editor, session = opened.editor, opened.editor.session
+    session.load(Recipe((), Development(straighten=45.0)))
+    editor._proportions = Proportions(cut=WHOLE, base=(0.0, 0.0, 0.1, 0.1))
+    editor._hold("1:1")
+    assert "crop must have its middle within the photograph" in opened.errors()[-1]
+    assert editor._proportions.name == "Free"
+    assert not editor._is_cropping
+    editor._hold("1:1")  # now of the crop as it is
+    opened.finish()
+    before = session.recipe
+    scripts.clear()
+    editor._crop((0.0, 0.0, 1.0, 1.1))
+    opened.finish()
+    assert "crop must be the left, top, right and bottom edge" in opened.errors()[-1]
+    assert session.recipe == before
+    assert any("cropper.show(" in script for script in scripts)  # the frame of before
 
 
 def test_a_file_that_cannot_be_opened(page: Page, photo: Path) -> None:

@@ -47,7 +47,7 @@ def test_steps_that_were_used_are_listed(shown: Controls, steps: StepList) -> No
     assert "None yet. Move a slider, or paint." in shown.texts()
     shown.recipe = Recipe((), Development(exposure=1.0))
     steps.follow()
-    assert 'None yet, but what "Photo" does, which comes first.' in shown.texts()
+    assert 'No steps yet; the settings of "Photo" come first.' in shown.texts()
     assert shown.replaced == []
     assert listed(Recipe((Step("defocus", (IN,)), IDLE.mixed(on=False)))) == ((0, "Defocus"), (1, "Abstract"))
 
