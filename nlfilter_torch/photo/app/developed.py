@@ -1,6 +1,6 @@
 """The open photograph as it is developed, and what the editor shows of it."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from torch import Tensor
@@ -8,6 +8,9 @@ from torch import Tensor
 from nlfilter_torch.photo.app.preview import Preview
 from nlfilter_torch.photo.declared.development import AS_IT_IS, Development, Frame
 from nlfilter_torch.photo.declared.presets import DEVELOPING_BYTES
+from nlfilter_torch.photo.declared.steps import Step
+from nlfilter_torch.photo.declared.strokes import Stroke
+from nlfilter_torch.photo.edits.applying import left_by_crop
 from nlfilter_torch.photo.io.developed import cut_photograph, lit_photograph
 from nlfilter_torch.photo.io.photographs import Photograph, check_memory
 from nlfilter_torch.photo.picture.developing import (
@@ -18,6 +21,8 @@ from nlfilter_torch.photo.picture.developing import (
     reframed,
     turned_canvas,
 )
+from nlfilter_torch.photo.picture.in_memory import InMemory
+from nlfilter_torch.photo.picture.painting import TensorPainter
 from nlfilter_torch.photo.picture.resizing import resize
 from nlfilter_torch.photo.tiled.parts import Parts, Rectangle
 
@@ -45,6 +50,7 @@ class Developed:
     before: Tensor
     preview: Preview
     parts: Parts
+    _counted: dict[tuple[Stroke, ...], bool] = field(default_factory=dict)  # whether strokes reach pixels that count
 
     @staticmethod
     def of(photograph: Photograph, name: str, pixels: int) -> "Developed":
@@ -73,6 +79,21 @@ class Developed:
         else:
             before = resize(cut.pixels.float(), preview.size)
         return Developed(development, frame, edited, cut, before, preview, parts_of(edited, name))
+
+    def counted(self, step: Step) -> Step:
+        """A step of this photograph, without its strokes if those of its objects cover only pixels that do not count.
+
+        See :func:`left_by_crop`, which paints at full size; its results are kept.
+        """
+        objects = step.painted_as("object", "added")
+        if not objects or self.frame.is_whole:
+            return step
+        if objects not in self._counted:
+            weights = self.photograph.weights
+            source = InMemory(self.photograph.pixels, weights=weights)
+            left = step if weights is None else left_by_crop(step, source, TensorPainter())
+            self._counted[objects] = bool(left.strokes)
+        return step if self._counted[objects] else step.changed(strokes=())
 
     def original(self, place: Rectangle) -> Tensor:
         """A part before the edit, (1, C, h, w) in [0, 1]."""

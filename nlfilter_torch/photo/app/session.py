@@ -21,7 +21,7 @@ from nlfilter_torch.photo.declared.parameters import EDITS
 from nlfilter_torch.photo.declared.presets import Recipe, on_frame
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.declared.strokes import Stroke, thin
-from nlfilter_torch.photo.edits.applying import apply_recipe, left_by_crop
+from nlfilter_torch.photo.edits.applying import apply_recipe
 from nlfilter_torch.photo.io import tiff
 from nlfilter_torch.photo.io.exif import read_upright
 from nlfilter_torch.photo.io.photographs import (
@@ -38,8 +38,6 @@ from nlfilter_torch.photo.io.photographs import (
 from nlfilter_torch.photo.io.rows import TILED, WHOLE, usual_memory
 from nlfilter_torch.photo.io.writing import open_beside
 from nlfilter_torch.photo.picture.developing import balance_of
-from nlfilter_torch.photo.picture.in_memory import InMemory
-from nlfilter_torch.photo.picture.painting import TensorPainter
 from nlfilter_torch.photo.picture.resizing import resize
 from nlfilter_torch.photo.tiled.durations import duration, expected_stages, writing
 from nlfilter_torch.photo.tiled.parts import Parts, Rectangle
@@ -353,12 +351,7 @@ class Session:
 
     def _on(self, developed: Developed, recipe: Recipe, seen: tuple[int, int] | None = None) -> Recipe:
         """The steps of a recipe for the developed photograph, or for that reduced to a size."""
-        photograph, weights = developed.photograph, developed.photograph.weights
-        steps = [on_frame(step, developed.frame, seen) for step in recipe.steps]
-        if weights is not None and not developed.frame.is_whole:
-            source, painter = InMemory(photograph.pixels, weights=weights), TensorPainter()
-            steps = [left_by_crop(step, source, painter) for step in steps]
-        return Recipe(tuple(steps))
+        return Recipe(tuple(developed.counted(on_frame(step, developed.frame, seen)) for step in recipe.steps))
 
     def eigenvalues(self, detail: Step) -> Tensor:
         """Eigenvalues (R,) of the filter of a step of detail, which its layers belong to."""
@@ -367,7 +360,7 @@ class Session:
 
     def mask(self, edit: str) -> Tensor | None:
         """The mask (1, 1, h, w) of what the scribbles of the chosen step of an edit select, or None."""
-        step, preview = self.step_in_view(edit), self.preview
+        step, preview = self.developed.counted(self.step_in_view(edit)), self.preview
         with self._drawing:
             if step.declared.regional is not None:
                 return preview.mask(step)
@@ -375,7 +368,7 @@ class Session:
 
     def ignored(self, edit: str) -> Tensor | None:
         """Which pixels (1, 1, h, w) under these scribbles do not count, or None."""
-        step = self.step_in_view(edit)
+        step = self.developed.counted(self.step_in_view(edit))
         with self._drawing:
             return self._overlays.ignored(step, self.preview.before(step))
 

@@ -87,7 +87,9 @@ def test_strokes_that_are_cropped_away_select_nothing(session: Session, tiled: b
     assert torch.equal(apply_recipe(recipe, cat()), wanted)
 
 
-def test_strokes_of_which_a_crop_leaves_hidden_pixels_select_nothing(tmp_path: Path) -> None:
+def test_strokes_of_which_a_crop_leaves_hidden_pixels_select_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     alpha = torch.ones_like(cat()[:, :1])
     alpha[..., 30:90] = 0
     write_photograph(Photograph(cat(), alpha=alpha), tmp_path / "holed.png")
@@ -96,8 +98,13 @@ def test_strokes_of_which_a_crop_leaves_hidden_pixels_select_nothing(tmp_path: P
     session.open(tmp_path / "holed.png")
     session.load(Recipe((Step("recolor", (across,)),), Development(crop=(0.0, 0.0, 0.7, 1.0))))
     assert (session.render() - session.developed.before).abs().max() > 0.1  # some pixels are left
+    assert session.mask("recolor") is not None
     session.load(replace(session.recipe, develop=Development(crop=(0.0, 0.0, 0.5, 1.0))))
     assert torch.equal(session.render(), session.developed.before)
+    assert session.mask("recolor") is session.ignored("recolor") is None
+    monkeypatch.setattr("nlfilter_torch.photo.app.developed.left_by_crop", None)
+    session.set("recolor", tolerance=0.2)
+    assert torch.equal(session.render(0), session.developed.before)  # without painting at full size again
     saved = read_photograph(session.save("out.png")).pixels
     assert difference(saved[..., :30], session.developed.before[..., :30]) < 0.51
     assert len(session.step_in_view("recolor").strokes) == 1  # it is still shown
