@@ -396,9 +396,10 @@ class Editor:
 
     async def _draw_looks(self) -> None:
         """Draw thumbnails of the photograph, as it is developed, under each look."""
-        self._pictured = developed = self.session.developed
+        developed = self.session.developed
         pictures = await self._tasks.run("Working", partial(thumbnails, developed.preview.pixels))
-        if self._pictured is developed:  # still
+        if self.session.opened is not None and self.session.developed is developed:  # still
+            self._pictured = developed
             self._picturing += 1
             self._canvas.pictures |= {f"look-{look}": content for look, content in pictures.items()}
 

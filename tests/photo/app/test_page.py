@@ -195,6 +195,19 @@ def test_a_crop_that_is_refused_changes_nothing(opened: Page, scripts: list[str]
     assert any("cropper.show(" in script for script in scripts)  # the frame of before
 
 
+def test_looks_that_failed_are_drawn_with_the_next_picture(opened: Page, monkeypatch: pytest.MonkeyPatch) -> None:
+    editor, before = opened.editor, opened.editor._thumbnail("warm")
+    with monkeypatch.context() as failing:
+        failing.setattr("nlfilter_torch.photo.app.page.thumbnails", lambda _: ["is no dictionary"][1])
+        editor._develop({"crop": (0.0, 0.0, 0.5, 0.5)}, True)
+        with pytest.raises(IndexError):
+            opened.finish()
+    assert editor._thumbnail("warm") == before
+    editor._change("detail", {"alpha": ALPHA}, True)
+    opened.finish()
+    assert editor._thumbnail("warm") != before
+
+
 def test_a_file_that_cannot_be_opened(page: Page, photo: Path) -> None:
     photo.write_text("dear diary")
     page.open(photo)
