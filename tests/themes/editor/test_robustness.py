@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 import skimage.data
 import torch
-from playwright.sync_api import Browser, expect
+from playwright.sync_api import Browser, Page, expect
 
 from nlfilter_torch.photo.declared.presets import Recipe, find_recipe
 from nlfilter_torch.photo.declared.steps import Step
@@ -33,19 +33,41 @@ def test_errors_leave_when_something_succeeds(opened: Tab, folder: Path) -> None
     expect(error).not_to_be_visible(timeout=5000)  # before it would disappear by itself
 
 
+def dropped(page: Page, files: dict[str, bytes]) -> bool:
+    """Drop files on the page, or text if there are none; whether the browser does with them what it would do."""
+    return bool(
+        page.evaluate(
+            """files => { const data = new DataTransfer(); data.setData("text/plain", "text");
+            for (const [name, bytes] of files) data.items.add(new File([new Uint8Array(bytes)], name,
+              { type: name.endsWith(".png") ? "image/png" : "" }));
+            const how = { dataTransfer: data, bubbles: true, cancelable: true };
+            return document.querySelector(".panel").dispatchEvent(new DragEvent("drop", how)); }""",
+            [(name, list(content)) for name, content in files.items()],
+        )
+    )
+
+
 def test_before_a_photograph_one_is_chosen_or_dropped(tab: Tab, folder: Path) -> None:
     page = tab.page
     page.get_by_role("button", name="Save photo").click()
     expect(page.get_by_text("open a photograph first; there is nothing to save")).to_be_visible()
     with page.expect_file_chooser():
         page.get_by_role("button", name="Open a photograph to begin").click()
-    drop = """bytes => { const files = new DataTransfer();
-        files.items.add(new File([new Uint8Array(bytes)], "dropped.png", { type: "image/png" }));
-        const how = { dataTransfer: files, bubbles: true, cancelable: true };
-        return document.querySelector(".panel").dispatchEvent(new DragEvent("drop", how)); }"""
-    assert not page.evaluate(drop, list((folder / "cat.png").read_bytes()))  # the page is not left for it
-    expect(page.get_by_text("dropped.png")).to_be_visible()
+    content = (folder / "cat.png").read_bytes()
+    assert not dropped(page, {"notes.txt": b"", "dropped.png": content, "b.png": b""})  # the page is not left for it
+    expect(page.get_by_text("Only one file is opened at a time: dropped.png.")).to_be_visible()
+    expect(page.locator(".title")).to_have_text("dropped.png")
     tab.wait_until_ready()
+    before = tab.source()
+    assert not dropped(page, {"edit.json": Recipe((Step("detail", alpha=(3.0, 1.0, 1.0, 1.0)),)).to_json().encode()})
+    tab.wait_for_picture(before)
+    assert not dropped(page, {"notes.txt": b"dear diary"})
+    expect(page.get_by_text("notes.txt must be a PNG, JPEG, TIFF, WebP or AVIF file")).to_be_visible()
+    assert dropped(page, {})  # text, which fields take
+    page.get_by_role("button", name="Save photo").click()
+    expect(page.get_by_role("dialog")).to_be_visible()
+    assert not dropped(page, {"edit.json": b""})
+    expect(page.get_by_text("edit.json is not opened while a dialog is; close it")).to_be_visible()
 
 
 def test_a_slider_before_a_photograph(tab: Tab, folder: Path) -> None:
@@ -172,7 +194,9 @@ def test_a_tab_that_is_closed_with_a_dialog_open(opened: Tab, browser: Browser, 
     expect(other.page.get_by_label("Name")).to_be_visible()
     address = other.source()
     other.close()
-    opened.wait_until(lambda: opened.answer(address).status, least=404)  # when the page is considered closed
+    # The page is considered closed after a while; then a request is answered behind all that its end has logged.
+    opened.wait_until(lambda: float(opened.answer(address).status), least=404, most=404)
+    assert opened.answer(address).status == 404
     assert editor.log.read_text() == ""
 
 

@@ -1,29 +1,52 @@
 /** What the page does beside zoom and pan: the question before it is left, and what its controls send to the server. */
 
-/* global emitEvent -- of NiceGUI: sends an event to the server */
+/* global emitEvent, getElement -- of NiceGUI: send an event to the server; the component of an element */
 
 import { watchSliders } from "./sliders.js";
+
+/** Names of the files that are loaded as edits or looks. */
+const EDITS = /\.(json|cube)$/i;
 
 /** The page, as the server and the controls use it. */
 class Page {
   /** Whether the edit has changed since a file was written; the server sets it. */
   isUnsaved = false;
 
-  #takeFiles = null;
+  #photographs = null;
 
-  /** Let a function take the first file that is dropped on the page, which the browser would leave the page for. */
-  takeDropped(take) {
-    if (!this.#takeFiles) {
+  /** Take a file that is dropped on the page, which the browser would leave the page for: photographs by an upload. */
+  takeDropped(photographs) {
+    if (!this.#photographs) {
+      const hasFiles = (event) => event.dataTransfer?.types.includes("Files");
       window.addEventListener("dragstart", (event) => event.target.matches?.("img") && event.preventDefault());
-      window.addEventListener("dragover", (event) => event.preventDefault());
+      window.addEventListener("dragover", (event) => hasFiles(event) && event.preventDefault());
       window.addEventListener("drop", (event) => {
-        event.preventDefault();
-        if (event.dataTransfer.files.length && !document.querySelector(".q-dialog")) {
-          this.#takeFiles([event.dataTransfer.files[0]]);
+        if (hasFiles(event)) {
+          event.preventDefault();
+          this.#take([...event.dataTransfer.files]);
         }
       });
     }
-    this.#takeFiles = take;
+    this.#photographs = photographs;
+  }
+
+  /** Send the first photograph of some files, or the first edit, and tell the upload what is not opened. */
+  #take(files) {
+    const photograph = files.find((file) => file.type.startsWith("image/"));
+    const file = photograph ?? files.find(({ name }) => EDITS.test(name)) ?? files[0];
+    if (!file) {
+      return;
+    }
+    const uploads = [...document.querySelectorAll(".q-uploader")].map((element) => getElement(element).$refs.qRef);
+    const edits = EDITS.test(file.name) && uploads.find(({ $props }) => $props.accept.includes(".json"));
+    const upload = edits || this.#photographs;
+    const isBusy = document.querySelector(".q-dialog");
+    if (isBusy || files.length > 1) {
+      upload.$emit("rejected", [{ failedPropValidation: isBusy ? "dialog" : "several", file }]);
+    }
+    if (!isBusy) {
+      upload.addFiles([file]);
+    }
   }
 
   /** Leave without a question once the editor has ended: the edit is kept in a file. */
