@@ -22,7 +22,8 @@ from nlfilter_torch.photo.app.sidecar import state_folder
 
 TITLE = "nlfilter-torch"
 STARTING, PAUSE = 30.0, 0.05  # seconds for the server to accept connections, and between two attempts
-#: Objects, and multiples, after which Python looks for circles among the youngest, the younger and all: its defaults.
+#: Objects, and multiples, after which Python looks for circles among the youngest, the younger and all: as Python 3.11
+#: does by itself.
 COLLECTED = (700, 10, 10)
 
 
@@ -85,7 +86,7 @@ def serve(pages: Pages, *, host: str, port: int, open_page: bool) -> None:
 
 
 def free_closed_pages() -> None:
-    """Look as often as Python does by itself, not as seldom as commands do, for objects that refer to each other.
+    """Look as often as Python 3.11 does by itself, not as seldom as commands do, for objects that refer to each other.
 
     Pages that were closed are such objects, and hold their photographs. What is loaded by now stays, and is left alone.
     """

@@ -3,8 +3,12 @@
 from pathlib import Path
 
 import pytest
+import typer
+from typer.core import TyperGroup
 
-from nlfilter_torch.photo.cli.hints import OTHER_NAMES, SHORT, explained
+from nlfilter_torch.photo.app.command import app
+from nlfilter_torch.photo.cli.application import assembled
+from nlfilter_torch.photo.cli.hints import OTHER_COMMANDS, OTHER_NAMES, SHORT, explained
 from tests.commands import refusal
 
 DETAIL = ["--alpha", "--bandwidth", "--region", "--force", "--quality"]
@@ -79,3 +83,13 @@ def test_other_messages_are_left_as_they_are() -> None:
 def test_short_names_stand_for_long_ones() -> None:
     assert explained("No such option: -q", ["detail"], DETAIL) == "No such option: -q; here it is --quality"
     assert set(SHORT.values()) <= {*OTHER_NAMES, "--quality", "--mask", "--preset"}
+
+
+def test_the_commands_that_are_named_exist() -> None:
+    group = typer.main.get_command(assembled([app]))
+    assert isinstance(group, TyperGroup)
+    options = {name: {name for own in command.params for name in own.opts} for name, command in group.commands.items()}
+    assert not OTHER_COMMANDS.keys() & options.keys()
+    for ours in OTHER_COMMANDS.values():
+        command, *words = ours.split()
+        assert {word for word in words if word.startswith("--")} <= options[command], ours
