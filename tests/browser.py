@@ -26,7 +26,7 @@ CHROMIUM = next(
 SCREENS = [(390, 844), (800, 600), (1280, 800), (1920, 1080)]  # width and height
 TOUCHED, POINTED = SCREENS[::2], SCREENS[1::2]  # long tests take two of them by finger, and two by mouse
 TIMEOUT = 60_000  # milliseconds, of everything that is waited for; a machine may be busy
-FLASHES = re.compile("flash-[01]")  # the class of what is shown for a moment, which a busy machine may look at too late
+FLASHES = re.compile(r"^(?!.*\bhidden\b).*\bflash-[01]\b")  # the classes of what is shown for a moment
 
 
 @contextmanager
@@ -159,7 +159,17 @@ class Tab:
 
     def expect_picture(self, other: torch.Tensor, *, least: float = 0.0, most: float = math.inf) -> None:
         """Wait until the difference of the picture shown from another one is in a range, see :func:`difference`."""
-        self.wait_until(lambda: difference(self.picture(), other), least=least, most=most)
+        self.wait_until(lambda: self._difference_from(other), least=least, most=most)
+
+    def _difference_from(self, other: torch.Tensor) -> float:
+        answer = self.answer(self.source())
+        # The address may be that of a picture before, which is gone.
+        return difference(pixels_of(answer), other) if answer.status == 200 else math.nan
+
+    def expect_mask(self) -> None:
+        """Wait until the mask is shown for a moment: its picture and classes, as a busy machine may look too late."""
+        expect(self.mask).to_have_class(FLASHES)
+        self.page.wait_for_function("image => image.naturalWidth > 0", arg=self.mask.element_handle())
 
     def open(self, path: Path) -> None:
         """Choose a photograph."""

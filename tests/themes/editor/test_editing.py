@@ -10,7 +10,7 @@ from nlfilter_torch.photo.cli import main
 from nlfilter_torch.photo.declared.presets import Recipe, find_recipe
 from nlfilter_torch.photo.edits.applying import apply_recipe
 from nlfilter_torch.photo.io.photographs import read_photograph
-from tests.browser import FLASHES, Tab, difference
+from tests.browser import Tab, difference
 from tests.problems import cat
 
 
@@ -66,7 +66,7 @@ def test_stroke_shows_a_mask_and_sliders_of_the_region(opened: Tab) -> None:
     opened.paint((0.2, 0.9), (0.3, 0.9), release=False)
     expect(page.locator("path.stroke")).to_have_count(1)  # while the button is held
     page.mouse.up()
-    expect(opened.mask).to_have_class(FLASHES)
+    opened.expect_mask()
     expect(page.get_by_text("In the region")).to_be_visible()
     expect(opened.mask).not_to_be_visible()  # after a second, by itself
     page.get_by_role("checkbox", name="Mask").click()
@@ -89,7 +89,7 @@ def test_saved_files_are_what_the_library_and_the_command_line_make(opened: Tab,
     page = opened.page
     opened.drag(opened.slider("Fine detail"), 0.2, 0.6)
     opened.paint((0.2, 0.9), (0.3, 0.9))
-    expect(opened.mask).to_have_class(FLASHES)
+    opened.expect_mask()
     before = opened.source()
     page.get_by_role("tab", name="Recolor").click()
     page.get_by_role("button", name="#8a46c8").first.click()
@@ -120,7 +120,7 @@ def test_saved_files_are_what_the_library_and_the_command_line_make(opened: Tab,
     opened.load_edit(folder / "edit.json")
     opened.wait_for_picture(before)
     page.get_by_role("tab", name="Detail").click()
-    expect(opened.mask).to_have_class(FLASHES)
+    opened.expect_mask()
     opened.expect_picture(saved, most=5)
 
     page.get_by_role("button", name="Save photo").click()

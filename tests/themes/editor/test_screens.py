@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Browser, Locator, expect
 
-from tests.browser import FLASHES, POINTED, SCREENS, TOUCHED, Editor, Tab, by_finger
+from tests.browser import POINTED, SCREENS, TOUCHED, Editor, Tab, by_finger
 
 
 def test_keyboard_focus_can_be_seen(opened: Tab) -> None:
@@ -63,7 +63,7 @@ def test_an_edit_on_every_screen(
         by_finger(tab, (0.2, 0.9), (0.25, 0.9), (0.3, 0.9))
     else:
         tab.paint((0.2, 0.9), (0.3, 0.9))
-    expect(tab.mask).to_have_class(FLASHES)
+    tab.expect_mask()
     expect(page.locator("path.stroke")).to_have_count(1)
     expect(page.get_by_text("In the region")).to_be_visible()
     expect(page.get_by_role("img", name="histogram")).to_be_visible()
