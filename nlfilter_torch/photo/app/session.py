@@ -255,6 +255,8 @@ class Session:
         """
         size = self._opened_to("develop").photograph.size
         develop = Development(**{**vars(self.recipe.develop), **values})
+        if "crop" in values:  # its size stays if only its place changes
+            develop = replace(develop, crop=self.recipe.develop.frame(size).placed(develop.crop))
         frame = develop.frame(size)
         if "crop" in values:
             frame = frame if aspect is None else frame.trimmed(aspect)

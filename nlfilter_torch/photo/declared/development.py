@@ -16,6 +16,7 @@ from nlfilter_torch.photo.declared.strokes import Point, Stroke
 Crop = tuple[float, float, float, float]
 WHOLE: Crop = (0.0, 0.0, 1.0, 1.0)
 EXACT = 1e-9  # pixels, within which an edge is that of a pixel
+SAME = 0.01  # pixels, by which the sides of a crop that was moved may differ
 
 #: Declared as an edit is, though it is no step: it comes first, and once.
 DEVELOP = Edit(
@@ -248,12 +249,30 @@ class Frame:
         bottom, right = self.top + self.height, self.left + self.width
         return self.left / width, self.top / height, right / width, bottom / height
 
+    def placed(self, crop: Crop) -> Crop:
+        """A crop moved to whole pixels if its size is that of this frame, so that no pixel is lost; others as they are.
+
+        >>> AS_IT_IS.frame((10, 20)).trimmed(1.0).placed((0.13, 0.0, 0.63, 1.0))
+        (0.15, 0.0, 0.65, 1.0)
+        """
+        height, width = self.original
+        left, top, right, bottom = crop
+        if max(abs((right - left) * width - self.width), abs((bottom - top) * height - self.height)) > SAME:
+            return crop
+        column = min(round(left * width), width - self.width)
+        row = min(round(top * height), height - self.height)
+        return replace(self, left=column, top=row).edges
+
     def trimmed(self, aspect: float) -> "Frame":
         """The largest frame within it, about its middle, whose width is ``aspect`` times its height.
+
+        It is itself if it has that aspect but for the rounding to whole pixels.
 
         >>> AS_IT_IS.frame((100, 150)).trimmed(1.0).edges
         (0.16666666666666666, 0.0, 0.8333333333333334, 1.0)
         """
+        if self.width == round(self.height * aspect) or self.height == round(self.width / aspect):
+            return self
         width = min(self.width, max(1, round(self.height * aspect)))
         height = min(self.height, max(1, round(width / aspect)))
         top, left = self.top + (self.height - height) // 2, self.left + (self.width - width) // 2

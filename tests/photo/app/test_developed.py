@@ -168,6 +168,24 @@ def test_undo_redo_and_the_sidecar(session: Session) -> None:
     assert session.recipe.develop.exposure == 1
 
 
+@pytest.mark.parametrize("straighten", [0.0, 3.0])
+@pytest.mark.parametrize("aspect", [None, 16 / 9, 2 / 3])
+def test_a_crop_keeps_its_size_where_it_is_moved(session: Session, straighten: float, aspect: float | None) -> None:
+    session.load(session.developing({"straighten": straighten}))
+    session.load(session.developing({"crop": (0.2, 0.2, 0.75, 0.8)}, aspect))
+    size = session.recipe.develop.frame((100, 150)).size
+    for _ in range(12):
+        left, top, right, bottom = session.crop
+        session.load(
+            session.developing({"crop": (left + 0.0047, top - 0.0033, right + 0.0047, bottom - 0.0033)}, aspect)
+        )
+        assert session.recipe.develop.frame((100, 150)).size == size
+    assert session.crop[0] > left + 0.004
+    session.load(session.developing({"crop": session.crop}, 1.0))  # other proportions are cut all the same
+    height, width = session.recipe.develop.frame((100, 150)).size
+    assert height == width
+
+
 def test_a_crop_is_what_the_photograph_can_have(session: Session) -> None:
     session.load(session.developing({"straighten": 10.0}))
     session.load(session.developing({"crop": (0.0, 0.0, 1.0, 1.0)}))
