@@ -5,7 +5,7 @@
 import { watchSliders } from "./sliders.js";
 
 /** Names of the files that are loaded as edits or looks. */
-const EDITS = /\.(json|cube)$/i;
+const EDITS = /\.(json|cube)$/iu;
 
 /** The page, as the server and the controls use it. */
 class Page {
