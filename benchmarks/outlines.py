@@ -3,9 +3,10 @@
 The outlines of ``outlines.json`` are of objects in :mod:`benchmarks.keepers`, as polygons whose points are fractions of
 width and height, with holes; they were drawn without looking at results. Parts that may or may not be meant, such as
 the orange tips of red legs or a shadow that hides feet, are "either" and do not count. The mask of each job is computed
-from its strokes, with the settings of its edit. "IoU" is the intersection over union of the pixels above 0.5 and the
-object, "missed" the share of the object that is not selected, and "outside" what is selected beside it, as a share of
-the object; pixels within 1 % of the short side of an outline do not count.
+from its strokes, with the settings of its edit; that of ``recolor`` is the one before hues are compared. "IoU" is the
+intersection over union of the pixels above 0.5 and the object, "missed" the share of the object that is not selected,
+and "outside" what is selected beside it, as a share of the object; pixels within 1 % of the short side of an outline do
+not count.
 
 ``--pictures`` is the folder of :mod:`benchmarks.denoiser_training.free_photographs`; without it only scikit-image's
 photographs are measured. ``--peers`` adds GrabCut and closed-form matting, with the same strokes and, as they cannot do
@@ -118,7 +119,7 @@ def score(selected: Mask, wanted: Mask, either: Mask | None = None) -> Score:
 
 
 def selected(job: Job, image: Tensor) -> Tensor:
-    """The mask (1, 1, H, W) that the edit of a job uses."""
+    """The mask (1, 1, H, W) that the edit of a job uses; that of ``recolor`` before it is corrected by hue."""
     size = (image.shape[-2], image.shape[-1])
     if job.edit == "mask":
         return region_mask(image, *_strokes(job, size))
@@ -180,7 +181,7 @@ def measure(outline: Outline, image: Tensor, peers: Sequence[str], out: Path | N
 
 def line(name: str, scores: dict[str, Score]) -> str:
     """A line of the table: IoU, missed and outside of each method."""
-    figures = (f"{each.overlap:8.3f}{each.missed:8.1%}{each.outside:9.1%}" for each in scores.values())
+    figures = (f"{score.overlap:8.3f}{score.missed:8.1%}{score.outside:9.1%}" for score in scores.values())
     return f"{name:44}" + "  ".join(figures)
 
 

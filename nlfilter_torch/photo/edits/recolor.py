@@ -14,11 +14,7 @@ from nlfilter_torch.operator.options import Completion, Sampling
 from nlfilter_torch.photo.declared.declaration import Edit
 from nlfilter_torch.photo.declared.parameters import RECOLOR
 from nlfilter_torch.photo.looks.look_filter import acts
-from nlfilter_torch.photo.picture.colour import (
-    dot,
-    merge_luminance,
-    split_luminance,
-)
+from nlfilter_torch.photo.picture.colour import dot, merge_luminance, split_luminance
 from nlfilter_torch.photo.picture.drawn import Drawn, M
 from nlfilter_torch.photo.picture.in_memory import edit_image
 from nlfilter_torch.photo.picture.pixels import whole_image
@@ -59,9 +55,9 @@ def recolor(
 ) -> Tensor:
     """Recolour the objects that strokes are painted on, and similar pixels around them.
 
-    Paper: Sec. V-A, with :func:`region_mask` in place of k-means, for any number of colours. Where hues
-    and saturations around a pixel are not among those under the stroke, it stays unchanged even if its brightness and
-    texture are similar; dark shade of the object's hue that the object encloses takes the new colour, too.
+    Paper: Sec. V-A, with :func:`region_mask` in place of k-means, for any number of colours. Where hues and saturations
+    around a pixel are not among those under the stroke, it stays unchanged even if its brightness and texture are
+    similar. Dark shade of the object's hue in the object, up to 3 % of the short side wide, takes the new colour, too.
 
     Args:
         image: (B, 3, H, W), RGB in [0, 1].
@@ -156,7 +152,7 @@ class Recolor(ObjectEdit):
         reduced, masks = change.compared(objects.reduced), objects.reduced_masks()
         shares = [refine_mask(reduced, share) for share in change.shares(masks).split(1, dim=1)]
         beside = [colours_beside(reduced, share).planes for share in shares]
-        by_hue = groups.corrections(source.size, objects.reduced, masks, shares, kept)
+        by_hue = groups.corrected_by_hue(source.size, objects.reduced, masks, shares, kept)
         return Fitted(RecoloredPixels(change, objects, beside, by_hue))
 
 
@@ -181,7 +177,7 @@ class RecoloredPixels:
         sides = [Sides.of(self.objects.rows(planes, pixels)) for planes in self.beside]
         by_hand = None if self.objects.by_hand is None else partial(self.objects.by_hand.over, pixels=pixels)
         by_hue = []
-        for planes, scribbles in zip(self.by_hue, self.objects.scribbles, strict=False):
+        for planes, scribbles in zip(self.by_hue, self.objects.scribbles if self.by_hue else [], strict=True):
             factor, enclosed = self.objects.rows(planes, pixels).split(1, dim=1)
             front, back = scribbles.planes(pixels).split(1, dim=1)
             by_hue.append((torch.lerp(factor, torch.ones_like(factor), front), enclosed * (1 - back)))

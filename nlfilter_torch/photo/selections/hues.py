@@ -14,6 +14,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from nlfilter_torch.core.precision import squarable
 from nlfilter_torch.operator.features import blur
 from nlfilter_torch.photo.picture.colour import dot, split_luminance
 from nlfilter_torch.photo.picture.resizing import block_means, enlarged
@@ -21,6 +22,7 @@ from nlfilter_torch.photo.selections.scribbled_colours import colours_in_lab, de
 
 DARK = 0.02  # luminance below which hue and saturation are uncertain
 HALF_COUNTED = 0.1  # luminance of a scribbled pixel that counts half, for the same reason
+BLACK = 1e-4  # added to it, so that pixels of a black object count, too
 NUM_COLOURS = 128  # approximate number of scribbled pixels that others are compared with
 BANDWIDTH, PER_SATURATION = 0.06, 0.08  # of this comparison: for a grey object, and how it grows with the saturation
 SIMILAR_SHARE = 0.3  # share of the scribbled pixels that a pixel has to resemble
@@ -54,9 +56,9 @@ class HueSamples:
     @staticmethod
     def of(colours: Tensor, weights: Tensor) -> "HueSamples":
         """Choose from scribbled pixels of colours (B, 3, n), in order :func:`outwards`, and of weights (B, 1, n)."""
-        sample, shares = every_nth(colours, weights, NUM_COLOURS)
-        luminance = split_luminance(sample.unsqueeze(2))[0].squeeze(2).clamp(min=0.0)
-        shares = shares * luminance / (luminance + HALF_COUNTED)
+        sample, shares = every_nth(colours.clamp(0.0, 1.0), weights, NUM_COLOURS)  # as the reduced picture is
+        luminance = split_luminance(sample.unsqueeze(2))[0].squeeze(2)
+        shares = shares * (luminance + BLACK) / (luminance + HALF_COUNTED)
         return HueSamples(relative_chroma(sample), shares / shares.sum(2, keepdim=True).clamp(min=EPSILON))
 
     def likeness(self, image: Tensor) -> Tensor:
@@ -129,9 +131,12 @@ def shade(luminance: Tensor, chroma: Tensor, scribbled_luminance: Tensor, scribb
         scribbled_luminance: mean under the scribbles on the object, (B, 1, 1, 1).
         scribbled_chroma: likewise, (B, 3, 1, 1).
     """
+    luminance, chroma, scribbled_luminance, scribbled_chroma = map(
+        squarable, (luminance, chroma, scribbled_luminance, scribbled_chroma)
+    )
     product = dot(chroma, scribbled_chroma.expand_as(chroma))
     squares = dot(chroma, chroma), dot(scribbled_chroma, scribbled_chroma)
-    cosine = product * ((squares[0] + EPSILON) * (squares[1] + EPSILON)).rsqrt()
+    cosine = product * (squares[0] + EPSILON).rsqrt() * (squares[1] + EPSILON).rsqrt()
     darkness = luminance.clamp(min=DARK) / scribbled_luminance.clamp(min=EPSILON)
     saturation = product / (squares[1] + EPSILON) / darkness.clamp(min=EPSILON)
     return (1 - ramp(darkness, *SHADED)) * ramp(saturation, *SATURATED) * ramp(cosine, *SAME_HUE)

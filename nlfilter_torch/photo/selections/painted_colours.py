@@ -101,16 +101,16 @@ class Groups:
         luminance, chroma = (region_means(part, counted) for part in split_luminance(image))
         return luminance, chroma
 
-    def corrections(
+    def corrected_by_hue(
         self, size: tuple[int, int], image: Tensor, masks: Tensor, shares: list[Tensor], kept: list[Scribbles]
     ) -> list[Tensor]:
-        """Corrections of each share (B, 1, h, w), see :func:`corrections`; none if there are no strokes on objects.
+        """:func:`corrections` (B, 2, h, w) of the share of each colour; none if there are no strokes on objects.
 
         Args:
             size: (H, W) of the picture.
             image: the reduced picture, (B, 3, h, w).
             masks: of the objects, (B, K, h, w).
-            shares: of each colour.
+            shares: of each colour, (B, 1, h, w).
             kept: strokes on what stays as it is, or none.
         """
         if self.strokes is None:

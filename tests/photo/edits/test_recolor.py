@@ -249,3 +249,49 @@ def test_brightness_is_differentiable() -> None:
     )
     torch.testing.assert_close(slope, (above - below) / 2e-5, rtol=1e-4, atol=1e-4)
     assert torch.autograd.grad(edited.sum(), image)[0].isfinite().all()
+
+
+def synthetic(*parts: tuple[tuple[slice, slice], tuple[float, float, float]]) -> torch.Tensor:
+    """A grey picture (1, 3, 96, 96) with rectangles of colours, all slightly textured."""
+    image = torch.full((1, 3, 96, 96), 0.45)
+    for where, channels in parts:
+        image[..., *where] = torch.tensor(channels).view(1, 3, 1, 1)
+    return image * (1 + 0.05 * torch.rand((1, 1, 96, 96), generator=torch.Generator().manual_seed(0)))
+
+
+RED_PAINT, STROKE = ((slice(20, 80), slice(10, 50)), (0.6, 0.1, 0.1)), box(30, 15, 8, 30, size=(96, 96))
+
+
+def blue(image: torch.Tensor, **options: object) -> torch.Tensor:
+    """What changes, (H, W), with a blue stroke on the red paint."""
+    return (recolor(image, paint(0.1, 0.2, 0.9, STROKE), STROKE, **options) - image).abs().amax(1)[0]
+
+
+def test_another_hue_of_the_same_brightness_stays() -> None:
+    image = synthetic(RED_PAINT, ((slice(20, 80), slice(50, 90)), (0.4, 0.2, 0.1)))
+    changed = blue(image)
+    assert changed[24:76, 14:46].min() > 0.1
+    assert changed[24:76, 56:86].max() < 0.01
+
+
+def test_enclosed_shade_takes_the_colour_and_what_is_unlike_less() -> None:
+    pixels = torch.tensor([[0.05, 0.004, 0.004], [0.3, 0.3, 0.3], [0.6, 0.1, 0.1]]).T.view(1, 3, 1, 3)
+    under, old = (part.view(1, 1, -1) for part in split_luminance(torch.tensor(RED_PAINT[1]).view(1, 3, 1, 1)))
+    change = Recoloring(old, old, torch.ones(1, 1, dtype=torch.bool), under)
+    shares, factor = torch.tensor([0.0, 0.0, 0.8]).view(1, 1, 1, 3), torch.tensor([1.0, 1.0, 0.5]).view(1, 1, 1, 3)
+    for enclosed, wanted in ((1.0, [1.0, 0.0, 0.4]), (0.0, [0.0, 0.0, 0.4])):
+        by_hue = [(factor, torch.full_like(factor, enclosed))]
+        share = change.corrected(*split_luminance(pixels), shares, by_hue)
+        torch.testing.assert_close(share, torch.tensor(wanted).view(1, 1, 1, 3))
+
+
+def test_shade_of_a_grey_object_takes_less_colour() -> None:
+    image, stroke = lit(1.0, 1.0, 1.0, low=0.15, high=0.6), box(4, 2, 32, 36, size=(40, 40))
+    added = split_luminance(recolor(image, paint(0.1, 0.2, 0.9, stroke), stroke))[1].norm(dim=1)[0, 20]
+    assert added[4] < 0.7 * added[20]  # lighter parts have less room for it
+
+
+@pytest.mark.parametrize(("level", "brightness"), [((0.0, 0.0, 0.0), 1.0), ((3.0, 1.2, 1.2), 0.0)])
+def test_black_objects_and_objects_above_white_change(level: tuple[float, float, float], brightness: float) -> None:
+    image = synthetic((RED_PAINT[0], level))
+    assert blue(image, brightness=brightness)[24:76, 14:46].min() > 0.1

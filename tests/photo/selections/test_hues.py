@@ -84,13 +84,30 @@ def test_shade_is_darker_of_a_similar_hue_and_no_less_saturated() -> None:
 def test_corrections_are_differentiable() -> None:
     generator = torch.Generator().manual_seed(0)
     image, mask, share, colours = (
-        torch.rand(1, channels, 12, 9, generator=generator, dtype=torch.float64).requires_grad_()
+        torch.rand(1, channels, 130, 121, generator=generator, dtype=torch.float64).requires_grad_()
         for channels in (3, 1, 1, 3)
     )
 
     def corrected(*inputs: torch.Tensor) -> torch.Tensor:
-        scribbled = inputs[3].flatten(2)
+        scribbled = inputs[3][..., :9, :12].flatten(2)
         samples = HueSamples.of(scribbled, torch.ones_like(scribbled[:, :1]))
         return corrections(*inputs[:3], samples, (scribbled[..., :5], torch.ones_like(scribbled[:, :1, :5])))
 
     assert torch.autograd.gradcheck(corrected, (image, mask, share, colours), fast_mode=True)
+
+
+def test_black_objects_and_objects_above_white_are_like_themselves() -> None:
+    weights = torch.ones(1, 1, 40, dtype=torch.float64)
+    assert HueSamples.of(colour(0, 0, 0).expand(1, 3, 40), weights).likeness(filled(0, 0, 0)).min() == 1
+    bright = HueSamples.of(colour(3, 1.2, 1.2).expand(1, 3, 40), weights)
+    assert bright.likeness(filled(3, 1.2, 1.2).clamp(0, 1)).min() == 1
+
+
+def test_shade_of_huge_values_is_finite() -> None:
+    chroma = torch.tensor((1e20, -1e20, 3e37)).view(1, 3, 1, 1).requires_grad_()
+    luminance = torch.full((1, 1, 1, 1), 1e37).requires_grad_()
+    shaded = shade(luminance, chroma, luminance, chroma)
+    shaded.sum().backward()
+    for tensor in (shaded, luminance.grad, chroma.grad):
+        assert tensor is not None
+        assert tensor.isfinite().all()
