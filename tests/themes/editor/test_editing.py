@@ -221,6 +221,7 @@ def crop_to_a_square(tab: Tab) -> None:
     tab.choose("Proportions", "1:1")
     expect(left).to_be_visible()
     expect(page.get_by_text("92×92 pixels")).to_be_attached()
+    expect(left).to_have_attribute("aria-valuenow", re.compile(r"^19\."))  # 29 of 150 pixels
     left.focus()
     page.keyboard.press("ArrowRight")
     expect(page.get_by_text("92×92 pixels")).to_have_count(0)

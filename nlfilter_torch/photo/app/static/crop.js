@@ -111,11 +111,12 @@ class Cropper {
   }
 
   #key(event) {
-    const isElsewhere = document.querySelector(".q-dialog, .q-menu") !== null; // a question, or an open list
+    const edge = event.target.dataset?.edge;
+    // A question or an open list has the keys, but not a list that is fading since an edge has the focus.
+    const isElsewhere = document.querySelector(edge ? ".q-dialog" : ".q-dialog, .q-menu") !== null;
     if (!document.documentElement.classList.contains("cropping") || isElsewhere) {
       return;
     }
-    const edge = event.target.dataset?.edge;
     const way = KEYS[event.key];
     if (edge && way) {
       const step = event.shiftKey ? STEP / 10 : STEP;

@@ -5,26 +5,27 @@ import { mock, test } from "node:test";
 
 const frame = { style: {}, querySelectorAll: () => [] };
 const picture = { style: {}, querySelector: () => ({}) };
-const OVER = ".q-dialog, .q-menu";
-const parts = { ".crop-picture": picture, ".crop-frame": frame, ".cropper": { addEventListener() {} }, [OVER]: null };
+const over = new Set(); // what is open over the frame
+const parts = { ".crop-picture": picture, ".crop-frame": frame, ".cropper": { addEventListener() {} } };
 const sent = [];
 let press;
 
 globalThis.emitEvent = (name, value) => sent.push(value ? `${name} ${value.map((edge) => edge.toFixed(2))}` : name);
 globalThis.document = {
   documentElement: { classList: { add() {}, remove() {}, contains: () => true } },
-  querySelector: (selector) => parts[selector],
+  querySelector: (selector) => parts[selector] ?? (selector.split(", ").some((part) => over.has(part)) ? {} : null),
 };
 globalThis.window = { addEventListener: (_, listener) => (press = listener) };
 mock.timers.enable({ apis: ["setTimeout"] });
 await import("../../../../nlfilter_torch/photo/app/static/crop.js");
 const { cropper } = globalThis.window;
 
-const keys = (...names) => {
+const keysAt = (edge, names) => {
   for (const key of names) {
-    press({ key, target: { dataset: { edge: "left" } }, shiftKey: false, stopPropagation() {}, preventDefault() {} });
+    press({ key, target: { dataset: { edge } }, shiftKey: false, stopPropagation() {}, preventDefault() {} });
   }
 };
+const keys = (...names) => keysAt("left", names);
 const told = () => sent.splice(0);
 
 test("keys are told after a rest, or before the end", () => {
@@ -44,15 +45,29 @@ test("keys are told after a rest, or before the end", () => {
   }
 });
 
-test("keys belong to an open list or dialog", () => {
+test("keys belong to an open dialog or list", () => {
   cropper.show("whole", 100, 100, [0, 0, 1, 1]);
-  parts[OVER] = {};
-  keys("Escape", "ArrowRight", "Enter");
-  mock.timers.tick(400);
-  assert.deepEqual(told(), []);
-  parts[OVER] = null;
-  keys("Escape");
+  for (const [what, edge] of [
+    [".q-dialog", "left"],
+    [".q-menu", undefined],
+  ]) {
+    over.add(what);
+    keysAt(edge, ["Escape", "ArrowRight", "Enter"]);
+    mock.timers.tick(400);
+    assert.deepEqual(told(), []);
+    over.delete(what);
+  }
+  keysAt(undefined, ["Escape"]);
   assert.deepEqual(told(), ["crop_done"]);
+});
+
+test("keys belong to an edge that has the focus while a list fades", () => {
+  cropper.show("whole", 100, 100, [0, 0, 1, 1]);
+  over.add(".q-menu");
+  keys("ArrowRight");
+  mock.timers.tick(400);
+  over.clear();
+  assert.deepEqual(told(), ["crop 0.01,0.00,1.00,1.00"]);
 });
 
 test("a frame keeps the aspect that the server tells", () => {
