@@ -187,7 +187,7 @@ class Editor:
         self._follow_change(moving)
 
     def _develop(self, values: Mapping[str, Value], complete: bool) -> bool:
-        """Change how the photograph is developed; ``complete`` when the pointer is released. Returns if it can be."""
+        """Change how the photograph is developed, and return whether it can be; ``complete`` at the end of a drag."""
         session = self.session
         if session.opened is None:
             self._panel.follow()
@@ -271,7 +271,7 @@ class Editor:
             return
         self._proportions = replace(before, name=name, kept=frozenset())
         if not self._develop({"crop": self._proportions.begin(develop.crop)}, True):
-            self._proportions = replace(before, cut=None)  # the next begin with the crop as it is
+            self._proportions = replace(before, cut=None)  # the next cut begins with the crop as it is
             return
         self._proportions.cut = self.session.recipe.develop.crop
         if not self._is_cropping:

@@ -18,14 +18,13 @@ from nlfilter_torch.core.precision import squarable
 from nlfilter_torch.operator.features import blur
 from nlfilter_torch.photo.picture.colour import dot, split_luminance
 from nlfilter_torch.photo.picture.resizing import block_means, enlarged
-from nlfilter_torch.photo.selections.scribbled_colours import colours_in_lab, density, every_nth
+from nlfilter_torch.photo.selections.scribbled_colours import SIMILAR_SHARE, colours_in_lab, density, every_nth
 
 DARK = 0.02  # luminance below which hue and saturation are uncertain
 HALF_COUNTED = 0.1  # luminance of a scribbled pixel that counts half, for the same reason
 BLACK = 1e-4  # added to it, so that pixels of a black object count, too
 NUM_COLOURS = 128  # approximate number of scribbled pixels that others are compared with
 BANDWIDTH, PER_SATURATION = 0.06, 0.08  # of this comparison: for a grey object, and how it grows with the saturation
-SIMILAR_SHARE = 0.3  # share of the scribbled pixels that a pixel has to resemble
 AROUND_SIGMA, AROUND_GRID = 0.02, 60  # surroundings: standard deviation, share of the short side; rows or columns
 LEAST_SIGMA = 3.0  # the least of it, in pixels: wider than a soft border, whose pixels are mixtures
 # Mean likeness of the surroundings up to which what a mask of 1 selects does not count, and from which on it does.

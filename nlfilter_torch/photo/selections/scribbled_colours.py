@@ -21,7 +21,7 @@ from nlfilter_torch.photo.selections.trimap import by_trimap
 
 FRAME_POINTS = 64  # approximate number of points along the upper or left border of a picture
 NUM_COMPARED = 512  # approximate number of scribbled pixels that the frame is compared with
-SIMILAR_SHARE = 0.3  # a frame point similar to this share of the scribbled pixels does not count as background
+SIMILAR_SHARE = 0.3  # a pixel that is similar to this share of the scribbled ones counts as similar to them
 # Approximate number of scribbled pixels on each side that the colours of all pixels are compared with, and bandwidth of
 # that comparison as a share of the photometric bandwidth: for a few scribbles, and for a trimap.
 NUM_COLOURS = (32, 128)
