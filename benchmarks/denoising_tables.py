@@ -15,7 +15,7 @@ from typing import Any
 from benchmarks.denoising.patterns import pattern_table
 from benchmarks.denoising.sets import set_table
 from benchmarks.report import between, table
-from nlfilter_torch.photo.io.writing import open_beside
+from nlfilter_torch.photo.files.writing import open_beside
 
 MARKERS = ("<!-- denoising: written by python -m benchmarks.denoising_tables -->", "<!-- end of denoising -->")
 Results = dict[str, dict[str, Any]]

@@ -1,6 +1,6 @@
 """How long the stages of edits take in tiles: ``python -m benchmarks.durations``, about half an hour on a core.
 
-Prints the content of ``nlfilter_torch/photo/tiled/durations.json``, in seconds of the processor with one thread, of
+Prints the content of ``nlfilter_torch/photo/picture/durations.json``, in seconds of the processor with one thread, of
 which the time left of an edit is estimated. Each edit runs on ``benchmarks.streaming``'s mosaic in two sizes up to the
 viewing size, and two larger ones; what a stage takes is linear in between. Each run is in a process of its own, like a
 command, which loads what it needs, and memory that it never used before. ``--quick`` takes small pictures, to see that
@@ -21,8 +21,8 @@ import torch
 
 from benchmarks.streaming import mosaic
 from nlfilter_torch.photo import Step, Stroke
-from nlfilter_torch.photo.tiled.recipe import edit_rows
-from nlfilter_torch.photo.tiled.tiles import Passes
+from nlfilter_torch.photo.edits.recipe import edit_rows
+from nlfilter_torch.photo.picture.tiles import Passes
 
 SIZES = {"small": (0.5, 1.4), "large": (2.0, 12.0)}  # megapixels
 SLOW = {"denoise": {"small": (0.5, 1.4), "large": (2.0, 4.0)}}  # of edits that take many seconds for each

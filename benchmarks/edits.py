@@ -29,7 +29,7 @@ from nlfilter_torch import (
     nonlocal_operator,
     recolor,
 )
-from nlfilter_torch.photo.io.writing import open_beside
+from nlfilter_torch.photo.files.writing import open_beside
 
 SUIT = (60, 300, 20, 20)  # column, row, width, height on the astronaut's suit
 TIMES = (0.5, 1.0, 2.0, 5.0)

@@ -30,7 +30,7 @@ from nlfilter_torch import (
     sharpen,
 )
 from nlfilter_torch.photo import PRESETS, apply_recipe
-from nlfilter_torch.photo.io.writing import open_beside
+from nlfilter_torch.photo.files.writing import open_beside
 from nlfilter_torch.photo.picture.colour import edit_luminance
 from nlfilter_torch.photo.plotting import plot_response, show_eigenvectors, show_images, show_layers
 

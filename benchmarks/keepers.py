@@ -36,7 +36,7 @@ from nlfilter_torch.photo.declared.presets import Recipe, find_recipe
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.declared.strokes import Stroke
 from nlfilter_torch.photo.edits.applying import apply_recipe
-from nlfilter_torch.photo.io.photographs import Photograph, write_photograph
+from nlfilter_torch.photo.files.photographs import Photograph, write_photograph
 from nlfilter_torch.photo.picture.painting import colour_of, mask_of
 from nlfilter_torch.photo.picture.resizing import resize
 

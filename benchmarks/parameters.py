@@ -22,7 +22,7 @@ FILES = (
     "photo/declared/presets.py",
     "photo/declared/steps.py",
     "photo/edits/applying.py",
-    "photo/tiled/recipe.py",
+    "photo/edits/recipe.py",
 )
 HEAD = """# Parameters
 

@@ -28,11 +28,11 @@ from nlfilter_torch import nonlocal_operator, polynomial_filter
 from nlfilter_torch.photo import Drawn, Step, stream
 from nlfilter_torch.photo.declared.steps import working_bytes
 from nlfilter_torch.photo.edits.applying import fit_step
-from nlfilter_torch.photo.io.rows import open_picture, write_picture
+from nlfilter_torch.photo.files.rows import open_picture, write_picture
 from nlfilter_torch.photo.picture.colour import edit_luminance
-from nlfilter_torch.photo.tiled.pictures import Picture
-from nlfilter_torch.photo.tiled.source import Tiled
-from nlfilter_torch.photo.tiled.tiles import SAMPLE, Passes, Statistics
+from nlfilter_torch.photo.picture.pictures import Picture
+from nlfilter_torch.photo.picture.tiled import Tiled
+from nlfilter_torch.photo.picture.tiles import SAMPLE, Passes, Statistics
 
 ALPHA = torch.tensor([3.0, 3.0, 4.0, 1.05])
 PLAIN: dict[str, Any] = {  # the filter without limits or threshold, in pixels of the file

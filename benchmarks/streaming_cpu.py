@@ -20,7 +20,7 @@ from benchmarks.streaming_strokes import Boxes
 from nlfilter_torch import recolor
 from nlfilter_torch.photo import Drawn, Step, stream
 from nlfilter_torch.photo.edits.detail import enhance
-from nlfilter_torch.photo.tiled.pictures import stored_as
+from nlfilter_torch.photo.picture.pictures import stored_as
 
 Edit = Callable[[], NDArray[Any]]
 

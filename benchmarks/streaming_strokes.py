@@ -23,11 +23,11 @@ from benchmarks.streaming import mosaic, write_mosaic
 from nlfilter_torch import colorize, recolor
 from nlfilter_torch.photo import Drawn, Step, stream
 from nlfilter_torch.photo.edits.applying import fit_step
-from nlfilter_torch.photo.io.rows import open_picture, write_picture
+from nlfilter_torch.photo.files.rows import open_picture, write_picture
 from nlfilter_torch.photo.picture.colour import colour_guide, split_luminance
-from nlfilter_torch.photo.tiled.pictures import Picture
-from nlfilter_torch.photo.tiled.source import Tiled
-from nlfilter_torch.photo.tiled.tiles import Passes
+from nlfilter_torch.photo.picture.pictures import Picture
+from nlfilter_torch.photo.picture.tiled import Tiled
+from nlfilter_torch.photo.picture.tiles import Passes
 
 VERBS = ("recolor", "colorize")
 BOXES = (  # (top, left, height, width) as shares of the picture, and RGB

@@ -11,10 +11,10 @@ import torch
 from numpy.typing import NDArray
 from PIL import ExifTags, Image, ImageCms
 
-from nlfilter_torch.photo.io.photographs import Photograph
-from nlfilter_torch.photo.io.rows import open_picture
-from nlfilter_torch.photo.io.tables import POINTERS, Tables
-from nlfilter_torch.photo.tiled.pictures import stored_as
+from nlfilter_torch.photo.files.photographs import Photograph
+from nlfilter_torch.photo.files.rows import open_picture
+from nlfilter_torch.photo.files.tables import POINTERS, Tables
+from nlfilter_torch.photo.picture.pictures import stored_as
 
 PROFILE = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
 INTEGERS = ("uint8", "uint16")

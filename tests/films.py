@@ -10,8 +10,8 @@ import skimage.data
 import torch
 from av.video.reformatter import Interpolation
 
-from nlfilter_torch.photo.io.films import display_matrix
-from nlfilter_torch.photo.tiled.tiles import Passes
+from nlfilter_torch.photo.files.films import display_matrix
+from nlfilter_torch.photo.picture.tiles import Passes
 
 PASSES = Passes("float32")
 SCENE = skimage.data.astronaut().astype(np.float32) / 255

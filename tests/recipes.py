@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.declared.strokes import Stroke
-from nlfilter_torch.photo.tiled import recipe as whole_edit
-from nlfilter_torch.photo.tiled.tiles import Passes
+from nlfilter_torch.photo.edits import recipe as whole_edit
+from nlfilter_torch.photo.picture.tiles import Passes
 
 LINE = ((0.25, 0.25), (0.5, 0.3))
 IN, OUT = Stroke(LINE, 0.06, "in"), Stroke(((0.8, 0.8),), 0.1, "out")

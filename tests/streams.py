@@ -14,11 +14,11 @@ from nlfilter_torch.photo.edits.detail import Detail
 from nlfilter_torch.photo.edits.recolor import Recolor
 from nlfilter_torch.photo.picture.drawn import Drawn
 from nlfilter_torch.photo.picture.edit import PhotoEdit
+from nlfilter_torch.photo.picture.pictures import Picture, RowSource, RowTarget
+from nlfilter_torch.photo.picture.sampling import in_silence
+from nlfilter_torch.photo.picture.tiled import Tiled
+from nlfilter_torch.photo.picture.tiles import SAMPLE, Passes, check_target, fill
 from nlfilter_torch.photo.selections.mask import RegionMask
-from nlfilter_torch.photo.tiled.pictures import Picture, RowSource, RowTarget
-from nlfilter_torch.photo.tiled.sampling import in_silence
-from nlfilter_torch.photo.tiled.source import Tiled
-from nlfilter_torch.photo.tiled.tiles import SAMPLE, Passes, check_target, fill
 
 FUNCTIONS: dict[type[PhotoEdit], Callable[..., Tensor]] = {
     Detail: enhance,

@@ -22,7 +22,7 @@ from benchmarks.denoiser_training.graphs import graphed_pivots
 from benchmarks.denoiser_training.pictures import Pictures
 from nlfilter_torch.nn.denoiser.network import PLANES, SLOPE, WIDTH, Layer, NonlocalDenoiser, shapes_of
 from nlfilter_torch.nn.denoiser.weights import read_weights
-from nlfilter_torch.photo.io.writing import open_beside
+from nlfilter_torch.photo.files.writing import open_beside
 from nlfilter_torch.photo.plotting import save_figure
 
 BATCH = 6  # crops in a step

@@ -40,7 +40,7 @@ from benchmarks.denoising.measuring import table
 from benchmarks.denoising.methods import METHODS, Method, available, network
 from benchmarks.denoising.published import LEVELS
 from nlfilter_torch import NonlocalDenoiser
-from nlfilter_torch.photo.io.writing import open_beside
+from nlfilter_torch.photo.files.writing import open_beside
 
 
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:

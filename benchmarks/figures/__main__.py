@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 
 from benchmarks.figures import FIGURES, SIZE
-from nlfilter_torch.photo.io.writing import open_beside
+from nlfilter_torch.photo.files.writing import open_beside
 from nlfilter_torch.photo.plotting import save_figure
 
 QUICK = 72  # longer side of a photograph, in pixels

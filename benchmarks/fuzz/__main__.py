@@ -20,7 +20,7 @@ import torch
 from benchmarks.fuzz.checks import PROMISES, Figure
 from benchmarks.fuzz.pictures import pictures
 from benchmarks.fuzz.running import Check, Result, function_case, operator_case, picture_case, rank, results
-from nlfilter_torch.photo.io.writing import open_beside
+from nlfilter_torch.photo.files.writing import open_beside
 
 WORKERS = 2
 SHOWN = 5  # kinds of warnings printed

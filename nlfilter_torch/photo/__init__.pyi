@@ -15,10 +15,11 @@ from .edits.frames import filter_frames as filter_frames
 from .edits.look import apply_look as apply_look
 from .edits.recolor import recolor as recolor
 from .edits.sharpen import sharpen as sharpen
+from .edits.streaming import stream as stream
 from .edits.tone import adjust_tone as adjust_tone
-from .io.photographs import Photograph as Photograph
-from .io.photographs import read_photograph as read_photograph
-from .io.photographs import write_photograph as write_photograph
+from .files.photographs import Photograph as Photograph
+from .files.photographs import read_photograph as read_photograph
+from .files.photographs import write_photograph as write_photograph
 from .look_fitting.fit_look import FittedLook as FittedLook
 from .look_fitting.fit_look import fit_look as fit_look
 from .look_fitting.own_steps import FittedSteps as FittedSteps
@@ -33,4 +34,3 @@ from .plotting import show_images as show_images
 from .plotting import show_layers as show_layers
 from .plotting import show_mask as show_mask
 from .selections.mask import region_mask as region_mask
-from .tiled.streaming import stream as stream

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from nlfilter_torch.filtering.filters import polynomial_response
 from nlfilter_torch.operator.spectrum import Spectrum
-from nlfilter_torch.photo.io.writing import open_beside
+from nlfilter_torch.photo.files.writing import open_beside
 
 DPI = 100
 POINTS = 72  # typographic points per inch

@@ -19,9 +19,9 @@ import zarr
 from PIL import Image
 
 from nlfilter_torch.photo.cli import main
-from nlfilter_torch.photo.io.photographs import Photograph, read_photograph, write_photograph
-from nlfilter_torch.photo.io.tiff import TiffRows
-from nlfilter_torch.photo.tiled import pictures, tiles
+from nlfilter_torch.photo.files.photographs import Photograph, read_photograph, write_photograph
+from nlfilter_torch.photo.files.tiff import TiffRows
+from nlfilter_torch.photo.picture import pictures, tiles
 from tests.files import PROFILE, Array, cat
 from tests.ranks import forked
 
@@ -31,8 +31,8 @@ LITTLE = "0.03"  # gigabytes: less than the whole picture needs, more than small
 @pytest.fixture(autouse=True)
 def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
     """Reduce samples and blocks in proportion to small pictures."""
-    monkeypatch.setattr("nlfilter_torch.photo.tiled.sampling.PILOT", 8000)
-    monkeypatch.setattr("nlfilter_torch.photo.tiled.pictures.STATISTICS_PIXELS", 6000)
+    monkeypatch.setattr("nlfilter_torch.photo.picture.sampling.PILOT", 8000)
+    monkeypatch.setattr("nlfilter_torch.photo.picture.pictures.STATISTICS_PIXELS", 6000)
 
 
 @pytest.fixture

@@ -12,9 +12,9 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from nlfilter_torch.photo.io.extras import Extras
-from nlfilter_torch.photo.io.photographs import DEPTHS, SUFFIXES, Photograph, read_photograph, write_photograph
-from nlfilter_torch.photo.io.rows import open_picture, write_picture
+from nlfilter_torch.photo.files.extras import Extras
+from nlfilter_torch.photo.files.photographs import DEPTHS, SUFFIXES, Photograph, read_photograph, write_photograph
+from nlfilter_torch.photo.files.rows import open_picture, write_picture
 from tests.files import PROFILE, fields_of, rows_of
 
 LOSSY = ("JPEG", "AVIF")

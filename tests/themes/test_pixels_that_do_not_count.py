@@ -15,10 +15,10 @@ from nlfilter_torch.operator.hidden import fill_nearby
 from nlfilter_torch.photo import Recipe, Step, apply_recipe, stream
 from nlfilter_torch.photo.cli import editing, main
 from nlfilter_torch.photo.edits.noise import noise_of, profile_of
-from nlfilter_torch.photo.io import read_photograph, write_photograph
+from nlfilter_torch.photo.files import read_photograph, write_photograph
 from nlfilter_torch.photo.picture.in_memory import InMemory
+from nlfilter_torch.photo.picture.pictures import NodataRows, lacks_data
 from nlfilter_torch.photo.picture.pixels import whole_image
-from nlfilter_torch.photo.tiled.pictures import NodataRows, lacks_data
 
 Levels = NDArray[np.uint8]
 SIZE = (96, 110)

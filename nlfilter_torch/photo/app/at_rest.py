@@ -11,7 +11,7 @@ from torch import Tensor
 from nlfilter_torch.core.progress import Progress
 from nlfilter_torch.photo.app.work import Interruptible, OutdatedError, Run, Start
 from nlfilter_torch.photo.declared.presets import Recipe
-from nlfilter_torch.photo.tiled.sampling import Report
+from nlfilter_torch.photo.picture.sampling import Report
 
 QUIET = 1.0  # seconds without a change, after which the whole photograph is edited
 

@@ -11,8 +11,8 @@ from nlfilter_torch.core.progress import Progress
 from nlfilter_torch.photo.app import drawing
 from nlfilter_torch.photo.app.work import Interruptible, OutdatedError, Run, Start
 from nlfilter_torch.photo.declared.presets import Recipe
-from nlfilter_torch.photo.tiled.parts import Rectangle
-from nlfilter_torch.photo.tiled.sampling import Report
+from nlfilter_torch.photo.edits.parts import Rectangle
+from nlfilter_torch.photo.picture.sampling import Report
 
 CELL = 64  # pixels; pieces consist of squares of that size
 PIECE = 1 << 19  # pixels of a piece, at most

@@ -37,8 +37,8 @@ def app(image: Image = None, out: Out = None, host: Host = "127.0.0.1", port: Po
 
     Example: `nlfilter-torch app photo.jpg`
     """
-    from nlfilter_torch.photo.io.photographs import first_bytes
-    from nlfilter_torch.photo.io.writing import check_folder
+    from nlfilter_torch.photo.files.photographs import first_bytes
+    from nlfilter_torch.photo.files.writing import check_folder
 
     if image is not None:
         first_bytes(image)

@@ -11,8 +11,9 @@ from nlfilter_torch.photo.declared.presets import DEVELOPING_BYTES
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.declared.strokes import Stroke
 from nlfilter_torch.photo.edits.applying import left_by_crop
-from nlfilter_torch.photo.io.developed import cut_photograph, lit_photograph
-from nlfilter_torch.photo.io.photographs import Photograph, check_memory
+from nlfilter_torch.photo.edits.parts import Parts, Rectangle
+from nlfilter_torch.photo.files.developed import cut_photograph, lit_photograph
+from nlfilter_torch.photo.files.photographs import Photograph, check_memory
 from nlfilter_torch.photo.picture.developing import (
     develop_image,
     in_light,
@@ -24,7 +25,6 @@ from nlfilter_torch.photo.picture.developing import (
 from nlfilter_torch.photo.picture.in_memory import InMemory
 from nlfilter_torch.photo.picture.painting import TensorPainter
 from nlfilter_torch.photo.picture.resizing import resize
-from nlfilter_torch.photo.tiled.parts import Parts, Rectangle
 
 DEVELOPING = -1  # the place before all steps, of a slider that moves
 

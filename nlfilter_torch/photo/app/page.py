@@ -34,7 +34,7 @@ from nlfilter_torch.photo.declared.development import Development
 from nlfilter_torch.photo.declared.json_values import Value
 from nlfilter_torch.photo.declared.parameters import DETAIL, EDITS
 from nlfilter_torch.photo.declared.presets import Recipe
-from nlfilter_torch.photo.tiled.sampling import Report
+from nlfilter_torch.photo.picture.sampling import Report
 
 Save = Callable[[str, Report], Path]  # name and progress
 LARGEST_PRESET = 20_000_000  # bytes

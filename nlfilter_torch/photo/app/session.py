@@ -22,9 +22,11 @@ from nlfilter_torch.photo.declared.presets import Recipe, on_frame
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.declared.strokes import Stroke, thin
 from nlfilter_torch.photo.edits.applying import apply_recipe
-from nlfilter_torch.photo.io import tiff
-from nlfilter_torch.photo.io.exif import read_upright
-from nlfilter_torch.photo.io.photographs import (
+from nlfilter_torch.photo.edits.parts import Parts, Rectangle
+from nlfilter_torch.photo.edits.recipe import edit_rows
+from nlfilter_torch.photo.files import tiff
+from nlfilter_torch.photo.files.exif import read_upright
+from nlfilter_torch.photo.files.photographs import (
     BITS,
     DEPTHS,
     SUFFIXES,
@@ -35,15 +37,13 @@ from nlfilter_torch.photo.io.photographs import (
     read_photograph,
     write_photograph,
 )
-from nlfilter_torch.photo.io.rows import TILED, WHOLE, usual_memory
-from nlfilter_torch.photo.io.writing import open_beside
+from nlfilter_torch.photo.files.rows import TILED, WHOLE, usual_memory
+from nlfilter_torch.photo.files.writing import open_beside
 from nlfilter_torch.photo.picture.developing import balance_of
+from nlfilter_torch.photo.picture.durations import duration, expected_stages, writing
 from nlfilter_torch.photo.picture.resizing import resize
-from nlfilter_torch.photo.tiled.durations import duration, expected_stages, writing
-from nlfilter_torch.photo.tiled.parts import Parts, Rectangle
-from nlfilter_torch.photo.tiled.recipe import edit_rows
-from nlfilter_torch.photo.tiled.sampling import Report, in_silence
-from nlfilter_torch.photo.tiled.tiles import Passes, Statistics
+from nlfilter_torch.photo.picture.sampling import Report, in_silence
+from nlfilter_torch.photo.picture.tiles import Passes, Statistics
 
 POINTED = 2  # pixels of the preview on all sides of a point that are averaged
 SPACING = 0.2  # distance of the points of a stroke, as a share of its radius

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from nlfilter_torch.photo.declared.presets import Recipe
-from nlfilter_torch.photo.io.writing import open_beside
+from nlfilter_torch.photo.files.writing import open_beside
 
 ENDING = ".edit.json"
 UNREADABLE = ".unreadable"

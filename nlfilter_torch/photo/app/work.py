@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Protocol, TypeVar
 
 from nlfilter_torch.core.progress import Progress
-from nlfilter_torch.photo.tiled.sampling import Report
+from nlfilter_torch.photo.picture.sampling import Report
 
 T = TypeVar("T")
 Start = Callable[[Awaitable[None]], None]  # a task in the background, whose failure is reported

@@ -96,7 +96,7 @@ def batch(
     from nlfilter_torch.photo.cli.editing import allowed_memory, check_quality_of, check_workers
     from nlfilter_torch.photo.cli.folders import Tally, edit_folder, left_out, pictures, prepare, subfolders
     from nlfilter_torch.photo.cli.progress import steps
-    from nlfilter_torch.photo.io.rows import WHOLE, free_memory
+    from nlfilter_torch.photo.files.rows import WHOLE, free_memory
 
     check_workers(workers, cluster)
     if cluster is not None:  # whose workers run in other folders

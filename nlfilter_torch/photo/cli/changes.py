@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from nlfilter_torch.photo.cli.options import LEVELS
-from nlfilter_torch.photo.io.photographs import Depth, Photograph, write_photograph
+from nlfilter_torch.photo.files.photographs import Depth, Photograph, write_photograph
 from nlfilter_torch.photo.picture.edit import Rows
-from nlfilter_torch.photo.tiled.pictures import WHITE, is_hidden
-from nlfilter_torch.photo.tiled.tiles import Tiling
+from nlfilter_torch.photo.picture.pictures import WHITE, is_hidden
+from nlfilter_torch.photo.picture.tiles import Tiling
 
 MAP_DEPTH: Depth = "uint16"
 ROWS, AROUND = 256, 2  # rows of the photograph that are read at once, and additional rows on both sides

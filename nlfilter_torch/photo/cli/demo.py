@@ -39,7 +39,7 @@ def demo(folder: Folder = Path("out")) -> None:
     from nlfilter_torch.photo.declared.presets import find_recipe
     from nlfilter_torch.photo.edits.applying import apply_recipe
     from nlfilter_torch.photo.edits.recolor import recolor
-    from nlfilter_torch.photo.io.writing import check_folder
+    from nlfilter_torch.photo.files.writing import check_folder
     from nlfilter_torch.photo.plotting import (
         plot_response,
         show_eigenvectors,

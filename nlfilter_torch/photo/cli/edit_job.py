@@ -20,16 +20,16 @@ from nlfilter_torch.photo.cli.showing import Scribbled
 from nlfilter_torch.photo.declared.development import AS_IT_IS, Development
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.edits.applying import edit_of
-from nlfilter_torch.photo.io.photographs import Photograph
-from nlfilter_torch.photo.io.rows import StoredPicture, open_picture
+from nlfilter_torch.photo.files.photographs import Photograph
+from nlfilter_torch.photo.files.rows import StoredPicture, open_picture
 from nlfilter_torch.photo.picture.drawn import Drawn, M
+from nlfilter_torch.photo.picture.durations import stages_of
 from nlfilter_torch.photo.picture.edit import PhotoEdit, Rows
 from nlfilter_torch.photo.picture.in_memory import InMemory, edit_image, fit_edit
+from nlfilter_torch.photo.picture.pictures import Picture, RowSource, stored_as
 from nlfilter_torch.photo.picture.source import Source, seeded
-from nlfilter_torch.photo.tiled.durations import stages_of
-from nlfilter_torch.photo.tiled.pictures import Picture, RowSource, stored_as
-from nlfilter_torch.photo.tiled.source import Tiled
-from nlfilter_torch.photo.tiled.tiles import Tiling
+from nlfilter_torch.photo.picture.tiled import Tiled
+from nlfilter_torch.photo.picture.tiles import Tiling
 
 
 @dataclass(frozen=True)

@@ -17,8 +17,8 @@ from nlfilter_torch.photo.cli.changes import MAP_DEPTH
 from nlfilter_torch.photo.cli.progress import stages, steps
 from nlfilter_torch.photo.declared.development import Development
 from nlfilter_torch.photo.declared.steps import Step, working_bytes
-from nlfilter_torch.photo.io.developed import develop_photograph
-from nlfilter_torch.photo.io.photographs import (
+from nlfilter_torch.photo.files.developed import develop_photograph
+from nlfilter_torch.photo.files.photographs import (
     Photograph,
     TooLarge,
     check_depth,
@@ -28,7 +28,7 @@ from nlfilter_torch.photo.io.photographs import (
     read_photograph,
     write_photograph,
 )
-from nlfilter_torch.photo.io.rows import (
+from nlfilter_torch.photo.files.rows import (
     TILED,
     WHOLE,
     StoredPicture,
@@ -38,12 +38,12 @@ from nlfilter_torch.photo.io.rows import (
     usual_memory,
     write_picture,
 )
+from nlfilter_torch.photo.picture.durations import written
 from nlfilter_torch.photo.picture.edit import Rows
+from nlfilter_torch.photo.picture.pictures import Picture, mask_plane
+from nlfilter_torch.photo.picture.sampling import Report
+from nlfilter_torch.photo.picture.tiles import Passes, Processes, Statistics, Tiling
 from nlfilter_torch.photo.picture.viewing import viewed_size
-from nlfilter_torch.photo.tiled.durations import written
-from nlfilter_torch.photo.tiled.pictures import Picture, mask_plane
-from nlfilter_torch.photo.tiled.sampling import Report
-from nlfilter_torch.photo.tiled.tiles import Passes, Processes, Statistics, Tiling
 
 MOST = 1e6  # gigabytes; upper limit of ``--memory``
 

@@ -99,7 +99,7 @@ def fit(
     step = step_of(EDITS["look"], values)
 
     from nlfilter_torch.photo.cli.progress import steps
-    from nlfilter_torch.photo.io.writing import open_beside
+    from nlfilter_torch.photo.files.writing import open_beside
 
     tables = Tables(cube, hald)
     paths = _paths(before, after)
@@ -191,8 +191,8 @@ class Pairs:
 def _check_results(results: list[Path], preview: Path | None, left: Path | None, **inputs: list[Path]) -> None:
     """Raise ValueError or OSError unless all files can be written and differ from the inputs."""
     from nlfilter_torch.photo.cli.editing import check_apart
-    from nlfilter_torch.photo.io.photographs import check_type
-    from nlfilter_torch.photo.io.writing import check_file
+    from nlfilter_torch.photo.files.photographs import check_type
+    from nlfilter_torch.photo.files.writing import check_file
 
     for path in results:
         check_file(path)
@@ -288,7 +288,7 @@ def _counterpart(path: Path, others: Sequence[Path]) -> Path | None:
 def _read(before: Path, after: Path, step: "Step") -> "tuple[Tensor, Tensor]":
     """A pair on the same pixels, in colour if one of them is."""
     from nlfilter_torch.photo.cli.editing import viewed_within_memory
-    from nlfilter_torch.photo.io.photographs import read_photograph
+    from nlfilter_torch.photo.files.photographs import read_photograph
     from nlfilter_torch.photo.look_fitting.alignment import align
     from nlfilter_torch.photo.look_fitting.pairs import check_belong
 
@@ -409,7 +409,7 @@ def _draw(before: "Tensor", after: "Tensor", result: "Tensor", preview: Path | N
     """Write the preview and the map of what is left."""
     import torch
 
-    from nlfilter_torch.photo.io.photographs import Photograph, write_photograph
+    from nlfilter_torch.photo.files.photographs import Photograph, write_photograph
 
     if preview is not None:
         rest = (0.5 + AMPLIFIED * (after - result)).clamp(0, 1)

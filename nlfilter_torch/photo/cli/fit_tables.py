@@ -45,8 +45,8 @@ class Tables:
     def check(self, **inputs: list[Path]) -> None:
         """Raise ValueError or OSError unless the files can be written and differ from the inputs."""
         from nlfilter_torch.photo.cli.editing import check_apart
-        from nlfilter_torch.photo.io.photographs import check_type
-        from nlfilter_torch.photo.io.writing import check_file
+        from nlfilter_torch.photo.files.photographs import check_type
+        from nlfilter_torch.photo.files.writing import check_file
 
         if self.cube is not None:
             check_file(self.cube)
@@ -88,7 +88,7 @@ class Tables:
 def _write_cube(look: "FittedLook", path: Path) -> None:
     from nlfilter_torch.photo.declared.colour_tables import cube_of
     from nlfilter_torch.photo.edits.colour_part import colour_table
-    from nlfilter_torch.photo.io.writing import open_beside
+    from nlfilter_torch.photo.files.writing import open_beside
 
     with open_beside(path) as stream:
         stream.write(cube_of(colour_table(look.step, CUBE_NODES).numpy(), path.stem).encode())
@@ -99,7 +99,7 @@ def _write_hald(look: "FittedLook", path: Path) -> None:
 
     from nlfilter_torch.photo.declared.colour_tables import HALD_LEVEL, hald_of
     from nlfilter_torch.photo.edits.colour_part import colour_table
-    from nlfilter_torch.photo.io.photographs import Photograph, write_photograph
+    from nlfilter_torch.photo.files.photographs import Photograph, write_photograph
 
     levels = hald_of(colour_table(look.step, HALD_LEVEL**2).numpy())
     pixels = torch.from_numpy(levels.astype("float64") / 65535).permute(2, 0, 1)[None]

@@ -1,8 +1,8 @@
 """A folder of photographs edited by worker processes: those of joblib on this machine, or those of a cluster.
 
 Needs the ``cli`` extra, and ``cluster`` for a cluster. A file is done when the output folder has a file of
-its name, since a name appears only when its file is complete (:func:`~nlfilter_torch.photo.io.writing.open_beside`). An
-interrupted run continues when it is started again.
+its name, since a name appears only when its file is complete
+(:func:`~nlfilter_torch.photo.files.writing.open_beside`). An interrupted run continues when it is started again.
 """
 
 import contextlib
@@ -17,8 +17,8 @@ from pathlib import Path
 
 from nlfilter_torch.photo.cli.options import NOTE
 from nlfilter_torch.photo.cli.workers import DEATHS, Workers, is_death, worker_pool
-from nlfilter_torch.photo.io.photographs import SUFFIXES
-from nlfilter_torch.photo.io.writing import check_file, check_folder, open_beside, remove_stale
+from nlfilter_torch.photo.files.photographs import SUFFIXES
+from nlfilter_torch.photo.files.writing import check_file, check_folder, open_beside, remove_stale
 
 RECORD = ".nlfilter-batch.json"  # in the output folder: the settings of the files there
 FRAMES_RECORD = ".nlfilter-frames.json"  # in that of ``frames``: the names of the files that it wrote there

@@ -23,9 +23,9 @@ from nlfilter_torch.photo.declared.parameters import EDITS
 from nlfilter_torch.photo.declared.presets import PRESETS, Recipe
 
 if TYPE_CHECKING:
-    from nlfilter_torch.photo.io.photographs import Photograph
-    from nlfilter_torch.photo.tiled.film import FilmEdit, FrameArray
-    from nlfilter_torch.photo.tiled.tiles import Passes
+    from nlfilter_torch.photo.edits.film import FilmEdit, FrameArray
+    from nlfilter_torch.photo.files.photographs import Photograph
+    from nlfilter_torch.photo.picture.tiles import Passes
 
 #: Edits without scribbles.
 EDITS_WITHOUT_STROKES = tuple(edit for edit in EDITS.values() if not edit.requires_strokes)
@@ -107,10 +107,10 @@ def frames(
 
     from nlfilter_torch.photo.cli.editing import allowed_memory
     from nlfilter_torch.photo.cli.showing import notes_if_idle
-    from nlfilter_torch.photo.io.films import is_film
-    from nlfilter_torch.photo.io.rows import TILED
-    from nlfilter_torch.photo.tiled.film import film_steps
-    from nlfilter_torch.photo.tiled.tiles import Passes
+    from nlfilter_torch.photo.edits.film import film_steps
+    from nlfilter_torch.photo.files.films import is_film
+    from nlfilter_torch.photo.files.rows import TILED
+    from nlfilter_torch.photo.picture.tiles import Passes
 
     film_steps(recipe.steps)
     film = is_film(source) and not source.is_dir()
@@ -127,7 +127,7 @@ def fitted(
     recipe: Recipe, passes: "Passes", seed: int, notes: Iterable[str], samples: "list[FrameArray]"
 ) -> "FilmEdit":
     """Print the notes on the options, and fit an edit to frames that have been read."""
-    from nlfilter_torch.photo.tiled.film import FilmEdit
+    from nlfilter_torch.photo.edits.film import FilmEdit
 
     for note in notes:
         options.note(note)
@@ -161,7 +161,7 @@ def chosen_recipe(context: typer.Context, name: str, preset: str | None, values:
 def edit_film(source: Path, target: Path, references: int, fit: "Callable[[list[FrameArray]], FilmEdit]") -> int:
     """Edit a film, and return the number of its frames."""
     from nlfilter_torch.photo.cli.progress import steps
-    from nlfilter_torch.photo.io.films import check_film_output, open_film, write_film
+    from nlfilter_torch.photo.files.films import check_film_output, open_film, write_film
 
     if target.exists() and target.samefile(source):
         raise ValueError(f"OUT must be another file than the film, got {target}; choose another name")
@@ -196,8 +196,8 @@ def edit_folder(source: Path, target: Path, references: int, fit: "Callable[[lis
 def frames_of(source: Path, target: Path) -> list[Path]:
     """The photographs in a folder, of which edited ones can be written to another folder."""
     from nlfilter_torch.photo.cli.folders import pictures
-    from nlfilter_torch.photo.io.films import is_film
-    from nlfilter_torch.photo.io.writing import check_folder
+    from nlfilter_torch.photo.files.films import is_film
+    from nlfilter_torch.photo.files.writing import check_folder
 
     if source.is_file():
         raise ValueError(f"{source} must be a film (.mp4, .m4v or .mov) or a folder; convert it")
@@ -218,7 +218,7 @@ class FrameReader:
 
     def __call__(self, path: Path) -> "tuple[Photograph, FrameArray]":
         """A photograph, and its pixels (H, W, C)."""
-        from nlfilter_torch.photo.io.photographs import read_photograph
+        from nlfilter_torch.photo.files.photographs import read_photograph
 
         photograph = read_photograph(path, bytes_per_pixel=BYTES_PER_PIXEL)
         rows = photograph.pixels[0].permute(1, 2, 0).float().contiguous().numpy()
@@ -243,7 +243,7 @@ class EditedFrames:
     def prepare(self, photograph: "Photograph", name: str, paths: list[Path]) -> None:
         """Create the folder, record the names of all frames there, and check that it can hold a photograph."""
         from nlfilter_torch.photo.cli.folders import record_written
-        from nlfilter_torch.photo.io.photographs import check_output
+        from nlfilter_torch.photo.files.photographs import check_output
 
         self._folder.mkdir(exist_ok=True)
         try:
@@ -260,6 +260,6 @@ class EditedFrames:
         """Write a photograph with other pixels (H, W, C)."""
         import torch
 
-        from nlfilter_torch.photo.io.photographs import write_photograph
+        from nlfilter_torch.photo.files.photographs import write_photograph
 
         write_photograph(photograph.with_pixels(torch.from_numpy(rows).permute(2, 0, 1)[None]), self._folder / name)

@@ -125,7 +125,7 @@ class _Signals:
 
         During an import, which could catch it, end the process, or send the signal again later if a file is unfinished.
         """
-        files = sys.modules.get("nlfilter_torch.photo.io.writing")
+        files = sys.modules.get("nlfilter_torch.photo.files.writing")
         if _imports.running > 0:
             if getattr(files, "unfinished", None):
                 self._repeat(number)

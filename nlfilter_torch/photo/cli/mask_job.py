@@ -16,9 +16,9 @@ from nlfilter_torch.photo.cli.showing import Scribbled, tell_selected
 from nlfilter_torch.photo.declared.json_values import Value
 from nlfilter_torch.photo.declared.parameters import MASK
 from nlfilter_torch.photo.declared.steps import working_bytes
-from nlfilter_torch.photo.io.decoded import NO_METADATA
-from nlfilter_torch.photo.io.pfm import PFM, write_pfm
-from nlfilter_torch.photo.io.photographs import (
+from nlfilter_torch.photo.files.decoded import NO_METADATA
+from nlfilter_torch.photo.files.pfm import PFM, write_pfm
+from nlfilter_torch.photo.files.photographs import (
     Depth,
     Photograph,
     check_depth,
@@ -26,17 +26,17 @@ from nlfilter_torch.photo.io.photographs import (
     check_output,
     write_photograph,
 )
-from nlfilter_torch.photo.io.rows import TILED, StoredPicture, check_place, open_picture, write_picture
-from nlfilter_torch.photo.io.writing import check_file
+from nlfilter_torch.photo.files.rows import TILED, StoredPicture, check_place, open_picture, write_picture
+from nlfilter_torch.photo.files.writing import check_file
 from nlfilter_torch.photo.picture.drawn import Drawn, M
 from nlfilter_torch.photo.picture.edit import Rows
 from nlfilter_torch.photo.picture.in_memory import InMemory
+from nlfilter_torch.photo.picture.pictures import Picture
 from nlfilter_torch.photo.picture.seen import Seen, of_picture, range_of
 from nlfilter_torch.photo.picture.source import Fitted, Source, seeded
+from nlfilter_torch.photo.picture.tiled import Tiled
+from nlfilter_torch.photo.picture.tiled_scribbles import region_rows
 from nlfilter_torch.photo.selections.mask import RegionMask
-from nlfilter_torch.photo.tiled.pictures import Picture
-from nlfilter_torch.photo.tiled.scribbles import region_rows
-from nlfilter_torch.photo.tiled.source import Tiled
 
 PLANE_BYTES = 16  # per pixel, of a mask that is computed in tiles but written at once
 

@@ -1,9 +1,9 @@
 """Tiles computed by worker processes, which write them to a zarr array: the last part of an edit of a large picture.
 
-The edit is fitted in one process. The result, a :class:`~nlfilter_torch.photo.tiled.tiles.Tiling`, is written to a file
-in the folder of the new array. A worker reads it, opens the picture and the array, computes some rows, and writes the
-chunks that they make up. If a worker dies, another one computes its rows again. Workers need to see the folders under
-the same names; pixels do not pass through the process that fits.
+The edit is fitted in one process. The result, a :class:`~nlfilter_torch.photo.picture.tiles.Tiling`, is written to a
+file in the folder of the new array. A worker reads it, opens the picture and the array, computes some rows, and writes
+the chunks that they make up. If a worker dies, another one computes its rows again. Workers need to see the folders
+under the same names; pixels do not pass through the process that fits.
 """
 
 import pickle
@@ -15,10 +15,10 @@ from pathlib import Path
 from tempfile import gettempdir
 
 from nlfilter_torch.photo.cli.workers import DEATHS, Workers, is_death, worker_pool
-from nlfilter_torch.photo.io.rows import ZarrRows, write_band, zarr_package
-from nlfilter_torch.photo.io.writing import claimed, part_beside
-from nlfilter_torch.photo.tiled.pictures import RowSource
-from nlfilter_torch.photo.tiled.tiles import Comparison, Tiling
+from nlfilter_torch.photo.files.rows import ZarrRows, write_band, zarr_package
+from nlfilter_torch.photo.files.writing import claimed, part_beside
+from nlfilter_torch.photo.picture.pictures import RowSource
+from nlfilter_torch.photo.picture.tiles import Comparison, Tiling
 
 TASK_PIXELS = 1 << 20  # that a worker computes before it is given others, if there are enough of them
 TASKS = 4  # per worker at least, so that they end at about the same time

@@ -16,21 +16,21 @@ from nlfilter_torch.photo.declared.development import Development
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.edits.applying import apply_recipe, edit_of, left_by_crop
-from nlfilter_torch.photo.io.photographs import Photograph
-from nlfilter_torch.photo.io.rows import StoredPicture
+from nlfilter_torch.photo.edits.recipe import edit_regions, edit_tiling
+from nlfilter_torch.photo.files.photographs import Photograph
+from nlfilter_torch.photo.files.rows import StoredPicture
 from nlfilter_torch.photo.picture.changes import blend_edited
 from nlfilter_torch.photo.picture.drawn import M, Painter
+from nlfilter_torch.photo.picture.durations import expected_stages, straightening
 from nlfilter_torch.photo.picture.edit import Rows
 from nlfilter_torch.photo.picture.in_memory import InMemory
 from nlfilter_torch.photo.picture.painting import TensorPainter
+from nlfilter_torch.photo.picture.pictures import Picture
 from nlfilter_torch.photo.picture.source import Source
-from nlfilter_torch.photo.tiled.developed import developed_rows
-from nlfilter_torch.photo.tiled.durations import expected_stages, straightening
-from nlfilter_torch.photo.tiled.pictures import Picture
-from nlfilter_torch.photo.tiled.recipe import edit_regions, edit_tiling
-from nlfilter_torch.photo.tiled.scribbles import RowPainter
-from nlfilter_torch.photo.tiled.source import Tiled
-from nlfilter_torch.photo.tiled.tiles import Tiling
+from nlfilter_torch.photo.picture.tiled import Tiled
+from nlfilter_torch.photo.picture.tiled_developed import developed_rows
+from nlfilter_torch.photo.picture.tiled_scribbles import RowPainter
+from nlfilter_torch.photo.picture.tiles import Tiling
 
 
 @dataclass(frozen=True)

@@ -15,10 +15,10 @@ from torch import Tensor
 
 from nlfilter_torch.photo.cli.options import parse_sliders
 from nlfilter_torch.photo.declared.declaration import Edit, Scribble, ScribbleRole
-from nlfilter_torch.photo.io.photographs import check_depth
-from nlfilter_torch.photo.io.rows import StoredPicture
+from nlfilter_torch.photo.files.photographs import check_depth
+from nlfilter_torch.photo.files.rows import StoredPicture
 from nlfilter_torch.photo.picture.drawn import Drawn
-from nlfilter_torch.photo.tiled.pictures import LazyRows, Picture, mask_of, transparency
+from nlfilter_torch.photo.picture.pictures import LazyRows, Picture, mask_of, transparency
 
 Size = tuple[int, int]  # (height, width) of the photograph
 Open = Callable[[Path], StoredPicture]  # opens a picture of scribbles or a mask

@@ -18,7 +18,7 @@ from nlfilter_torch.photo.cli.options import note
 from nlfilter_torch.photo.cli.scribbles import Overlay, overlays
 from nlfilter_torch.photo.declared.declaration import Edit
 from nlfilter_torch.photo.declared.presets import Recipe
-from nlfilter_torch.photo.io.photographs import Photograph, write_photograph
+from nlfilter_torch.photo.files.photographs import Photograph, write_photograph
 from nlfilter_torch.photo.picture.colour import hundredths_of_lab
 from nlfilter_torch.photo.picture.drawn import Drawn
 from nlfilter_torch.photo.picture.edit import MARKS, PhotoEdit, Rows

@@ -2,8 +2,8 @@
 
 An edit has two parts: statistics of the whole picture (sums over all pixels), and a function of some of the pixels
 given these statistics. A :class:`Source` computes the sums: in :mod:`nlfilter_torch.photo.picture.in_memory` for an
-image or a batch in memory, with gradients; in :mod:`nlfilter_torch.photo.tiled.source` for a picture that is read a few
-rows at a time.
+image or a batch in memory, with gradients; in :mod:`nlfilter_torch.photo.picture.tiled` for a picture that is read a
+few rows at a time.
 """
 
 from collections.abc import Callable, Hashable, Iterable, Sequence

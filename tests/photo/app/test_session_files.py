@@ -14,7 +14,7 @@ from nlfilter_torch.operator.features import reduce_channels
 from nlfilter_torch.photo.app.session import FileOptions, Session, reduced_size
 from nlfilter_torch.photo.declared.presets import find_recipe
 from nlfilter_torch.photo.edits.applying import apply_recipe
-from nlfilter_torch.photo.io.photographs import HiddenPixels, Photograph, read_photograph, write_photograph
+from nlfilter_torch.photo.files.photographs import HiddenPixels, Photograph, read_photograph, write_photograph
 from nlfilter_torch.photo.picture.resizing import resize
 from tests.problems import LINE, cat, difference
 
@@ -163,7 +163,7 @@ def test_an_interrupted_save_leaves_the_old_file(session: Session, monkeypatch: 
         stream.write(before[:100])
         raise OSError("no space left on device")
 
-    monkeypatch.setattr("nlfilter_torch.photo.io.png.write_png", break_off)
+    monkeypatch.setattr("nlfilter_torch.photo.files.png.write_png", break_off)
     with pytest.raises(OSError, match="no space left"):
         session.save("out.png")
     assert target.read_bytes() == before

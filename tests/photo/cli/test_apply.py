@@ -9,14 +9,14 @@ from nlfilter_torch.photo.cli import main
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.edits.applying import apply_recipe
-from nlfilter_torch.photo.io.photographs import Photograph, read_photograph, write_photograph
+from nlfilter_torch.photo.files.photographs import Photograph, read_photograph, write_photograph
 from tests.problems import cat, difference
 from tests.recipes import COLORIZE, DEFOCUS, DETAIL, RECOLOR
 
 
 def test_the_command_line_goes_by_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("nlfilter_torch.photo.tiled.sampling.PILOT", 4000)
-    monkeypatch.setattr("nlfilter_torch.photo.tiled.pictures.STATISTICS_PIXELS", 6000)
+    monkeypatch.setattr("nlfilter_torch.photo.picture.sampling.PILOT", 4000)
+    monkeypatch.setattr("nlfilter_torch.photo.picture.pictures.STATISTICS_PIXELS", 6000)
     photo, preset = tmp_path / "in.tif", tmp_path / "edit.json"
     write_photograph(Photograph(cat().repeat(1, 1, 2, 2), "uint16"), photo)  # more than tiles need
     preset.write_text(Recipe((DETAIL, RECOLOR)).to_json())

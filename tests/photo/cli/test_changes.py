@@ -11,7 +11,7 @@ from PIL import Image
 
 from nlfilter_torch.photo.cli import main
 from nlfilter_torch.photo.cli.changes import ChangeMeter, squared_difference, write_map
-from nlfilter_torch.photo.io.photographs import Photograph, read_photograph, write_photograph
+from nlfilter_torch.photo.files.photographs import Photograph, read_photograph, write_photograph
 from nlfilter_torch.photo.picture.edit import Rows
 
 

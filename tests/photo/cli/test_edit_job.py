@@ -15,8 +15,8 @@ from nlfilter_torch.photo.cli import main
 from nlfilter_torch.photo.cli.edit_job import EditJob
 from nlfilter_torch.photo.cli.scribbles import ScribbleOptions
 from nlfilter_torch.photo.declared.steps import Step
-from nlfilter_torch.photo.io.photographs import Photograph, read_photograph, write_photograph
-from nlfilter_torch.photo.tiled import sampling
+from nlfilter_torch.photo.files.photographs import Photograph, read_photograph, write_photograph
+from nlfilter_torch.photo.picture import sampling
 from tests.problems import box, seeded
 
 SIZE = HEIGHT, WIDTH = 48, 64
@@ -50,7 +50,7 @@ def strokes(tmp_path: Path) -> Path:
 def scan(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A file of 16 bits, 180x150, beside strokes over it in two files, and a copy in grey."""
     monkeypatch.setattr(sampling, "PILOT", 8000)
-    monkeypatch.setattr("nlfilter_torch.photo.tiled.pictures.STATISTICS_PIXELS", 6000)
+    monkeypatch.setattr("nlfilter_torch.photo.picture.pictures.STATISTICS_PIXELS", 6000)
     picture = skimage.data.chelsea()[20:170, 90:270].astype(np.uint16) * 257
     tifffile.imwrite(tmp_path / "in.tif", picture, photometric="rgb", tile=(64, 64), compression="zlib")
     tifffile.imwrite(tmp_path / "grey.tif", picture[..., 1], photometric="minisblack")

@@ -12,7 +12,7 @@ from nlfilter_torch.photo.cli import main
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.edits.applying import apply_step
-from nlfilter_torch.photo.io.photographs import Photograph, read_photograph, write_photograph
+from nlfilter_torch.photo.files.photographs import Photograph, read_photograph, write_photograph
 from nlfilter_torch.photo.picture.resizing import resize
 from tests.commands import refusal
 from tests.looks import ALPHA, CAT, CUP, SEPIA, explained, in_bytes, rgb

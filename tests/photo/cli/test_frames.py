@@ -16,10 +16,10 @@ from nlfilter_torch.photo.declared.presets import PRESETS, Recipe, find_recipe
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.declared.strokes import Stroke
 from nlfilter_torch.photo.edits.applying import apply_step
-from nlfilter_torch.photo.io.films import open_film
-from nlfilter_torch.photo.io.photographs import Photograph, read_photograph, write_photograph
-from nlfilter_torch.photo.tiled.film import FilmEdit
-from nlfilter_torch.photo.tiled.tiles import Passes
+from nlfilter_torch.photo.edits.film import FilmEdit
+from nlfilter_torch.photo.files.films import open_film
+from nlfilter_torch.photo.files.photographs import Photograph, read_photograph, write_photograph
+from nlfilter_torch.photo.picture.tiles import Passes
 from tests.films import PASSES, facts, pan, write
 
 

@@ -21,9 +21,9 @@ from nlfilter_torch.photo.cli.workers import DEATHS, Workers
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.declared.strokes import Stroke
-from nlfilter_torch.photo.io.rows import open_picture, write_picture
-from nlfilter_torch.photo.tiled.pictures import Picture, Tile
-from nlfilter_torch.photo.tiled.tiles import Passes, Tiling
+from nlfilter_torch.photo.files.rows import open_picture, write_picture
+from nlfilter_torch.photo.picture.pictures import Picture, Tile
+from nlfilter_torch.photo.picture.tiles import Passes, Tiling
 from tests.files import cat
 
 FEW = ("--landmarks", "20")
@@ -41,9 +41,9 @@ def picture(tmp_path: Path) -> Path:
 
 @pytest.fixture(autouse=True)
 def small_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("nlfilter_torch.photo.io.rows.CHUNK", 32)
+    monkeypatch.setattr("nlfilter_torch.photo.files.rows.CHUNK", 32)
     monkeypatch.setattr(
-        "nlfilter_torch.photo.tiled.tiles.CHUNK_PIXELS", 7 * 50
+        "nlfilter_torch.photo.picture.tiles.CHUNK_PIXELS", 7 * 50
     )  # such that chunks begin in the midst of one
 
 

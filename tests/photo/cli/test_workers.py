@@ -12,7 +12,7 @@ import pytest
 
 from nlfilter_torch.photo.cli import interrupts, workers
 from nlfilter_torch.photo.cli.folders import RECORD, pictures
-from nlfilter_torch.photo.io.writing import open_beside
+from nlfilter_torch.photo.files.writing import open_beside
 from tests.folders import fill, plain_files, refused, tally_of
 
 ROOT = Path(__file__).parents[3]

@@ -9,9 +9,9 @@ from torch import Tensor
 from nlfilter_torch import Look, apply_look
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.edits.applying import apply_step
+from nlfilter_torch.photo.edits.recipe import edit_rows
 from nlfilter_torch.photo.picture.in_memory import InMemory
-from nlfilter_torch.photo.tiled.recipe import edit_rows
-from nlfilter_torch.photo.tiled.tiles import Passes
+from nlfilter_torch.photo.picture.tiles import Passes
 from tests.looks import ALPHA, BANDS, BENT, CAT, CUP, LOCAL, SEPIA, STRETCH, TEXTURE, VIVID
 
 

@@ -11,12 +11,12 @@ from nlfilter_torch import abstract, adjust_tone, defocus, denoise, enhance, fil
 from nlfilter_torch.nn.denoiser.profile import NoiseProfile
 from nlfilter_torch.photo import Recipe, Step, apply_recipe
 from nlfilter_torch.photo.app.preview import Preview
+from nlfilter_torch.photo.edits.film import FilmEdit
+from nlfilter_torch.photo.edits.parts import Parts, Rectangle
+from nlfilter_torch.photo.edits.streaming import stream
 from nlfilter_torch.photo.picture.in_memory import InMemory
 from nlfilter_torch.photo.picture.seen import LEAST_STEPS, range_of
-from nlfilter_torch.photo.tiled.film import FilmEdit
-from nlfilter_torch.photo.tiled.parts import Parts, Rectangle
-from nlfilter_torch.photo.tiled.streaming import stream
-from nlfilter_torch.photo.tiled.tiles import Passes
+from nlfilter_torch.photo.picture.tiles import Passes
 from tests.problems import colour
 
 BLACK, SCALE = 0.02, 0.01

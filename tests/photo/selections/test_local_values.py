@@ -11,12 +11,12 @@ from torch import Tensor
 from benchmarks.levin import propagate
 from nlfilter_torch import colorize
 from nlfilter_torch.photo.picture.in_memory import InMemory
+from nlfilter_torch.photo.picture.pictures import Picture
 from nlfilter_torch.photo.picture.source import luminance
+from nlfilter_torch.photo.picture.tiled import Tiled
+from nlfilter_torch.photo.picture.tiles import Passes
 from nlfilter_torch.photo.selections import local_values
 from nlfilter_torch.photo.selections.local_values import ABSOLUTE, RELATIVE, Links, LocalValues
-from nlfilter_torch.photo.tiled.pictures import Picture
-from nlfilter_torch.photo.tiled.source import Tiled
-from nlfilter_torch.photo.tiled.tiles import Passes
 from tests.problems import box, colour
 from tests.problems import luminance as grey_of
 from tests.streams import stream_colorize
@@ -111,7 +111,7 @@ def test_pictures_of_one_pixel_and_of_one_row(links: Links) -> None:
 
 @pytest.mark.parametrize("step", [1, 3, 7])
 def test_blocks_of_tiles_are_those_of_the_whole(monkeypatch: pytest.MonkeyPatch, step: int) -> None:
-    monkeypatch.setattr("nlfilter_torch.photo.tiled.pictures.STATISTICS_PIXELS", 500)
+    monkeypatch.setattr("nlfilter_torch.photo.picture.pictures.STATISTICS_PIXELS", 500)
     picture = np.random.default_rng(0).random((83, 61, 3), np.float32)
     tiled = Tiled(Picture(picture), Passes("float32"))
     image = torch.from_numpy(picture).permute(2, 0, 1)[None]

@@ -8,15 +8,15 @@ import pytest
 import torch
 
 from nlfilter_torch import region_mask
+from nlfilter_torch.photo.picture import sampling
 from nlfilter_torch.photo.picture.drawn import Drawn
 from nlfilter_torch.photo.picture.in_memory import InMemory
+from nlfilter_torch.photo.picture.pictures import Picture
 from nlfilter_torch.photo.picture.resizing import block_means
+from nlfilter_torch.photo.picture.tiled import Tiled
+from nlfilter_torch.photo.picture.tiles import Passes
 from nlfilter_torch.photo.selections import mask as masks
 from nlfilter_torch.photo.selections.mask import RegionMask
-from nlfilter_torch.photo.tiled import sampling
-from nlfilter_torch.photo.tiled.pictures import Picture
-from nlfilter_torch.photo.tiled.source import Tiled
-from nlfilter_torch.photo.tiled.tiles import Passes
 from tests.problems import box, colour, noise, seeded
 from tests.streams import settings_of
 
@@ -122,7 +122,7 @@ def test_gradients() -> None:
 @pytest.mark.parametrize("tile_rows", [16, 40])
 def test_tiles_are_as_in_memory(tile_rows: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sampling, "CHUNK", 300)
-    monkeypatch.setattr("nlfilter_torch.photo.tiled.pictures.STATISTICS_PIXELS", 2500)
+    monkeypatch.setattr("nlfilter_torch.photo.picture.pictures.STATISTICS_PIXELS", 2500)
     monkeypatch.setattr(masks, "SOLVED", 5000)
     image = colour("coffee", 110, 130)
     front, back = box(50, 50, 8, 12, size=(110, 130)), box(4, 8, 8, 12, size=(110, 130))

@@ -1,0 +1,147 @@
+"""WebP and AVIF files: written by Pillow, and read by it or, beyond its limits and its 8 bits, by imagecodecs."""
+
+import io
+import struct
+from mmap import mmap
+from pathlib import Path
+from typing import BinaryIO
+
+import imagecodecs
+import numpy as np
+from PIL import AvifImagePlugin, Image, ImageFile
+
+from nlfilter_torch.photo.files import colours, xmp
+from nlfilter_torch.photo.files import exif as exif_tags
+from nlfilter_torch.photo.files.decoded import Channels, CheckSize, Decoded, Metadata, UnhandledImage, quiet
+from nlfilter_torch.photo.files.extras import Extras
+
+ENCODING: dict[str, dict[str, object]] = {
+    "WebP": {"lossless": True, "exact": True},  # exact: also where it is transparent
+    "AVIF": {"quality": 90, "subsampling": "4:4:4"},
+}
+MOST_AVIF, LONGEST_AVIF = 1 << 28, 1 << 15  # pixels, and those of a side, that libavif decodes
+HEAD = 1 << 16  # bytes that hold the description of an AVIF file
+PIXELS = (b"VP8 ", b"VP8L", b"ALPH", b"ANMF")
+WEBP_CHUNKS = (b"VP8 ", b"VP8L", b"VP8X", b"ALPH", b"ICCP", b"EXIF", b"XMP ", b"ANIM", b"ANMF")
+
+
+def is_webp(head: bytes) -> bool:
+    """Whether a file with these first bytes is WebP."""
+    return head[:4] == b"RIFF" and head[8:12] == b"WEBP"
+
+
+def is_avif(head: bytes) -> bool:
+    """Whether a file with these first bytes is AVIF."""
+    return head[4:8] == b"ftyp" and b"avi" in head
+
+
+def read_webp(path: Path, data: bytes | mmap, check_size: CheckSize) -> Decoded:
+    """Read a WebP file. Pillow would refuse more than 179 megapixels whatever the memory."""
+    chunks = _webp_chunks(data)
+    if (frames := sum(name == b"ANMF" for name, _ in chunks)) > 1:
+        raise UnhandledImage(f"{path} is an animation of {frames} frames; save one of them as a picture")
+    by_name = dict(chunks)
+    check_size(_webp_size(by_name))
+    upright = exif_tags.read_upright(by_name.get(b"EXIF"))
+    packet, left_out = xmp.upright(by_name.get(b"XMP "), upright.orientation)
+    left_out += [f"the chunk {name.decode('latin-1').strip()}" for name in by_name if name not in WEBP_CHUNKS]
+    channels = np.asarray(imagecodecs.webp_decode(data))
+    metadata = Metadata(by_name.get(b"ICCP"), upright.block, Extras(packet, left_out=(*left_out, *upright.left_out)))
+    return Decoded(channels.reshape(*channels.shape[:2], -1), upright.orientation, metadata)
+
+
+def _webp_chunks(data: bytes | mmap) -> list[tuple[bytes, bytes]]:
+    """Names and contents of the chunks of a WebP file, of the pixels only the beginning."""
+    chunks, place = [], 12
+    while place + 8 <= len(data):
+        name, length = struct.unpack_from("<4sI", data, place)
+        if place + 8 + length > len(data):
+            raise EOFError("it ends too early")
+        chunks.append((name, bytes(data[place + 8 : place + 8 + (length if name not in PIXELS else 16)])))
+        place += 8 + length + length % 2
+    return chunks
+
+
+def _webp_size(chunks: dict[bytes, bytes]) -> tuple[int, int]:
+    """(width, height) of a WebP file."""
+    if head := chunks.get(b"VP8X"):
+        return 1 + int.from_bytes(head[4:7], "little"), 1 + int.from_bytes(head[7:10], "little")
+    if head := chunks.get(b"VP8L"):
+        bits = int.from_bytes(head[1:5], "little")
+        return 1 + bits % (1 << 14), 1 + (bits >> 14) % (1 << 14)
+    width, height = struct.unpack_from("<HH", chunks[b"VP8 "], 6)
+    return width % (1 << 14), height % (1 << 14)
+
+
+def read_avif(path: Path, data: bytes | mmap, check_size: CheckSize) -> Decoded:
+    """Read an AVIF file."""
+    _check_avif_size(path, data)
+    with quiet():
+        image = AvifImagePlugin.AvifImageFile(path)
+    with image:
+        if (frames := getattr(image, "n_frames", 1)) > 1:
+            raise UnhandledImage(f"{path} is an animation of {frames} frames; save one of them as a picture")
+        check_size(image.size)
+        if "icc_profile" not in image.info:
+            _check_colours(path, data)
+        # The block as stored: image.info may hold one that Pillow wrote anew.
+        block, orientation = image._decoder.get_info()[4:6]
+        upright = exif_tags.read_upright(block, orientation)
+        packet, left_out = xmp.upright(image.info.get("xmp"), upright.orientation)
+        left_out += [xmp.GAIN_MAP] * (b"tmap" in data[:HEAD])
+        channels = _decoded(image, data)
+        extras = Extras(packet, left_out=(*left_out, *upright.left_out))
+        metadata = Metadata(image.info.get("icc_profile"), upright.block, extras)
+        return Decoded(channels.reshape(*channels.shape[:2], -1), upright.orientation, metadata)
+
+
+def _decoded(image: ImageFile.ImageFile, data: bytes | mmap) -> Channels:
+    """The pixels (H, W) or (H, W, S) of an open AVIF file, as 16 bits if it has 10 or 12."""
+    if (bits := _bits_of_avif(data)) > 8:  # Pillow would reduce them to 8
+        levels = imagecodecs.avif_decode(data)
+        return np.rint(levels * (65535 / (2**bits - 1))).astype(np.uint16)
+    return np.asarray(image)
+
+
+def _check_avif_size(path: Path, data: bytes | mmap) -> None:
+    """Raise UnhandledImage if a picture is larger than libavif decodes."""
+    _, marker, size = data[:HEAD].partition(b"ispe")
+    if not marker or len(size) < 12:
+        return
+    width, height = struct.unpack_from(">II", size, 4)
+    if width * height > MOST_AVIF or max(width, height) > LONGEST_AVIF:
+        raise UnhandledImage(
+            f"{path} has {width}x{height} pixels, and libavif, which decodes it, takes at most {MOST_AVIF}, and "
+            f"{LONGEST_AVIF} per side; convert it to TIFF or PNG"
+        )
+
+
+def _check_colours(path: Path, data: bytes | mmap) -> None:
+    """Check the colours of an AVIF file without a profile, see :mod:`nlfilter_torch.photo.files.colours`."""
+    _, marker, numbers = data[:HEAD].partition(b"colrnclx")
+    if marker and len(numbers) >= 4:
+        colours.check_numbers(path, *struct.unpack(">HH", numbers[:4]))
+
+
+def _bits_of_avif(data: bytes | mmap) -> int:
+    """Read the bits per channel from the codec configuration, which is among the first boxes."""
+    head = data[:HEAD]
+    place = head.find(b"av1C") + 6  # after the version, the profile and the level
+    flags = head[place] if 6 <= place < len(head) else 0
+    return (12 if flags & 0x20 else 10) if flags & 0x40 else 8
+
+
+def write_by_pillow(stream: BinaryIO, kind: str, channels: Channels, metadata: Metadata) -> None:
+    """Write channels (H, W) or (H, W, S) of 8 bits as a WebP or AVIF file."""
+    block = metadata.exif or b""
+    # Pillow writes a block with an orientation anew. It gets it under another number, which is then set right.
+    hidden = exif_tags.hidden_orientation(block)
+    options: dict[str, object] = {"icc_profile": metadata.icc, "exif": hidden} | ENCODING[kind]
+    if metadata.extras.xmp is not None:
+        options["xmp"] = metadata.extras.xmp
+    encoded = io.BytesIO()
+    Image.fromarray(channels).save(encoded, format=kind, **options)
+    whole, place = encoded.getbuffer(), encoded.getvalue().find(hidden.removeprefix(exif_tags.PREFIX)) if block else 0
+    if block:
+        whole[place : place + len(block.removeprefix(exif_tags.PREFIX))] = block.removeprefix(exif_tags.PREFIX)
+    stream.write(whole)

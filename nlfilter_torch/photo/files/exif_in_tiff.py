@@ -1,0 +1,183 @@
+"""EXIF blocks of TIFF files: read from their tables, and written so that nothing in a block moves.
+
+A TIFF file may begin with a whole block, whose first table is then replaced by that of the picture. The nested tables,
+the values and the notes of the camera's maker keep their offsets.
+"""
+
+import struct
+from collections.abc import Container
+from dataclasses import dataclass
+from typing import BinaryIO
+
+from nlfilter_torch.photo.files.exif import PREFIX, parsed, refreshed
+from nlfilter_torch.photo.files.extras import RESOLUTION, STORAGE, Tag
+from nlfilter_torch.photo.files.tables import (
+    EXIF,
+    GPS,
+    INTEROP,
+    LONG,
+    LONG8,
+    MAKER_NOTE,
+    ORIENTATION,
+    POINTERS,
+    Field,
+    Tables,
+)
+
+# Fields of the first table that describe the photograph and belong to the EXIF block.
+DESCRIPTIVE = (269, 270, 271, 272, ORIENTATION, 285, 305, 306, 315, 316, 18246, 18249, *range(40091, 40096), 33432)
+DESCRIPTIVE += (EXIF, GPS)
+NEAR = 1 << 20  # bytes of a TIFF file in which tables can keep their place
+START = 16  # of tables that are moved, after the longest header
+MOVED = "the offsets inside the maker note, which is moved"
+
+
+def block_of(tables: Tables) -> tuple[bytes | None, bool]:
+    """The EXIF block of a TIFF file, and whether the maker note in it was moved."""
+    kept = [field for field in tables.fields(tables.first) if field.code in DESCRIPTIVE]
+    if not kept:
+        return None, False
+    has_note = any(field.code == MAKER_NOTE for field in tables.walk())
+    end = max(stop for _, stop in tables.ranges(DESCRIPTIVE))
+    if has_note and not tables.big and end <= NEAR:
+        return PREFIX + _copied(tables, kept, end), False
+    return PREFIX + packed(tables, DESCRIPTIVE), has_note
+
+
+def _copied(tables: Tables, kept: list[Field], end: int) -> bytes:
+    """The tables and their values at the offsets that they have, with zeros between them."""
+    block = bytearray(end)
+    for start, stop in tables.ranges(DESCRIPTIVE):
+        block[start:stop] = tables.data[start:stop]
+    block[:8] = _header(tables.order, tables.first)
+    first = struct.pack(tables.order + "H", len(kept))
+    first += b"".join(bytes(tables.data[field.entry : field.entry + tables.step]) for field in kept) + bytes(4)
+    block[tables.first : tables.first + len(first)] = first
+    return bytes(block)
+
+
+def _header(order: str, first: int) -> bytes:
+    return (b"II*\0" if order == "<" else b"MM\0*") + struct.pack(order + "I", first)
+
+
+def packed(tables: Tables, codes: Container[int] | None, without: Container[int] = ()) -> bytes:
+    """A block with those fields of the first table, and what is nested in them, moved together.
+
+    Fields of the codes ``without`` are left out in every table.
+    """
+    fields = [field for field in tables.fields(tables.first) if codes is None or field.code in codes]
+    head = _header(tables.order, START).ljust(START, b"\0")
+    return head + _packed_table(tables, fields, START, without, POINTERS)
+
+
+def _packed_table(
+    tables: Tables, fields: list[Field], base: int, without: Container[int], pointers: tuple[int, ...]
+) -> bytes:
+    """A table at the offset ``base``, followed by what its fields hold and point to."""
+    fields = [field for field in fields if field.code not in without and (field.kind < LONG8 or field.code in POINTERS)]
+    fields = [
+        field for field in fields if field.code not in POINTERS or (field.code in pointers and tables.inner(field))
+    ]
+    values = b""
+    entries = struct.pack(tables.order + "H", len(fields))
+    for field in fields:
+        at = base + 2 + 12 * len(fields) + 4 + len(values)
+        kind, count, raw = field.kind, field.count, tables.raw(field)
+        if field.code in POINTERS:
+            inner = (INTEROP,) if field.code == EXIF else ()
+            values += _packed_table(tables, tables.inner(field), at, without, inner)
+            kind, count, raw = LONG, 1, tables.packed(LONG, at)
+        elif len(raw) > 4:
+            values += raw + bytes(len(raw) % 2)
+            raw = tables.packed(LONG, at)
+        entries += struct.pack(tables.order + "HHI", field.code, kind, count) + raw.ljust(4, b"\0")
+    return entries + bytes(4) + values
+
+
+def shortened(block: bytes, longest: int) -> bytes | None:
+    """The block without thumbnail, and without maker note, in at most so many bytes; None if it needs more."""
+    for smaller in (refreshed(block, None), _without_note(block)):
+        if len(smaller) <= longest:
+            return smaller
+    return None
+
+
+def _without_note(block: bytes) -> bytes:
+    tables = parsed(block)
+    return block if tables is None else PREFIX + packed(tables, None, (MAKER_NOTE,))
+
+
+@dataclass(frozen=True)
+class Opening:
+    """What a TIFF file begins with to hold a block.
+
+    Attributes:
+        order: "<" or ">".
+        body: the bytes after the header.
+        tags: fields of the first table that the picture's table repeats.
+        nested: offsets of the nested tables by the fields that point to them.
+        moved: whether a maker note was moved.
+    """
+
+    order: str
+    body: bytes
+    tags: tuple[Tag, ...]
+    nested: dict[int, int]
+    moved: bool = False
+
+
+def opening(block: bytes | None, order: str, big: bool) -> Opening:
+    """What a TIFF or BigTIFF file begins with to hold a block; without a block it has that byte order."""
+    tables: Tables | None = parsed(None if block is None else refreshed(block, None))
+    if tables is None:
+        return Opening(order, b"", (), {})
+    moved = False
+    if big and any(start < START for start, _ in tables.ranges()):
+        moved = any(field.code == MAKER_NOTE for field in tables.walk())
+        tables = Tables(packed(tables, None))
+    fields = tables.fields(tables.first)
+    kept = [field for field in fields if field.code not in (*POINTERS, *RESOLUTION, *STORAGE, ORIENTATION)]
+    tags = tuple(Tag(field.code, field.kind, tables.raw(field), tables.order) for field in kept)
+    nested = {
+        field.code: tables.number(field) or 0 for field in fields if field.code in POINTERS and tables.inner(field)
+    }
+    body = bytes(tables.data)
+    if big:
+        nested, body = _as_big(tables, fields, body)
+    return Opening(tables.order, body[START if big else 8 :], tags, nested, moved)
+
+
+def _as_big(tables: Tables, fields: list[Field], body: bytes) -> tuple[dict[int, int], bytes]:
+    """Append the nested tables of a block in the form of a BigTIFF; their values stay where they are."""
+    nested = {}
+    for field in fields:
+        if field.code not in POINTERS or not tables.inner(field):
+            continue
+        inner: dict[int, int] = {}
+        if field.code == EXIF:
+            inner, body = _as_big(tables, tables.inner(field), body)
+        body += bytes(-len(body) % 2)
+        nested[field.code] = len(body)
+        body += _big_table(tables, tables.inner(field), inner)
+    return nested, body
+
+
+def _big_table(tables: Tables, fields: list[Field], inner: dict[int, int]) -> bytes:
+    table = struct.pack(tables.order + "Q", sum(field.code not in POINTERS or field.code in inner for field in fields))
+    for field in fields:
+        kind, count, raw = field.kind, field.count, tables.raw(field)
+        if field.code in inner:
+            kind, raw = LONG8, tables.packed(LONG8, inner[field.code])
+        elif field.code in POINTERS:
+            continue
+        elif len(raw) > 8:
+            raw = tables.packed(LONG8, field.place)
+        table += struct.pack(tables.order + "HHQ", field.code, kind, count) + raw.ljust(8, b"\0")
+    return table + bytes(8)
+
+
+def point(stream: BinaryIO, order: str, big: bool, position: int, code: int, offset: int) -> None:
+    """Write the field of a table at ``position`` that points to a nested table."""
+    stream.seek(position)
+    kind = LONG8 if big else LONG
+    stream.write(struct.pack(order + ("HHQQ" if big else "HHII"), code, kind, 1, offset))

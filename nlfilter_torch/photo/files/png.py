@@ -1,0 +1,332 @@
+"""PNG files: chunks, pixels by imagecodecs, and files written a few rows at a time.
+
+Pillow reduces 16 bits to 8, ignores wrong checksums and refuses long chunks, so that it is not used here.
+"""
+
+import io
+import struct
+import tempfile
+import zlib
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from mmap import ACCESS_READ, mmap
+from pathlib import Path
+from typing import BinaryIO, NamedTuple
+
+import imagecodecs
+import numpy as np
+
+from nlfilter_torch.photo.files import colours, xmp
+from nlfilter_torch.photo.files import exif as exif_tags
+from nlfilter_torch.photo.files.decoded import Channels, Metadata, UnhandledImage, bands, release
+from nlfilter_torch.photo.files.extras import Extras, Part, sound, turned
+
+SIGNATURE = b"\x89PNG\r\n\x1a\n"
+XMP_KEY = b"XML:com.adobe.xmp"
+RAW_KEY = b"Raw profile type "  # of texts in which some programs write EXIF, XMP and IPTC as hexadecimal numbers
+SAMPLES = {0: 1, 2: 3, 3: 3, 4: 2, 6: 4}  # by the type of colours
+PALETTE = 3
+ADAM7 = (
+    (0, 0, 8, 8),
+    (0, 4, 8, 8),
+    (4, 0, 8, 4),
+    (0, 2, 4, 4),
+    (2, 0, 4, 2),
+    (0, 1, 2, 2),
+    (1, 0, 2, 1),
+)  # y, x, steps
+# Chunks that describe the pixels of the file. Colours are checked, see colours.py.
+STORAGE = (b"IHDR", b"PLTE", b"tRNS", b"IDAT", b"IEND", b"gAMA", b"cHRM", b"sRGB", b"cICP")
+PIXELS = (b"IHDR", b"PLTE", b"tRNS", b"IDAT", b"IEND")
+TEXTS = (b"tEXt", b"zTXt", b"iTXt")
+READ = (b"iCCP", b"eXIf", b"pHYs", b"acTL", b"fcTL", b"fdAT")
+KEYS = (XMP_KEY, RAW_KEY + b"exif", RAW_KEY + b"xmp")  # of texts that are read
+LONGEST_TEXT = 1 << 28  # bytes of a text or profile
+BAND = 1 << 22  # bytes that are compressed at a time
+ROOM = 1 << 16  # bytes for chunks
+INCH = 0.0254  # metres
+LONGEST_SIDE = 1_000_000  # pixels; a limit of libpng
+
+
+class Chunk(NamedTuple):
+    """The name of a chunk, and the place of its content."""
+
+    name: bytes
+    start: int
+    stop: int
+
+
+def chunks(data: bytes | mmap) -> Iterator[Chunk]:
+    """The chunks of a file; raises ValueError where one is cut short or has a wrong checksum."""
+    place = len(SIGNATURE)
+    with memoryview(data) as view:
+        while place + 8 <= len(data):
+            length, name = struct.unpack_from(">I4s", data, place)
+            chunk = Chunk(name, place + 8, place + 8 + length)
+            if chunk.stop + 4 > len(data):
+                raise EOFError("it ends too early")
+            if zlib.crc32(view[place + 4 : chunk.stop]) != struct.unpack_from(">I", data, chunk.stop)[0]:
+                raise ValueError(f"wrong checksum in the chunk {name.decode('latin-1')}")
+            yield chunk
+            place = chunk.stop + 4
+            if name == b"IEND":
+                return
+
+
+@dataclass(frozen=True)
+class Png:
+    """A PNG file whose pixels are not decoded yet.
+
+    Attributes:
+        size: (width, height).
+        samples: channels after palettes and transparent colours are made plain.
+        dtype: of these.
+        in_passes: whether it is interlaced, so that decoding needs memory for all pixels.
+        orientation: EXIF orientation.
+        metadata: of the upright picture.
+        parts: all chunks.
+    """
+
+    size: tuple[int, int]
+    samples: int
+    dtype: np.dtype[np.generic]
+    in_passes: bool
+    orientation: int
+    metadata: Metadata
+    parts: tuple[Chunk, ...]
+
+    def decode_into(self, data: bytes | mmap, out: Channels) -> None:
+        """Decode the channels (H, W, S) of a file without interlacing into an array."""
+        with tempfile.TemporaryFile() as stream:
+            self._copy_pixels(data, stream)
+            stream.flush()
+            release(data)
+            with mmap(stream.fileno(), 0, access=ACCESS_READ) as pixels:
+                imagecodecs.png_decode(pixels, out=out[..., 0] if self.samples == 1 else out)
+
+    def decode(self, data: bytes | mmap) -> Channels:
+        """The channels (H, W, S) as stored."""
+        shape = (self.size[1], self.size[0], self.samples)
+        if self.in_passes:
+            return _interlaced(data, self.parts, shape, self.dtype)
+        stream = io.BytesIO()
+        self._copy_pixels(data, stream)
+        return np.asarray(imagecodecs.png_decode(stream.getvalue())).reshape(shape)
+
+    def _copy_pixels(self, data: bytes | mmap, stream: BinaryIO) -> None:
+        """Write the file without its metadata, of which libpng would print warnings."""
+        stream.write(SIGNATURE)
+        with memoryview(data) as view:
+            for chunk in self.parts:
+                if chunk.name in PIXELS:
+                    stream.write(view[chunk.start - 8 : chunk.stop + 4])
+
+
+def open_png(path: Path, data: bytes | mmap) -> Png:
+    """Read everything but the pixels, and check the colours.
+
+    Raises:
+        UnhandledImage: if it is an animation, or an HDR picture.
+        ValueError, EOFError: if it is damaged.
+    """
+    parts = tuple(chunks(data))
+    names = [chunk.name for chunk in parts]
+    if not parts or names[0] != b"IHDR" or b"IDAT" not in names:
+        raise ValueError("it has no picture")
+    width, height, bits, kind, _, _, interlace = struct.unpack_from(">IIBBBBB", data, parts[0].start)
+    if max(width, height) > LONGEST_SIDE:
+        raise UnhandledImage(
+            f"{path} has {width}x{height} pixels, and libpng, which decodes it, takes at most {LONGEST_SIDE} per side; "
+            "convert it to TIFF"
+        )
+    contents = [(chunk.name, bytes(data[chunk.start : chunk.stop])) for chunk in parts if chunk.name != b"IDAT"]
+    by_name = dict(contents)
+    if b"acTL" in by_name and (frames := struct.unpack_from(">I", by_name[b"acTL"])[0]) > 1:
+        raise UnhandledImage(f"{path} is an animation of {frames} frames; save one of them as a picture")
+    if b"iCCP" not in by_name:
+        _check_colours(path, by_name)
+    orientation, metadata = _metadata(contents)
+    samples = SAMPLES.get(kind, 1) + (b"tRNS" in names and kind not in (4, 6))
+    dtype = np.dtype(np.uint16 if bits == 16 else np.uint8)
+    return Png((width, height), samples, dtype, bool(interlace), orientation, metadata, parts)
+
+
+def _check_colours(path: Path, contents: dict[bytes, bytes]) -> None:
+    """Check the colours of a file without a profile, see :mod:`nlfilter_torch.photo.files.colours`."""
+    if numbers := contents.get(b"cICP"):
+        colours.check_numbers(path, *numbers[:2])
+    elif b"sRGB" not in contents:
+        gamma = contents.get(b"gAMA")
+        corners = contents.get(b"cHRM")
+        colours.check_png(
+            path,
+            None if gamma is None else struct.unpack(">I", gamma)[0] / 100_000,
+            None if corners is None else [number / 100_000 for number in struct.unpack(">8I", corners)],
+        )
+
+
+def _metadata(contents: list[tuple[bytes, bytes]]) -> tuple[int, Metadata]:
+    """The orientation, and the metadata of the upright picture."""
+    by_name = dict(contents)
+    texts = {key: text for name, content in contents for key, text in _text(name, content)}
+    exif, packet = by_name.get(b"eXIf"), texts.get(XMP_KEY)
+    orientation, exif, damaged = exif_tags.read_upright(exif or _from_hexadecimal(texts.get(RAW_KEY + b"exif")))
+    packet, left_out = xmp.upright(packet or _from_hexadecimal(texts.get(RAW_KEY + b"xmp")), orientation)
+    kept = []
+    for name, content in contents:
+        if name in STORAGE or name in READ or (name in TEXTS and _key(content) in KEYS):
+            continue
+        if chr(name[3]).islower():  # safe to copy, according to the standard
+            kept.append(Part("PNG", _described(name, content), struct.pack(">4s", name) + content))
+        else:
+            left_out.append(_described(name, content))
+    dpi = None
+    if (size := by_name.get(b"pHYs")) is not None and len(size) == 9:
+        across, down, unit = struct.unpack(">IIB", size)
+        dpi = sound(turned((across * INCH, down * INCH), orientation)) if unit == 1 else None
+        if unit == 0 and across != down:
+            left_out.append("the aspect of pixels")
+    icc = None
+    if profile := by_name.get(b"iCCP"):
+        icc = _inflated(profile.partition(b"\0")[2][1:])
+    return orientation, Metadata(icc, exif, Extras(packet, dpi, parts=tuple(kept), left_out=(*left_out, *damaged)))
+
+
+def _key(content: bytes) -> bytes:
+    return content.partition(b"\0")[0]
+
+
+def _text(name: bytes, content: bytes) -> Iterator[tuple[bytes, bytes]]:
+    """The key and the text of a text chunk; nothing of another chunk."""
+    if name not in TEXTS:
+        return
+    key, _, text = content.partition(b"\0")
+    packed = name == b"zTXt"
+    if name == b"iTXt":
+        packed, text = text[:1] == b"\1", text[2:].split(b"\0", 2)[-1]
+    elif packed:
+        text = text[1:]
+    if key == XMP_KEY or key.startswith(RAW_KEY):
+        yield key, _inflated(text) if packed else text
+
+
+def _inflated(content: bytes) -> bytes:
+    """The content of a compressed chunk; raises ValueError if it is damaged, or of an unlikely size."""
+    stream = zlib.decompressobj()
+    whole = stream.decompress(content, LONGEST_TEXT)
+    if not stream.eof:
+        raise ValueError(f"a compressed chunk is cut short, or longer than {LONGEST_TEXT} bytes")
+    return whole
+
+
+def _from_hexadecimal(text: bytes | None) -> bytes | None:
+    """The content of a text with a profile: a name, a length, and hexadecimal numbers."""
+    if text is None:
+        return None
+    try:
+        return bytes.fromhex("".join(text.decode("latin-1").split()[2:]))
+    except ValueError:
+        return None
+
+
+def _described(name: bytes, content: bytes) -> str:
+    if name in TEXTS:
+        return f"the text {_key(content).decode('latin-1')}"
+    return f"the chunk {name.decode('latin-1')}"
+
+
+def _interlaced(
+    data: bytes | mmap, parts: tuple[Chunk, ...], shape: tuple[int, int, int], dtype: np.dtype[np.generic]
+) -> Channels:
+    """The channels of an interlaced file, each pass of which is decoded as a file of its own.
+
+    imagecodecs decodes interlaced files, but libpng then prints a warning.
+    """
+    height, width, bits, kind = _header(data, parts)
+    stream = zlib.decompressobj()
+    packed = b"".join(bytes(data[chunk.start : chunk.stop]) for chunk in parts if chunk.name == b"IDAT")
+    before = [
+        (chunk.name, bytes(data[chunk.start : chunk.stop])) for chunk in parts if chunk.name in (b"PLTE", b"tRNS")
+    ]
+    channels = np.empty(shape, dtype)
+    stored = 1 if kind == PALETTE else SAMPLES[kind]
+    for top, left, down, across in ADAM7:
+        rows, columns = -(-(height - top) // down), -(-(width - left) // across)
+        if rows <= 0 or columns <= 0:
+            continue
+        length = rows * (1 + -(-columns * stored * bits // 8))
+        content = stream.decompress(packed, length)
+        packed = stream.unconsumed_tail
+        if len(content) < length:
+            raise EOFError("it ends too early")
+        small = io.BytesIO()
+        small.write(SIGNATURE)
+        header = struct.pack(">IIBBBBB", columns, rows, bits, kind, 0, 0, 0)
+        for name, body in [(b"IHDR", header), *before, (b"IDAT", zlib.compress(content, 0)), (b"IEND", b"")]:
+            write_chunk(small, name, body)
+        decoded = np.asarray(imagecodecs.png_decode(small.getvalue()))
+        channels[top::down, left::across] = decoded.reshape(rows, columns, shape[2])
+    return channels
+
+
+def _header(data: bytes | mmap, parts: tuple[Chunk, ...]) -> tuple[int, int, int, int]:
+    """Height, width, bits and type of colours."""
+    width, height, bits, kind = struct.unpack_from(">IIBB", data, parts[0].start)
+    return height, width, bits, kind
+
+
+def write_chunk(stream: BinaryIO, name: bytes, *content: bytes) -> None:
+    """Write a chunk, whose content may be given in pieces."""
+    checksum = zlib.crc32(name)
+    stream.write(struct.pack(">I4s", sum(map(len, content)), name))
+    for piece in content:
+        checksum = zlib.crc32(piece, checksum)
+        stream.write(piece)
+    stream.write(struct.pack(">I", checksum))
+
+
+def write_png(
+    stream: BinaryIO,
+    rows: Iterable[Channels],
+    shape: tuple[int, int, int],
+    dtype: np.dtype[np.generic],
+    metadata: Metadata,
+) -> None:
+    """Write rows (h, W, S) of a picture of ``shape`` and uint8 or uint16 as they arrive."""
+    height, width, samples = shape
+    length = 1 + width * samples * dtype.itemsize
+    stream.write(SIGNATURE)
+    colour = {1: 0, 2: 4, 3: 2, 4: 6}[samples]
+    write_chunk(stream, b"IHDR", struct.pack(">IIBBBBB", width, height, 8 * dtype.itemsize, colour, 0, 0, 0))
+    for name, content in _written(metadata):
+        write_chunk(stream, name, content)
+    packer = zlib.compressobj(6, strategy=zlib.Z_FILTERED)
+    above: Channels | None = None
+    for band in bands(rows, max(1, BAND // length)):
+        # libpng chooses the filters, which need the row above.
+        part = np.ascontiguousarray(band if above is None else np.concatenate([above, band]))
+        room = bytearray(part.nbytes + part.nbytes // 64 + 16 * len(part) + ROOM)  # imagecodecs' own is too small
+        encoded = bytes(imagecodecs.png_encode(part, level=0, out=room))
+        filtered = zlib.decompress(b"".join(encoded[c.start : c.stop] for c in chunks(encoded) if c.name == b"IDAT"))
+        packed = packer.compress(memoryview(filtered)[0 if above is None else length :])
+        if packed:
+            write_chunk(stream, b"IDAT", packed)
+        above = band[-1:]
+    write_chunk(stream, b"IDAT", packer.flush())
+    write_chunk(stream, b"IEND")
+
+
+def _written(metadata: Metadata) -> Iterator[tuple[bytes, bytes]]:
+    """The chunks between header and pixels."""
+    extras = metadata.extras
+    if metadata.icc is not None:
+        yield b"iCCP", b"ICC Profile\0\0" + zlib.compress(metadata.icc)
+    if metadata.exif is not None:
+        yield b"eXIf", metadata.exif.removeprefix(exif_tags.PREFIX)
+    if extras.dpi is not None:
+        yield b"pHYs", struct.pack(">IIB", *(round(value / INCH) for value in extras.dpi), 1)
+    if extras.xmp is not None:
+        yield b"iTXt", XMP_KEY + bytes(5) + extras.xmp
+    for part in extras.parts:
+        if part.kind == "PNG":
+            yield part.data[:4], part.data[4:]

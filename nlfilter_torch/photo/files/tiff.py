@@ -1,0 +1,384 @@
+"""Reading and writing of TIFF files with profile and EXIF, by tifffile; whole, or a few rows at a time."""
+
+import logging
+import os
+import struct
+from collections.abc import Iterable, Iterator
+from mmap import ACCESS_READ, mmap
+from pathlib import Path
+from typing import BinaryIO, TypedDict, Unpack
+
+import numpy as np
+import tifffile
+
+from nlfilter_torch.core.warning import warn
+from nlfilter_torch.photo.files import exif as exif_tags
+from nlfilter_torch.photo.files import exif_in_tiff, xmp
+from nlfilter_torch.photo.files.decoded import Channels, CheckSize, Decoded, Metadata, UnhandledImage, bands, decoding
+from nlfilter_torch.photo.files.extras import GROUND, RESOLUTION, STORAGE, Extras, Tag, sound, turned, turned_tag
+from nlfilter_torch.photo.files.tables import LONG, ORIENTATION, RATIONAL, SHORT, Tables
+
+# tifffile logs problems with a file. Without a handler Python would print them beside our error message.
+logging.getLogger("tifffile").addHandler(logging.NullHandler())
+XMP, SUB_FILES = 700, 330  # tags
+INCH = 2  # unit of the resolution
+TILE_SIZE = 256  # side of the tiles that are written
+MAX_CLASSIC_BYTES = 4_000_000_000  # bytes of pixels above which a BigTIFF is written
+_ASSOCIATED = tifffile.EXTRASAMPLE.ASSOCALPHA
+MOST_PAGES = 100  # that are counted
+CACHED_BANDS = 2  # cached bands of strips or tiles: rows shared by two tiles of a picture span at most two
+
+
+class _Resolution(TypedDict, total=False):
+    """Options of tifffile for the print resolution."""
+
+    resolution: tuple[float | tuple[int, int], float | tuple[int, int]]
+    resolutionunit: int
+
+
+class _Options(TypedDict, total=False):
+    """Further options of tifffile."""
+
+    tile: tuple[int, int]
+    maxworkers: int
+    buffersize: int
+
+
+def is_tiff(head: bytes) -> bool:
+    """Whether a file with these first bytes is a TIFF or BigTIFF."""
+    return head[:4] in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+
+
+def read(path: Path, check_size: CheckSize) -> Decoded:
+    """Read the first page."""
+    with decoding(path), TiffRows(path) as rows:
+        check_size((rows.shape[1], rows.shape[0]), double=rows.dtype == np.float64)
+        ends = (at + count for at, count in zip(rows.page.dataoffsets, rows.page.databytecounts, strict=True) if count)
+        if max(ends, default=0) > path.stat().st_size:  # decoders of JPEG fill what is missing
+            raise EOFError("it ends too early")
+        channels = np.asarray(rows.page.asarray())
+        if rows.page.axes == "SYX":
+            channels = np.moveaxis(channels, 0, -1)
+        warn_of_pages(path)
+        return Decoded(plain(rows.page, channels.reshape(rows.shape)), rows.orientation, rows.metadata)
+
+
+def count_pages(path: Path) -> int:
+    """Number of pictures in a TIFF file, at most :data:`MOST_PAGES`, not counting masks and reduced versions."""
+    count = 1
+    with path.open("rb") as stream, tifffile.TiffFile(stream, name=str(path)) as file:
+        try:
+            for number in range(1, MOST_PAGES):
+                page = file.pages[number]
+                count += not (isinstance(page, tifffile.TiffPage) and (page.is_reduced or page.is_mask))
+        except Exception:  # no such page, or damage behind the first one, which alone is needed
+            return count
+    return count
+
+
+def warn_of_pages(path: Path) -> None:
+    """Warn if a file has several pages, of which only the first is read."""
+    if (count := count_pages(path)) > 1:
+        least = "at least " if count == MOST_PAGES else ""
+        warn(f"{path} has {least}{count} pages, of which only the first is read; save the others as files of their own")
+
+
+def check_page(path: Path, page: tifffile.TiffPage) -> None:
+    """Raise UnhandledImage unless a page is a picture in grey or RGB, with or without alpha."""
+    kinds = tifffile.PHOTOMETRIC
+    by_jpeg = page.compression in (tifffile.COMPRESSION.JPEG, tifffile.COMPRESSION.OJPEG)
+    handled = {kinds.MINISWHITE, kinds.MINISBLACK, kinds.RGB} | ({kinds.YCBCR} if by_jpeg else set())
+    if page.photometric not in handled:
+        name = getattr(page.photometric, "name", page.photometric)
+        raise UnhandledImage(f"{path} is stored in {name} colours, which are not supported; convert it to grey or RGB")
+    bits = page.bitspersample if isinstance(page.bitspersample, int) else max(page.bitspersample)
+    if page.dtype is None or bits != 8 * page.dtype.itemsize:
+        raise UnhandledImage(
+            f"{path} has {bits} bits per channel, which is not supported; convert it to 8 or 16 bits or floats"
+        )
+    if page.axes not in ("YX", "YXS", "SYX"):
+        raise UnhandledImage(f"{path} has the axes {page.axes}, which are not those of a picture; save a plain picture")
+    if page.samplesperpixel - len(page.extrasamples) not in (1, 3) or len(page.extrasamples) > 1:
+        raise UnhandledImage(
+            f"{path} has {page.samplesperpixel} channels; convert it to grey or RGB, with or without alpha"
+        )
+
+
+def _native(page: tifffile.TiffPage) -> np.dtype[np.generic]:
+    """The dtype of the pixels of a checked page, in native byte order."""
+    return np.dtype(page.dtype).newbyteorder("=")
+
+
+def plain(page: tifffile.TiffPage, channels: Channels) -> Channels:
+    """Convert channels (H, W, S) of a page, or some of its rows, to black as 0 and no premultiplied alpha."""
+    channels = channels.astype(_native(page), copy=True)
+    if page.photometric == tifffile.PHOTOMETRIC.MINISWHITE:
+        white = np.iinfo(channels.dtype.name).max if channels.dtype.kind == "u" else 1
+        channels[..., :1] = white - channels[..., :1]
+    return _unmultiplied(channels) if _ASSOCIATED in page.extrasamples else channels
+
+
+def read_metadata(file: tifffile.TiffFile, stream: BinaryIO, depth: str) -> tuple[int, Metadata]:
+    """Read the orientation of the first page of a file, and the metadata of the upright picture of that depth."""
+    profile = file.pages.first.tags.get(34675)
+    icc = profile.value if profile is not None and isinstance(profile.value, bytes) else None
+    with mmap(stream.fileno(), 0, access=ACCESS_READ) as data:
+        tables = Tables(data)
+        fields = tables.fields(tables.first)
+        block, moved = exif_in_tiff.block_of(tables)
+        orientation, exif, damaged = exif_tags.read_upright(block)
+        stored = [field for field in fields if field.code not in (*exif_in_tiff.DESCRIPTIVE, *STORAGE, XMP, SUB_FILES)]
+        tags = [Tag(field.code, field.kind, tables.raw(field), tables.order) for field in stored]
+        packet = next((tables.raw(field) for field in fields if field.code == XMP), None)
+        ratios = {field.code: tables.ratio(field) for field in fields if field.code in RESOLUTION[:2]}
+        units = [tables.number(field) for field in fields if field.code == RESOLUTION[2]]
+    packet, left_out = xmp.upright(packet, orientation)
+    left_out += [exif_in_tiff.MOVED] * moved + ["smaller versions and masks"] * any(f.code == SUB_FILES for f in fields)
+    scale = exif_tags.SCALES.get((units or [INCH])[0] or 0)
+    pair = None if scale is None or len(ratios) < 2 else sound([ratios[code] * scale for code in RESOLUTION[:2]])
+    if units == [1] and set(ratios.values()) == {1.0}:  # says nothing
+        tags = [tag for tag in tags if tag.code not in RESOLUTION]
+    if orientation > 1:
+        left_out += [f"the TIFF tag {tag.code}, as the picture is turned" for tag in tags if tag.code in GROUND]
+        tags = [turned_tag(tag, orientation) for tag in tags if tag.code not in GROUND]
+    height, width = file.pages.first.imagelength, file.pages.first.imagewidth
+    size = (width, height) if orientation >= 5 else (height, width)
+    extras = Extras(
+        packet,
+        None if pair is None else turned(pair, orientation),
+        tuple(tags),
+        size if tags else None,
+        depth if tags else "",
+        left_out=(*left_out, *damaged),
+    )
+    return orientation, Metadata(icc, exif, extras)
+
+
+def write_rows(
+    stream: BinaryIO,
+    rows: Iterable[Channels],
+    shape: tuple[int, int, int],
+    dtype: np.dtype[np.generic],
+    alpha: bool,
+    metadata: Metadata,
+) -> list[str]:
+    """Write rows (h, W, S) of a picture of ``shape`` as they arrive, in tiles; large files become BigTIFF.
+
+    Returns what is left out, see :func:`write`.
+    """
+    height, width, samples = shape
+    plain_shape = (height, width) if samples == 1 else shape
+    big = height * width * samples * dtype.itemsize > MAX_CLASSIC_BYTES
+    # Compressing ahead in threads would queue hundreds of megabytes.
+    size = TILE_SIZE * TILE_SIZE * samples * dtype.itemsize
+    options = _Options(maxworkers=1, buffersize=size, tile=(TILE_SIZE, TILE_SIZE))
+    return write(stream, _tiles(rows, width), plain_shape, dtype, alpha, metadata, big, **options)
+
+
+def _tiles(rows: Iterable[Channels], width: int) -> Iterator[Channels]:
+    """Cut rows (h, W, S) into square tiles, padded with zeros, without the last axis if S = 1."""
+    for band in bands(rows, TILE_SIZE):
+        for left in range(0, width, TILE_SIZE):
+            tile = band[:, left : left + TILE_SIZE]
+            padded = np.pad(tile, ((0, TILE_SIZE - tile.shape[0]), (0, TILE_SIZE - tile.shape[1]), (0, 0)))
+            yield padded[..., 0] if padded.shape[2] == 1 else padded
+
+
+def write(
+    stream: BinaryIO,
+    data: Channels | Iterator[Channels],
+    shape: tuple[int, ...],
+    dtype: np.dtype[np.generic],
+    alpha: bool,
+    metadata: Metadata,
+    big: bool = False,
+    **options: Unpack[_Options],
+) -> list[str]:
+    """Write a picture of ``shape`` (H, W) or (H, W, S), or an iterator over its tiles, compressed without loss.
+
+    ``alpha`` says whether the last channel is transparency; ``options`` are those of :func:`tifffile.imwrite`. Returns
+    the names of metadata that are left out.
+    """
+    extras = metadata.extras
+    kept = extras.tags_for((shape[0], shape[1]), dtype.name)
+    head = exif_in_tiff.opening(metadata.exif, kept[0].order if kept else "<", big)
+    tags = [tag.stored(head.order) for tag in (*head.tags, *kept) if tag.code not in RESOLUTION]
+    if extras.xmp is not None:
+        tags.append((XMP, 1, 0, extras.xmp, True))
+    # tifffile does not write nested tables, so a placeholder tag with the next lower number reserves space for each.
+    places = [(code - 1, LONG, 1, 0, True) for code in head.nested]
+    start = stream.tell()
+    with tifffile.TiffWriter(stream, bigtiff=big, byteorder=head.order) as file:  # type: ignore[arg-type]
+        stream.write(head.body)
+        file.write(
+            data,
+            shape=shape,
+            dtype=None if isinstance(data, np.ndarray) else dtype,
+            photometric="rgb" if len(shape) == 3 and shape[2] >= 3 else "minisblack",
+            planarconfig="contig" if len(shape) == 3 else None,
+            extrasamples=["unassalpha"] if alpha else None,
+            compression="zlib",
+            predictor=bool(np.issubdtype(dtype, np.integer)),
+            iccprofile=metadata.icc,
+            extratags=[(ORIENTATION, SHORT, 1, 1, True), *tags, *places],
+            metadata=None,
+            software=False,
+            **_resolution(extras, kept),
+            **options,
+        )
+    stream.seek(start)
+    with tifffile.TiffFile(stream) as written:
+        positions = {code: written.pages.first.tags[code - 1].offset for code in head.nested}
+    for code, offset in head.nested.items():
+        exif_in_tiff.point(stream, head.order, big, positions[code], code, offset)
+    return extras.lacking_tags(kept) + [exif_in_tiff.MOVED] * head.moved
+
+
+def _resolution(extras: Extras, tags: Iterable[Tag]) -> _Resolution:
+    """The resolution as stored in a TIFF file, or else in dpi."""
+    kinds = dict(zip(RESOLUTION, (RATIONAL, RATIONAL, SHORT), strict=True))
+    stored = {tag.code: tag for tag in tags if tag.kind == kinds.get(tag.code) and tag.count == 1}
+    values = [struct.unpack(stored[code].order + "II", stored[code].data) for code in RESOLUTION[:2] if code in stored]
+    unit = stored.get(RESOLUTION[2])
+    if len(values) == 2:
+        number = INCH if unit is None else struct.unpack(unit.order + "H", unit.data)[0]
+        return _Resolution(resolution=(values[0], values[1]), resolutionunit=number)
+    return {} if extras.dpi is None else _Resolution(resolution=extras.dpi, resolutionunit=INCH)
+
+
+def _unmultiplied(channels: Channels) -> Channels:
+    """Divide premultiplied colours by their alpha; black where alpha is 0."""
+    colour, alpha = channels[..., :-1].astype(np.float64), channels[..., -1:].astype(np.float64)
+    integer = np.issubdtype(channels.dtype, np.integer)
+    limit = np.iinfo(channels.dtype.name).max if integer else 1.0
+    plain = np.divide(colour * limit, alpha, out=np.zeros_like(colour), where=alpha > 0)
+    plain = np.rint(plain.clip(0, limit)) if integer else plain
+    return np.concatenate([plain.astype(channels.dtype), channels[..., -1:]], axis=-1)
+
+
+class TiffRows:
+    """The first page of a TIFF file, upright, as rows (H, W, S).
+
+    Attributes:
+        shape: (H, W, S).
+        dtype: dtype in native byte order.
+        metadata: profile, EXIF and the rest.
+        alpha: whether the last channel is transparency.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Open the file and read the header; raises UnhandledImage if the picture is of an unsupported kind."""
+        self.path = path
+        self.stream: BinaryIO = path.open("rb")
+        try:
+            self.file = tifffile.TiffFile(self.stream, name=str(path))
+            page = self.file.pages.first
+            check_page(path, page)
+            self.orientation, self.metadata = read_metadata(self.file, self.stream, _native(page).name)
+        except BaseException:
+            self.stream.close()
+            raise
+        self.page = page
+        self.stamp = self._look()
+        self.shape = (page.imagelength, page.imagewidth, page.samplesperpixel)
+        self.dtype = _native(page)
+        self.alpha = bool(page.extrasamples)
+        # (height, width) of a strip or tile; the declared height of a strip may exceed the picture's.
+        self.segment = (page.tilelength, page.tilewidth) if page.is_tiled else (page.rowsperstrip, page.imagewidth)
+        self.segment = (min(self.segment[0], self.shape[0]), self.segment[1])
+        self.bands: dict[int, Channels] = {}
+
+    def __reduce__(self) -> tuple[type["TiffRows"], tuple[Path]]:
+        return TiffRows, (self.path.absolute(),)  # another process opens the file again
+
+    def __enter__(self) -> "TiffRows":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.stream.close()
+
+    @property
+    def turned(self) -> bool:
+        """Whether the rows of the upright picture are stored as columns."""
+        return self.orientation >= 5
+
+    @property
+    def cached(self) -> int:
+        """Bytes of decoded strips or tiles that are cached while rows are read."""
+        rows = 0 if self._raw else (CACHED_BANDS + 1) * self.segment[0]
+        return rows * self.shape[1] * self.shape[2] * self.dtype.itemsize
+
+    def __getitem__(self, rows: slice) -> Channels:
+        """Read the rows from ``rows.start`` to ``rows.stop``.
+
+        Raises:
+            ValueError: if the file has changed since it was opened, or is damaged.
+        """
+        first, last = rows.start, rows.stop
+        if self.orientation in (3, 4):  # stored upside down
+            first, last = self.shape[0] - last, self.shape[0] - first
+        try:
+            with decoding(self.path):
+                stored = self._read_raw(first, last) if self._raw else self._decode(first, last)
+        finally:
+            self._check_unchanged()
+        return exif_tags.upright(plain(self.page, stored), 1 if self.turned else self.orientation)
+
+    @property
+    def _raw(self) -> bool:
+        """Whether the file stores the rows uncompressed and contiguous."""
+        contiguous: bool = self.page.is_contiguous and self.page.planarconfig == tifffile.PLANARCONFIG.CONTIG
+        return contiguous and self.page.compression == tifffile.COMPRESSION.NONE and not self.page.is_tiled
+
+    def _read_raw(self, first: int, last: int) -> Channels:
+        length = self.shape[1] * self.shape[2] * self.dtype.itemsize
+        self.stream.seek(self.page.dataoffsets[0] + first * length)
+        data = self.stream.read((last - first) * length)
+        stored = np.dtype(self.page.dtype).newbyteorder(self.file.byteorder)
+        return np.frombuffer(data, stored).reshape(last - first, *self.shape[1:])
+
+    def _decode(self, first: int, last: int) -> Channels:
+        height = self.segment[0]
+        wanted = range(first // height, -(-last // height))
+        for band in wanted:
+            if band not in self.bands:
+                self.bands[band] = self._band(band)
+        whole = np.concatenate([self.bands[band] for band in wanted])
+        for band in sorted(self.bands)[: -CACHED_BANDS or None]:
+            del self.bands[band]
+        return whole[first - wanted.start * height : last - wanted.start * height]
+
+    def _band(self, band: int) -> Channels:
+        """Decode one row of tiles, or one strip, (h, W, S)."""
+        height, width, samples = self.shape
+        top = band * self.segment[0]
+        result = np.full((min(self.segment[0], height - top), width, samples), self.page.nodata, self.page.dtype)
+        down, across = -(-height // self.segment[0]), -(-width // self.segment[1])
+        apart = self.page.planarconfig == tifffile.PLANARCONFIG.SEPARATE and samples > 1
+        for plane in range(samples if apart else 1):
+            for column in range(across):
+                index = (plane * down + band) * across + column
+                self.stream.seek(self.page.dataoffsets[index])
+                count = self.page.databytecounts[index]
+                data = self.stream.read(count) if count else None
+                if data is not None and len(data) < count:
+                    raise EOFError("it ends too early")
+                segment, _, _ = self.page.decode(data, index, jpegtables=self.page.jpegtables)
+                if segment is None:
+                    continue  # absent, as in sparse files
+                left = column * self.segment[1]
+                part = segment[0, : result.shape[0], : width - left]
+                channels = slice(plane, plane + 1) if apart else slice(None)
+                result[: part.shape[0], left : left + part.shape[1], channels] = part
+        return result
+
+    def _look(self) -> tuple[int, int]:
+        status = os.fstat(self.stream.fileno())
+        return status.st_size, status.st_mtime_ns
+
+    def _check_unchanged(self) -> None:
+        if self._look() != self.stamp:
+            raise ValueError(
+                f"{self.path} changed while it was read, from {self.stamp[0]} to {self._look()[0]} bytes; "
+                "make sure that nothing writes to it, and start again"
+            )

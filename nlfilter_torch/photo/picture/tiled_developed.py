@@ -1,0 +1,152 @@
+"""A picture larger than memory as it is developed: its rows, computed when they are read.
+
+A picture is straightened through two temporary files, since a row of it crosses many rows of the original.
+"""
+
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from nlfilter_torch.core.workers import in_order
+from nlfilter_torch.photo.declared.development import Development, Frame
+from nlfilter_torch.photo.picture.developing import bands_of, finished, in_light, turned_band
+from nlfilter_torch.photo.picture.pictures import WHITE, FileRows, Picture, Rows, RowSource, Stored, Tile, transparency
+from nlfilter_torch.photo.picture.tiles import TILE_PIXELS, Passes, Tiling, between_steps, intermediate, tile_by_tile
+
+
+@contextmanager
+def developed_rows(
+    development: Development, passes: Passes, source: RowSource, name: str, nodata: float | None = None
+) -> Iterator[RowSource]:
+    """Yield the rows of a developed picture, as :func:`develop_image` makes it.
+
+    Args:
+        development: how.
+        passes: tiling options.
+        source: the picture. Its colours become floats unless it is only cropped.
+        name: that of the source, for error messages.
+        nodata: the value of pixels without data, if the last channel marks these.
+
+    Raises:
+        ValueError: if it is straightened for several processes, which cannot share its temporary file, or the middle of
+            the crop is outside.
+        OSError: if a temporary file does not fit.
+    """
+    picture, floats = Picture(source, name), between_steps(passes, source)
+    picture.accept_any_scale()  # until it is edited
+    frame = development.frame(picture.size)
+    if frame.angle and passes.processes is not None:
+        raise ValueError(
+            f"straighten must be 0 with --workers or --cluster, got {development.straighten:g}; leave these out"
+        )
+    limits = picture.limits if frame.angle or development.changes_tones else (0.0, 1.0)
+    with ExitStack() as stack:
+        if frame.angle:
+            source = stack.enter_context(_turned(picture, frame, floats, limits, nodata))
+        elif not frame.is_whole:
+            source = CroppedRows(source, frame)
+        if development.changes_tones:
+            framed = Picture(source, name)
+            framed.accept_any_scale()
+            source = TiledRows(tile_by_tile(floats, framed, Light(development, limits)))
+        yield source
+
+
+@dataclass(frozen=True)
+class CroppedRows:
+    """The part of rows (H, W) or (H, W, S) that a frame without a turn shows."""
+
+    whole: RowSource
+    frame: Frame
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """(h, w) or (h, w, S)."""
+        return *self.frame.size, *self.whole.shape[2:]
+
+    @property
+    def dtype(self) -> np.dtype[np.generic]:
+        """Of the rows."""
+        return self.whole.dtype
+
+    def __getitem__(self, rows: slice) -> Stored:
+        """The rows from ``rows.start`` to ``rows.stop``."""
+        top, left = self.frame.top, self.frame.left
+        return np.asarray(self.whole[top + rows.start : top + rows.stop])[:, left : left + self.frame.width]
+
+
+@dataclass(frozen=True)
+class TiledRows:
+    """The rows of a tiling, computed when they are read."""
+
+    tiling: Tiling
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """(H, W, S)."""
+        picture = self.tiling.picture
+        return *picture.size, picture.samples
+
+    @property
+    def dtype(self) -> np.dtype[np.generic]:
+        """Floats."""
+        return np.dtype(self.tiling.passes.kind)
+
+    def __getitem__(self, rows: slice) -> Stored:
+        """The rows from ``rows.start`` to ``rows.stop``."""
+        return self.tiling.part(rows.start, rows.stop)[0]
+
+
+@dataclass(frozen=True)
+class Light:
+    """Exposure and white balance of tiles of a picture whose values are within ``limits``."""
+
+    development: Development
+    limits: tuple[float, float]
+
+    def __call__(self, tile: Tile) -> Tensor:
+        """The changed colours (1, C, h, W)."""
+        least, most = map(torch.tensor, self.limits)
+        return in_light(tile.inner, self.development, (least, most))
+
+
+@contextmanager
+def _turned(
+    picture: Picture, frame: Frame, floats: Passes, limits: tuple[float, float], nodata: float | None
+) -> Iterator[FileRows]:
+    """The rows of a picture that is straightened and cropped, as floats in a temporary file."""
+    with ExitStack() as stack:
+        with intermediate(_as_floats(picture, floats.kind), picture.size, floats.folder) as whole:
+            bands = _bands(whole, frame, picture, limits, nodata, floats)
+            turned = stack.enter_context(intermediate(bands, frame.size, floats.folder))
+        yield turned
+
+
+def _as_floats(picture: Picture, kind: str) -> Rows:
+    """All rows (h, W, S) as floats, hidden pixels with colours of pixels nearby."""
+    for tile in picture.tiles(0, max(1, TILE_PIXELS // picture.size[1])):
+        colours = tile.pixels[0].permute(1, 2, 0).numpy().astype(kind)
+        rows = slice(tile.start, tile.start + len(colours))
+        yield rows, np.concatenate([colours, transparency(tile, kind)], axis=2)
+
+
+def _bands(
+    whole: FileRows, frame: Frame, picture: Picture, limits: tuple[float, float], nodata: float | None, passes: Passes
+) -> Rows:
+    """The rows (h, w, S) of the developed picture."""
+    hidden = None if nodata is None else nodata / WHITE.get(picture.kind, 1)
+    bands, turn = bands_of(frame), partial(turned_band, partial(_part, whole), frame)
+    for rows, band in zip(bands, in_order(turn, bands, passes.workers(1)), strict=True):
+        passes.report("Straightening", rows.start, frame.height)
+        planes = finished(band, picture.colours, limits, hidden)
+        yield slice(rows.start, rows.stop), np.ascontiguousarray(planes[0].permute(1, 2, 0).numpy())
+
+
+def _part(whole: FileRows, rows: range, columns: range) -> Tensor:
+    """A part (1, S, h, w) of stored rows."""
+    return torch.from_numpy(whole.part(rows, columns)).permute(2, 0, 1)[None]

@@ -1,0 +1,44 @@
+"""Balancing by passes over the pixels."""
+
+import pytest
+import torch
+
+from nlfilter_torch import nonlocal_operator
+from nlfilter_torch.operator.columns import Columns
+from nlfilter_torch.operator.pixel_matrix import PixelMatrix
+from nlfilter_torch.photo.picture import sampling
+from nlfilter_torch.photo.picture.pictures import Picture
+from nlfilter_torch.photo.picture.sampling import GuidePicture
+from nlfilter_torch.photo.picture.source import Guide
+from nlfilter_torch.photo.picture.statistics import Block, ShiftedTerms, balance_by_passes, sum_up_shifted
+from tests.problems import noise
+from tests.tiles import cat
+
+
+def silent(stage: str, done: int, total: int) -> None:
+    """Report nothing."""
+
+
+def test_balancing_that_does_not_settle_warns(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("nlfilter_torch.photo.picture.statistics.MAX_PASSES", 1)
+    picture = GuidePicture(Picture(cat(30, 40)), Guide({}))
+    pilot = sampling.take_pilot(picture, silent, num_landmarks=20)
+    with pytest.warns(UserWarning, match="balancing still changed by .* after 1 passes"):
+        balance_by_passes(lambda of: [of(pilot.sample)], 9 * pilot.moment, completed=True)
+
+
+def test_sums_over_weighted_blocks_solve_shifted_systems() -> None:
+    shifts, planes = torch.tensor([0.001, 0.5], dtype=torch.float64), noise(1, 2, 70, seed=1)
+    operator = nonlocal_operator(noise(1, 1, 7, 10), num_landmarks=9, photometric_bandwidth=0.4)
+    parts = operator.factor, operator.scaling, operator.remainder
+    weights = torch.rand(1, 70, generator=torch.Generator().manual_seed(0), dtype=torch.float64) + 0.5
+    matrix = PixelMatrix(*parts, operator.communicator, weights)
+    wanted = matrix.solve(planes, shifts, matrix.capacitances(shifts))
+    cuts = [slice(0, 30), slice(30, 70)]
+    blocks = [Block(parts[0][:, :, cut], parts[2][:, cut], planes[:, :, cut], weights[:, cut]) for cut in cuts]
+    columns = {id(block): Columns(*(part[..., cut] for part in parts)) for block, cut in zip(blocks, cuts, strict=True)}
+    terms = ShiftedTerms(lambda block: (block.image, columns[id(block)]), shifts, False)
+    inner = sum_up_shifted(lambda function: map(function, blocks), terms).inner()
+    smooth = inner.mT @ parts[0].unsqueeze(1) * parts[1]
+    lowered = shifts.view(1, -1, 1, 1) / (parts[2][:, None, None] + shifts.view(1, -1, 1, 1))
+    torch.testing.assert_close(lowered * (planes.unsqueeze(1) - smooth), wanted, atol=1e-9, rtol=0)
