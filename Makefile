@@ -94,7 +94,6 @@ QUICK := \
 	'streaming_cpu --quick' \
 	'streaming_busy --quick' \
 	'busy --quick sharpen' \
-	'durations --quick sharpen' \
 	'commands --quick' \
 	'scribbles --quick' \
 	'app --side 96 --megapixels 0.05 --repeats 3 --quick' \

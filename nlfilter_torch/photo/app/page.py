@@ -526,8 +526,7 @@ class Editor:
             dialog = SaveDialog("Save the photograph", name, session.folder, session.check_photograph, side)
         chosen = await dialog.answer()
         if chosen is not None:
-            progress = Progress(stages=session.stages(chosen))
-            self._tasks.start(self._save(partial(session.save, options=dialog.options), chosen, progress))
+            self._tasks.start(self._save(partial(session.save, options=dialog.options), chosen, Progress()))
 
     async def _ask_edit_name(self) -> None:
         name = "edit" if self.session.opened is None else Path(self.session.opened.name).stem

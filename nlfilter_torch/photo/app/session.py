@@ -10,7 +10,6 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from nlfilter_torch.core.progress import Stage
 from nlfilter_torch.photo.app.developed import DEVELOPING, Developed, uncropped
 from nlfilter_torch.photo.app.overlays import Overlays
 from nlfilter_torch.photo.app.preview import PIXELS, Preview
@@ -40,7 +39,6 @@ from nlfilter_torch.photo.files.photographs import (
 from nlfilter_torch.photo.files.rows import TILED, WHOLE, usual_memory
 from nlfilter_torch.photo.files.writing import open_beside
 from nlfilter_torch.photo.picture.developing import balance_of
-from nlfilter_torch.photo.picture.durations import duration, expected_stages, writing
 from nlfilter_torch.photo.picture.resizing import resize
 from nlfilter_torch.photo.picture.sampling import Report, in_silence
 from nlfilter_torch.photo.picture.tiles import Passes, Statistics
@@ -424,8 +422,7 @@ class Session:
         if _in_tiles(photograph.size, steps):
             return None
         check_memory(Path(opened.name), width, height, steps.bytes_per_pixel)
-        tell = partial(_tell, report, [duration(step, photograph.size) for step in steps.acting])
-        return apply_recipe(steps, photograph.pixels, tell, weights=photograph.weights)
+        return apply_recipe(steps, photograph.pixels, partial(report, "Editing"), weights=photograph.weights)
 
     def _opened_to(self, purpose: str) -> Opened:
         """The open photograph; if there is none, raises a ValueError that names the purpose."""
@@ -478,15 +475,6 @@ class Session:
             suffix = ".tif" if BITS[photograph.depth] == "floats" else ".png"
         return f"{path.stem}-edited{suffix}"
 
-    def stages(self, name: str) -> list[Stage]:
-        """The stages of :meth:`save`, if they are known."""
-        whole = self._opened_to("save").photograph.size
-        size, recipe = self.recipe.develop.frame(whole).size, self.recipe.on_developed(whole)
-        if math.prod(size) <= SMALL or not _in_tiles(size, recipe):
-            return []
-        stages = expected_stages(recipe.steps, size)
-        return [*stages, Stage("Writing", writing(size, Path(name)))] if stages else []
-
     def save(self, name: str, report: Report = in_silence, options: FileOptions = FileOptions()) -> Path:
         """Edit the photograph at its full size and write it to the folder; the file appears complete or not at all.
 
@@ -534,11 +522,6 @@ class Session:
 def _in_tiles(size: tuple[int, int], recipe: Recipe) -> bool:
     """Whether a photograph (H, W) is edited in tiles, since that at once needs too much memory."""
     return math.prod(size) * recipe.bytes_per_pixel > WHOLE
-
-
-def _tell(report: Report, seconds: list[float], done: int, total: int) -> None:
-    """Report that so many of the steps are done, by how long they take."""
-    report("Editing", round(1000 * sum(seconds[:done]) / sum(seconds)), 1000)
 
 
 def reduced_size(photograph: Photograph, side: int | None) -> tuple[int, int]:

@@ -10,7 +10,6 @@ import torch
 import typer
 from torch import Tensor
 
-from nlfilter_torch.core.progress import Stage
 from nlfilter_torch.core.workers import single_threaded
 from nlfilter_torch.photo.cli import editing, options
 from nlfilter_torch.photo.cli.changes import ChangeMeter, squared_difference, write_map
@@ -23,7 +22,6 @@ from nlfilter_torch.photo.edits.applying import edit_of
 from nlfilter_torch.photo.files.photographs import Photograph
 from nlfilter_torch.photo.files.rows import StoredPicture, open_picture
 from nlfilter_torch.photo.picture.drawn import Drawn, M
-from nlfilter_torch.photo.picture.durations import stages_of
 from nlfilter_torch.photo.picture.edit import PhotoEdit, Rows
 from nlfilter_torch.photo.picture.in_memory import InMemory, edit_image, fit_edit
 from nlfilter_torch.photo.picture.pictures import Picture, RowSource, stored_as
@@ -108,12 +106,6 @@ class EditJob:
             meter.add(squared_difference(before, after))
             typer.echo(edit.summary(meter.change))
         return pixels
-
-    def stages(self, size: tuple[int, int]) -> list[Stage]:
-        """The stages of the edit in tiles of a photograph (H, W), if they are known."""
-        edit = self.step.declared
-        regional = edit.regional is not None and self.scribbles.marks_objects(edit)
-        return [] if self.full else stages_of(self.step, size, regional=regional)
 
     @contextmanager
     def tiling(self, job: Job) -> Iterator[Tiling]:

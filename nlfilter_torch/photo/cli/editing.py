@@ -11,7 +11,6 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from nlfilter_torch.core.progress import Stage
 from nlfilter_torch.photo.cli import options
 from nlfilter_torch.photo.cli.changes import MAP_DEPTH
 from nlfilter_torch.photo.cli.progress import stages, steps
@@ -38,7 +37,6 @@ from nlfilter_torch.photo.files.rows import (
     usual_memory,
     write_picture,
 )
-from nlfilter_torch.photo.picture.durations import written
 from nlfilter_torch.photo.picture.edit import Rows
 from nlfilter_torch.photo.picture.pictures import Picture, mask_plane
 from nlfilter_torch.photo.picture.sampling import Report
@@ -284,9 +282,6 @@ class FileEdit(Protocol):
     def edited(self, photograph: Photograph) -> Tensor:
         """New pixels (1, C, H, W) of a photograph in memory that is developed already."""
 
-    def stages(self, size: tuple[int, int]) -> list[Stage]:
-        """The stages of the edit in tiles of a photograph that is (H, W) before it is developed, if they are known."""
-
     def tiling(self, job: Job) -> AbstractContextManager[Tiling]:
         """The edited rows of a photograph that does not fit in memory, which are computed within the block."""
 
@@ -347,7 +342,7 @@ def edit_file(
         check_place(Path(target), stored, like, allowed)
         note_developing(edit, source, size, picture.shape[2])
         processes = processes_for(workers, cluster, stack)
-        report = stack.enter_context(stages(written(edit.stages(size), framed, Path(target))))
+        report = stack.enter_context(stages())
         job = Job(picture, stored, allowed - picture.cached, allowed_memory(memory, TILED), report, stack, processes)
         with edit.tiling(job) as tiling:
             write_picture(Path(target), tiling, stored, like, quality)

@@ -2,7 +2,7 @@
 
 import sys
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
@@ -12,11 +12,11 @@ from rich.progress import (
     Progress,
     ProgressColumn,
     SpinnerColumn,
-    Task,
     TaskID,
     TaskProgressColumn,
     TextColumn,
     TimeElapsedColumn,
+    TimeRemainingColumn,
 )
 
 from nlfilter_torch.core import progress
@@ -29,19 +29,6 @@ def _bar(*columns: ProgressColumn) -> Progress:
     console = Console(stderr=True)
     console.quiet = not console.is_terminal  # older versions of rich end a disabled bar with an empty line
     return Progress(*columns, console=console, transient=True, disable=console.quiet)
-
-
-class _TimeLeft(ProgressColumn):
-    """The time left, as the lines say it."""
-
-    def __init__(self, current: progress.Progress) -> None:
-        super().__init__()
-        self._current = current
-
-    def render(self, task: Task) -> str:
-        """The time left, or nothing if it is unknown."""
-        left = self._current.seconds_left
-        return "" if left is None else f"about {progress.time_text(left)} left"
 
 
 @contextmanager
@@ -83,12 +70,15 @@ class _Shown:
     def begin(self, name: str) -> None:
         """End the current step, and begin the one of that name."""
         self.bar.update(self.task, description=name, advance=1)
-        self.lines.begin(name)
+        self.lines(name, 0, 1)
 
     def report(self, stage: str, done: int, total: int) -> None:
         """Show how much of a stage is done."""
         self.lines(stage, done, total)
-        self.bar.update(self.task, description=stage, completed=self.lines.fraction, total=1.0)
+        shown = self.bar.tasks[0]
+        if stage != shown.description or done < shown.completed:
+            self.bar.reset(self.task, description=stage, total=max(total, 1))  # the time left is that of the stage
+        self.bar.update(self.task, completed=done)
 
 
 @contextmanager
@@ -103,12 +93,11 @@ def steps(total: int, *, lines: bool = True) -> Iterator[Callable[[str], None]]:
 
 
 @contextmanager
-def stages(expected: Sequence[progress.Stage] = ()) -> Iterator[Callable[[str, int, int], None]]:
-    """Show a bar of a job; yield a function of the stage, the amount done and the total.
-
-    The bar is that of the whole job if its stages are expected, and otherwise restarts with every stage.
-    """
-    current = progress.Progress(stages=expected)
-    columns = (TextColumn("{task.description}", markup=False), BarColumn(), TaskProgressColumn(), _TimeLeft(current))
-    with _bar(*columns) as bar, _lines(current, bar.disable) as lines:
-        yield _Shown(bar, bar.add_task("", total=1.0), lines).report
+def stages() -> Iterator[Callable[[str, int, int], None]]:
+    """Show a bar, which restarts with every stage; yield a function of the stage, the amount done and the total."""
+    text = TextColumn("{task.description}", markup=False)
+    with (
+        _bar(text, BarColumn(), TaskProgressColumn(), TimeRemainingColumn()) as bar,
+        _lines(progress.Progress(), bar.disable) as lines,
+    ):
+        yield _Shown(bar, bar.add_task(""), lines).report

@@ -9,7 +9,6 @@ from pathlib import Path
 
 from torch import Tensor
 
-from nlfilter_torch.core.progress import Stage
 from nlfilter_torch.photo.cli import editing, options
 from nlfilter_torch.photo.cli.editing import Job, pixels_of, rows_of
 from nlfilter_torch.photo.declared.development import Development
@@ -21,7 +20,6 @@ from nlfilter_torch.photo.files.photographs import Photograph
 from nlfilter_torch.photo.files.rows import StoredPicture
 from nlfilter_torch.photo.picture.changes import blend_edited
 from nlfilter_torch.photo.picture.drawn import M, Painter
-from nlfilter_torch.photo.picture.durations import expected_stages, straightening
 from nlfilter_torch.photo.picture.edit import Rows
 from nlfilter_torch.photo.picture.in_memory import InMemory
 from nlfilter_torch.photo.picture.painting import TensorPainter
@@ -99,12 +97,6 @@ class RecipeJob:
             recipes = self._seen(InMemory(photograph.pixels, weights=weights), TensorPainter())
         pixels = [apply_recipe(recipe, photograph.pixels, weights=weights) for recipe in recipes]
         return pixels[0] if masks is None else blend_edited(photograph.pixels, pixels, masks)
-
-    def stages(self, size: tuple[int, int]) -> list[Stage]:
-        """The stages in tiles of a photograph that is (H, W) before it is developed, if they are known."""
-        framed, recipes = self.develop.frame(size).size, self.on_developed(size).recipes
-        stages = [] if self.full else expected_stages((step for recipe in recipes for step in recipe.steps), framed)
-        return [straightening(framed), *stages] if stages and self.develop.straighten else stages
 
     @contextmanager
     def tiling(self, job: Job) -> Iterator[Tiling]:

@@ -3,13 +3,11 @@
 import os
 import time
 from collections.abc import Iterator
-from functools import partial
 from pathlib import Path
 
 import pytest
 from rich.console import Console
 
-from nlfilter_torch.core.progress import Progress, Stage
 from nlfilter_torch.photo.cli import progress
 
 
@@ -52,17 +50,3 @@ def test_report_of_progress_is_drawn_on_a_terminal(terminal: Console) -> None:
     text = terminal.export_text()
     assert "Filtering" in text
     assert "75%" in text
-
-
-def test_a_bar_of_the_whole_job_if_its_stages_are_known(monkeypatch: pytest.MonkeyPatch, terminal: Console) -> None:
-    now = [0.0]  # without a clock of its own, a job as quick as this is over before it is shown
-    monkeypatch.setattr(progress.progress, "Progress", partial(Progress, lambda: now[0]))
-    with progress.stages([Stage("Looking", 1.0), Stage("Filtering", 4.0)]) as report:
-        report("Looking", 0, 1)
-        now[0] = 0.2
-        report("Looking", 1, 1)
-        report("Filtering", 0, 4)
-        report("Filtering", 1, 4)
-    text = terminal.export_text()
-    assert "40%" in text
-    assert "about 1 s left" in text

@@ -1,6 +1,5 @@
 """Recipes of any edits that are applied to one photograph, in memory and in tiles."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +9,6 @@ from PIL import Image
 
 from nlfilter_torch.photo.cli import main
 from nlfilter_torch.photo.cli.recipe_job import RecipeJob
-from nlfilter_torch.photo.declared.development import Development
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.files.photographs import read_photograph
@@ -92,14 +90,6 @@ def test_what_is_known_before_the_photograph_is_read() -> None:
     assert both.bytes_per_pixel > max(detail.bytes_per_pixel, tone.bytes_per_pixel)
     assert not both.coloured
     assert RecipeJob([tone, Recipe((COLORIZE,))], [], "", "", False).coloured
-
-
-def test_a_crop_takes_as_long_as_a_picture_of_its_size() -> None:
-    tone, crop = (Step("tone", contrast=1.5),), Development(crop=(0.0, 0.0, 0.5, 0.25))
-    cropped, plain = (RecipeJob([Recipe(tone, how)], [], "", "", False) for how in (crop, Development()))
-    assert cropped.stages((4000, 6000)) == plain.stages((1000, 3000)) != plain.stages((4000, 6000))
-    turned = RecipeJob([Recipe(tone, replace(crop, straighten=2.0))], [], "", "", False)
-    assert [stage.name for stage in turned.stages((4000, 6000))][:2] == ["Straightening", "Looking"]
 
 
 def test_masks_have_the_size_of_the_photograph(tmp_path: Path, tiled: bool, capsys: pytest.CaptureFixture[str]) -> None:
