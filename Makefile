@@ -115,8 +115,7 @@ QUICK := \
 	'compilation --quick --only export' \
 	'memory --side 128 --repeats 1' \
 	'training points block floors refinement clusters --quick' \
-	'training functions sizes equivariance styles --quick' \
-	'fuzz --cases 20'
+	'training functions sizes equivariance styles --quick'
 
 # Trains the denoiser further, from the weights of the package, on the pictures of scikit-image and on all of a folder:
 # make train PICTURES=folder. A stopped training is resumed; out/denoiser holds its state, weights and curve.

@@ -1,28 +1,56 @@
-"""The fuzzer ``benchmarks.fuzz`` for a minute on images of at most 32x32 pixels, and the faults its checks detect."""
+"""Random operators, pictures and calls keep the library's promises, and the faults that the checks detect.
 
+The same few cases in every run; ``RANDOM_CASES=10000 pytest tests/themes/test_random_input.py`` draws as many new ones
+for each test, on operators of up to 64x64 pixels and pictures of all sizes, and simplifies those that fail.
+"""
+
+import os
 import random
 import warnings
 from dataclasses import replace
 
+import numpy as np
 import pytest
+import skimage.data
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from skimage.color import rgb2gray
+from skimage.transform import resize
+from skimage.util import img_as_float64
 
-from benchmarks.fuzz import checks
-from benchmarks.fuzz.__main__ import main
-from benchmarks.fuzz.cases import random_case
-from benchmarks.fuzz.checks import Findings, check_case, check_operator, is_sentence, judged
-from benchmarks.fuzz.functions import FUNCTIONS, check_call, random_call
-from benchmarks.fuzz.pictures import check_picture, pictures
-from benchmarks.fuzz.truth import Exact
 from nlfilter_torch import NonlocalOperator, nonlocal_operator
 from nlfilter_torch.core.checks import check_positive
 from nlfilter_torch.core.warning import warn
+from tests import random_operators as checks
 from tests.problems import noise
+from tests.random_calls import FUNCTIONS, check_call, random_call
+from tests.random_operators import (
+    SAMPLINGS,
+    Exact,
+    Findings,
+    check_case,
+    check_operator,
+    is_sentence,
+    judged,
+    random_case,
+)
+
+MANY = int(os.environ.get("RANDOM_CASES", "0"))
+# All pictures of scikit-image that load without a download.
+PICTURES = (
+    "astronaut", "brick", "camera", "cell", "chelsea", "clock", "coffee", "coins", "colorwheel", "grass", "gravel",
+    "horse", "hubble_deep_field", "immunohistochemistry", "logo", "microaneurysms", "moon", "page", "retina", "rocket",
+    "shepp_logan_phantom", "stereo_motorcycle", "text",
+)  # fmt: skip
 
 # Hypothesis draws every choice, so that it can simplify a failing case.
 sources = st.randoms(use_true_random=False)
+
+
+def examples(few: int) -> settings:
+    """As many fixed cases in the suite; random ones where the environment asks for many."""
+    return settings(max_examples=MANY or few, derandomize=not MANY)
 
 
 def assert_kept(what: object, findings: Findings) -> None:
@@ -32,24 +60,46 @@ def assert_kept(what: object, findings: Findings) -> None:
 
 @pytest.mark.slow
 @given(rng=sources)
-@settings(max_examples=150)
+@examples(150)
 def test_random_operators_keep_their_promises(rng: random.Random) -> None:
-    case = random_case(rng, side=32)
+    case = random_case(rng, side=64 if MANY else 32)
     assert_kept(case, check_case(case))
 
 
 @pytest.mark.slow
 @given(rng=sources)
-@settings(max_examples=400)
+@examples(400)
 def test_public_functions_with_random_arguments(rng: random.Random) -> None:
     call = random_call(rng)
     assert_kept(call, check_call(call))
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("picture", [picture for picture in pictures(0) if picture.side == 64][:6], ids=str)
-def test_pictures_keep_the_promises_of_their_operators(picture) -> None:
-    assert_kept(picture, check_picture(picture))
+@given(
+    name=st.sampled_from(PICTURES),
+    side=st.sampled_from((64, 96, 160, 256) if MANY else (64,)),
+    levels=st.sampled_from((1, 2, 4, 10, 25, 100)),
+    landmarks=st.sampled_from(SAMPLINGS),
+    count=st.sampled_from((5, 20, 50, 100, 200)),
+)
+@examples(8)
+def test_pictures_keep_the_promises_of_their_operators(name, side, levels, landmarks, count) -> None:
+    picture = getattr(skimage.data, name)()
+    image = squeezed(picture[0] if isinstance(picture, tuple) else picture, side)
+    findings, made = Findings(), None
+    options = {"photometric_bandwidth": levels / 255, "landmarks": landmarks, "num_landmarks": count}
+    with torch.no_grad(), judged(findings, legal=True, completed=True):
+        made = nonlocal_operator(image, **options)
+        check_operator(findings, made, image, None)
+    assert_kept((name, side, options), findings)
+
+
+def squeezed(picture: np.ndarray, side: int) -> torch.Tensor:
+    """A picture in grey, (1, 1, side, side), whatever its proportions."""
+    picture = img_as_float64(picture)
+    picture = rgb2gray(picture[..., :3]) if picture.ndim == 3 else picture
+    reduced = resize(picture, (side, side), anti_aliasing=True).clip(0, 1)
+    return torch.from_numpy(np.ascontiguousarray(reduced))[None, None].float()
 
 
 def operator(**changes: object) -> NonlocalOperator:
@@ -102,7 +152,7 @@ def test_the_largest_eigenvalue_is_found_without_a_dense_matrix(monkeypatch, sca
     factor[2] = 0  # the largest eigenvalue is then the largest entry of the diagonal
     exact = Exact(factor, diagonal)
     _, dense = exact.eigenvalue_range()
-    monkeypatch.setattr("benchmarks.fuzz.truth.DENSE", 0)
+    monkeypatch.setattr("tests.random_operators.DENSE", 0)
     least, most = exact.eigenvalue_range()
     torch.testing.assert_close(most, dense, atol=0, rtol=1e-7)
     torch.testing.assert_close(least, diagonal.amin(1))
@@ -165,23 +215,3 @@ def test_every_public_function_is_called() -> None:
         "Spectrum",
     }
     assert set(nlfilter_torch.__all__) - results <= FUNCTIONS.keys()
-
-
-@pytest.mark.parametrize("kind", [[], ["--functions"], ["--pictures"]])
-def test_a_seed_gives_the_same_cases_and_a_broken_promise_exit_status_1(kind, monkeypatch, tmp_path, capsys) -> None:
-    if not kind:
-        monkeypatch.setattr(checks, "SLACK", {torch.float32: -1.0, torch.float64: -1.0})  # every residual is too large
-    runs = []
-    for _ in range(2):
-        with pytest.raises(SystemExit) as stopped:
-            main([*kind, "--cases", "3", "--workers", "1", "--out", str(tmp_path / "new" / "fuzz.json")])
-        runs.append((stopped.value.code, capsys.readouterr().out, (tmp_path / "new" / "fuzz.json").read_text()))
-    assert runs[0] == runs[1]
-    if not kind:
-        assert runs[0][0] == 1
-        assert f"{checks.RESIDUAL}, 3 such" in runs[0][1]
-        assert "python -m benchmarks.fuzz --seed 0 --case" in runs[0][1]
-        with pytest.raises(SystemExit) as stopped:
-            main(["--case", "1"])
-        assert stopped.value.code == 1
-        assert f"BROKEN {checks.RESIDUAL}" in capsys.readouterr().out

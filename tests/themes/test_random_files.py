@@ -1,24 +1,23 @@
-"""Files with every kind of metadata, edited at alpha 1 and compared: ``python -m benchmarks.files [--count 200]``.
+"""Random files with every kind of metadata, edited at alpha 1: nothing changes that no note names.
 
 Each case is a file of a random type, depth, size, orientation and set of metadata, made by other libraries and by hand.
 The command ``detail --alpha 1,1`` edits it, in memory or in tiles, and writes a file of a random type that holds its
 depth. Pixels, EXIF fields (type, bytes, and the place of the maker note), profile, XMP, resolution and tags of both
-files are compared, and every difference that no note names is reported. Prints the number of these; 0 is right.
+files are compared. ``RANDOM_CASES=1000 pytest tests/themes/test_random_files.py`` draws as many other files.
 """
 
-import argparse
 import contextlib
 import io
 import math
+import os
 import random
-import sys
-import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import imagecodecs
 import numpy as np
+import pytest
 import tifffile
 from PIL import Image, ImageCms, PngImagePlugin
 
@@ -295,36 +294,19 @@ def exif_differences(case: Case, first: Photograph, second: Photograph, notes: l
             yield "thumbnail"
 
 
-def check(seed: int, number: int, folder: Path) -> tuple[Case, list[str]]:
-    """Make the file of a case, edit it, and compare."""
-    case = random_case(random.Random(f"{seed}:{number}"))
-    source, target = folder / f"{number}{case.source}", folder / f"{number}_out{case.target}"
-    make(case, source, pixels(case, number))
-    arguments = ["detail", str(source), str(target), "--alpha", "1,1", "--landmarks", "10"]
-    with contextlib.redirect_stderr(io.StringIO()) as shown:
-        status = command([*arguments, *(["--memory", TILED] if case.tiled else [])])
-    notes = shown.getvalue().splitlines()
-    if status:
-        return case, [f"status {status}"]
-    return case, list(differences(case, source, target, notes))
-
-
-def main(arguments: list[str] | None = None) -> int:
-    """Check cases by number; return 1 if there is a difference that no note names."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.files", description=__doc__)
-    parser.add_argument("--count", type=int, default=200, help="number of cases")
-    parser.add_argument("--seed", type=int, default=0, help="seed of the cases")
-    options = parser.parse_args(arguments)
-    failed = 0
-    with tempfile.TemporaryDirectory() as folder:
-        for number in range(options.count):
-            case, unnamed = check(options.seed, number, Path(folder))
-            failed += len(unnamed)
-            if unnamed:
-                print(f"{number}: {case}: {', '.join(unnamed)}", flush=True)
-    print(f"{options.count} files, {failed} differences that no note names")
-    return int(failed > 0)
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+@pytest.mark.slow
+@pytest.mark.filterwarnings("always")
+@pytest.mark.parametrize("part", range(4))
+def test_every_difference_is_named_by_a_note(part: int, tmp_path: Path) -> None:
+    many = int(os.environ.get("RANDOM_CASES", "0"))
+    seed, count = (random.randrange(1 << 32), many // 4) if many else (0, 10)
+    for number in range(part * count, part * count + count):
+        case = random_case(random.Random(f"{seed}:{number}"))
+        source, target = tmp_path / f"{number}{case.source}", tmp_path / f"{number}_out{case.target}"
+        make(case, source, pixels(case, number))
+        arguments = ["detail", str(source), str(target), "--alpha", "1,1", "--landmarks", "10"]
+        with contextlib.redirect_stderr(io.StringIO()) as shown:
+            status = command([*arguments, *(["--memory", TILED] if case.tiled else [])])
+        assert status == 0, (number, seed, case)
+        unnamed = list(differences(case, source, target, shown.getvalue().splitlines()))
+        assert not unnamed, (number, seed, case)

@@ -1,1 +1,0 @@
-"""Random operators, pictures and calls, checked against the library's promises: ``python -m benchmarks.fuzz``."""
