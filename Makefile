@@ -101,7 +101,6 @@ QUICK := \
 	'denoising --quick --patterns --methods noisy ours' \
 	'real_noise --quick' \
 	'looks --quick' \
-	'own_edits --quick' \
 	'look_costs --quick' \
 	'detail --quick' \
 	'detail --quick --scales' \

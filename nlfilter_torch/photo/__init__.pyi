@@ -22,8 +22,6 @@ from .files.photographs import read_photograph as read_photograph
 from .files.photographs import write_photograph as write_photograph
 from .look_fitting.fit_look import FittedLook as FittedLook
 from .look_fitting.fit_look import fit_look as fit_look
-from .look_fitting.own_steps import FittedSteps as FittedSteps
-from .look_fitting.own_steps import fit_steps as fit_steps
 from .looks.look_module import Look as Look
 from .picture.drawn import Drawn as Drawn
 from .plotting import plot_eigenvalues as plot_eigenvalues

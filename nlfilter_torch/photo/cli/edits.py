@@ -130,18 +130,6 @@ def option_value(parameter: Parameter, value: Value) -> float | str | None:
     return f"{value:.9g}" if parameter.words and isinstance(value, int | float) else value
 
 
-def options_of(step: Step) -> str:
-    """The options of a step that differ from their defaults, without those of strokes.
-
-    >>> options_of(Step("detail", alpha=(2.0, 1.0), threshold=0.0)), options_of(Step("tone"))
-    ('--alpha 2,1 --threshold 0', 'with its defaults')
-    """
-    values = [(step.declared[name], value) for name, value in step.values]
-    texts = [(parameter.name, option_value(parameter, value)) for parameter, value in values if parameter.is_option]
-    shown = [(name, f"{text:.9g}" if isinstance(text, float) else text) for name, text in texts]
-    return " ".join(f"--{name.replace('_', '-')} {text}" for name, text in shown) or "with its defaults"
-
-
 def option(parameter: Parameter, panel: str | None = None) -> object:
     """The annotation of a parameter's option; ``panel`` replaces the title of its section in the help."""
     number = None if parameter.words else NUMBERS.get(parameter.kind)

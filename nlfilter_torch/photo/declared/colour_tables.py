@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 EXPORT = "export a 3-D table of colours from 0 to 1"
 MOST_LEVELS = math.isqrt(MAX_NODES)
-HALD_LEVEL = 8  # of pictures that are written
+CUBE_NODES, HALD_LEVEL = 33, 8  # of the tables that are written
 WHITE = 65535
 
 
