@@ -60,7 +60,8 @@ def edits(image: "torch.Tensor") -> dict[str, Job]:
     """Every edit of an image (1, 3, H, W), by its name."""
     import torch
 
-    from nlfilter_torch import photo, region_mask
+    from nlfilter_torch import photo
+    from nlfilter_torch.photo import region_mask
 
     side = image.shape[-1]
     region, other = torch.zeros_like(image[:, :1]), torch.zeros_like(image[:, :1])

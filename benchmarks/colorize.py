@@ -22,7 +22,7 @@ from torch import Tensor
 from benchmarks.denoising.cases import psnr
 from benchmarks.levin import propagate
 from benchmarks.photographs import photograph, pictures
-from nlfilter_torch import colorize
+from nlfilter_torch.photo import colorize
 from nlfilter_torch.photo.picture.colour import merge_luminance, split_luminance, with_green
 
 CHOOSING = ("astronaut", "chelsea", "coffee", "motorcycle", "rocket")

@@ -28,8 +28,8 @@ from torch import Tensor
 from benchmarks.detail_peers import clahe, detail_enhance, smoothers
 from benchmarks.photographs import pictures
 from benchmarks.unsharp import gaussian
-from nlfilter_torch import enhance
 from nlfilter_torch.operator.features import reduce_channels
+from nlfilter_torch.photo import enhance
 from nlfilter_torch.photo.declared.parameters import DETAIL
 from nlfilter_torch.photo.declared.presets import PRESETS
 from nlfilter_torch.photo.edits.applying import apply_step

@@ -19,16 +19,8 @@ from skimage.color import rgb2hsv
 from torch import Tensor
 
 from benchmarks.figures.scenes import luminance, scene, spots, strokes
-from nlfilter_torch import (
-    Spectrum,
-    abstract,
-    adjust_tone,
-    defocus,
-    diffusion_mask,
-    filter_frames,
-    nonlocal_operator,
-    recolor,
-)
+from nlfilter_torch import Spectrum, diffusion_mask, nonlocal_operator
+from nlfilter_torch.photo import abstract, adjust_tone, defocus, filter_frames, recolor
 from nlfilter_torch.photo.files.writing import open_beside
 
 SUIT = (60, 300, 20, 20)  # column, row, width, height on the astronaut's suit

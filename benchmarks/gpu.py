@@ -17,22 +17,17 @@ from torch import Tensor
 
 from nlfilter_torch import (
     NonlocalFilter,
-    abstract,
     captured_energy,
-    denoise,
     detail_layers,
     diffusion_mask,
-    enhance,
     fit_alpha,
     nonlocal_operator,
     polynomial_filter,
     propagate_strokes,
-    recolor,
-    region_mask,
     segment_mask,
-    sharpen,
     spectral_filter,
 )
+from nlfilter_torch.photo import abstract, denoise, enhance, recolor, region_mask, sharpen
 
 MEGAPIXELS = (0.25, 1.0, 4.0, 16.0)
 LANDMARKS, FEATURES = 100, 25

@@ -14,22 +14,25 @@ from torch import Tensor
 
 from benchmarks.photographs import LETTERS, photograph
 from nlfilter_torch import (
-    abstract,
-    adjust_tone,
     captured_energy,
-    colorize,
-    defocus,
-    denoise,
     detail_layers,
     diffusion_mask,
-    enhance,
     estimate_bandwidth,
     nonlocal_operator,
     polynomial_filter,
+)
+from nlfilter_torch.photo import (
+    PRESETS,
+    abstract,
+    adjust_tone,
+    apply_recipe,
+    colorize,
+    defocus,
+    denoise,
+    enhance,
     recolor,
     sharpen,
 )
-from nlfilter_torch.photo import PRESETS, apply_recipe
 from nlfilter_torch.photo.files.writing import open_beside
 from nlfilter_torch.photo.picture.colour import edit_luminance
 from nlfilter_torch.photo.plotting import plot_response, show_eigenvectors, show_images, show_layers

@@ -29,7 +29,7 @@ from torch import Tensor
 from benchmarks.edited_photographs import edited_photographs
 from benchmarks.figures.scenes import luminance, scribbled
 from benchmarks.photographs import reduced_to
-from nlfilter_torch import region_mask
+from nlfilter_torch.photo import region_mask
 from nlfilter_torch.photo.app.brush import RADIUS
 from nlfilter_torch.photo.declared.parameters import EDITS, MASK
 from nlfilter_torch.photo.declared.presets import Recipe, find_recipe

@@ -17,8 +17,8 @@ from torch import Tensor
 from benchmarks.looks import EDITS, applied
 from benchmarks.memory import forget_peak, resident
 from benchmarks.whole import photograph
-from nlfilter_torch import apply_look, fit_look
 from nlfilter_torch.core.kernels import definitions_only
+from nlfilter_torch.photo import apply_look, fit_look
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.edits.applying import apply_step
 from nlfilter_torch.photo.looks.lattice import lattice_change

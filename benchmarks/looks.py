@@ -31,7 +31,7 @@ from skimage import exposure, filters
 from torch import Tensor
 
 from benchmarks.photographs import pictures
-from nlfilter_torch import fit_look
+from nlfilter_torch.photo import fit_look
 
 Bytes = NDArray[np.uint8]
 Edit = Callable[[Bytes], Bytes]

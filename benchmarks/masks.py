@@ -18,8 +18,8 @@ from torch import Tensor
 from benchmarks.composites import Composite, composites, setup
 from benchmarks.mask_peers import PEERS
 from benchmarks.photographs import photograph
-from nlfilter_torch import region_mask
 from nlfilter_torch.core.precision import working_dtype
+from nlfilter_torch.photo import region_mask
 from nlfilter_torch.photo.declared.parameters import MASK
 from nlfilter_torch.photo.picture.drawn import Drawn
 from nlfilter_torch.photo.picture.in_memory import InMemory

@@ -33,7 +33,7 @@ from benchmarks.edited_photographs import edited_photographs
 from benchmarks.keepers import Job, jobs
 from benchmarks.mask_peers import PEERS
 from benchmarks.photographs import reduced_to
-from nlfilter_torch import region_mask
+from nlfilter_torch.photo import region_mask
 from nlfilter_torch.photo.edits.applying import edit_of, scribbles_of
 from nlfilter_torch.photo.files.photographs import Photograph, write_photograph
 from nlfilter_torch.photo.picture.drawn import Drawn

@@ -35,7 +35,7 @@ from torch.nn.functional import avg_pool2d
 
 from benchmarks.composites import Composite, composites, draw_strokes, setup
 from benchmarks.photographs import photograph
-from nlfilter_torch import defocus, recolor
+from nlfilter_torch.photo import defocus, recolor
 from nlfilter_torch.photo.edits.defocus import blur_kernel, convolve
 from nlfilter_torch.photo.edits.recolor import Recoloring, with_room
 from nlfilter_torch.photo.picture.colour import hundredths_of_lab, merge_luminance, split_luminance

@@ -35,7 +35,7 @@ from benchmarks.edited_photographs import edited_photographs
 from benchmarks.photographs import reduced_to
 from benchmarks.recolor import CHANGED, COLOURS, recoloured, tinted
 from benchmarks.training.figures import Figure, table
-from nlfilter_torch import recolor
+from nlfilter_torch.photo import recolor
 from nlfilter_torch.photo.files.photographs import Photograph, write_photograph
 from nlfilter_torch.photo.picture.in_memory import InMemory
 from nlfilter_torch.photo.selections.stray_parts import stray_parts

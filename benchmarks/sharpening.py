@@ -33,8 +33,9 @@ from torch import Tensor
 
 from benchmarks import unsharp
 from benchmarks.photographs import photograph, pictures
-from nlfilter_torch import detail_layers, nonlocal_operator, polynomial_filter, sharpen
+from nlfilter_torch import detail_layers, nonlocal_operator, polynomial_filter
 from nlfilter_torch.operator.features import reduce_channels
+from nlfilter_torch.photo import sharpen
 
 PICTURES = ("astronaut", "camera", "chelsea", "coffee")
 NOISES = (0, 10, 20)  # grey levels

@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 
 from benchmarks.streaming import ALPHA, mosaic
 from benchmarks.streaming_strokes import Boxes
-from nlfilter_torch import recolor
-from nlfilter_torch.photo import Drawn, Step, stream
+from nlfilter_torch.photo import Drawn, Step, recolor, stream
 from nlfilter_torch.photo.edits.detail import enhance
 from nlfilter_torch.photo.picture.pictures import stored_as
 

@@ -20,8 +20,7 @@ from numpy.typing import NDArray
 
 from benchmarks.memory import MIB, forget_peak, resident
 from benchmarks.streaming import mosaic, write_mosaic
-from nlfilter_torch import colorize, recolor
-from nlfilter_torch.photo import Drawn, Step, stream
+from nlfilter_torch.photo import Drawn, Step, colorize, recolor, stream
 from nlfilter_torch.photo.edits.applying import fit_step
 from nlfilter_torch.photo.files.rows import open_picture, write_picture
 from nlfilter_torch.photo.picture.colour import colour_guide, split_luminance

@@ -37,19 +37,5 @@ from .operator.operator import Diagnostics as Diagnostics
 from .operator.operator import NonlocalOperator as NonlocalOperator
 from .operator.padding import pad_images as pad_images
 from .operator.spectrum import Spectrum as Spectrum
-from .photo.edits.abstract import abstract as abstract
-from .photo.edits.colorize import colorize as colorize
-from .photo.edits.defocus import defocus as defocus
-from .photo.edits.denoise import denoise as denoise
-from .photo.edits.detail import enhance as enhance
-from .photo.edits.frames import filter_frames as filter_frames
-from .photo.edits.look import apply_look as apply_look
-from .photo.edits.recolor import recolor as recolor
-from .photo.edits.sharpen import sharpen as sharpen
-from .photo.edits.tone import adjust_tone as adjust_tone
-from .photo.look_fitting.fit_look import FittedLook as FittedLook
-from .photo.look_fitting.fit_look import fit_look as fit_look
-from .photo.looks.look_module import Look as Look
-from .photo.selections.mask import region_mask as region_mask
 
 __version__: str

@@ -4,7 +4,7 @@ from typing import Any
 
 import torch
 
-from nlfilter_torch import adjust_tone, enhance, sharpen
+from nlfilter_torch.photo import adjust_tone, enhance, sharpen
 from nlfilter_torch.photo.picture.in_memory import InMemory
 from nlfilter_torch.photo.picture.limits import Balance, Limits
 from nlfilter_torch.photo.picture.pixels import Fitted, part_of

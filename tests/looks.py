@@ -4,7 +4,7 @@ import skimage.data
 import torch
 from torch import Tensor
 
-from nlfilter_torch import FittedLook
+from nlfilter_torch.photo import FittedLook
 from nlfilter_torch.photo.declared.steps import Step
 
 ALPHA = (2.2, 1.6, 1.3, 1.02)

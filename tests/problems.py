@@ -8,7 +8,15 @@ from hypothesis import strategies as st
 from skimage.transform import resize
 
 from nlfilter_torch import NonlocalOperator, nonlocal_operator
+from nlfilter_torch.photo.declared.parameters import EDITS, MASK
 from tests.images import photograph
+
+#: Functions of the application that take images.
+IMAGE_FUNCTIONS = {
+    *(edit.function or edit.name for edit in (*EDITS.values(), MASK)),
+    *("Look", "apply_look", "filter_frames", "fit_look"),
+}
+
 
 SAMPLINGS = ("kmeans", "uniform", "random")
 LUMINANCE = torch.tensor([0.299, 0.587, 0.114]).view(1, 3, 1, 1)

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 import nlfilter_torch as nlf
+from nlfilter_torch import photo
 from nlfilter_torch.photo.declared.shared_parameters import EXTENT
 from tests.random_operators import SAMPLINGS, Findings, judged, log_uniform
 
@@ -233,13 +234,13 @@ def _refine_module(logits: Tensor, guide: Tensor, **options: Any) -> Tensor:
 
 def _look(**options: Any) -> Tensor:
     image = options.pop("image")
-    return nlf.Look(**options)(image)
+    return photo.Look(**options)(image)
 
 
 def _fitted_look(before: Tensor, **options: Any) -> Tensor:
     after = before.square() if isinstance(before, Tensor) else before
-    look = nlf.fit_look([(before, after)], **options)
-    assert isinstance(look, nlf.FittedLook)
+    look = photo.fit_look([(before, after)], **options)
+    assert isinstance(look, photo.FittedLook)
     return torch.tensor([look.fitted, look.left_out])
 
 
@@ -325,7 +326,7 @@ FUNCTIONS = {
         | {"rounding": _plain(0, 0.01)},
     ),
     "filter_frames": Function(
-        lambda **arguments: list(nlf.filter_frames(**arguments)),
+        lambda **arguments: list(photo.filter_frames(**arguments)),
         {
             "frames": lambda scene: [scene.image(3) for _ in range(2)],
             "references": lambda scene: [_first(scene)],
@@ -341,9 +342,9 @@ FUNCTIONS = {
         },
         ORDER,
     ),
-    "enhance": Function(nlf.enhance, {"image": _image(1, 3)} | ALPHA, RESIDUAL | FILTER),
+    "enhance": Function(photo.enhance, {"image": _image(1, 3)} | ALPHA, RESIDUAL | FILTER),
     "enhance with regions": Function(
-        nlf.enhance,
+        photo.enhance,
         {"image": _image(1, 3)} | REGIONS | ROWS,
         RESIDUAL
         | FILTER
@@ -351,13 +352,15 @@ FUNCTIONS = {
         | REMOVED,
     ),
     "sharpen": Function(
-        nlf.sharpen, {"image": _image(1, 3)}, FILTER | {"amount": _number(0, 8), "guide_blur": _short_side(0.5)}
+        photo.sharpen, {"image": _image(1, 3)}, FILTER | {"amount": _number(0, 8), "guide_blur": _short_side(0.5)}
     ),
     "adjust_tone": Function(
-        nlf.adjust_tone, {"image": _image(1, 3)}, FILTER | ORDER | {"contrast": _number(0, 2), "clarity": _number(0, 4)}
+        photo.adjust_tone,
+        {"image": _image(1, 3)},
+        FILTER | ORDER | {"contrast": _number(0, 2), "clarity": _number(0, 4)},
     ),
     "denoise": Function(
-        nlf.denoise,
+        photo.denoise,
         IMAGE,
         LOCAL
         | {
@@ -370,7 +373,7 @@ FUNCTIONS = {
         },
     ),
     "abstract": Function(
-        nlf.abstract,
+        photo.abstract,
         {"image": _image(1, 3)},
         LOCAL
         | BANDWIDTH
@@ -378,7 +381,7 @@ FUNCTIONS = {
         | {"tones": _count(2, 9)},
     ),
     "defocus": Function(
-        nlf.defocus,
+        photo.defocus,
         {"image": _image(1, 3), "focus_region": lambda scene: scene.mask(1)},
         LOCAL
         | BY_HAND
@@ -386,7 +389,7 @@ FUNCTIONS = {
         | {"photometric_bandwidth": _plain(0.03, 0.5)},
     ),
     "region_mask": Function(
-        nlf.region_mask,
+        photo.region_mask,
         {"image": _image(1, 3), "scribbles": lambda scene: scene.mask(1)},
         LOCAL
         | BY_HAND
@@ -397,7 +400,7 @@ FUNCTIONS = {
         },
     ),
     "recolor": Function(
-        nlf.recolor,
+        photo.recolor,
         {"image": _image(3)} | PAINTED,
         LOCAL
         | REMOVED
@@ -411,14 +414,14 @@ FUNCTIONS = {
         },
     ),
     "colorize": Function(
-        nlf.colorize,
+        photo.colorize,
         {"grey": _image(1)} | PAINTED,
         LOCAL
         | {"method": _one_of("regression", "kmeans"), "strength": _number(0, 1), "time": _number(0.1, 5)}
         | {"photometric_bandwidth": _plain(0.03, 0.5)},
     ),
     "apply_look": Function(
-        nlf.apply_look,
+        photo.apply_look,
         {"image": _image(1, 3)},
         FILTER
         | {"alpha": lambda scene: 4 * scene.noise(scene.order + 1), "bands": lambda scene: 2 * scene.noise(7)}

@@ -3,7 +3,7 @@
 On photographs that were not used in training, with white noise of 5, 15, 25 and 50 grey levels, in grey and in colour:
 PSNR, SSIM and CPU seconds of
 
-ours             ``nlfilter_torch.denoise``, given the noise level; the mean over four rotations; with estimated noise;
+ours             ``denoise``, given the noise level; the mean over four rotations; with estimated noise;
 rule             ``denoise(method="rule")``: sliders by rule, nothing learned;
 BM3D, CBM3D      package ``bm3d``, which may be used for non-commercial purposes only; left out where not installed;
 scikit-image     ``denoise_nl_means``, cycle-spun wavelets, and ``denoise_tv_chambolle`` with the best of five weights

@@ -10,8 +10,9 @@ from benchmarks.denoising.measuring import judge
 from benchmarks.denoising.methods import METHODS, Method
 from benchmarks.memory import forget_peak, resident
 from benchmarks.photographs import photograph
-from nlfilter_torch import NonlocalDenoiser, denoise, estimate_noise
+from nlfilter_torch import NonlocalDenoiser, estimate_noise
 from nlfilter_torch.operator.features import reduce_channels
+from nlfilter_torch.photo import denoise
 
 GAINS, FLOOR = (0.002, 0.01), 2 / 255  # of noise whose variance grows with brightness, as in cameras
 

@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 
 from benchmarks.denoising.cases import Case, as_image, psnr
-from nlfilter_torch import NonlocalDenoiser, denoise
+from nlfilter_torch import NonlocalDenoiser
+from nlfilter_torch.photo import denoise
 
 OPENCV_STRENGTHS = (0.6, 0.8, 1.0, 1.2)  # times the noise level
 TV_WEIGHTS = (0.5, 0.7, 0.9, 1.1, 1.4)  # times the noise level

@@ -4,7 +4,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from benchmarks.figures.scenes import SIDE, SIZE, Numbers, luminance, rounded, scene
-from nlfilter_torch import abstract
+from nlfilter_torch.photo import abstract
 from nlfilter_torch.photo.edits.abstract import edge_lines, quantize
 from nlfilter_torch.photo.picture.colour import merge_luminance, split_luminance
 from nlfilter_torch.photo.plotting import show_images

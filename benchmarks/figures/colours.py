@@ -8,7 +8,8 @@ from torch import Tensor
 from benchmarks.colorize import levin
 from benchmarks.denoising.cases import psnr
 from benchmarks.figures.scenes import SIDE, SIZE, Box, Numbers, luminance, painted_over, rounded, scene, spots, strokes
-from nlfilter_torch import colorize, diffusion_mask, nonlocal_operator, recolor
+from nlfilter_torch import diffusion_mask, nonlocal_operator
+from nlfilter_torch.photo import colorize, recolor
 from nlfilter_torch.photo.picture.colour import merge_luminance, split_luminance
 from nlfilter_torch.photo.plotting import show_images
 

@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from benchmarks.figures.scenes import SIDE, SIZE, Box, Numbers, marked, rounded, scene, spots
-from nlfilter_torch import defocus, region_mask
+from nlfilter_torch.photo import defocus, region_mask
 from nlfilter_torch.photo.declared.parameters import DEFOCUS
 from nlfilter_torch.photo.edits.defocus import blur_behind, focus_of
 from nlfilter_torch.photo.plotting import show_images

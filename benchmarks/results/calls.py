@@ -9,6 +9,7 @@ from typing import Any
 import torch
 
 import nlfilter_torch
+import nlfilter_torch.photo
 from benchmarks.results import edits, functions, modules, photographs, refusals
 from benchmarks.results.digests import Digest, of_text, of_value
 
@@ -17,9 +18,11 @@ Call = Callable[[], object]
 
 def results() -> Iterator[tuple[str, Digest]]:
     """The results of all calls, by their names, with those of all public names."""
-    names = sorted(nlfilter_torch.__all__)
+    packages = (nlfilter_torch, nlfilter_torch.photo)
+    public = {name: getattr(package, name) for package in packages for name in sorted(package.__all__)}
+    names = sorted(public)
     yield "public names", list(names)
-    yield from ((f"arguments of {name}", arguments(getattr(nlfilter_torch, name))) for name in names)
+    yield from ((f"arguments of {name}", arguments(public[name])) for name in names if callable(public[name]))
     called: set[str] = set()
     for dtype in (torch.float32, torch.float64):
         for part in (functions, edits, modules):

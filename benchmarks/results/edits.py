@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 import nlfilter_torch as nf
+import nlfilter_torch.photo as nfp
 from benchmarks.results.functions import Calls
 from benchmarks.results.gradients import with_gradients
 from benchmarks.results.inputs import box, image, seeded
@@ -32,44 +33,46 @@ def of_tones(photo: Tensor, grey: Tensor, dtype: torch.dtype) -> Calls:
     plain: dict[str, Any] = {"limits": "none", "threshold": 0.0, "channels": "all", "residual": 1.0}
 
     def enhanced(picture: Tensor, sliders: Tensor) -> Tensor:
-        return nf.enhance(picture, sliders, **FEW)
+        return nfp.enhance(picture, sliders, **FEW)
 
     def within(picture: Tensor, sliders: Tensor) -> Tensor:
-        return nf.enhance(picture, sliders, regions, negative=box(18, 2, dtype), outside=2 - alpha, reach=0.8, **FEW)
+        return nfp.enhance(picture, sliders, regions, negative=box(18, 2, dtype), outside=2 - alpha, reach=0.8, **FEW)
 
     def sharpened(picture: Tensor, amount: Tensor) -> Tensor:
-        return nf.sharpen(picture, amount=amount, **FEW)
+        return nfp.sharpen(picture, amount=amount, **FEW)
 
     def toned(picture: Tensor, contrast: Tensor) -> Tensor:
-        return nf.adjust_tone(picture, contrast=contrast, clarity=2.0, **FEW)
+        return nfp.adjust_tone(picture, contrast=contrast, clarity=2.0, **FEW)
 
     def cleaned(picture: Tensor, noise: Tensor) -> Tensor:
-        return nf.denoise(picture, noise_level=noise, method="rule", **FEW)
+        return nfp.denoise(picture, noise_level=noise, method="rule", **FEW)
 
     def flattened(picture: Tensor, power: Tensor) -> Tensor:
-        return nf.abstract(picture, power=power, edges=0.5, tones=6, **FEW)
+        return nfp.abstract(picture, power=power, edges=0.5, tones=6, **FEW)
 
     return {
         "enhance": lambda: with_gradients(enhanced, pair, alpha),
         "enhance: grey": lambda: enhanced(grey, alpha),
-        "enhance: plain": lambda: nf.enhance(photo, alpha, photometric_bandwidth="auto", **plain, **FEW),
+        "enhance: plain": lambda: nfp.enhance(photo, alpha, photometric_bandwidth="auto", **plain, **FEW),
         "enhance: regions": lambda: with_gradients(within, photo, sliders),
-        "enhance: viewing size": lambda: nf.enhance(photo, alpha, viewing_size=3e-4, spatial_bandwidth="none", **FEW),
+        "enhance: viewing size": lambda: nfp.enhance(photo, alpha, viewing_size=3e-4, spatial_bandwidth="none", **FEW),
         "sharpen": lambda: with_gradients(sharpened, pair, amount),
-        "sharpen: options": lambda: nf.sharpen(photo, guide_blur=0.0, limits="none", patch_size=3, **FEW),
+        "sharpen: options": lambda: nfp.sharpen(photo, guide_blur=0.0, limits="none", patch_size=3, **FEW),
         "adjust_tone": lambda: with_gradients(toned, pair, amount / 2),
-        "adjust_tone: options": lambda: nf.adjust_tone(grey, contrast=0.7, order=2, limits="none", **FEW),
-        "denoise": lambda: nf.denoise(rough),
-        "denoise: grey": lambda: nf.denoise(rough[:, :1], noise_level=0.1, strength=0.5),
+        "adjust_tone: options": lambda: nfp.adjust_tone(grey, contrast=0.7, order=2, limits="none", **FEW),
+        "denoise": lambda: nfp.denoise(rough),
+        "denoise: grey": lambda: nfp.denoise(rough[:, :1], noise_level=0.1, strength=0.5),
         "denoise: rule": lambda: with_gradients(cleaned, rough, levels),
         "estimate_noise": lambda: nf.estimate_noise(rough),
         "estimate_noise: grey": lambda: nf.estimate_noise(grey),
         "noise_profile": lambda: nf.noise_profile(rough).levels,
         "profile_of_difference": lambda: nf.profile_of_difference(rough, grey.expand_as(rough)).levels,
         "abstract": lambda: with_gradients(flattened, pair, levels),
-        "abstract: options": lambda: nf.abstract(photo, edges=1.0, edge_width=1.0, patch_size=5, viewing_size=0, **FEW),
-        "filter_frames": lambda: list(nf.filter_frames(pair.split(1), alpha, references=[photo], **FEW)),
-        "filter_frames: plain": lambda: list(nf.filter_frames([pair], alpha, references=pair.split(1), **plain)),
+        "abstract: options": lambda: nfp.abstract(
+            photo, edges=1.0, edge_width=1.0, patch_size=5, viewing_size=0, **FEW
+        ),
+        "filter_frames": lambda: list(nfp.filter_frames(pair.split(1), alpha, references=[photo], **FEW)),
+        "filter_frames: plain": lambda: list(nfp.filter_frames([pair], alpha, references=pair.split(1), **plain)),
     }
 
 
@@ -82,32 +85,32 @@ def of_strokes(photo: Tensor, grey: Tensor, dtype: torch.dtype) -> Calls:
     kmeans: dict[str, Any] = {"method": "kmeans", "time": 2.0, "generator": seeded(4), "strength": 0.7}
 
     def recoloured(picture: Tensor, strokes: Tensor) -> Tensor:
-        return nf.recolor(picture, strokes, inside, keep=outside, reach=0.7)
+        return nfp.recolor(picture, strokes, inside, keep=outside, reach=0.7)
 
     def colourised(picture: Tensor, strokes: Tensor) -> Tensor:
-        return nf.colorize(picture, strokes, painted, strength=0.9)
+        return nfp.colorize(picture, strokes, painted, strength=0.9)
 
     def focused(picture: Tensor) -> Tensor:
-        return nf.defocus(picture, inside, background=outside, radius=2.0)
+        return nfp.defocus(picture, inside, background=outside, radius=2.0)
 
     def selected(picture: Tensor) -> Tensor:
-        return nf.region_mask(picture, inside, outside)
+        return nfp.region_mask(picture, inside, outside)
 
     return {
         "recolor": lambda: with_gradients(recoloured, photo, blue),
-        "recolor: options": lambda: nf.recolor(
+        "recolor: options": lambda: nfp.recolor(
             photo, blue, inside, photometric_bandwidth=0.15, spatial_bandwidth=9.0, patch_size=3, num_landmarks=40
         ),
         "colorize": lambda: with_gradients(colourised, grey, mixed),
-        "colorize: k-means": lambda: nf.colorize(grey, mixed, painted, **kmeans),
+        "colorize: k-means": lambda: nfp.colorize(grey, mixed, painted, **kmeans),
         "defocus": lambda: with_gradients(focused, photo),
-        "defocus: options": lambda: nf.defocus(photo, inside, aperture="gaussian", reach=0.5, num_landmarks=40),
-        "recolor: by hand": lambda: nf.recolor(
+        "defocus: options": lambda: nfp.defocus(photo, inside, aperture="gaussian", reach=0.5, num_landmarks=40),
+        "recolor: by hand": lambda: nfp.recolor(
             photo, None, None, added=torch.cat([mixed, painted], dim=1), removed=box(8, 10, dtype)
         ),
         "region_mask": lambda: with_gradients(selected, photo),
-        "region_mask: by hand": lambda: nf.region_mask(photo, inside, added=outside, removed=box(8, 10, dtype)),
-        "region_mask: options": lambda: nf.region_mask(
+        "region_mask: by hand": lambda: nfp.region_mask(photo, inside, added=outside, removed=box(8, 10, dtype)),
+        "region_mask: options": lambda: nfp.region_mask(
             photo, inside, reach=0.8, spatial_bandwidth=12.0, num_landmarks=40
         ),
     }
@@ -129,10 +132,10 @@ def of_looks(photo: Tensor, dtype: torch.dtype) -> Calls:
     }
 
     def under(picture: Tensor, matrix: Tensor) -> Tensor:
-        return nf.apply_look(picture, **parts | {"matrix": matrix}, amount=0.7, **FEW)
+        return nfp.apply_look(picture, **parts | {"matrix": matrix}, amount=0.7, **FEW)
 
     def fitted(*pairs: tuple[Tensor, ...], **options: Any) -> list[Any]:
-        look = nf.fit_look(pairs, **options)
+        look = nfp.fit_look(pairs, **options)
         looks = look if isinstance(look, tuple) else (look,)
         return [[look.to_json(), look.parts, look.explained, look.tensors, look.apply(other)] for look in looks]
 
@@ -141,13 +144,13 @@ def of_looks(photo: Tensor, dtype: torch.dtype) -> Calls:
     masks = torch.cat([box(0, 0, dtype, 16), box(8, 16, dtype, 16)], dim=1)
     return {
         "apply_look": lambda: with_gradients(under, photo, torch.tensor(SEPIA, dtype=dtype)),
-        "apply_look: identity": lambda: nf.apply_look(photo),
-        "apply_look: sliders": lambda: nf.apply_look(photo, alpha=(2.0, 1.0), viewing_size=3e-4, **FEW),
+        "apply_look: identity": lambda: nfp.apply_look(photo),
+        "apply_look: sliders": lambda: nfp.apply_look(photo, alpha=(2.0, 1.0), viewing_size=3e-4, **FEW),
         "fit_look": lambda: fitted((photo, edited), (other, warmer)),
         "fit_look: parts": lambda: fitted((photo, edited), parts=("curves", "matrix"), order=2, generator=seeded(1)),
-        "FittedLook": lambda: nf.fit_look([(photo, edited)]),
+        "FittedLook": lambda: nfp.fit_look([(photo, edited)]),
         "FittedLook: regions": lambda: fitted((photo, edited, masks)),
         "FittedLook: sliders": lambda: fitted(
-            (photo, nf.enhance(photo, torch.tensor([2.0, 1.0, 1.0, 1.0], dtype=dtype)))
+            (photo, nfp.enhance(photo, torch.tensor([2.0, 1.0, 1.0, 1.0], dtype=dtype)))
         ),
     }

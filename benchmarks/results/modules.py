@@ -7,6 +7,7 @@ import torch
 from torch import Tensor, nn
 
 import nlfilter_torch as nf
+import nlfilter_torch.photo as nfp
 from benchmarks.results.functions import Calls
 from benchmarks.results.gradients import with_gradients
 from benchmarks.results.inputs import box, image
@@ -80,7 +81,7 @@ def of_masks(spectrum: nf.Spectrum, photo: Tensor, dtype: torch.dtype) -> Calls:
 def of_looks(photo: Tensor, dtype: torch.dtype) -> Calls:
     """Calls of looks."""
     start = {"alpha": torch.tensor(ALPHA), "local": torch.linspace(0, 0.3, 8), "stretch": torch.full((3,), 0.2)}
-    look, plain = nf.Look(start, num_landmarks=40).to(dtype), nf.Look(learn=("curves",), knots=5).to(dtype)
+    look, plain = nfp.Look(start, num_landmarks=40).to(dtype), nfp.Look(learn=("curves",), knots=5).to(dtype)
     matrix = torch.eye(3, dtype=dtype)[[1, 0, 2]]
     return {
         "Look": lambda: of_module(look, look, photo),

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 import nlfilter_torch as nf
+import nlfilter_torch.photo as nfp
 from benchmarks.results.functions import Calls
 from benchmarks.results.photographs import public
 
@@ -54,19 +55,19 @@ OF_IMAGES: dict[str, Callable[[Any], object]] = {
     "refine": lambda x: nf.refine(x, BUILT),
     "propagate_strokes": lambda x: nf.propagate_strokes(SPECTRUM, IMAGE, x),
     "filter_regions": lambda x: nf.filter_regions(BUILT, IMAGE, x, ONES[None]),
-    "enhance": lambda x: nf.enhance(x, ONES, **FEW),
-    "enhance with regions": lambda x: nf.enhance(IMAGE, ONES, x, **FEW),
-    "denoise": nf.denoise,
-    "recolor": lambda x: nf.recolor(IMAGE, x, PAINTED),
-    "colorize": lambda x: nf.colorize(GREY, IMAGE, x),
-    "defocus": lambda x: nf.defocus(IMAGE, x),
-    "region_mask": lambda x: nf.region_mask(IMAGE, PAINTED, x),
-    "apply_look": nf.apply_look,
-    "fit_look": lambda x: nf.fit_look([(GREY, x)]),
-    "filter_frames": lambda x: list(nf.filter_frames([x], ONES, references=[SINGLE])),
+    "enhance": lambda x: nfp.enhance(x, ONES, **FEW),
+    "enhance with regions": lambda x: nfp.enhance(IMAGE, ONES, x, **FEW),
+    "denoise": nfp.denoise,
+    "recolor": lambda x: nfp.recolor(IMAGE, x, PAINTED),
+    "colorize": lambda x: nfp.colorize(GREY, IMAGE, x),
+    "defocus": lambda x: nfp.defocus(IMAGE, x),
+    "region_mask": lambda x: nfp.region_mask(IMAGE, PAINTED, x),
+    "apply_look": nfp.apply_look,
+    "fit_look": lambda x: nfp.fit_look([(GREY, x)]),
+    "filter_frames": lambda x: list(nfp.filter_frames([x], ONES, references=[SINGLE])),
     "NonlocalFilter": lambda x: nf.NonlocalFilter(num_landmarks=20)(IMAGE, guide=x),
     "NonlocalDenoiser": lambda x: nf.NonlocalDenoiser()(IMAGE, x),
-    "Look": lambda x: nf.Look()(x),
+    "Look": lambda x: nfp.Look()(x),
 }
 NUMBERS: dict[str, Any] = {
     "NaN": NAN,
@@ -94,24 +95,24 @@ OF_NUMBERS: dict[str, Callable[[Any], object]] = {
     "width": lambda v: nf.diffusion_mask(SPECTRUM, PAINTED, width=v),
     "smoothness": lambda v: nf.propagate_strokes(SPECTRUM, IMAGE, PAINTED, smoothness=v),
     "ridge": lambda v: nf.fit_alpha(BUILT, IMAGE, IMAGE, ridge=v),
-    "amount": lambda v: nf.sharpen(IMAGE, amount=v, **FEW),
-    "guide_blur": lambda v: nf.sharpen(IMAGE, guide_blur=v, **FEW),
-    "contrast": lambda v: nf.adjust_tone(IMAGE, contrast=v, **FEW),
-    "limits": lambda v: nf.adjust_tone(IMAGE, limits=v, **FEW),
-    "noise_level": lambda v: nf.denoise(IMAGE, noise_level=v),
-    "strength": lambda v: nf.denoise(IMAGE, strength=v),
-    "threshold": lambda v: nf.enhance(IMAGE, ONES, threshold=v, **FEW),
-    "viewing_size": lambda v: nf.enhance(IMAGE, ONES, viewing_size=v, **FEW),
-    "reach": lambda v: nf.recolor(IMAGE, IMAGE, PAINTED, reach=v),
-    "radius": lambda v: nf.defocus(IMAGE, PAINTED, radius=v),
-    "aperture": lambda v: nf.defocus(IMAGE, PAINTED, aperture=v),
-    "power": lambda v: nf.abstract(IMAGE, power=v, **FEW),
-    "edges": lambda v: nf.abstract(IMAGE, edges=v, **FEW),
-    "tones": lambda v: nf.abstract(IMAGE, tones=v, **FEW),
-    "method": lambda v: nf.colorize(GREY, IMAGE, PAINTED, method=v),
+    "amount": lambda v: nfp.sharpen(IMAGE, amount=v, **FEW),
+    "guide_blur": lambda v: nfp.sharpen(IMAGE, guide_blur=v, **FEW),
+    "contrast": lambda v: nfp.adjust_tone(IMAGE, contrast=v, **FEW),
+    "limits": lambda v: nfp.adjust_tone(IMAGE, limits=v, **FEW),
+    "noise_level": lambda v: nfp.denoise(IMAGE, noise_level=v),
+    "strength": lambda v: nfp.denoise(IMAGE, strength=v),
+    "threshold": lambda v: nfp.enhance(IMAGE, ONES, threshold=v, **FEW),
+    "viewing_size": lambda v: nfp.enhance(IMAGE, ONES, viewing_size=v, **FEW),
+    "reach": lambda v: nfp.recolor(IMAGE, IMAGE, PAINTED, reach=v),
+    "radius": lambda v: nfp.defocus(IMAGE, PAINTED, radius=v),
+    "aperture": lambda v: nfp.defocus(IMAGE, PAINTED, aperture=v),
+    "power": lambda v: nfp.abstract(IMAGE, power=v, **FEW),
+    "edges": lambda v: nfp.abstract(IMAGE, edges=v, **FEW),
+    "tones": lambda v: nfp.abstract(IMAGE, tones=v, **FEW),
+    "method": lambda v: nfp.colorize(GREY, IMAGE, PAINTED, method=v),
     "noise": lambda v: nf.NonlocalDenoiser()(IMAGE, v),
     "passes": lambda v: nf.NonlocalDenoiser(v),
-    "knots": lambda v: nf.Look(knots=v),
+    "knots": lambda v: nfp.Look(knots=v),
     "time of a module": lambda v: nf.DiffusionMask(time=v),
     "bandwidth of a module": lambda v: nf.NonlocalAffinity(photometric_bandwidth=v),
 }
@@ -128,9 +129,9 @@ OF_SLIDERS: dict[str, Callable[[Any], object]] = {
     "polynomial_filter": lambda v: nf.polynomial_filter(BUILT, IMAGE, v),
     "polynomial_response": lambda v: nf.polynomial_response(torch.ones(2, 3), v),
     "compose_alpha": lambda v: nf.compose_alpha(PAINTED, v),
-    "enhance": lambda v: nf.enhance(IMAGE, v, **FEW),
-    "outside": lambda v: nf.enhance(IMAGE, ONES, PAINTED, outside=v, **FEW),
-    "apply_look": lambda v: nf.apply_look(IMAGE, alpha=v),
+    "enhance": lambda v: nfp.enhance(IMAGE, v, **FEW),
+    "outside": lambda v: nfp.enhance(IMAGE, ONES, PAINTED, outside=v, **FEW),
+    "apply_look": lambda v: nfp.apply_look(IMAGE, alpha=v),
     "NonlocalFilter": lambda v: nf.NonlocalFilter(v),
     "fitted": lambda v: FITTED(SINGLE, v),
 }
@@ -150,10 +151,13 @@ def calls() -> Calls:
 
 def of_arguments() -> Calls:
     """Calls without arguments, and with unknown ones."""
-    names = [name for name in sorted(nf.__all__) if not name[0].isupper()]
-    missing: Calls = {f"{name}()": getattr(nf, name) for name in names}
-    unknown: Calls = {f"{name} of an unknown argument": partial(getattr(nf, name), IMAGE, colour=1) for name in names}
-    classes = {name: getattr(nf, name) for name in nf.__all__ if name[0].isupper()}
+    public = {name: getattr(package, name) for package in (nf, nfp) for name in sorted(package.__all__)}
+    functions = {name: value for name, value in public.items() if not name[0].isupper()}
+    missing: Calls = {f"{name}()": function for name, function in functions.items()}
+    unknown: Calls = {
+        f"{name} of an unknown argument": partial(function, IMAGE, colour=1) for name, function in functions.items()
+    }
+    classes = {name: value for name, value in public.items() if isinstance(value, type)}
     learned: Calls = {
         f"{name} that learns an unknown option": partial(module, learn=("colour",))
         for name, module in classes.items()
@@ -203,25 +207,25 @@ def of_edits() -> Calls:
     """Calls of edits with arguments that do not fit together."""
     black = torch.zeros_like(IMAGE)
     return {
-        "recolor of grey": lambda: nf.recolor(GREY, IMAGE, PAINTED),
-        "colorize of colours": lambda: nf.colorize(IMAGE, IMAGE, PAINTED),
-        "recolor without a stroke": lambda: nf.recolor(IMAGE, IMAGE, EMPTY),
-        "defocus without a region": lambda: nf.defocus(IMAGE, EMPTY),
-        "enhance of unknown channels": lambda: nf.enhance(IMAGE, ONES, channels="red", **FEW),
-        "enhance of values far above white": lambda: nf.enhance(255 * IMAGE, ONES, **FEW),
-        "a curve of too few values": lambda: nf.apply_look(IMAGE, red=(0.0, 1.0)),
-        "a matrix of four values": lambda: nf.apply_look(IMAGE, matrix=(1.0, 0.0, 0.0, 1.0)),
-        "fit_look of no pair": lambda: nf.fit_look([]),
-        "fit_look of equal pictures": lambda: nf.fit_look([(IMAGE, IMAGE)]),
-        "fit_look of a black picture": lambda: nf.fit_look([(IMAGE, black)]),
-        "fit_look of unknown parts": lambda: nf.fit_look([(IMAGE, IMAGE**2)], parts=("colour",)),
-        "frames without references": lambda: nf.filter_frames([SINGLE], ONES, references=[]),
-        "frames of two references and distances": lambda: nf.filter_frames(
+        "recolor of grey": lambda: nfp.recolor(GREY, IMAGE, PAINTED),
+        "colorize of colours": lambda: nfp.colorize(IMAGE, IMAGE, PAINTED),
+        "recolor without a stroke": lambda: nfp.recolor(IMAGE, IMAGE, EMPTY),
+        "defocus without a region": lambda: nfp.defocus(IMAGE, EMPTY),
+        "enhance of unknown channels": lambda: nfp.enhance(IMAGE, ONES, channels="red", **FEW),
+        "enhance of values far above white": lambda: nfp.enhance(255 * IMAGE, ONES, **FEW),
+        "a curve of too few values": lambda: nfp.apply_look(IMAGE, red=(0.0, 1.0)),
+        "a matrix of four values": lambda: nfp.apply_look(IMAGE, matrix=(1.0, 0.0, 0.0, 1.0)),
+        "fit_look of no pair": lambda: nfp.fit_look([]),
+        "fit_look of equal pictures": lambda: nfp.fit_look([(IMAGE, IMAGE)]),
+        "fit_look of a black picture": lambda: nfp.fit_look([(IMAGE, black)]),
+        "fit_look of unknown parts": lambda: nfp.fit_look([(IMAGE, IMAGE**2)], parts=("colour",)),
+        "frames without references": lambda: nfp.filter_frames([SINGLE], ONES, references=[]),
+        "frames of two references and distances": lambda: nfp.filter_frames(
             [SINGLE], ONES, references=[SINGLE, SINGLE], spatial_bandwidth=5.0
         ),
-        "parts of a Look": lambda: nf.Look({"colour": ONES}),
-        "a part of a Look of another shape": lambda: nf.Look({"matrix": ONES}),
-        "an option of a Look": lambda: nf.Look(colour=1),
+        "parts of a Look": lambda: nfp.Look({"colour": ONES}),
+        "a part of a Look of another shape": lambda: nfp.Look({"matrix": ONES}),
+        "an option of a Look": lambda: nfp.Look(colour=1),
         "learning an automatic bandwidth": lambda: nf.NonlocalAffinity(learn=("photometric_bandwidth",)),
         "learning no distance": lambda: nf.NonlocalAffinity(learn=("spatial_bandwidth",)),
     }

@@ -12,20 +12,16 @@ from torch import Tensor
 
 from benchmarks.photographs import photograph
 from benchmarks.training.figures import Figure
-from nlfilter_torch import (
-    NonlocalFilter,
-    SegmentMask,
+from nlfilter_torch import NonlocalFilter, SegmentMask, diffusion_mask, nonlocal_operator, refine
+from nlfilter_torch.photo import (
     abstract,
     adjust_tone,
     apply_look,
     colorize,
     defocus,
-    diffusion_mask,
     enhance,
     filter_frames,
-    nonlocal_operator,
     recolor,
-    refine,
     region_mask,
     sharpen,
 )

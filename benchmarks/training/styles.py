@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from benchmarks.photographs import photograph, reduced_to
 from benchmarks.training.figures import Figure
-from nlfilter_torch import Look
+from nlfilter_torch.photo import Look
 
 TRAINED = ("astronaut", "coffee", "rocket", "hubble_deep_field")
 REPORTED = ("motorcycle", "immunohistochemistry", "retina", "colorwheel")

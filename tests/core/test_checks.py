@@ -12,28 +12,30 @@ from torch import Tensor
 
 from nlfilter_torch import (
     NonlocalFilter,
-    abstract,
-    adjust_tone,
     apply_function,
-    colorize,
-    defocus,
-    denoise,
     diffusion_map,
     diffusion_mask,
-    enhance,
-    filter_frames,
     filter_regions,
     fit_filter,
     nonlocal_operator,
     polynomial_filter,
     propagate_strokes,
-    recolor,
     segment_mask,
-    sharpen,
     spectral_filter,
 )
 from nlfilter_torch.core.checks import check_finite
-from nlfilter_torch.photo import Step
+from nlfilter_torch.photo import (
+    Step,
+    abstract,
+    adjust_tone,
+    colorize,
+    defocus,
+    denoise,
+    enhance,
+    filter_frames,
+    recolor,
+    sharpen,
+)
 from tests.problems import noise
 
 IMAGE = noise(2, 3, 8, 9, dtype=torch.float32)

@@ -13,7 +13,6 @@ from torch import nn
 import nlfilter_torch
 from nlfilter_torch import (
     DiffusionMask,
-    Look,
     NonlocalAffinity,
     NonlocalFilter,
     PolynomialSliders,
@@ -22,6 +21,7 @@ from nlfilter_torch import (
     nonlocal_operator,
     polynomial_filter,
 )
+from nlfilter_torch.photo import Look
 from tests.layers import ALPHA, OPTIONS, image
 from tests.problems import noise, picture
 

@@ -9,21 +9,16 @@ import torch
 
 from nlfilter_torch import (
     NonlocalFilter,
-    abstract,
-    adjust_tone,
-    defocus,
     diffusion_map,
     diffusion_mask,
-    enhance,
     estimate_bandwidth,
-    filter_frames,
     fit_alpha,
     fit_filter,
     nonlocal_operator,
     polynomial_filter,
     polynomial_response,
-    sharpen,
 )
+from nlfilter_torch.photo import abstract, adjust_tone, defocus, enhance, filter_frames, sharpen
 from tests.problems import noise
 
 IMAGE = noise(2, 3, 8, 9, dtype=torch.float32)

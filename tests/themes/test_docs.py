@@ -117,7 +117,7 @@ def test_the_reference_has_every_public_name(site: Path) -> None:
     """Each name is on the page of its topic, to which the first page of the reference links."""
     first = (site / "reference.html").read_text(encoding="utf-8")
     pages = {page.stem: page.read_text(encoding="utf-8") for page in (site / "reference").glob("*.html")}
-    assert set(photo.__all__) - set(nlfilter_torch.__all__)
+    assert not set(photo.__all__) & set(nlfilter_torch.__all__)
     for name in {*nlfilter_torch.__all__, *photo.__all__}:
         full = f"nlfilter_torch.photo.{name}" if name in photo.__all__ else f"nlfilter_torch.{name}"
         topics = [topic for topic, text in pages.items() if f'id="{full}"' in text]

@@ -5,7 +5,8 @@ from collections.abc import Callable
 import pytest
 import torch
 
-from nlfilter_torch import (
+from nlfilter_torch.operator.build import nonlocal_operator
+from nlfilter_torch.photo import (
     abstract,
     adjust_tone,
     colorize,
@@ -16,7 +17,6 @@ from nlfilter_torch import (
     region_mask,
     sharpen,
 )
-from nlfilter_torch.operator.build import nonlocal_operator
 from tests.problems import box, colour, noise, paint
 
 GREY = 0.2 + 0.6 * noise(2, 1, 20, 22, dtype=torch.float32)

@@ -7,19 +7,16 @@ import pytest
 import torch
 from torch import Tensor
 
-from nlfilter_torch import (
-    SegmentMask,
+from nlfilter_torch import SegmentMask, diffusion_mask, nonlocal_operator, refine
+from nlfilter_torch.photo import (
     abstract,
     adjust_tone,
     apply_look,
     colorize,
     defocus,
-    diffusion_mask,
     enhance,
     filter_frames,
-    nonlocal_operator,
     recolor,
-    refine,
     region_mask,
     sharpen,
 )

@@ -14,7 +14,6 @@ from nlfilter_torch import (
     compose_alpha,
     detail_layers,
     diffusion_mask,
-    enhance,
     estimate_bandwidth,
     nonlocal_operator,
     polynomial_filter,
@@ -24,6 +23,7 @@ from nlfilter_torch import (
     segment_mask,
     spectral_filter,
 )
+from nlfilter_torch.photo import enhance
 from tests.problems import noise
 
 GUIDE = noise(2, 1, 8, 9)

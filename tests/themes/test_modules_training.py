@@ -8,7 +8,8 @@ import torch
 from torch import nn
 from torch.utils.checkpoint import checkpoint
 
-from nlfilter_torch import Look, compose_alpha, filter_regions, nonlocal_operator, spectral_filter
+from nlfilter_torch import compose_alpha, filter_regions, nonlocal_operator, spectral_filter
+from nlfilter_torch.photo import Look
 from tests.layers import backward, everything, image, untouched
 from tests.problems import seeded
 

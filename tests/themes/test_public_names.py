@@ -21,3 +21,7 @@ def test_public_names_are_those_of_the_stub(package: ModuleType) -> None:
         assert name == "PRESETS" or getattr(package, name).__name__ == name
     with pytest.raises(AttributeError, match="sharpenn"):
         _ = package.sharpenn
+
+
+def test_names_of_the_application_are_not_at_the_root() -> None:
+    assert not set(nlfilter_torch.__all__) & set(nlfilter_torch.photo.__all__)

@@ -11,6 +11,7 @@ import torch.distributed as dist
 from torch import Tensor
 
 import nlfilter_torch as nlf
+from nlfilter_torch import photo
 from nlfilter_torch.operator.features import GuideFeatures, gradients, pad_border, patch_window
 from tests import reference
 from tests.ranks import run_ranks
@@ -325,8 +326,8 @@ def test_a_layer_holds_the_assignment_of_a_volume(volume: Tensor) -> None:
             r"patch_weights must have the 3 axes of the guide, got \(3, 3\); pass \(p, p, p\)",
         ),
         (lambda op, x: nlf.nonlocal_operator(x.flatten(2)), r"guide must have shape \(B, C, H, W\) or \(B, C, D, H,"),
-        (lambda op, x: nlf.enhance(x, 2.0), r"image must have shape \(B, C, H, W\), got .*; index or flatten"),
-        (lambda op, x: nlf.denoise(x), r"image must have shape \(B, C, H, W\), got .*; index or flatten"),
+        (lambda op, x: photo.enhance(x, 2.0), r"image must have shape \(B, C, H, W\), got .*; index or flatten"),
+        (lambda op, x: photo.denoise(x), r"image must have shape \(B, C, H, W\), got .*; index or flatten"),
         (lambda op, x: nlf.estimate_noise(x), r"image must have shape \(B, C, H, W\), got .*; index or flatten"),
         (lambda op, x: nlf.noise_profile(x), r"image must have shape \(B, C, H, W\), got .*; index or flatten"),
     ],

@@ -6,7 +6,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from nlfilter_torch import denoise, estimate_noise
+from nlfilter_torch import estimate_noise
 from nlfilter_torch.nn.denoiser.estimate import (
     INPUTS,
     inputs_of,
@@ -19,6 +19,7 @@ from nlfilter_torch.nn.denoiser.estimate import (
 from nlfilter_torch.nn.denoiser.noise import Noise
 from nlfilter_torch.nn.denoiser.profile import KNOTS, profile_of_difference
 from nlfilter_torch.nn.denoiser.statistics import statistics_of
+from nlfilter_torch.photo import denoise
 from nlfilter_torch.photo.edits.noise import profile_of
 from nlfilter_torch.photo.picture.in_memory import InMemory
 from tests.problems import colour, decibels, noisy, picture

@@ -4,13 +4,14 @@ import pytest
 import torch
 from torch import Tensor
 
-from nlfilter_torch import NonlocalDenoiser, denoise
+from nlfilter_torch import NonlocalDenoiser
 from nlfilter_torch.core.inner import EVERYWHERE
 from nlfilter_torch.nn.denoiser import tiles
 from nlfilter_torch.nn.denoiser.colours import join_colours, split_colours, split_noise
 from nlfilter_torch.nn.denoiser.network import NOISIEST, PIXELS, WIDTH, level_planes
 from nlfilter_torch.nn.denoiser.profile import KNOTS, NoiseProfile
 from nlfilter_torch.nn.denoiser.tiles import SIDE, STEP, in_tiles
+from nlfilter_torch.photo import denoise
 from nlfilter_torch.photo.edits.denoise import NetworkDenoising
 from tests.problems import colour, decibels, noisy, seeded
 

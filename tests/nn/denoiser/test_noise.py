@@ -3,8 +3,9 @@
 import pytest
 import torch
 
-from nlfilter_torch import denoise, estimate_noise
+from nlfilter_torch import estimate_noise
 from nlfilter_torch.nn.denoiser.noise import Noise
+from nlfilter_torch.photo import denoise
 from nlfilter_torch.photo.edits.noise import noise_of
 from nlfilter_torch.photo.picture.in_memory import InMemory
 from tests.problems import colour, decibels, noisy, picture

@@ -6,9 +6,10 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from nlfilter_torch import estimate_bandwidth, nonlocal_operator, polynomial_filter, region_mask
+from nlfilter_torch import estimate_bandwidth, nonlocal_operator, polynomial_filter
 from nlfilter_torch.operator.features import reduce_channels
 from nlfilter_torch.operator.operator import NonlocalOperator
+from nlfilter_torch.photo import region_mask
 from nlfilter_torch.photo.app.preview import PIXELS, Preview, reduce, sampled_operator
 from nlfilter_torch.photo.app.session import Session
 from nlfilter_torch.photo.declared.parameters import EDITS

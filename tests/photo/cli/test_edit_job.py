@@ -10,7 +10,7 @@ import tifffile
 import torch
 from PIL import Image
 
-from nlfilter_torch import abstract, adjust_tone, colorize, defocus, denoise, enhance, recolor, sharpen
+from nlfilter_torch.photo import abstract, adjust_tone, colorize, defocus, denoise, enhance, recolor, sharpen
 from nlfilter_torch.photo.cli import main
 from nlfilter_torch.photo.cli.edit_job import EditJob
 from nlfilter_torch.photo.cli.scribbles import ScribbleOptions

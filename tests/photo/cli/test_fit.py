@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from nlfilter_torch import apply_look
+from nlfilter_torch.photo import apply_look
 from nlfilter_torch.photo.cli import main
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.declared.steps import Step

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from nlfilter_torch import apply_look
+from nlfilter_torch.photo import apply_look
 from nlfilter_torch.photo.cli import main
 from nlfilter_torch.photo.declared.presets import find_recipe
 from nlfilter_torch.photo.edits.applying import apply_step

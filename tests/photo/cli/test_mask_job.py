@@ -9,7 +9,7 @@ import tifffile
 import torch
 from PIL import Image
 
-from nlfilter_torch import region_mask
+from nlfilter_torch.photo import region_mask
 from nlfilter_torch.photo.cli import main
 from nlfilter_torch.photo.cli.mask_job import MaskJob
 from nlfilter_torch.photo.cli.options import FileDepth

@@ -9,8 +9,8 @@ from typing import get_args
 import pytest
 from torch import Tensor
 
-import nlfilter_torch
 from benchmarks import parameters
+from nlfilter_torch import photo
 from nlfilter_torch.photo.declared.declaration import Edit, Parameter
 from nlfilter_torch.photo.declared.parameters import EDITS, MASK
 from nlfilter_torch.photo.declared.shared_parameters import FILTER
@@ -53,7 +53,7 @@ NAMES = [edit.function or edit.name for edit in (*EDITS.values(), MASK)]
 
 @pytest.mark.parametrize("name", NAMES)
 def test_docstrings_describe_the_arguments_of_the_function_of_an_image(name: str) -> None:
-    function = getattr(nlfilter_torch, name)
+    function = getattr(photo, name)
     described = re.findall(r"^    (\**)(\w+): ", inspect.getdoc(function).split("Args:")[1], flags=re.MULTILINE)
     assert [argument for _, argument in described] == list(inspect.signature(function).parameters)
     assert list(function.__annotations__) == [argument for _, argument in described] + ["return"]
@@ -62,7 +62,7 @@ def test_docstrings_describe_the_arguments_of_the_function_of_an_image(name: str
 
 @pytest.mark.parametrize("edit", [*EDIT_OF.values(), RegionMask], ids=lambda edit: edit.declared.name)
 def test_settings_of_an_edit_are_arguments_of_its_function(edit: type[PhotoEdit]) -> None:
-    function = inspect.signature(getattr(nlfilter_torch, edit.declared.function or edit.declared.name)).parameters
+    function = inspect.signature(getattr(photo, edit.declared.function or edit.declared.name)).parameters
     drawn = {"image", "grey", "strokes", *(scribble.argument for scribble in edit.declared.scribbles)}
     settings = {field.name for field in fields(edit)} - {"names", "working", "hot_pixels"}  # of masks; measured
     fixed = {"sharpen": {"guide_channels"}}.get(edit.declared.name, set())  # its guide is grey
@@ -72,7 +72,7 @@ def test_settings_of_an_edit_are_arguments_of_its_function(edit: type[PhotoEdit]
 
 @pytest.mark.parametrize("name", NAMES)
 def test_the_image_is_the_first_argument_or_a_keyword(name: str) -> None:
-    function, picture = getattr(nlfilter_torch, name), "grey" if name == "colorize" else "image"
+    function, picture = getattr(photo, name), "grey" if name == "colorize" else "image"
     parameters = inspect.signature(function).parameters.values()
     others = {p.name: None for p in parameters if p.default is inspect.Parameter.empty and p.name != picture}
     with pytest.raises(TypeError, match=rf"{picture} must be a torch.Tensor, got str"):
@@ -85,7 +85,7 @@ def test_the_image_is_the_first_argument_or_a_keyword(name: str) -> None:
 
 @pytest.mark.parametrize("edit", [*EDITS.values(), MASK], ids=lambda edit: edit.name)
 def test_annotations_say_which_numbers_may_differ_between_images(edit: Edit) -> None:
-    function = inspect.signature(getattr(nlfilter_torch, edit.function or edit.name)).parameters
+    function = inspect.signature(getattr(photo, edit.function or edit.name)).parameters
     for parameter in edit:
         if parameter.kind == "number" and parameter.domain is not None:
             annotation = function[parameter.keyword].annotation
@@ -94,7 +94,7 @@ def test_annotations_say_which_numbers_may_differ_between_images(edit: Edit) -> 
 
 @pytest.mark.parametrize("edit", EDITS.values(), ids=lambda edit: edit.name)
 def test_functions_have_the_declared_defaults(edit: Edit) -> None:
-    function = inspect.signature(getattr(nlfilter_torch, edit.function or edit.name)).parameters
+    function = inspect.signature(getattr(photo, edit.function or edit.name)).parameters
     for parameter in edit:
         name = parameter.keyword
         if name in function and parameter.kind != "sliders" and name != "photometric_bandwidth":

@@ -3,7 +3,8 @@
 import pytest
 import torch
 
-from nlfilter_torch import abstract, nonlocal_operator, spectral_filter
+from nlfilter_torch import nonlocal_operator, spectral_filter
+from nlfilter_torch.photo import abstract
 from nlfilter_torch.photo.declared.parameters import ABSTRACT
 from tests.problems import colour, luminance
 

@@ -5,10 +5,20 @@ from dataclasses import replace
 import pytest
 import torch
 
-from nlfilter_torch import abstract, adjust_tone, colorize, defocus, denoise, enhance, recolor, region_mask, sharpen
 from nlfilter_torch.filtering.filters import polynomial_filter
 from nlfilter_torch.operator.build import nonlocal_operator
 from nlfilter_torch.operator.features import reduce_channels
+from nlfilter_torch.photo import (
+    abstract,
+    adjust_tone,
+    colorize,
+    defocus,
+    denoise,
+    enhance,
+    recolor,
+    region_mask,
+    sharpen,
+)
 from nlfilter_torch.photo.declared.parameters import CRISP, EDITS
 from nlfilter_torch.photo.declared.presets import PRESETS, Recipe
 from nlfilter_torch.photo.declared.steps import Step

@@ -6,7 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from nlfilter_torch import colorize
+from nlfilter_torch.photo import colorize
 from nlfilter_torch.photo.edits.colorize import (
     Colorize,
     Operators,

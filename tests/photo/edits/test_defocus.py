@@ -4,7 +4,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from nlfilter_torch import defocus, region_mask
+from nlfilter_torch.photo import defocus, region_mask
 from nlfilter_torch.photo.edits.defocus import ROWS, convolve
 from tests.problems import box, colour
 

@@ -5,7 +5,8 @@ from typing import Literal
 import pytest
 import torch
 
-from nlfilter_torch import NoiseProfile, denoise, estimate_noise
+from nlfilter_torch import NoiseProfile, estimate_noise
+from nlfilter_torch.photo import denoise
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.edits.applying import apply_step
 from nlfilter_torch.photo.picture.colour import split_luminance

@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 import torch
 
-from nlfilter_torch import adjust_tone, enhance
+from nlfilter_torch.photo import adjust_tone, enhance
 from nlfilter_torch.photo.cli import main
 from nlfilter_torch.photo.files.photographs import Photograph, read_photograph, write_photograph
 from tests.brightness import ALPHA

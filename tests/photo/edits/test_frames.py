@@ -5,8 +5,9 @@ from itertools import pairwise
 import pytest
 import torch
 
-from nlfilter_torch import filter_frames, nonlocal_operator, polynomial_filter
+from nlfilter_torch import nonlocal_operator, polynomial_filter
 from nlfilter_torch.operator.features import reduce_channels
+from nlfilter_torch.photo import filter_frames
 from nlfilter_torch.photo.picture.colour import edit_luminance
 from tests.films import pan
 from tests.problems import noise, picture

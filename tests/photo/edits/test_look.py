@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from nlfilter_torch import Look, apply_look
+from nlfilter_torch.photo import Look, apply_look
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.edits.applying import apply_step
 from nlfilter_torch.photo.edits.recipe import edit_rows

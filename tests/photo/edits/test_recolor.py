@@ -4,7 +4,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from nlfilter_torch import recolor
+from nlfilter_torch.photo import recolor
 from nlfilter_torch.photo.edits.recolor import Brightening, Recoloring, split_colours, with_room
 from nlfilter_torch.photo.picture.colour import group_colours, split_luminance
 from nlfilter_torch.photo.selections.border_colours import colours_beside

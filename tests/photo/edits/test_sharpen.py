@@ -2,7 +2,7 @@
 
 import torch
 
-from nlfilter_torch import sharpen
+from nlfilter_torch.photo import sharpen
 from tests.problems import colour, luminance, noise
 
 

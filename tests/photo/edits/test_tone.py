@@ -5,7 +5,8 @@ from typing import Any
 import pytest
 import torch
 
-from nlfilter_torch import adjust_tone, enhance, nonlocal_operator, polynomial_filter
+from nlfilter_torch import nonlocal_operator, polynomial_filter
+from nlfilter_torch.photo import adjust_tone, enhance
 from nlfilter_torch.photo.picture.colour import split_luminance
 from tests.problems import colour, luminance
 

@@ -14,8 +14,8 @@ import skimage.exposure
 import torch
 from torch import Tensor
 
-from nlfilter_torch import apply_look, fit_look
 from nlfilter_torch.operator.features import reduce_channels
+from nlfilter_torch.photo import apply_look, fit_look
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.edits.applying import apply_step

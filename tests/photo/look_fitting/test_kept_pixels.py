@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from nlfilter_torch import fit_look
+from nlfilter_torch.photo import fit_look
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.edits.applying import apply_step

@@ -2,7 +2,7 @@
 
 import torch
 
-from nlfilter_torch import fit_look
+from nlfilter_torch.photo import fit_look
 from nlfilter_torch.photo.look_fitting.look_choice import CHOICES, Candidate, nonnegative, simplest
 from tests.looks import CAT, FEW, in_bytes, single_look
 

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from nlfilter_torch import fit_look
+from nlfilter_torch.photo import fit_look
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.edits.applying import apply_step
 from nlfilter_torch.photo.look_fitting.look_pixels import EditedPhotograph

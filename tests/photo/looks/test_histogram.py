@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from nlfilter_torch import apply_look
+from nlfilter_torch.photo import apply_look
 from tests.looks import CAT, LOCAL, STRETCH
 
 

@@ -4,8 +4,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from nlfilter_torch import Look, apply_look
 from nlfilter_torch.core.kernels.lattice import corners
+from nlfilter_torch.photo import Look, apply_look
 from nlfilter_torch.photo.looks.lattice import colours_of_nodes, lattice_change, resampled
 from tests.looks import BENT, CAT, CUP
 

@@ -7,7 +7,7 @@ import skimage.data
 import skimage.exposure
 import torch
 
-from nlfilter_torch import apply_look, enhance
+from nlfilter_torch.photo import apply_look, enhance
 from nlfilter_torch.photo.looks.look_filter import bands_of, tone_curve
 from tests.looks import ALPHA, BENT, CAT, SEPIA, VIVID
 

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from nlfilter_torch import Look, apply_look, fit_look
+from nlfilter_torch.photo import Look, apply_look, fit_look
 from tests.looks import BENT, CAT, FEW, SEPIA, in_bytes, single_look
 
 

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from nlfilter_torch import enhance
+from nlfilter_torch.photo import enhance
 from nlfilter_torch.photo.picture.changes import limit_by_activity, split_sliders
 from tests.brightness import ALPHA
 

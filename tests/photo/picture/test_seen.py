@@ -7,9 +7,20 @@ import pytest
 import torch
 from torch import Tensor
 
-from nlfilter_torch import abstract, adjust_tone, defocus, denoise, enhance, filter_frames, region_mask, sharpen
 from nlfilter_torch.nn.denoiser.profile import NoiseProfile
-from nlfilter_torch.photo import Recipe, Step, apply_recipe
+from nlfilter_torch.photo import (
+    Recipe,
+    Step,
+    abstract,
+    adjust_tone,
+    apply_recipe,
+    defocus,
+    denoise,
+    enhance,
+    filter_frames,
+    region_mask,
+    sharpen,
+)
 from nlfilter_torch.photo.app.preview import Preview
 from nlfilter_torch.photo.edits.film import FilmEdit
 from nlfilter_torch.photo.edits.parts import Parts, Rectangle

@@ -8,9 +8,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from nlfilter_torch import estimate_noise, noise_profile, nonlocal_operator, region_mask
+from nlfilter_torch import estimate_noise, noise_profile, nonlocal_operator
 from nlfilter_torch.filtering.filters import filter_regions
 from nlfilter_torch.operator.features import reduce_channels
+from nlfilter_torch.photo import region_mask
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.edits.noise import noise_of, profile_of

@@ -8,10 +8,10 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from nlfilter_torch import colorize, recolor
 from nlfilter_torch.operator.build import operator_from_guide
 from nlfilter_torch.operator.operator import NonlocalOperator
 from nlfilter_torch.operator.options import OperatorOptions
+from nlfilter_torch.photo import colorize, recolor
 from nlfilter_torch.photo.picture import sampling, tiles
 from nlfilter_torch.photo.picture.colour import split_luminance
 from nlfilter_torch.photo.picture.painting import cover, mask_of, paint

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from nlfilter_torch import enhance
+from nlfilter_torch.photo import enhance
 from nlfilter_torch.photo.picture.resizing import resize
 from nlfilter_torch.photo.picture.viewing import enlarged_and_reduced, viewed_size
 from tests.brightness import ALPHA, EDITS

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from nlfilter_torch import defocus, enhance, recolor, region_mask
+from nlfilter_torch.photo import defocus, enhance, recolor, region_mask
 from nlfilter_torch.photo.picture.drawn import Drawn
 from nlfilter_torch.photo.picture.in_memory import InMemory
 from nlfilter_torch.photo.picture.source import Fitted

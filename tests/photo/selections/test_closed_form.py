@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from nlfilter_torch import region_mask
+from nlfilter_torch.photo import region_mask
 from nlfilter_torch.photo.selections import closed_form
 from tests.problems import box, colour, noise
 

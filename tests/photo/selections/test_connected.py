@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from nlfilter_torch import defocus, enhance, recolor, region_mask
+from nlfilter_torch.photo import defocus, enhance, recolor, region_mask
 from nlfilter_torch.photo.selections.connected import BORDER, connected
 from tests.problems import box, inverse, noise, oriented, paint
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from benchmarks.levin import propagate
-from nlfilter_torch import colorize
+from nlfilter_torch.photo import colorize
 from nlfilter_torch.photo.picture.in_memory import InMemory
 from nlfilter_torch.photo.picture.pictures import Picture
 from nlfilter_torch.photo.picture.source import luminance

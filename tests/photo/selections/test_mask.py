@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from nlfilter_torch import region_mask
+from nlfilter_torch.photo import region_mask
 from nlfilter_torch.photo.picture import sampling
 from nlfilter_torch.photo.picture.drawn import Drawn
 from nlfilter_torch.photo.picture.in_memory import InMemory

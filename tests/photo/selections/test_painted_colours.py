@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import torch
 
-from nlfilter_torch import recolor
+from nlfilter_torch.photo import recolor
 from nlfilter_torch.photo.picture.drawn import Drawn
 from nlfilter_torch.photo.picture.in_memory import InMemory
 from nlfilter_torch.photo.selections.painted_colours import Painted

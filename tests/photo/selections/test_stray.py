@@ -11,7 +11,7 @@ from benchmarks.edited_photographs import edited_photographs
 from benchmarks.photographs import photograph, reduced_to
 from benchmarks.recolor import CHANGED, HATS, hat_scene
 from benchmarks.scribbles import STORED, Job, as_mask, jobs, line
-from nlfilter_torch import recolor, region_mask
+from nlfilter_torch.photo import recolor, region_mask
 from nlfilter_torch.photo.picture.in_memory import InMemory
 from nlfilter_torch.photo.selections.stray import strays
 from tests.problems import box, paint

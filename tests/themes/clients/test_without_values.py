@@ -18,7 +18,9 @@ from torch._subclasses import FakeTensorMode
 from torch._subclasses.fake_tensor import DataDependentOutputException, DynamicOutputShapeException
 
 import nlfilter_torch as nlf
+from nlfilter_torch import photo
 from tests.pages import ROOT
+from tests.problems import IMAGE_FUNCTIONS
 from tests.themes.clients import fake_cuda
 
 LANDMARKS = 20
@@ -85,15 +87,15 @@ CASES: dict[str, Case] = {
     "segment_mask": lambda x: nlf.segment_mask(x.spectrum(), x.mask(2)),
     "refine": lambda x: nlf.refine(x.image(4), x.image(), confidence=x.mask(), num_landmarks=20),
     "refine trimap": lambda x: nlf.refine(x.mask(), x.image(), kind="trimap", num_landmarks=20),
-    "enhance": lambda x: nlf.enhance(x.image(), x.zeros(4)),
-    "sharpen": lambda x: nlf.sharpen(x.image()),
-    "adjust_tone": lambda x: nlf.adjust_tone(x.image()),
-    "denoise": lambda x: nlf.denoise(x.image()),
+    "enhance": lambda x: photo.enhance(x.image(), x.zeros(4)),
+    "sharpen": lambda x: photo.sharpen(x.image()),
+    "adjust_tone": lambda x: photo.adjust_tone(x.image()),
+    "denoise": lambda x: photo.denoise(x.image()),
     "estimate_noise": lambda x: nlf.estimate_noise(x.image()),
     "noise_profile": lambda x: nlf.noise_profile(x.image()).levels,
     "profile_of_difference": lambda x: nlf.profile_of_difference(x.image(), x.image()).levels,
-    "abstract": lambda x: nlf.abstract(x.image()),
-    "filter_frames": lambda x: next(nlf.filter_frames([x.image()], x.zeros(4), references=[x.image()])),
+    "abstract": lambda x: photo.abstract(x.image()),
+    "filter_frames": lambda x: next(photo.filter_frames([x.image()], x.zeros(4), references=[x.image()])),
     "DiffusionMask": lambda x: nlf.DiffusionMask()(x.spectrum(), x.mask()),
     "Refine": lambda x: nlf.Refine(learn=(), num_landmarks=20)(x.image(4), x.image()),
     "SegmentMask": lambda x: nlf.SegmentMask()(x.spectrum(), x.mask()),
@@ -115,20 +117,19 @@ READS: dict[str, Case] = {
     ),
     "operator_from_features": lambda x: x.points(weights=torch.ones(50, device=x.device)),
     "fit_alpha": lambda x: nlf.fit_alpha(x.operator(), x.image(), x.image()),
-    "apply_look": lambda x: nlf.apply_look(x.image(), alpha=x.zeros(4)),
-    "Look": lambda x: nlf.Look(learn=())(x.image(), alpha=x.zeros(4)),
-    "fit_look": lambda x: nlf.fit_look([(x.image(), x.image())]),
+    "apply_look": lambda x: photo.apply_look(x.image(), alpha=x.zeros(4)),
+    "Look": lambda x: photo.Look(learn=())(x.image(), alpha=x.zeros(4)),
+    "fit_look": lambda x: photo.fit_look([(x.image(), x.image())]),
     "propagate_strokes": lambda x: nlf.propagate_strokes(x.spectrum(), x.mask(3), x.mask()),
-    "recolor": lambda x: nlf.recolor(x.image(), x.mask(3), x.mask()),
-    "colorize": lambda x: nlf.colorize(x.image(1), x.mask(3), x.mask()),
-    "defocus": lambda x: nlf.defocus(x.image(), x.mask()),
-    "region_mask": lambda x: nlf.region_mask(x.image(), x.mask()),
-    "enhance": lambda x: nlf.enhance(x.image(), x.zeros(2, 4), x.mask(2)),
+    "recolor": lambda x: photo.recolor(x.image(), x.mask(3), x.mask()),
+    "colorize": lambda x: photo.colorize(x.image(1), x.mask(3), x.mask()),
+    "defocus": lambda x: photo.defocus(x.image(), x.mask()),
+    "region_mask": lambda x: photo.region_mask(x.image(), x.mask()),
+    "enhance": lambda x: photo.enhance(x.image(), x.zeros(2, 4), x.mask(2)),
 }
 CLASSES = {
     "Certificate",
     "Diagnostics",
-    "FittedLook",
     "FunctionProduct",
     "NoiseProfile",
     "NonlocalOperator",
@@ -149,7 +150,7 @@ def cuda() -> AbstractContextManager[object]:
 
 
 def test_every_public_name_is_tried() -> None:
-    assert {name.split()[0] for name in (*CASES, *READS)} | CLASSES >= set(nlf.__all__)
+    assert {name.split()[0] for name in (*CASES, *READS)} | CLASSES >= {*nlf.__all__, *IMAGE_FUNCTIONS}
 
 
 @pytest.mark.client("GPUs, without one", "no public function reads values but those [listed](training.md)")
