@@ -36,7 +36,9 @@ def strips(planes: Tensor, count: int) -> Tensor:
 
 def block_length(batch: int, device: torch.device, length: int) -> int:
     """Number of pixels of each image in a block of about ``length`` pixels per core."""
-    return max(256, (length * cores() if device.type == "cpu" else ACCELERATED) // max(batch, 1))
+    # A program is traced through every block; there, caches are its compiler's concern.
+    blocked = device.type == "cpu" and not torch.compiler.is_compiling()
+    return max(256, (length * cores() if blocked else ACCELERATED) // max(batch, 1))
 
 
 def pixel_blocks(count: int, batch: int, device: torch.device, *, length: int = CACHED) -> Iterator[slice]:

@@ -11,7 +11,7 @@ of steps.
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache, wraps
 from typing import Any, ParamSpec, TypeVar, cast
@@ -33,7 +33,6 @@ from torch._C._functorch import (
 from torch._functorch.pyfunctorch import temporarily_clear_interpreter_stack
 from torch._subclasses.fake_tensor import FakeTensor
 from torch.autograd import forward_ad
-from torch.utils._python_dispatch import _disable_current_modes
 from torch.utils._pytree import tree_map_only
 
 P = ParamSpec("P")
@@ -41,6 +40,7 @@ R = TypeVar("R")
 Definition = TypeVar("Definition", bound=Callable[..., Any])
 
 OPERATORS = torch.library.Library("nlfilter", "DEF")
+DEFINITIONS: dict[Any, Callable[..., Any]] = {}  # of the operators of torch.ops.nlfilter
 _FAKE = torch._C._TorchDispatchModeKey.FAKE
 
 # An operator that sees the dispatch keys of a call can call its own kernel for CPUs. Without private parts it would
@@ -92,11 +92,6 @@ def has_modes() -> bool:
     """
     written = torch._C._len_torch_dispatch_stack() + torch._C._len_torch_function_stack() > 0
     return written or torch.is_autocast_enabled("cpu") or in_transform() or in_forward_mode() or is_traced()
-
-
-def outside_modes() -> AbstractContextManager[Any]:
-    """Context in which constants of an exported program are computed as ordinary tensors, outside its fake mode."""
-    return _disable_current_modes()
 
 
 def is_on_cpu(keys: Any) -> bool:
@@ -321,6 +316,7 @@ def register(
         OPERATORS.impl(name, on_processors, "CPU")
         torch.library.register_fake(f"nlfilter::{name}", fake, lib=OPERATORS)
         operator = getattr(torch.ops.nlfilter, name).default
+        DEFINITIONS[operator] = definition
         if differentiable:
             OPERATORS.impl(name, under_autograd, "Autograd", with_keyset=True)
             OPERATORS.impl(name, definition, "FuncTorchBatched")

@@ -3,10 +3,11 @@
 from typing import Any
 
 import torch
-from torch import nn
+from torch import Tensor, nn
+from torch.overrides import TorchFunctionMode
 
 from nlfilter_torch.core.checks import check_instance
-from nlfilter_torch.operator.portable import PortableForms
+from nlfilter_torch.core.torch_internals import DEFINITIONS
 
 
 class Portable(nn.Module):
@@ -20,15 +21,18 @@ class Portable(nn.Module):
 
     Args:
         module: the model, which may use :class:`NonlocalFilter` and other layers and functions of this package.
-            Landmarks by k-means are limited to 256. Spectra, and therefore ``residual``, cannot be exported.
+            Landmarks must be given, as an operator or as features, or be the uniform grid: what chooses others is not
+            exported, and neither are spectra, and therefore ``residual``.
 
     Raises:
         TypeError: if ``module`` is not a module.
+        ValueError: on export, if a layer chooses landmarks by k-means or at random.
 
     Example:
-        >>> from nlfilter_torch import NonlocalFilter
-        >>> layer = NonlocalFilter(alpha=(3, 3, 4, 1.05), num_landmarks=20)
+        >>> from nlfilter_torch import NonlocalFilter, nonlocal_operator
         >>> image = torch.rand(1, 3, 24, 32, generator=torch.Generator().manual_seed(0))
+        >>> operator = nonlocal_operator(image, num_landmarks=20)
+        >>> layer = NonlocalFilter(alpha=(3, 3, 4, 1.05), landmarks=operator, hold="features")
         >>> torch.equal(Portable(layer)(image), layer(image))
         True
     """
@@ -42,5 +46,25 @@ class Portable(nn.Module):
         """Call the module."""
         if not torch.compiler.is_compiling():
             return self.module(*args, **kwargs)
-        with PortableForms():
+        with ThroughDefinitions():
             return self.module(*args, **kwargs)
+
+
+class ThroughDefinitions(TorchFunctionMode):
+    """Context in which a program is traced through the operators of ``torch.ops.nlfilter``, which runtimes lack."""
+
+    def __torch_function__(
+        self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
+    ) -> Any:
+        """Call the definition of an operator of this package, or any other function itself."""
+        if func is torch.hypot:
+            return root_of_squares(*args)
+        if func not in DEFINITIONS:
+            return func(*args, **(kwargs or {}))
+        with self:  # a mode is not active in its own function, and definitions call one another
+            return DEFINITIONS[func](*args, **(kwargs or {}))
+
+
+def root_of_squares(down: Tensor, right: Tensor) -> Tensor:
+    """As :func:`torch.hypot`, which ONNX lacks, except that squares of values above 1e19 overflow."""
+    return (down.square() + right.square()).sqrt()

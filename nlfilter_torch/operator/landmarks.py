@@ -394,6 +394,11 @@ def choose(
 
     ``patch`` and ``coordinates`` are the :class:`Layout` of the features; a width of 0 means that there is none.
     """
+    if sampling != "uniform" and torch.compiler.is_compiling():  # traced through: a program holds no random numbers
+        raise ValueError(
+            f"landmarks must be given or 'uniform' in a portable program, got {sampling!r}; pass an operator, and "
+            "hold='features'"
+        )
     layout = Layout(patch, coordinates) if patch else None
     assignment = assign_landmarks(features, tuple(size), count, sampling, None, layout=layout)[1]
     batch = (len(features), -1)

@@ -24,6 +24,8 @@ CANCELLATION = 1e-7  # error of a squared distance above which distances are not
 LARGEST_SQUARE = 60.0  # distance: smaller affinities would become denormal numbers of float32, which are slow
 JITTER = 1e-5  # added to the landmark block; limits the amplification of rounding by the inverse factor to 316 times
 
+CONVERGED = 1e-12  # distance from 1, the limit of all eigenvalues of the Newton-Schulz iteration
+
 
 def inverse_cholesky(landmarks: Tensor) -> Tensor:
     """Inverse Cholesky factor (B, M, M) of the affinities between ``landmarks`` (B, D, M), computed in float64."""
@@ -44,9 +46,31 @@ def inverse_cholesky(landmarks: Tensor) -> Tensor:
 )
 def invert(affinity: Tensor) -> Tensor:
     """Inverse Cholesky factor (B, M, M) of positive definite matrices (B, M, M)."""
+    if torch.compiler.is_compiling():  # a program is traced through, as for ONNX, which has no Cholesky factors
+        return inverse_root(affinity)
     lower = torch.linalg.cholesky(affinity)
     identity = torch.eye(affinity.shape[1], dtype=affinity.dtype, device=affinity.device)
     return torch.linalg.solve_triangular(lower, identity.expand_as(lower), upper=False).contiguous()
+
+
+def inverse_root(affinity: Tensor) -> Tensor:
+    """Inverse square root (B, M, M) of the affinities between landmarks, in matrix products alone.
+
+    Like the inverse Cholesky factor, it makes a Nystrom factor of the affinities of pixels; the two factors differ by a
+    rotation. In the coupled Newton-Schulz iteration all eigenvalues tend to 1; scaling by a bound of the smallest
+    halves the steps.
+    """
+    batch, count, _ = affinity.shape
+    identity = torch.eye(count, dtype=affinity.dtype, device=affinity.device).expand(batch, -1, -1)
+    most = affinity.sum(2, keepdim=True).amax(1, keepdim=True)  # bounds the eigenvalues; at most M + JITTER
+    root, inverse = affinity / most, identity
+    least = (JITTER / (count + JITTER)) ** 0.5
+    while least < 1 - CONVERGED:
+        scale = (3 / (1 + least + least * least)) ** 0.5
+        step = torch.baddbmm(identity, inverse, root, beta=1.5 * scale, alpha=-0.5 * scale**3)
+        root, inverse = torch.bmm(root, step), torch.bmm(step, inverse)
+        least = scale * least * (3 - (scale * least) ** 2) / 2
+    return inverse / most.sqrt()
 
 
 def _squared_distances(points: Tensor) -> Tensor:

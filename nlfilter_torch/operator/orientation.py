@@ -114,7 +114,7 @@ def orientation_of(sums: Tensor, channels: int) -> Orientation:
     """
     order = None
     if 1 < channels == sums.shape[1]:
-        order = _descending(sums[:, :, ONES, ONES])
+        order = sums[:, :, ONES, ONES].argsort(dim=1, descending=True, stable=True)
         sums = sums.gather(1, order[..., None, None].expand_as(sums))
     mixed = sums[:, 0]
     for number in range(1, sums.shape[1]):
@@ -129,15 +129,6 @@ def orientation_of(sums: Tensor, channels: int) -> Orientation:
     heaviest, tied = torch.stack(gravity, dim=1), torch.stack(hashes, dim=1)
     tied = torch.where(heaviest == heaviest.amax(1, keepdim=True), tied, torch.iinfo(torch.long).min)
     return Orientation(tied.argmax(1), order)
-
-
-def _descending(values: Tensor) -> Tensor:
-    """Indices (B, C) that sort whole numbers (B, C); without a sort, which portable programs lack."""
-    places = torch.arange(values.shape[1], device=values.device)
-    before, after = values.unsqueeze(2), values.unsqueeze(1)  # (B, C, C)
-    first = (before > after) | ((before == after) & (places.unsqueeze(1) < places))
-    ranks = first.sum(1)
-    return (ranks.unsqueeze(1) == places.unsqueeze(1)).byte().argmax(2)
 
 
 def whole_sums(shares: Tensor, first_row: int, size: Sequence[int], counted: Tensor | None = None) -> Tensor:

@@ -147,7 +147,9 @@ class _ImplicitScaling(torch.autograd.Function):
 
 def solve(matrix: KernelMatrix, tolerance: float, completed: bool) -> Solution:
     """Balance a kernel by the method that suits it, and continue with the damped method if that does not converge."""
-    solution = newton(matrix, tolerance) if completed else _chebyshev(matrix, tolerance)
+    # A program that is traced through has neither Cholesky factors nor the search for a place in a sorted list.
+    quick = completed and not torch.compiler.is_compiling()
+    solution = newton(matrix, tolerance) if quick else _chebyshev(matrix, tolerance)
     goal = attainable(matrix.factor, tolerance, matrix.communicator)
     if not is_hidden(matrix.factor) and not bool((solution.residual <= goal).all()):
         solution = damped(matrix, solution, goal)
@@ -272,7 +274,7 @@ def _solve_and_warn(factor: Tensor, diagonal: Tensor, *, tolerance: float, compl
     """Balance a kernel without a gradient; return the solution and its residual, 0 on accelerators."""
     solution = solve(KernelMatrix(factor, diagonal), tolerance, completed)
     warn_of_residual(solution.residual, tolerance, factor.dtype, completed=completed)
-    return solution, float(solution.residual.max()) if factor.device.type == "cpu" else 0.0
+    return solution, 0.0 if is_hidden(factor) else float(solution.residual.max())
 
 
 def _fake_sinkhorn(
@@ -300,9 +302,10 @@ def sinkhorn(
     exceed 1, of large factors only with ``bound``.
     """
     balanced = partial(_solve_and_warn, tolerance=tolerance, completed=completed)
-    rounds = sinkhorn_in_rounds(factor, diagonal, balanced, completed=completed and factor.device.type == "cpu")
+    watched = not is_hidden(factor)
+    rounds = sinkhorn_in_rounds(factor, diagonal, balanced, completed=completed and watched)
     result, factor, diagonal = rounds.result, rounds.factor, rounds.diagonal
-    if (bound or factor.shape[1] * factor.shape[2] <= ALWAYS) and factor.device.type == "cpu":
+    if watched and (bound or factor.shape[1] * factor.shape[2] <= ALWAYS):
         remainder = result.scaling * (result.scaling * diagonal)
         gram = shifted_gram(factor, result.scaling, remainder, ALONE)
         if exceeds(gram, result.moment, slack(factor.dtype, rounds.residual)):
