@@ -38,7 +38,7 @@ from benchmarks.training.figures import Figure, table
 from nlfilter_torch.photo import recolor
 from nlfilter_torch.photo.files.photographs import Photograph, write_photograph
 from nlfilter_torch.photo.picture.in_memory import InMemory
-from nlfilter_torch.photo.selections.stray_parts import stray_parts
+from nlfilter_torch.photo.selections.stray import stray_parts
 
 STRAY = 0.2  # of a stroke
 LENGTH, BEND, POINTS, TRIES = 0.35, 0.4, 40, 400  # of the strokes on composites; length as a share of the short side

@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles
-from nlfilter_torch.photo.selections.stroke_groups import StrokeGroups
+from nlfilter_torch.photo.selections.connected import StrokeGroups
 
 SIZE = (20, 30)
 

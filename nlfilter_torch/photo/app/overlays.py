@@ -7,7 +7,7 @@ from nlfilter_torch.photo.edits.applying import edit_of, scribbles_of
 from nlfilter_torch.photo.picture.drawn import Drawn
 from nlfilter_torch.photo.picture.in_memory import InMemory, edit_image
 from nlfilter_torch.photo.picture.painting import TensorPainter
-from nlfilter_torch.photo.selections.stray_parts import stray_parts
+from nlfilter_torch.photo.selections.stray import stray_parts
 
 
 class Overlays:

@@ -24,7 +24,7 @@ from nlfilter_torch.photo.picture.drawn import Drawn
 from nlfilter_torch.photo.picture.edit import MARKS, PhotoEdit, Rows
 from nlfilter_torch.photo.picture.in_memory import InMemory, edit_image
 from nlfilter_torch.photo.selections.scribbled_colours import frame_places
-from nlfilter_torch.photo.selections.stray_parts import stray_parts
+from nlfilter_torch.photo.selections.stray import stray_parts
 
 Read = Callable[[slice], Tensor]  # rows of the photograph as (1, C, h, W) in [0, 1]
 MAX_PIXELS = 500_000  # largest size of the picture that shows scribbles

@@ -56,10 +56,10 @@ from nlfilter_torch.photo.picture.source import (
     luminance,
 )
 from nlfilter_torch.photo.picture.viewing import Coarse, viewed_size
+from nlfilter_torch.photo.selections.connected import StrokeGroups
 from nlfilter_torch.photo.selections.local_values import ABSOLUTE, RELATIVE, Links, LocalValues
 from nlfilter_torch.photo.selections.mask import blocks_of
-from nlfilter_torch.photo.selections.stroke_groups import StrokeGroups
-from nlfilter_torch.photo.selections.texture import TEXTURE_MARGIN, with_texture
+from nlfilter_torch.photo.selections.rough_mask import TEXTURE_MARGIN, with_texture
 
 Method = Literal["regression", "kmeans"]
 

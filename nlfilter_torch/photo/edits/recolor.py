@@ -24,7 +24,7 @@ from nlfilter_torch.photo.selections.border_colours import Sides, colours_beside
 from nlfilter_torch.photo.selections.connected import Extent
 from nlfilter_torch.photo.selections.hues import shade
 from nlfilter_torch.photo.selections.mask import ObjectEdit, Regions, background_of, fit_regions
-from nlfilter_torch.photo.selections.painted_colours import Painted
+from nlfilter_torch.photo.selections.painted import Painted
 
 EPSILON = 1e-12  # keeps the derivative of a root finite
 END_MARGIN = 0.1  # masks closer to 0 or 1 are set to 0 or 1: a faint tint far away is visible, a less soft edge is not

@@ -8,8 +8,7 @@ from torch import Tensor
 
 from nlfilter_torch.photo.picture.colour import dot
 from nlfilter_torch.photo.picture.resizing import block_means
-from nlfilter_torch.photo.selections.closed_form import linear_mask
-from nlfilter_torch.photo.selections.pyramid import pyramid_levels
+from nlfilter_torch.photo.selections.matting import linear_mask, pyramid_levels
 
 REFINEMENT_ROUNDS, HALF_TRUST_CONTRAST = 2, 0.03  # rounds of refinement; colour difference at which it is half trusted
 SIDE_RADIUS = 4  # radius over which the colours on each side of a border are averaged, in pixels of the coarsest level

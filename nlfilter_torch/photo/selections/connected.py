@@ -1,32 +1,42 @@
-"""Which part of a mask belongs to the object under a scribble: what is connected with it."""
+"""Connected areas: the part of a mask that is connected with a scribble, and the strokes of a picture in groups.
 
+The groups are for cross-validation: methods are compared by how well they predict a group from the others.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Literal
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from nlfilter_torch.core.blocks import order_by
+from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles, blocks_at
+
 Extent = Literal["near", "object", "everywhere"]
-INSIDE = 0.5  # mask from which on a pixel is inside an object, in which pixels are connected
-BORDER = 8  # width in pixels of a soft border, which belongs to the nearest object
-SMALL = 0.03  # of the pixels of the object; smaller pieces within its border, such as hair, belong to it
+INSIDE_MASK = 0.5  # mask from which on a pixel is inside an object, in which pixels are connected
+SOFT_BORDER = 8  # width in pixels of a soft border, which belongs to the nearest object
+SMALL_PIECE = 0.03  # of the pixels of the object; smaller pieces within its border, such as hair, belong to it
 
 
 @torch.no_grad()
 def connected(masks: Tensor, scribbles: Tensor) -> Tensor:
     """Which pixels belong to what is connected with a scribble, (B, K, H, W) of bool.
 
-    Pixels are connected by their sides through those with a mask of at least :data:`INSIDE`.
+    Pixels are connected by their sides through those with a mask of at least :data:`INSIDE_MASK`.
 
     Args:
         masks: of K regions, (B, K, H, W).
         scribbles: weights of those on the regions, (B, K, H, W), above 0 where painted.
     """
     painted = scribbles > 0
-    inside = (masks >= INSIDE) | painted
+    inside = (masks >= INSIDE_MASK) | painted
     parts = [_parts(*planes) for planes in zip(inside.flatten(0, 1), painted.flatten(0, 1), strict=True)]
     own, others = (torch.stack(planes).view_as(inside).to(masks) for planes in zip(*parts, strict=True))
-    for _ in range(BORDER):
+    for _ in range(SOFT_BORDER):
         wider = torch.where(others > 0, 0.0, _widened(own))
         others, own = torch.where(wider > 0, 0.0, _widened(others)), wider
     return own > 0
@@ -38,10 +48,88 @@ def _parts(inside: Tensor, painted: Tensor) -> tuple[Tensor, Tensor]:
 
     numbers = torch.from_numpy(label(inside.cpu().numpy(), connectivity=1)).to(inside.device)
     own = torch.isin(numbers, numbers[painted].unique()) & inside
-    large = numbers.flatten().bincount() >= SMALL * own.sum()
+    large = numbers.flatten().bincount() >= SMALL_PIECE * own.sum()
     return own, inside & ~own & large[numbers]
 
 
 def _widened(planes: Tensor) -> Tensor:
     """Planes (B, K, H, W) of 0 and 1 with another pixel around the ones."""
     return F.max_pool2d(planes, 3, 1, 1)
+
+
+GROUPS = 5
+CELLS_ACROSS = 64  # number of cells along the short side; painted areas in the same or in adjacent cells are connected
+
+
+def _cells(length: int, side: float) -> int:
+    """Number of cells along an axis, such that no border of two cells runs through the middle of a pixel."""
+    count = math.ceil(length / side)
+    return count if length % count == 0 or count % 2 == 1 else count + 1
+
+
+@dataclass(frozen=True, eq=False)
+class StrokeGroups:
+    """The strokes of each image of a batch: its connected painted areas.
+
+    Attributes:
+        strokes: number of the stroke at each scribbled pixel, (B, n); any number where nothing is painted. Strokes with
+            the same remainder after division by :data:`GROUPS` are a group.
+        count: number S of strokes, the largest of all images.
+    """
+
+    strokes: Tensor
+    count: int
+
+    @staticmethod
+    def of(scribbles: Scribbles, size: tuple[int, int]) -> "StrokeGroups":
+        """Number the strokes of a picture (H, W). Areas closer together than 1/64 of the short side are connected."""
+        from skimage.measure import label
+
+        side = max(1.0, min(size) / CELLS_ACROSS)
+        cells = (_cells(size[0], side), _cells(size[1], side))
+        at = blocks_at(scribbles.places, size, cells)
+        weights = scribbles.weights.detach().amax(1)
+        painted = weights.new_zeros(len(weights), cells[0] * cells[1]).index_add(1, at, weights).unflatten(1, cells) > 0
+        numbers = torch.from_numpy(np.stack([label(image, connectivity=2) for image in painted.cpu().numpy()]))
+        strokes = (numbers.to(at).flatten(1)[:, at] - 1).clamp(min=0)
+        groups = StrokeGroups(strokes, int(numbers.max()))
+        return groups if groups.count <= GROUPS else groups._outwards(scribbles, size)
+
+    def _outwards(self, scribbles: Scribbles, size: tuple[int, int]) -> "StrokeGroups":
+        """The strokes, numbered from the middle of the picture outwards, so that the numbers turn with it.
+
+        Strokes at the same distance are ordered by brightness.
+        """
+        places = scribbles.places
+        distances = (2 * (places // size[1]) + 1 - size[0]).square() + (2 * (places % size[1]) + 1 - size[1]).square()
+        painted = (scribbles.weights.detach() > 0).any(1)
+        distances = torch.where(painted, distances, distances.max() + 1)
+        nearest = distances.new_full((len(self.strokes), self.count), torch.iinfo(torch.long).max)
+        nearest = nearest.scatter_reduce(1, self.strokes, distances, "amin")
+        light = self.sums(scribbles.image.detach().mean(1, keepdim=True) * painted.unsqueeze(1)).squeeze(1)
+        return StrokeGroups(order_by(nearest, light).argsort(1).gather(1, self.strokes), self.count)
+
+    @property
+    def groups(self) -> Tensor:
+        """Number of the group at each scribbled pixel, (B, 1, n)."""
+        return (self.strokes % GROUPS).unsqueeze(1)
+
+    def without_each(self, weighted: Tensor) -> list[Tensor]:
+        """Values (B, C, n) with those of one group replaced by 0, for each group; an empty list for single strokes."""
+        if self.count < 2:
+            return []
+        return [weighted * (self.groups != number) for number in range(min(GROUPS, self.count))]
+
+    def weights_without_each(self, weights: Tensor) -> list[Tensor]:
+        """:meth:`without_each` of weights (B, 1, n), but images that would be left without any keep all of them."""
+        sets = self.without_each(weights)
+        return [torch.where(left.sum(2, keepdim=True) > 0, left, weights) for left in sets]
+
+    def of_own(self, values: Sequence[Tensor]) -> Tensor:
+        """Select, at each pixel, the values (B, C, n) that belong to its own group from those for every group."""
+        return torch.stack(list(values)).gather(0, self.groups.expand(1, *values[0].shape)).squeeze(0)
+
+    def sums(self, values: Tensor) -> Tensor:
+        """Sums (B, C, S) of values (B, C, n) over each stroke, in float64."""
+        sums = values.new_zeros(*values.shape[:2], self.count, dtype=torch.float64)
+        return sums.scatter_add(2, self.strokes.unsqueeze(1).expand(values.shape), values.double())

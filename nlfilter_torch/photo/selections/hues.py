@@ -16,14 +16,21 @@ from torch import Tensor
 
 from nlfilter_torch.core.precision import squarable
 from nlfilter_torch.operator.features import blur
+from nlfilter_torch.photo.declared.parameters import MASK
 from nlfilter_torch.photo.picture.colour import dot, split_luminance
 from nlfilter_torch.photo.picture.resizing import block_means, enlarged
-from nlfilter_torch.photo.selections.scribbled_colours import SIMILAR_SHARE, colours_in_lab, density, every_nth
+from nlfilter_torch.photo.selections.scribbled_colours import (
+    EPSILON,
+    NUM_COLOURS,
+    SIMILAR_SHARE,
+    colours_in_lab,
+    density,
+    every_nth,
+)
 
-DARK = 0.02  # luminance below which hue and saturation are uncertain
+DARK_LUMINANCE = 0.02  # luminance below which hue and saturation are uncertain
 HALF_COUNTED = 0.1  # luminance of a scribbled pixel that counts half, for the same reason
 BLACK = 1e-4  # added to it, so that pixels of a black object count, too
-NUM_COLOURS = 128  # approximate number of scribbled pixels that others are compared with
 BANDWIDTH, PER_SATURATION = 0.06, 0.08  # of this comparison: for a grey object, and how it grows with the saturation
 AROUND_SIGMA, AROUND_GRID = 0.02, 60  # surroundings: standard deviation, share of the short side; rows or columns
 LEAST_SIGMA = 3.0  # the least of it, in pixels: wider than a soft border, whose pixels are mixtures
@@ -36,8 +43,8 @@ WIDEST = 0.03  # width of shade that is enclosed, as a share of the short side
 SHADED = (0.5, 0.8)
 SATURATED = (0.5, 0.9)
 SAME_HUE = (0.75, 0.9)
-SAME_LAB = 0.08  # bandwidth in hundredths of Lab, in which colours are compared with those of scribbles to keep
-EPSILON = 1e-6
+#: Bandwidth in which colours are compared with those of scribbles to keep: that of masks, as both say what is alike.
+KEPT_BANDWIDTH: float = MASK.defaults["photometric_bandwidth"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +62,7 @@ class HueSamples:
     @staticmethod
     def of(colours: Tensor, weights: Tensor) -> "HueSamples":
         """Choose from scribbled pixels of colours (B, 3, n), in order :func:`outwards`, and of weights (B, 1, n)."""
-        sample, shares = every_nth(colours.clamp(0.0, 1.0), weights, NUM_COLOURS)  # as the reduced picture is
+        sample, shares = every_nth(colours.clamp(0.0, 1.0), weights, NUM_COLOURS[1])  # as the reduced picture is
         luminance = split_luminance(sample.unsqueeze(2))[0].squeeze(2)
         shares = shares * (luminance + BLACK) / (luminance + HALF_COUNTED)
         return HueSamples(relative_chroma(sample), shares / shares.sum(2, keepdim=True).clamp(min=EPSILON))
@@ -71,7 +78,7 @@ class HueSamples:
 def relative_chroma(colours: Tensor) -> Tensor:
     """Red and blue chroma, (B, 2, n), of colours (B, 3, n) relative to their luminance: the same in light and shade."""
     luminance, chroma = (part.squeeze(2) for part in split_luminance(colours.unsqueeze(2)))
-    return (chroma / (luminance.clamp(min=0.0) + DARK + (dot(chroma, chroma) + EPSILON).sqrt()))[:, ::2]
+    return (chroma / (luminance.clamp(min=0.0) + DARK_LUMINANCE + (dot(chroma, chroma) + EPSILON).sqrt()))[:, ::2]
 
 
 def corrections(
@@ -89,9 +96,9 @@ def corrections(
     factor = trusted(mask, samples.likeness(image))
     within = enclosed(share * factor)
     if kept is not None:
-        sample, shares = every_nth(*kept, NUM_COLOURS)
+        sample, shares = every_nth(*kept, NUM_COLOURS[1])
         places, points = (colours_in_lab(colours) for colours in (image.flatten(2), sample))
-        near = density(places, points, shares, image.new_tensor(SAME_LAB)).unflatten(2, image.shape[-2:])
+        near = density(places, points, shares, image.new_tensor(KEPT_BANDWIDTH)).unflatten(2, image.shape[-2:])
         within = within * (1 - (near / SIMILAR_SHARE).clamp(max=1.0))
     return torch.cat([factor, within], dim=1)
 
@@ -136,7 +143,7 @@ def shade(luminance: Tensor, chroma: Tensor, scribbled_luminance: Tensor, scribb
     product = dot(chroma, scribbled_chroma.expand_as(chroma))
     squares = dot(chroma, chroma), dot(scribbled_chroma, scribbled_chroma)
     cosine = product * (squares[0] + EPSILON).rsqrt() * (squares[1] + EPSILON).rsqrt()
-    darkness = luminance.clamp(min=DARK) / scribbled_luminance.clamp(min=EPSILON)
+    darkness = luminance.clamp(min=DARK_LUMINANCE) / scribbled_luminance.clamp(min=EPSILON)
     saturation = product / (squares[1] + EPSILON) / darkness.clamp(min=EPSILON)
     return (1 - ramp(darkness, *SHADED)) * ramp(saturation, *SATURATED) * ramp(cosine, *SAME_HUE)
 

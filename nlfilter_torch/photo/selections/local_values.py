@@ -22,9 +22,9 @@ from torch import Tensor
 
 from nlfilter_torch.core.kernels.stencil import solve_stencil
 from nlfilter_torch.photo.picture.scribbled_pixels import parts_in_blocks, sums_in_blocks
-from nlfilter_torch.photo.selections.stroke_groups import StrokeGroups
+from nlfilter_torch.photo.selections.connected import StrokeGroups
 
-SAME = 0.007  # difference in luminance at which an absolute weight falls to a quarter
+SAME_LUMINANCE = 0.007  # difference in luminance at which an absolute weight falls to a quarter
 SHARE_OF_VARIANCE, MIN_VARIANCE = 0.6, 2e-6  # squared differences at which a relative weight falls to 1/e
 MIN_RELATIVE = 1e-6  # relative weight of the least similar neighbour
 SAME_BLOCK, MIN_WEIGHT = 0.042, 1e-5  # difference from a block at which its weight falls to 1/e, and least weight
@@ -56,7 +56,7 @@ class Links:
 
 
 def _absolute(difference: Tensor, inside: Tensor) -> Tensor:
-    return inside * (1 + difference.square() / SAME**2) ** -2
+    return inside * (1 + difference.square() / SAME_LUMINANCE**2) ** -2
 
 
 def _relative(difference: Tensor, inside: Tensor) -> Tensor:

@@ -3,9 +3,9 @@
 A regression with the filter's covariance (:mod:`nlfilter_torch.filtering.scribbles`) on colour, surrounding colour and
 texture separates foreground from background, together with the colours of single pixels
 (:mod:`nlfilter_torch.photo.selections.scribbled_colours`). Points that an even area, such as a sky, links to a scribble
-count as scribbled, too. Two local solves (:mod:`nlfilter_torch.photo.selections.random_walker` and
-:mod:`nlfilter_torch.photo.selections.closed_form`) then align the borders of the mask with those of the picture. All
-run on a copy reduced to about :data:`SOLVED` pixels, so the cost hardly grows with
+count as scribbled, too. Two local solves (:mod:`nlfilter_torch.photo.selections.matting` and
+:mod:`nlfilter_torch.photo.selections.matting`) then align the borders of the mask with those of the picture. All
+run on a copy reduced to about :data:`SOLVED_PIXELS` pixels, so the cost hardly grows with
 the size of the picture. The result is a linear function of the colour for each place, which gives the mask of any pixel
 from its own colour; results in tiles are therefore exact.
 """
@@ -32,21 +32,19 @@ from nlfilter_torch.photo.picture.resizing import enlarged
 from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles, parts_in_blocks
 from nlfilter_torch.photo.picture.source import Fitted, Reduced, Source
 from nlfilter_torch.photo.picture.viewing import viewed_size
-from nlfilter_torch.photo.selections.by_hand import ByHand, check_drawn
-from nlfilter_torch.photo.selections.closed_form import LinearMasks, linear_mask, linear_models, solve_linear
 from nlfilter_torch.photo.selections.connected import Extent, connected
-from nlfilter_torch.photo.selections.random_walker import solve_mask
+from nlfilter_torch.photo.selections.matting import LinearMasks, linear_mask, linear_models, solve_linear, solve_mask
+from nlfilter_torch.photo.selections.painted import ByHand, check_drawn
 from nlfilter_torch.photo.selections.rough_mask import RoughMasks
+from nlfilter_torch.photo.selections.scribbled_colours import EPSILON, trimap_share
 from nlfilter_torch.photo.selections.stray import without_strays
-from nlfilter_torch.photo.selections.trimap import trimap_share
 
-SOLVED = 1 << 17  # pixels
+SOLVED_PIXELS = 1 << 17  # pixels
 VIEWED = VIEWING_SIZE.default_number  # megapixels; larger pictures are first reduced to this size
 FLOATS_PER_PIXEL = 80  # estimated working memory per pixel of the reduced picture, in addition to its operator
 ROUGH_CONFIDENCE, SCRIBBLE_CONFIDENCE = 0.02, 1000.0  # confidence in the rough mask, and in scribbles
 ODDS, STEEPNESS = 1.5, 1.4  # of the curve from the solution along borders, too low halfway, to masks
 MOST_WAITING = 2  # threads: operations on so few pixels are not worth dividing between two
-EPSILON = 1e-6
 
 
 def region_mask(
@@ -383,7 +381,7 @@ def _reduced(source: Source[M], floats: int) -> tuple[Reduced, tuple[float, floa
     """
     size = viewed_size(source.size, VIEWED)
     viewed = source if size == source.size else source.resized(size)
-    side = math.ceil(math.sqrt(size[0] * size[1] / SOLVED))
+    side = math.ceil(math.sqrt(size[0] * size[1] / SOLVED_PIXELS))
     small = viewed.blocks(side, floats)
     return small, (source.size[0] / small.size[0], source.size[1] / small.size[1])
 

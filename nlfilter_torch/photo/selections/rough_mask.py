@@ -1,9 +1,4 @@
-"""Rough masks of regions: a regression on the scribbles, and the colours of single pixels.
-
-The regression uses the covariance of the filter (:mod:`nlfilter_torch.filtering.scribbles`) and compares colour,
-surrounding colour and texture. Points along the borders of the picture count as background unless they resemble the
-region; points on a grid count as scribbled if an even area, such as a sky, links them to a scribble.
-"""
+"""Surroundings and texture of pixels, as channels of a guide: they tell apart areas of the same brightness."""
 
 import math
 from collections.abc import Callable, Iterable, Sequence
@@ -15,13 +10,15 @@ from torch import Tensor
 
 from nlfilter_torch.filtering.scribbles import fit_strokes
 from nlfilter_torch.operator.columns import Columns
-from nlfilter_torch.operator.features import blur
+from nlfilter_torch.operator.features import blur, blur_margin, pad_border
 from nlfilter_torch.operator.options import OperatorOptions
 from nlfilter_torch.photo.picture.colour import LIGHTNESS, hundredths_of_lab
 from nlfilter_torch.photo.picture.resizing import block_means, enlarged
 from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles, scribbled_blocks
 from nlfilter_torch.photo.picture.source import Blocks, Guide, Operator, Planes, Reduced
 from nlfilter_torch.photo.selections.scribbled_colours import (
+    EPSILON,
+    by_trimap,
     colour_likelihood,
     evenness,
     frame_places,
@@ -29,12 +26,36 @@ from nlfilter_torch.photo.selections.scribbled_colours import (
     likeness,
     linked_evenly,
     outwards,
+    trimap_share,
 )
-from nlfilter_torch.photo.selections.texture import TEXTURE_MARGIN, with_texture
-from nlfilter_torch.photo.selections.trimap import by_trimap, trimap_share
+
+# Gaussians, in pixels: surroundings, grain, average of its strength.
+SURROUND_SIGMA, GRAIN_SIGMA, TEXTURE_SIGMA = 2.0, 1.5, 3.0
+TEXTURE_MARGIN = max(blur_margin(SURROUND_SIGMA), blur_margin(GRAIN_SIGMA) + blur_margin(TEXTURE_SIGMA))
+
+
+def with_texture(planes: Tensor, brightness: Tensor, weight: float) -> Tensor:
+    """Append the means of planes around each pixel and the strength of the texture there.
+
+    Args:
+        planes: (B, C, H, W).
+        brightness: (B, 1, H, W), of which the texture is measured.
+        weight: of the texture.
+
+    Returns:
+        (B, 2 C + 3, H, W): the planes, their means, and ``weight`` times the strength of grain and of both gradients.
+    """
+    # In float32, blurred planes of a mirrored picture would differ by rounding, and with them its landmarks.
+    planes, brightness, dtype = planes.double(), brightness.double(), planes.dtype
+    padded = pad_border(brightness, 1)
+    rows, columns = padded[..., 1:-1, 2:] - padded[..., 1:-1, :-2], padded[..., 2:, 1:-1] - padded[..., :-2, 1:-1]
+    grain = torch.cat([brightness - blur(brightness, GRAIN_SIGMA), rows / 2, columns / 2], dim=1)
+    strength = (blur(grain.square(), TEXTURE_SIGMA) + 1e-8).sqrt()  # the derivative of the root is finite
+    return torch.cat([planes, blur(planes, SURROUND_SIGMA), weight * strength], dim=1).to(dtype)
+
 
 CHROMA_WEIGHT = 0.7  # weight of hue and saturation; that of lightness is LIGHTNESS
-TEXTURE_WEIGHT = 1.5
+GUIDE_TEXTURE = 1.5
 NUM_CHANNELS = 9  # channels of the guide
 SMOOTHNESS = 0.25  # of the regression
 CONTRAST = 4.0  # steepness of the curve from likelihood to rough mask
@@ -45,7 +66,6 @@ COLOUR_SHARE = (0.65, 1.0)
 # of the short side, number of rows or columns of the grid it is averaged on, and average from which on colours count.
 AROUND_SIGMA, AROUND_GRID, ENOUGH_AROUND = 0.1, 40, 0.5
 FRAME_PIXELS = 112 * 160  # in larger pictures points of the frame count more, as scribbles have more pixels there
-EPSILON = 1e-6
 
 ScribbledPoints = tuple[Callable[[], Iterable[Tensor]], Tensor, Tensor]  # columns, weights and values of pixels
 
@@ -54,7 +74,7 @@ def region_guide(image: Tensor) -> Tensor:
     """Guide of the operator, (B, 9, H, W): colour, surrounding colour, and strength of the texture."""
     lab = hundredths_of_lab(image)
     colours = lab * lab.new_tensor([LIGHTNESS, CHROMA_WEIGHT, CHROMA_WEIGHT]).view(1, 3, 1, 1)
-    return with_texture(colours, lab[:, :1], TEXTURE_WEIGHT)
+    return with_texture(colours, lab[:, :1], GUIDE_TEXTURE)
 
 
 @dataclass(frozen=True, eq=False)

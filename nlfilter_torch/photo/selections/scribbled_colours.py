@@ -1,8 +1,4 @@
-"""Comparison of colours with those of scribbled pixels, for masks.
-
-Regressions blur: their features include the surroundings of a pixel. Densities of colours on both sides of a border
-separate hair and thin parts, too, where their colours differ.
-"""
+"""Scribbles that cover most of a picture on both sides of a border, and settings of masks that depend on that."""
 
 import math
 from functools import partial
@@ -17,7 +13,26 @@ from nlfilter_torch.core.workers import divided_among, threads_for
 from nlfilter_torch.operator.features import blur
 from nlfilter_torch.photo.picture.colour import hundredths_of_lab
 from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles
-from nlfilter_torch.photo.selections.trimap import by_trimap
+
+SPARSE, DENSE = 0.3, 0.6  # share of a picture under scribbles up to which they are a few, and from which on a trimap
+
+
+def trimap_share(painted: Tensor) -> Tensor:
+    """How nearly scribbles are a trimap: 0 for a few of them, 1 for most of the picture, (...).
+
+    Args:
+        painted: weights (..., 2, n), for all pixels, of the scribbles on a region and on its background. 0 is returned
+            where either side has none.
+    """
+    shares = (painted.detach() > 0).to(painted).mean(-1)
+    return ((shares.sum(-1) - SPARSE) / (DENSE - SPARSE)).clamp(0.0, 1.0) * (shares.amin(-1) > 0)
+
+
+def by_trimap(values: tuple[float, float], trimap: Tensor) -> Tensor:
+    """A setting between its values for a few scribbles and for a trimap, by :func:`trimap_share`."""
+    few, most = values
+    return few + (most - few) * trimap
+
 
 FRAME_POINTS = 64  # approximate number of points along the upper or left border of a picture
 NUM_COMPARED = 512  # approximate number of scribbled pixels that the frame is compared with
@@ -35,7 +50,7 @@ LINK_STEP, MOST_LINKED = 3, 1000
 INNER_ROWS, MOST_INNER = 16, 64  # points inside the picture that are compared, along its short side, and at most
 MIN_DENSITY = 1e-4  # colours that are rarer than this on both sides belong to neither
 SMALLEST_EXPONENT = -30.0  # of Gaussians: smaller ones give denormal numbers, which are slow
-EPSILON = 1e-6
+EPSILON = 1e-6  # least sum of weights that is divided by; rounding errors of float32 sums of them are smaller
 
 
 def frame_places(size: tuple[int, int]) -> Tensor:

@@ -13,7 +13,7 @@ from nlfilter_torch.photo.declared.strokes import Stroke
 from nlfilter_torch.photo.edits import recipe as whole_edit
 from nlfilter_torch.photo.edits.applying import apply_recipe
 from nlfilter_torch.photo.picture.tiles import Passes
-from nlfilter_torch.photo.selections.pyramid import pyramid_levels
+from nlfilter_torch.photo.selections.matting import pyramid_levels
 from tests.problems import cat, difference
 from tests.recipes import BLUE, COLORIZE, DETAIL, IN, RECOLOR, by_rows, from_rows, rows_of
 from tests.tiles import cat as photograph

@@ -3,7 +3,7 @@
 import torch
 
 from nlfilter_torch.photo.selections.border_colours import Sides, colours_beside, refine_mask
-from nlfilter_torch.photo.selections.closed_form import linear_mask
+from nlfilter_torch.photo.selections.matting import linear_mask
 from tests.problems import noise
 
 INSIDE, OUTSIDE = (torch.tensor(values).view(1, 3, 1, 1) for values in ((0.7, 0.2, 0.1), (0.1, 0.3, 0.8)))

@@ -4,8 +4,10 @@ import pytest
 import torch
 
 from nlfilter_torch.photo import defocus, enhance, recolor, region_mask
-from nlfilter_torch.photo.selections.connected import BORDER, connected
+from nlfilter_torch.photo.selections.connected import SOFT_BORDER, connected
 from tests.problems import box, inverse, noise, oriented, paint
+from tests.strokes import SIZE as DOTTED
+from tests.strokes import dots, groups_of
 
 SIZE = (48, 64)
 LEFT, RIGHT, FAR = (box(*corner, 12, 12, size=SIZE) for corner in ((18, 4), (18, 26), (18, 50)))
@@ -31,7 +33,7 @@ def test_only_what_is_connected_belongs_to_the_object() -> None:
     assert belongs[LEFT > 0].all()
     assert not belongs[RIGHT > 0].any()
     assert belongs[..., 17, 10]  # its border
-    assert not belongs[..., 17 - BORDER - 1, 10]
+    assert not belongs[..., 17 - SOFT_BORDER - 1, 10]
     both = connected(masks.clamp(max=1), STROKE + box(20, 30, 2, 2, size=SIZE))
     assert both[LEFT + RIGHT > 0].all()
     fragment = box(15, 10, 1, 2, size=SIZE)  # such as hair beside it
@@ -82,3 +84,41 @@ def test_every_edit_of_objects_stops_at_the_object() -> None:
         change = (edited - image).abs().amax(1, keepdim=True)
         assert change[LEFT > 0].max() > 1e-3
         assert change[RIGHT > 0].max() == 0
+
+
+def test_strokes_are_connected_areas_of_each_image() -> None:
+    first = box(2, 3, 4, 2, size=DOTTED) + box(6, 5, 2, 6, size=DOTTED)  # these touch at a corner
+    mask = torch.cat([first + box(15, 20, 3, 3, size=DOTTED), box(4, 8, 12, 1, size=DOTTED)])
+    groups, places = groups_of(mask)
+    assert groups.count == 2
+    painted = mask.flatten(2)[:, :, places]
+    assert torch.equal(groups.strokes[0][painted[0, 0] > 0], (places >= 15 * 30).long()[painted[0, 0] > 0])
+    assert groups.sums(painted).squeeze(1).tolist() == [[20, 9], [12, 0]]
+
+
+def test_in_large_pictures_areas_close_together_are_one_stroke() -> None:
+    size = (640, 640)
+    first = box(10, 10, 4, 4, size=size)
+    assert groups_of(first + box(10, 15, 4, 4, size=size))[0].count == 1
+    assert groups_of(first + box(10, 40, 4, 4, size=size))[0].count == 2
+
+
+def test_each_group_is_left_out_once() -> None:
+    mask = dots(*((3 * (k // 4) + 1, 6 * (k % 4) + 2) for k in range(12)))
+    groups, _ = groups_of(mask)
+    values = torch.rand(2, 3, 12, generator=torch.Generator().manual_seed(0)) + 0.1
+    sets = groups.without_each(values)
+    assert len(sets) == 5
+    torch.testing.assert_close(sum(sets), 4 * values)  # type: ignore[arg-type]
+    assert not groups.of_own(sets).any()
+    torch.testing.assert_close(groups.of_own([values * k for k in range(5)]), values * (groups.strokes % 5)[:, None])
+
+
+def test_a_single_stroke_is_not_left_out_nor_are_all_strokes_of_an_image() -> None:
+    assert not groups_of(box(2, 3, 4, 2, size=DOTTED))[0].without_each(torch.ones(1, 1, 8))
+    mask = torch.cat([dots((2, 3), (9, 20)), dots((9, 20))])
+    groups, places = groups_of(mask)
+    weights = mask.flatten(2)[:, :, places]
+    first, second = groups.weights_without_each(weights)
+    assert first.squeeze(1).tolist() == [[0, 1], [0, 1]]
+    assert second.squeeze(1).tolist() == [[1, 0], [0, 1]]

@@ -123,7 +123,7 @@ def test_gradients() -> None:
 def test_tiles_are_as_in_memory(tile_rows: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sampling, "CHUNK", 300)
     monkeypatch.setattr("nlfilter_torch.photo.picture.pictures.STATISTICS_PIXELS", 2500)
-    monkeypatch.setattr(masks, "SOLVED", 5000)
+    monkeypatch.setattr(masks, "SOLVED_PIXELS", 5000)
     image = colour("coffee", 110, 130)
     front, back = box(50, 50, 8, 12, size=(110, 130)), box(4, 8, 8, 12, size=(110, 130))
     wanted = region_mask(image, front, back, num_landmarks=40)
@@ -138,7 +138,7 @@ def test_masks_of_a_reduced_picture_follow_the_borders_of_the_large_one(monkeypa
     image, inside = square(96, 112)
     scribble, ground = box(44, 50, 6, 10, size=(96, 112)), box(6, 6, 6, 10, size=(96, 112))
     whole = region_mask(image, scribble, ground)
-    monkeypatch.setattr(masks, "SOLVED", 96 * 112 // 4)
+    monkeypatch.setattr(masks, "SOLVED_PIXELS", 96 * 112 // 4)
     mask = region_mask(image, scribble, ground)
     assert (mask - inside).abs().mean() < 0.02
     assert ((mask > 0.5) == (inside > 0.5)).float().mean() > 0.99

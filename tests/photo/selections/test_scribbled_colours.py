@@ -16,6 +16,7 @@ from nlfilter_torch.photo.selections.scribbled_colours import (
     every_nth,
     linked_evenly,
     outwards,
+    trimap_share,
 )
 from tests.problems import noise
 
@@ -141,3 +142,12 @@ def test_each_worker_sums_densities_over_blocks_of_its_own(
         assert shared == []  # no threads are started for a single block
     else:
         assert [block.stop - block.start for block in shared[0]] == lengths
+
+
+def test_scribbles_that_leave_little_open_are_a_trimap() -> None:
+    inside, outside = torch.zeros(3, 10, 10), torch.zeros(3, 10, 10)
+    inside[0, :2], outside[0, -1:] = 1, 1
+    inside[1, :3], outside[1, -4:] = 0.5, 1
+    inside[2] = 1  # no side to tell it from
+    shares = trimap_share(torch.stack([inside, outside], dim=1).flatten(2))
+    assert shares.tolist() == [0, 1, 0]

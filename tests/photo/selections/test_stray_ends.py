@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from nlfilter_torch.photo.selections.stroke_ends import Slices, distances_along, stray_runs
+from nlfilter_torch.photo.selections.stray import Slices, distances_along, stray_runs
 
 LENGTH, WIDTH = 60, 5
 RED, GREEN, WHITE = (0.3, 0.5, 0.4), (0.25, -0.4, 0.3), (0.5, 0.0, 0.0)

@@ -1,9 +1,17 @@
-"""Closed-form matting (Levin, Lischinski and Weiss, 2008), from an initial mask.
+"""Alignment of rough masks with the borders of a picture, by two solves on a pyramid.
 
-In every small window the mask is a linear function of the colour, which models hair and soft borders. These functions
-also give the mask of any pixel of a larger picture (:class:`LinearMasks`).
+The random walker (Grady, 2006), with the rough mask as prior, gives a soft mask that changes along borders. It
+minimises ``sum_ij w_ij (a_i - a_j)^2 + sum_i c_i (a_i - t_i)^2`` over pixels and their eight neighbours, with weights w
+that decrease with the difference in colour, a rough mask t and confidences c in it. A few Jacobi steps on each level
+solve it approximately.
+
+Closed-form matting (Levin, Lischinski and Weiss, 2008) starts from there. In every small window the mask is a linear
+function of the colour, which models hair and soft borders. These functions also give the mask of any pixel of a larger
+picture (:class:`LinearMasks`).
 """
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -13,13 +21,128 @@ from torch import Tensor
 
 from nlfilter_torch.core.workers import in_order, single_threaded, threads_for
 from nlfilter_torch.photo.picture.colour import dot
-from nlfilter_torch.photo.selections.pyramid import doubled, halved, pyramid_levels
-from nlfilter_torch.photo.selections.trimap import by_trimap
+from nlfilter_torch.photo.picture.resizing import block_means
+from nlfilter_torch.photo.selections.scribbled_colours import by_trimap
+
+COARSEST = 48  # minimum short side of the coarsest level, in pixels
+MOST_HALVINGS = 4  # maximum number of reduced levels
+
+
+def pyramid_levels(short: int) -> int:
+    """Number of times a picture with that short side is halved."""
+    return max(0, min(MOST_HALVINGS, int(math.log2(max(short / COARSEST, 1)))))
+
+
+def halved(planes: Tensor, levels: int) -> list[Tensor]:
+    """A pyramid of planes (B, C, H, W), each level half the size, rounded up."""
+    pyramid = [planes]
+    for _ in range(levels):
+        pyramid.append(block_means(pyramid[-1], 2))
+    return pyramid
+
+
+def doubled(planes: Tensor, like: Tensor) -> Tensor:
+    """Planes of one level, enlarged to the next finer level, which has the size of ``like``."""
+    return F.interpolate(planes, like.shape[-2:], mode="bilinear", align_corners=False)
+
+
+OFFSETS = ((0, 1), (1, 0), (1, 1), (1, -1))  # (row, column) offsets to half of the neighbours, so each pair occurs once
+
+Slices = tuple[slice, slice]
+
+
+def _sides(offset: tuple[int, int]) -> tuple[Slices, Slices]:
+    """Slices of the pixels that have a neighbour at ``offset``, and of these neighbours."""
+    down, right = offset
+    here = (slice(None, -down or None), slice(1, None) if right < 0 else slice(None, -right or None))
+    there = (slice(down, None), slice(None, -1) if right < 0 else slice(right, None))
+    return here, there
+
+
+NEIGHBOURS = tuple(_sides(offset) for offset in OFFSETS)
+PADDING = ((0, 1, 0, 0), (0, 0, 0, 1), (0, 1, 0, 1), (1, 0, 0, 1))  # from pixels with such a neighbour to all pixels
+
+
+def neighbour_weights(guide: Tensor, weight: Callable[[Tensor], Tensor]) -> Tensor:
+    """Weights (B, 4, H, W) of each pixel of a guide with its neighbours at :data:`OFFSETS`, 0 where there is none.
+
+    ``weight`` is a function of squared distances (B, h, w), summed over the channels.
+    """
+    weights = []
+    for (here, there), padding in zip(NEIGHBOURS, PADDING, strict=True):
+        distance = (guide[..., *here] - guide[..., *there]).square().sum(1)
+        weights.append(F.pad(weight(distance), padding))
+    return torch.stack(weights, dim=1)
+
+
+JACOBI_STEPS = (2, 4, 8)  # Jacobi steps per level, finest first; the last number is for all coarser levels
+STEEPNESS = 300.0  # decay of the weights with the mean squared difference of the channels
+MIN_WEIGHT = 1e-4
+REFERENCE = 112  # short side, in pixels, for which the confidences were chosen
+
+
+def solve_mask(image: Tensor, rough: Tensor, confidence: Tensor) -> Tensor:
+    """Solve for soft masks (B, K, H, W).
+
+    Args:
+        image: (B, C, H, W), C = 1 or 3.
+        rough: t, (B, K, H, W).
+        confidence: c, (B, K, H, W), for a short side of at most :data:`REFERENCE` pixels; rescaled for larger pictures.
+    """
+    height, width = image.shape[-2:]
+    short = min(height, width)
+    levels = pyramid_levels(short)
+    planes = torch.cat([image, confidence * rough, confidence], dim=1)
+    scale = min(1.0, REFERENCE / short) ** 2
+    count, channels = rough.shape[1], image.shape[1]
+    coarser: Tensor | None = None
+    for level, planes_of_level in reversed(list(enumerate(halved(planes, levels)))):
+        colours, target, trust = planes_of_level.split([channels, count, count], dim=1)
+        area = scale * 4**level
+        target, trust = area * target, area * trust
+        mask = target / trust if coarser is None else doubled(coarser, planes_of_level)
+        weights = neighbour_weights(colours, partial(_weight, steepness=STEEPNESS / channels))
+        steps = JACOBI_STEPS[-1 if level == levels else min(level, len(JACOBI_STEPS) - 1)]
+        coarser = jacobi(mask, target, trust, weights, steps)
+    assert coarser is not None  # for mypy
+    return coarser.clamp(0.0, 1.0)
+
+
+def _weight(squared: Tensor, steepness: float) -> Tensor:
+    """Weight of neighbours whose colours have these squared distances."""
+    return torch.exp(-steepness * squared) + MIN_WEIGHT
+
+
+def jacobi(mask: Tensor, target: Tensor, trust: Tensor, weights: Tensor, steps: int) -> Tensor:
+    """Jacobi steps from a mask.
+
+    Args:
+        mask: the start, (B, K, H, W).
+        target: c t, confidence times rough mask.
+        trust: c, the confidence.
+        weights: w, :func:`neighbour_weights`.
+        steps: their number.
+    """
+    total = trust.clone()
+    links = [weights[:, k : k + 1, *here] for k, (here, _) in enumerate(NEIGHBOURS)]
+    for (here, there), weight in zip(NEIGHBOURS, links, strict=True):
+        total[..., *here] += weight
+        total[..., *there] += weight
+    inverse = 1 / total
+    for _ in range(steps):
+        # Not in place: the gradient needs every iterate.
+        following = target.clone()
+        for (here, there), weight in zip(NEIGHBOURS, links, strict=True):
+            following[..., *here].addcmul_(weight, mask[..., *there])
+            following[..., *there].addcmul_(weight, mask[..., *here])
+        mask = following * inverse
+    return mask
+
 
 WINDOW_RADIUS, NOISE = 2, 1e-6  # radius of the windows in which masks are linear in colour; variance of noise
 LINEAR_LEVELS, LINEAR_STEPS = 2, 24  # levels of the pyramid, steps on each
 # Mask values closer than this to 0 or 1 are set to 0 or 1: of a few scribbles, and of a trimap.
-END_MARGIN = (0.1, 0.05)
+CERTAIN_MARGIN = (0.1, 0.05)
 FEWEST_WORKERS = 3  # that solve for one mask each; each takes more than 1.5 times as long as the calling thread alone
 SLOWEST = 0.005  # smallest eigenvalue that the steps damp
 # Confidence in a rough mask of 0 or 1, and in scribbles.
@@ -146,18 +269,18 @@ def _solve_levels(models: list[LinearMasks], planes: Tensor, trimap: Tensor) -> 
         target, trust, first = planes_of_level.chunk(3, dim=1)
         masks = first if coarser is None else doubled(coarser, planes_of_level)
         solved = [
-            damped(model, a, 4**level * t, 4**level * c)
+            chebyshev_steps(model, a, 4**level * t, 4**level * c)
             for a, t, c in zip(masks.split(1, 1), target.split(1, 1), trust.split(1, 1), strict=True)
         ]
         coarser = torch.cat(solved, dim=1)
     assert coarser is not None  # for mypy
     functions = torch.stack([models[0].fit(mask.clamp(0.0, 1.0).double()) for mask in coarser.split(1, 1)], dim=1)
     slopes, constant = functions.tensor_split([-1], dim=2)
-    margin = by_trimap(END_MARGIN, trimap)[:, :, None, None, None]
+    margin = by_trimap(CERTAIN_MARGIN, trimap)[:, :, None, None, None]
     return torch.cat([slopes, constant - margin], dim=2) / (1 - 2 * margin)
 
 
-def damped(model: LinearMasks, mask: Tensor, target: Tensor, trust: Tensor) -> Tensor:
+def chebyshev_steps(model: LinearMasks, mask: Tensor, target: Tensor, trust: Tensor) -> Tensor:
     """Chebyshev steps from a mask (B, 1, H, W) towards ``(1 + c) a = S a + c t``, S being :meth:`LinearMasks.smoothed`.
 
     The eigenvalues of the preconditioned system lie in [0, 1]; error components with an eigenvalue below

@@ -1,5 +1,7 @@
 """Masks painted by hand: exactly 1 under the brush, 0 under the eraser, and as computed elsewhere."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -7,8 +9,8 @@ from nlfilter_torch.photo import defocus, enhance, recolor, region_mask
 from nlfilter_torch.photo.picture.drawn import Drawn
 from nlfilter_torch.photo.picture.in_memory import InMemory
 from nlfilter_torch.photo.picture.source import Fitted
-from nlfilter_torch.photo.selections.by_hand import ByHand, opaque
 from nlfilter_torch.photo.selections.mask import RegionMask
+from nlfilter_torch.photo.selections.painted import ByHand, Painted, opaque
 from tests.problems import box, noise, paint
 from tests.streams import settings_of
 
@@ -161,3 +163,63 @@ def test_an_edit_needs_something_that_is_painted(image: torch.Tensor) -> None:
         recolor(image, image, SCRIBBLE, added=BRUSH)
     with pytest.raises(ValueError, match="removed must be given together with regions"):
         enhance(image, torch.ones(3), removed=ERASER)
+
+
+SMALL = (24, 32)
+STROKE, DAB = box(4, 4, 5, 9, size=SMALL), box(16, 10, 4, 12, size=SMALL)
+EMPTY = torch.zeros(1, 1, *SMALL)
+IMAGE = noise(1, 3, *SMALL, dtype=torch.float32)
+RED, BLUE = (paint(*rgb, torch.ones_like(DAB)) for rgb in ((1, 0, 0), (0, 0, 1)))
+
+
+def read(images: torch.Tensor, mask: torch.Tensor, added: torch.Tensor | None) -> Painted | None:
+    colours = RED.expand(len(images), -1, -1, -1)
+    masks = {"stroke_mask": mask} if added is None else {"stroke_mask": mask, "added": added}
+    return Painted.of(InMemory(images), Drawn(masks, colours))
+
+
+def test_each_colour_has_its_pixels_and_the_mean_under_its_strokes() -> None:
+    painted = read(IMAGE, STROKE, torch.cat([torch.where(STROKE > 0, RED, BLUE), STROKE + DAB], dim=1))
+    assert painted is not None
+    shown, valid, groups = painted.grouped(matches=True)
+    order = shown[0, :, 0].argsort(descending=True)  # red first
+    torch.testing.assert_close(shown[0, order], torch.eye(3)[[0, 2]])
+    assert valid.all()
+    luminance, chroma = groups.means(SMALL)
+    for number, mask in zip(order, (STROKE, DAB), strict=True):
+        wanted = (IMAGE * mask).sum((0, 2, 3)) / mask.sum()
+        torch.testing.assert_close(luminance[0, number] + chroma[0, number], wanted)
+    by_hand = groups.by_hand(InMemory(IMAGE), None)
+    assert by_hand is not None
+    masks = by_hand.over(torch.zeros(1, 2, *SMALL), InMemory(IMAGE))
+    assert torch.equal(masks[:, order], torch.cat([STROKE, DAB], dim=1))
+    erased = replace(groups, on_mask=None).by_hand(InMemory(IMAGE), DAB)  # an eraser alone, for both colours
+    assert erased is not None
+    assert erased.count == 2
+
+
+def test_what_is_painted_depends_on_the_weights_alone() -> None:
+    nothing = torch.cat([BLUE, EMPTY], dim=1)
+    for added in (nothing, nothing.clone().requires_grad_()):
+        assert read(IMAGE, EMPTY, added) is None
+        assert torch.equal(recolor(IMAGE, None, None, added=added), IMAGE)
+    painted = read(IMAGE, STROKE, nothing.requires_grad_())
+    assert painted is not None
+    assert painted.on_mask is None
+    assert len(painted.marks) == 1
+
+
+def test_a_picture_of_a_batch_without_paint_stays_as_it_is() -> None:
+    images = torch.cat([IMAGE, IMAGE]).requires_grad_()
+    added = torch.cat([BLUE.expand(2, -1, -1, -1), torch.cat([DAB, EMPTY])], dim=1).requires_grad_()
+    edited = recolor(images, None, None, added=added, brightness=0.5)
+    assert torch.equal(edited[1:], IMAGE)
+    torch.testing.assert_close(edited[:1], recolor(IMAGE, None, None, added=added[:1], brightness=0.5))
+    edited.square().sum().backward()
+    for tensor in (images, added):
+        assert tensor.grad is not None
+        assert tensor.grad.isfinite().all()
+    strokes = torch.cat([STROKE, EMPTY])
+    both = recolor(images.detach(), RED, strokes, added=torch.zeros(2, 4, *SMALL), num_landmarks=20)
+    assert torch.equal(both[1:], IMAGE)
+    assert not torch.equal(both[:1], IMAGE)
