@@ -17,9 +17,9 @@ from nlfilter_torch.photo.picture.drawn import Drawn, M
 from nlfilter_torch.photo.picture.in_memory import edit_image
 from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles
 from nlfilter_torch.photo.picture.source import Fitted, Source
+from nlfilter_torch.photo.selections.by_hand import ByHand, check_drawn
 from nlfilter_torch.photo.selections.connected import Extent
 from nlfilter_torch.photo.selections.mask import ObjectEdit, background_of, fit_regions
-from nlfilter_torch.photo.selections.painted import ByHand, check_drawn
 
 Aperture = Literal["disc", "gaussian"]
 

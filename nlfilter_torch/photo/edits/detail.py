@@ -39,9 +39,9 @@ from nlfilter_torch.photo.picture.pixels import corner, whole_image
 from nlfilter_torch.photo.picture.resizing import enlarged
 from nlfilter_torch.photo.picture.source import Fitted, Guide, Pixels, Planes, Source, luminance
 from nlfilter_torch.photo.picture.viewing import balance, enlarged_change, fit_change, viewed_size
+from nlfilter_torch.photo.selections.by_hand import ByHand
 from nlfilter_torch.photo.selections.connected import Extent
 from nlfilter_torch.photo.selections.mask import RegionMask, Regions
-from nlfilter_torch.photo.selections.painted import ByHand
 
 Channels = Literal["luminance", "all"]
 

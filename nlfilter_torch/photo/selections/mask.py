@@ -32,9 +32,9 @@ from nlfilter_torch.photo.picture.resizing import enlarged
 from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles, parts_in_blocks
 from nlfilter_torch.photo.picture.source import Fitted, Reduced, Source
 from nlfilter_torch.photo.picture.viewing import viewed_size
+from nlfilter_torch.photo.selections.by_hand import ByHand, check_drawn
 from nlfilter_torch.photo.selections.connected import Extent, connected
 from nlfilter_torch.photo.selections.matting import LinearMasks, linear_mask, linear_models, solve_linear, solve_mask
-from nlfilter_torch.photo.selections.painted import ByHand, check_drawn
 from nlfilter_torch.photo.selections.rough_mask import RoughMasks
 from nlfilter_torch.photo.selections.scribbled_colours import EPSILON, trimap_share
 from nlfilter_torch.photo.selections.stray import without_strays

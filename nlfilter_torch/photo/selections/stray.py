@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from nlfilter_torch.core.torch_internals import is_unreadable
-from nlfilter_torch.photo.picture.in_memory import InMemory
 from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles, blocks_at
+from nlfilter_torch.photo.picture.source import Reduced
 from nlfilter_torch.photo.selections.scribbled_colours import colours_in_lab
 
 # Chosen with benchmarks.scribbles on the choosing set.
@@ -345,7 +345,7 @@ class Grid:
         return numbers
 
 
-def stray_parts(source: InMemory, painted: Tensor) -> Tensor:
+def stray_parts(source: Reduced, painted: Tensor) -> Tensor:
     """The parts (1, 1, H, W) of scribbles (1, 1, H, W) on an image that do not count."""
     scribbles = source.scribbles(painted, None, "scribbles", needed=False)
     return scribbles.weighted(strays(scribbles, source.size).to(source.image)).planes(source)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from nlfilter_torch import region_mask
+from nlfilter_torch.photo import region_mask
 from nlfilter_torch.photo.selections import matting
 from nlfilter_torch.photo.selections.matting import NEIGHBOURS, neighbour_weights
 from tests.problems import box, colour, noise
