@@ -31,7 +31,7 @@ from nlfilter_torch.photo.app import drawing
 from nlfilter_torch.photo.app.closeup import Closeup
 from nlfilter_torch.photo.app.session import Session
 from nlfilter_torch.photo.declared.presets import Recipe
-from nlfilter_torch.photo.files.photographs import Photograph, write_photograph
+from nlfilter_torch.photo.picture.photographs import Photograph, write_photograph
 
 MOVES = 9  # of the sliders of the other edits
 VIEW = (864, 648)  # width and height of the canvas in a window of 1280x800

@@ -9,7 +9,7 @@ from torch import Tensor
 from benchmarks.composites import CHOOSING, REPORTING
 from benchmarks.denoiser_training.free_photographs import photographs
 from benchmarks.photographs import photograph
-from nlfilter_torch.photo.files.photographs import read_photograph
+from nlfilter_torch.photo.picture.photographs import read_photograph
 
 SHIPPED = "scikit-image"
 

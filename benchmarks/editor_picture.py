@@ -13,7 +13,7 @@ import skimage.data
 import torch
 from playwright.sync_api import Browser
 
-from nlfilter_torch.photo.files.photographs import Photograph, write_photograph
+from nlfilter_torch.photo.picture.photographs import Photograph, write_photograph
 from tests.browser import Editor, Tab, by_finger, chromium
 
 QUALITY = 85

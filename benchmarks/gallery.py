@@ -16,7 +16,7 @@ from benchmarks.figures.focus import WIDE, default_map
 from benchmarks.figures.scenes import YELLOW, luminance, marked, painted_over, scene, scribbled, spots, strokes
 from benchmarks.photographs import LETTERS
 from nlfilter_torch.photo import abstract, colorize, defocus, enhance, recolor, region_mask
-from nlfilter_torch.photo.files.photographs import Photograph, write_photograph
+from nlfilter_torch.photo.picture.photographs import Photograph, write_photograph
 from nlfilter_torch.photo.picture.resizing import resize
 from nlfilter_torch.photo.plotting import save_figure, show_images
 

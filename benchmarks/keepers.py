@@ -36,8 +36,8 @@ from nlfilter_torch.photo.declared.presets import Recipe, find_recipe
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.declared.strokes import Stroke
 from nlfilter_torch.photo.edits.applying import apply_recipe
-from nlfilter_torch.photo.files.photographs import Photograph, write_photograph
 from nlfilter_torch.photo.picture.painting import colour_of, mask_of
+from nlfilter_torch.photo.picture.photographs import Photograph, write_photograph
 from nlfilter_torch.photo.picture.resizing import resize
 
 STORED = Path(__file__).with_suffix(".json")

@@ -35,10 +35,10 @@ from benchmarks.mask_peers import PEERS
 from benchmarks.photographs import reduced_to
 from nlfilter_torch.photo import region_mask
 from nlfilter_torch.photo.edits.applying import edit_of, scribbles_of
-from nlfilter_torch.photo.files.photographs import Photograph, write_photograph
 from nlfilter_torch.photo.picture.drawn import Drawn
 from nlfilter_torch.photo.picture.in_memory import edit_image
 from nlfilter_torch.photo.picture.painting import TensorPainter, mask_of
+from nlfilter_torch.photo.picture.photographs import Photograph, write_photograph
 from nlfilter_torch.photo.picture.resizing import resize
 from nlfilter_torch.photo.selections.mask import ObjectEdit
 

@@ -10,7 +10,7 @@ import torch
 import torch.nn.functional as F
 from skimage.transform import resize
 
-from nlfilter_torch.photo.files.photographs import read_photograph
+from nlfilter_torch.photo.picture.photographs import read_photograph
 
 LOADERS = {"motorcycle": lambda: skimage.data.stereo_motorcycle()[0]}
 

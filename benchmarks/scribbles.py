@@ -36,8 +36,8 @@ from benchmarks.photographs import reduced_to
 from benchmarks.recolor import CHANGED, COLOURS, recoloured, tinted
 from benchmarks.training.figures import Figure, table
 from nlfilter_torch.photo import recolor
-from nlfilter_torch.photo.files.photographs import Photograph, write_photograph
 from nlfilter_torch.photo.picture.in_memory import InMemory
+from nlfilter_torch.photo.picture.photographs import Photograph, write_photograph
 from nlfilter_torch.photo.selections.stray import stray_parts
 
 STRAY = 0.2  # of a stroke

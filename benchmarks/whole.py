@@ -25,7 +25,7 @@ from benchmarks import editors
 from nlfilter_torch.photo.declared.parameters import EDITS
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.declared.steps import Step
-from nlfilter_torch.photo.files.photographs import Photograph, write_photograph
+from nlfilter_torch.photo.picture.photographs import Photograph, write_photograph
 
 SCRIBBLE, OTHER = "45%,45%,6%,6%", "5%,5%,6%,6%"
 OPTIONS: dict[str, list[str]] = {

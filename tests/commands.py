@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from nlfilter_torch.photo.cli import main
-from nlfilter_torch.photo.files.photographs import Photograph, write_photograph
+from nlfilter_torch.photo.picture.photographs import Photograph, write_photograph
 
 
 def small_photo(folder: Path) -> Path:

@@ -42,7 +42,7 @@ def session(tmp_path: Path) -> "Session":
     """A session of the editor with a small photograph open: cat.png, in the folder that the session saves to."""
     # Imported here, so that tests of the filter run without the packages that read files.
     from nlfilter_torch.photo.app.session import Session
-    from nlfilter_torch.photo.files.photographs import Photograph, write_photograph
+    from nlfilter_torch.photo.picture.photographs import Photograph, write_photograph
     from tests.problems import cat
 
     write_photograph(Photograph(cat()), tmp_path / "cat.png")

@@ -11,9 +11,9 @@ import torch
 from numpy.typing import NDArray
 from PIL import ExifTags, Image, ImageCms
 
-from nlfilter_torch.photo.files.photographs import Photograph
 from nlfilter_torch.photo.files.rows import open_picture
 from nlfilter_torch.photo.files.tables import POINTERS, Tables
+from nlfilter_torch.photo.picture.photographs import Photograph
 from nlfilter_torch.photo.picture.pictures import stored_as
 
 PROFILE = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()

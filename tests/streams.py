@@ -9,12 +9,13 @@ import numpy as np
 from torch import Tensor
 
 from nlfilter_torch.photo import colorize, enhance, recolor, region_mask
+from nlfilter_torch.photo.declared.rows import RowSource
 from nlfilter_torch.photo.edits.colorize import Colorize
 from nlfilter_torch.photo.edits.detail import Detail
 from nlfilter_torch.photo.edits.recolor import Recolor
 from nlfilter_torch.photo.picture.drawn import Drawn
 from nlfilter_torch.photo.picture.edit import PhotoEdit
-from nlfilter_torch.photo.picture.pictures import Picture, RowSource, RowTarget
+from nlfilter_torch.photo.picture.pictures import Picture, RowTarget
 from nlfilter_torch.photo.picture.sampling import in_silence
 from nlfilter_torch.photo.picture.tiled import Tiled
 from nlfilter_torch.photo.picture.tiles import SAMPLE, Passes, check_target, fill

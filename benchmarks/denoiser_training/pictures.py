@@ -13,7 +13,7 @@ from torch import Tensor
 
 from benchmarks.denoiser_training.draws import Draws
 from benchmarks.photographs import photograph
-from nlfilter_torch.photo.files.photographs import read_photograph
+from nlfilter_torch.photo.picture.photographs import read_photograph
 
 #: How often each picture of scikit-image is drawn; photographs more often than textures and drawings.
 PICTURES = {

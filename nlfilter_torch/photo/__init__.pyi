@@ -17,13 +17,13 @@ from .edits.recolor import recolor as recolor
 from .edits.sharpen import sharpen as sharpen
 from .edits.streaming import stream as stream
 from .edits.tone import adjust_tone as adjust_tone
-from .files.photographs import Photograph as Photograph
-from .files.photographs import read_photograph as read_photograph
-from .files.photographs import write_photograph as write_photograph
 from .look_fitting.fit_look import FittedLook as FittedLook
 from .look_fitting.fit_look import fit_look as fit_look
 from .looks.look_module import Look as Look
 from .picture.drawn import Drawn as Drawn
+from .picture.photographs import Photograph as Photograph
+from .picture.photographs import read_photograph as read_photograph
+from .picture.photographs import write_photograph as write_photograph
 from .plotting import plot_eigenvalues as plot_eigenvalues
 from .plotting import plot_response as plot_response
 from .plotting import save_figure as save_figure

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from benchmarks.real_noise import listed, main, pairs_of, true_levels
-from nlfilter_torch.photo.files.photographs import Photograph, write_photograph
+from nlfilter_torch.photo.picture.photographs import Photograph, write_photograph
 from tests.problems import colour
 
 

@@ -12,7 +12,7 @@ from benchmarks.training import __main__ as program
 from benchmarks.training.figures import Figure, table
 from benchmarks.training.held_out import NUMBERS, PIECES, held_out, large
 from benchmarks.training.styles import StyleNetwork, style
-from nlfilter_torch.photo.files.photographs import Photograph, write_photograph
+from nlfilter_torch.photo.picture.photographs import Photograph, write_photograph
 
 
 @pytest.mark.parametrize(

@@ -19,9 +19,9 @@ import zarr
 from PIL import Image
 
 from nlfilter_torch.photo.cli import main
-from nlfilter_torch.photo.files.photographs import Photograph, read_photograph, write_photograph
 from nlfilter_torch.photo.files.tiff import TiffRows
 from nlfilter_torch.photo.picture import pictures, tiles
+from nlfilter_torch.photo.picture.photographs import Photograph, read_photograph, write_photograph
 from tests.files import PROFILE, Array, cat
 from tests.ranks import forked
 

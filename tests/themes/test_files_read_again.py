@@ -12,9 +12,10 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from nlfilter_torch.photo.files.extras import Extras
-from nlfilter_torch.photo.files.photographs import DEPTHS, SUFFIXES, Photograph, read_photograph, write_photograph
+from nlfilter_torch.photo.files.formats import DEPTHS, SUFFIXES
+from nlfilter_torch.photo.files.metadata import Extras
 from nlfilter_torch.photo.files.rows import open_picture, write_picture
+from nlfilter_torch.photo.picture.photographs import Photograph, read_photograph, write_photograph
 from tests.files import PROFILE, fields_of, rows_of
 
 LOSSY = ("JPEG", "AVIF")

@@ -11,12 +11,12 @@ PACKAGE = "nlfilter_torch"
 ROOMS = ("version", "core", "operator", "filtering", "nn", "photo")
 PHOTO_ROOMS = (
     "declared",
+    "files",
     "picture",
     "selections",
     "looks",
     "edits",
     "look_fitting",
-    "files",
     "plotting",
     "app",
     "cli",

@@ -12,7 +12,7 @@ import torch
 from PIL import Image
 
 from nlfilter_torch.__main__ import main
-from nlfilter_torch.photo.files.photographs import Photograph, check_output, read_photograph, write_photograph
+from nlfilter_torch.photo.picture.photographs import Photograph, check_output, read_photograph, write_photograph
 
 
 @pytest.fixture

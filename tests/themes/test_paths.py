@@ -10,7 +10,7 @@ import pytest
 import tifffile
 
 from nlfilter_torch.photo.cli import main
-from nlfilter_torch.photo.files.photographs import read_photograph
+from nlfilter_torch.photo.picture.photographs import read_photograph
 from tests.commands import refused, small_photo
 
 

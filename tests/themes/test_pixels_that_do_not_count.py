@@ -14,10 +14,10 @@ from torch import Tensor
 from nlfilter_torch.operator.hidden import fill_nearby
 from nlfilter_torch.photo import Recipe, Step, apply_recipe, stream
 from nlfilter_torch.photo.cli import editing, main
+from nlfilter_torch.photo.declared.rows import lacks_data
 from nlfilter_torch.photo.edits.noise import noise_of, profile_of
-from nlfilter_torch.photo.files import read_photograph, write_photograph
 from nlfilter_torch.photo.picture.in_memory import InMemory
-from nlfilter_torch.photo.picture.pictures import NodataRows, lacks_data
+from nlfilter_torch.photo.picture.photographs import read_photograph, write_photograph
 from nlfilter_torch.photo.picture.pixels import whole_image
 
 Levels = NDArray[np.uint8]
@@ -160,18 +160,6 @@ def test_no_pixel_with_data_gets_the_value_of_those_without(tmp_path: Path) -> N
     after = tifffile.imread(tmp_path / "out.tif")
     assert (after[:3] == 0).all()
     assert (after[3:] == 1).all()
-
-
-def test_what_lacks_data() -> None:
-    colours = np.array([[[0, 0, 0], [0, 5, 0]]], np.uint8)
-    assert lacks_data(colours, 0.0).tolist() == [[True, False]]
-    assert lacks_data(colours.astype(np.float32), 0.0).tolist() == [[True, True]]
-    assert not lacks_data(colours, -9999.0).any()
-    assert not lacks_data(colours.astype(np.float32), -1.8e308).any()
-    assert not lacks_data(colours, float("nan")).any()
-    rows = NodataRows(colours, 0.0)
-    assert rows.shape == (1, 2, 4)
-    assert rows[0:1][..., 3].tolist() == [[0, 255]]
 
 
 def test_nan_without_a_tag_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

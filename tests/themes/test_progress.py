@@ -6,7 +6,7 @@ import pytest
 
 from nlfilter_torch.photo.app.session import Session
 from nlfilter_torch.photo.cli import editing, main
-from nlfilter_torch.photo.files.photographs import Photograph, read_photograph, write_photograph
+from nlfilter_torch.photo.picture.photographs import Photograph, read_photograph, write_photograph
 from tests.problems import LINE, cat, difference
 
 

@@ -22,7 +22,7 @@ import tifffile
 from PIL import Image, ImageCms, PngImagePlugin
 
 from nlfilter_torch.photo.cli import main as command
-from nlfilter_torch.photo.files.photographs import Photograph, read_photograph
+from nlfilter_torch.photo.picture.photographs import Photograph, read_photograph
 from tests.files import camera_block, fields_of
 
 PROFILE = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()

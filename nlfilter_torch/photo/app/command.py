@@ -37,7 +37,7 @@ def app(image: Image = None, out: Out = None, host: Host = "127.0.0.1", port: Po
 
     Example: `nlfilter-torch app photo.jpg`
     """
-    from nlfilter_torch.photo.files.photographs import first_bytes
+    from nlfilter_torch.photo.files.formats import first_bytes
     from nlfilter_torch.photo.files.writing import check_folder
 
     if image is not None:

@@ -12,8 +12,7 @@ from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.declared.strokes import Stroke
 from nlfilter_torch.photo.edits.applying import left_by_crop
 from nlfilter_torch.photo.edits.parts import Parts, Rectangle
-from nlfilter_torch.photo.files.developed import cut_photograph, lit_photograph
-from nlfilter_torch.photo.files.photographs import Photograph, check_memory
+from nlfilter_torch.photo.files.formats import check_memory
 from nlfilter_torch.photo.picture.developing import (
     develop_image,
     in_light,
@@ -24,6 +23,7 @@ from nlfilter_torch.photo.picture.developing import (
 )
 from nlfilter_torch.photo.picture.in_memory import InMemory
 from nlfilter_torch.photo.picture.painting import TensorPainter
+from nlfilter_torch.photo.picture.photographs import Photograph, cut_photograph, lit_photograph
 from nlfilter_torch.photo.picture.resizing import resize
 
 DEVELOPING = -1  # the place before all steps, of a slider that moves

@@ -25,20 +25,11 @@ from nlfilter_torch.photo.edits.parts import Parts, Rectangle
 from nlfilter_torch.photo.edits.recipe import edit_rows
 from nlfilter_torch.photo.files import tiff
 from nlfilter_torch.photo.files.exif import read_upright
-from nlfilter_torch.photo.files.photographs import (
-    BITS,
-    DEPTHS,
-    SUFFIXES,
-    Photograph,
-    check_memory,
-    check_output,
-    first_bytes,
-    read_photograph,
-    write_photograph,
-)
+from nlfilter_torch.photo.files.formats import BITS, DEPTHS, SUFFIXES, check_memory, first_bytes
 from nlfilter_torch.photo.files.rows import TILED, WHOLE, usual_memory
 from nlfilter_torch.photo.files.writing import open_beside
 from nlfilter_torch.photo.picture.developing import balance_of
+from nlfilter_torch.photo.picture.photographs import Photograph, check_output, read_photograph, write_photograph
 from nlfilter_torch.photo.picture.resizing import resize
 from nlfilter_torch.photo.picture.sampling import Report, in_silence
 from nlfilter_torch.photo.picture.tiles import Passes, Statistics

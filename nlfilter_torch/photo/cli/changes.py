@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from nlfilter_torch.photo.cli.options import LEVELS
-from nlfilter_torch.photo.files.photographs import Depth, Photograph, write_photograph
+from nlfilter_torch.photo.declared.rows import WHITE, is_hidden
+from nlfilter_torch.photo.files.formats import Depth
 from nlfilter_torch.photo.picture.edit import Rows
-from nlfilter_torch.photo.picture.pictures import WHITE, is_hidden
+from nlfilter_torch.photo.picture.photographs import Photograph, write_photograph
 from nlfilter_torch.photo.picture.tiles import Tiling
 
 MAP_DEPTH: Depth = "uint16"

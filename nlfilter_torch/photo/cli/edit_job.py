@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -17,14 +17,15 @@ from nlfilter_torch.photo.cli.editing import Job, pixels_of, rows_of
 from nlfilter_torch.photo.cli.scribbles import Open, Overlay, ScribbleOptions, at_once, of_edit
 from nlfilter_torch.photo.cli.showing import Scribbled
 from nlfilter_torch.photo.declared.development import AS_IT_IS, Development
+from nlfilter_torch.photo.declared.rows import RowSource
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.edits.applying import edit_of
-from nlfilter_torch.photo.files.photographs import Photograph
 from nlfilter_torch.photo.files.rows import StoredPicture, open_picture
 from nlfilter_torch.photo.picture.drawn import Drawn, M
 from nlfilter_torch.photo.picture.edit import PhotoEdit, Rows
 from nlfilter_torch.photo.picture.in_memory import InMemory, edit_image, fit_edit
-from nlfilter_torch.photo.picture.pictures import Picture, RowSource, stored_as
+from nlfilter_torch.photo.picture.photographs import Photograph
+from nlfilter_torch.photo.picture.pictures import Picture, stored_as
 from nlfilter_torch.photo.picture.source import Source, seeded
 from nlfilter_torch.photo.picture.tiled import Tiled
 from nlfilter_torch.photo.picture.tiles import Tiling
@@ -119,7 +120,7 @@ class EditJob:
         with single_threaded(tiled.passes.workers(1)):
             fitted = fit_edit(edit, tiled, as_rows(drawn))
         with tiled.tiling(fitted) as whole:
-            meter, tiling = ChangeMeter(), job.picture.unmarked(whole)
+            meter, tiling = ChangeMeter(), replace(whole, nodata=job.picture.nodata)
             yield meter.watched(tiling) if edit.reports_change else tiling
         if edit.reports_change:
             typer.echo(edit.summary(meter.change))

@@ -16,17 +16,7 @@ from nlfilter_torch.photo.cli.changes import MAP_DEPTH
 from nlfilter_torch.photo.cli.progress import stages, steps
 from nlfilter_torch.photo.declared.development import Development
 from nlfilter_torch.photo.declared.steps import Step, working_bytes
-from nlfilter_torch.photo.files.developed import develop_photograph
-from nlfilter_torch.photo.files.photographs import (
-    Photograph,
-    TooLarge,
-    check_depth,
-    check_memory,
-    check_output,
-    check_type,
-    read_photograph,
-    write_photograph,
-)
+from nlfilter_torch.photo.files.formats import TooLarge, check_depth, check_memory, check_type
 from nlfilter_torch.photo.files.rows import (
     TILED,
     WHOLE,
@@ -38,6 +28,13 @@ from nlfilter_torch.photo.files.rows import (
     write_picture,
 )
 from nlfilter_torch.photo.picture.edit import Rows
+from nlfilter_torch.photo.picture.photographs import (
+    Photograph,
+    check_output,
+    develop_photograph,
+    read_photograph,
+    write_photograph,
+)
 from nlfilter_torch.photo.picture.pictures import Picture, mask_plane
 from nlfilter_torch.photo.picture.sampling import Report
 from nlfilter_torch.photo.picture.tiles import Passes, Processes, Statistics, Tiling
@@ -345,4 +342,4 @@ def edit_file(
         report = stack.enter_context(stages())
         job = Job(picture, stored, allowed - picture.cached, allowed_memory(memory, TILED), report, stack, processes)
         with edit.tiling(job) as tiling:
-            write_picture(Path(target), tiling, stored, like, quality)
+            write_picture(Path(target), tiling, stored, like, quality, tiling.fill)

@@ -19,12 +19,13 @@ from nlfilter_torch.photo.declared.colour_tables import CUBE_NODES, HALD_LEVEL, 
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.edits.applying import apply_step
 from nlfilter_torch.photo.edits.colour_part import colour_part, colour_table, table_error
-from nlfilter_torch.photo.files.photographs import Photograph, check_type, read_photograph, write_photograph
+from nlfilter_torch.photo.files.formats import check_type
 from nlfilter_torch.photo.files.writing import check_file, open_beside
 from nlfilter_torch.photo.look_fitting.alignment import align, explained, inside_frame
 from nlfilter_torch.photo.look_fitting.fit_look import FittedLook, fit_look
 from nlfilter_torch.photo.look_fitting.pairs import check_belong
 from nlfilter_torch.photo.picture.changes import blend_edited
+from nlfilter_torch.photo.picture.photographs import Photograph, read_photograph, write_photograph
 from nlfilter_torch.photo.picture.resizing import resize
 from nlfilter_torch.photo.picture.viewing import viewed_size
 

@@ -17,7 +17,7 @@ from pathlib import Path
 
 from nlfilter_torch.photo.cli.options import NOTE
 from nlfilter_torch.photo.cli.workers import DEATHS, Workers, is_death, worker_pool
-from nlfilter_torch.photo.files.photographs import SUFFIXES
+from nlfilter_torch.photo.files.formats import SUFFIXES
 from nlfilter_torch.photo.files.writing import check_file, check_folder, open_beside, remove_stale
 
 RECORD = ".nlfilter-batch.json"  # in the output folder: the settings of the files there

@@ -24,7 +24,7 @@ from nlfilter_torch.photo.declared.presets import PRESETS, Recipe
 
 if TYPE_CHECKING:
     from nlfilter_torch.photo.edits.film import FilmEdit, FrameArray
-    from nlfilter_torch.photo.files.photographs import Photograph
+    from nlfilter_torch.photo.picture.photographs import Photograph
     from nlfilter_torch.photo.picture.tiles import Passes
 
 #: Edits without scribbles.
@@ -218,7 +218,7 @@ class FrameReader:
 
     def __call__(self, path: Path) -> "tuple[Photograph, FrameArray]":
         """A photograph, and its pixels (H, W, C)."""
-        from nlfilter_torch.photo.files.photographs import read_photograph
+        from nlfilter_torch.photo.picture.photographs import read_photograph
 
         photograph = read_photograph(path, bytes_per_pixel=BYTES_PER_PIXEL)
         rows = photograph.pixels[0].permute(1, 2, 0).float().contiguous().numpy()
@@ -243,7 +243,7 @@ class EditedFrames:
     def prepare(self, photograph: "Photograph", name: str, paths: list[Path]) -> None:
         """Create the folder, record the names of all frames there, and check that it can hold a photograph."""
         from nlfilter_torch.photo.cli.folders import record_written
-        from nlfilter_torch.photo.files.photographs import check_output
+        from nlfilter_torch.photo.picture.photographs import check_output
 
         self._folder.mkdir(exist_ok=True)
         try:
@@ -260,6 +260,6 @@ class EditedFrames:
         """Write a photograph with other pixels (H, W, C)."""
         import torch
 
-        from nlfilter_torch.photo.files.photographs import write_photograph
+        from nlfilter_torch.photo.picture.photographs import write_photograph
 
         write_photograph(photograph.with_pixels(torch.from_numpy(rows).permute(2, 0, 1)[None]), self._folder / name)

@@ -59,8 +59,8 @@ def inspect(source: options.Source, folder: Folder, seed: options.Seed = 0, **va
     from nlfilter_torch.operator.features import reduce_channels
     from nlfilter_torch.photo.cli.editing import viewed_within_memory
     from nlfilter_torch.photo.cli.progress import steps
-    from nlfilter_torch.photo.files.photographs import read_photograph
     from nlfilter_torch.photo.files.writing import check_folder, open_beside
+    from nlfilter_torch.photo.picture.photographs import read_photograph
     from nlfilter_torch.photo.picture.resizing import resize
     from nlfilter_torch.photo.plotting import plot_eigenvalues, plot_response, save_figure, show_eigenvectors
 

@@ -16,21 +16,14 @@ from nlfilter_torch.photo.cli.showing import Scribbled, tell_selected
 from nlfilter_torch.photo.declared.json_values import Value
 from nlfilter_torch.photo.declared.parameters import MASK
 from nlfilter_torch.photo.declared.steps import working_bytes
-from nlfilter_torch.photo.files.decoded import NO_METADATA
-from nlfilter_torch.photo.files.pfm import PFM, write_pfm
-from nlfilter_torch.photo.files.photographs import (
-    Depth,
-    Photograph,
-    check_depth,
-    check_memory,
-    check_output,
-    write_photograph,
-)
+from nlfilter_torch.photo.files.formats import PFM, Depth, check_depth, check_memory, write_pfm
+from nlfilter_torch.photo.files.metadata import NO_METADATA
 from nlfilter_torch.photo.files.rows import TILED, StoredPicture, check_place, open_picture, write_picture
 from nlfilter_torch.photo.files.writing import check_file
 from nlfilter_torch.photo.picture.drawn import Drawn, M
 from nlfilter_torch.photo.picture.edit import Rows
 from nlfilter_torch.photo.picture.in_memory import InMemory
+from nlfilter_torch.photo.picture.photographs import Photograph, check_output, write_photograph
 from nlfilter_torch.photo.picture.pictures import Picture
 from nlfilter_torch.photo.picture.seen import Seen, of_picture, range_of
 from nlfilter_torch.photo.picture.source import Fitted, Source, seeded
@@ -147,7 +140,8 @@ class MaskJob:
             write_pfm(self.target, tiled.all(fitted)[0, 0].float().numpy())
             return
         with tiled.tiling(fitted) as tiling:
-            write_picture(self.target, replace(tiling, transparent=False), self.kind, plain)
+            plane = replace(tiling, transparent=False)
+            write_picture(self.target, plane, self.kind, plain, fill=plane.fill)
 
     def _edit_at(self, size: tuple[int, int], stride: float = 1) -> RegionMask:
         """The settings for a picture (H, W), sampled at every so many pixels of the photograph."""

@@ -14,7 +14,7 @@ from nlfilter_torch.photo.declared.declaration import FILTER_PANEL, GAINS, MAX_S
 from nlfilter_torch.photo.declared.development import Crop, check_value
 
 if TYPE_CHECKING:
-    from nlfilter_torch.photo.files.photographs import Depth
+    from nlfilter_torch.photo.files.formats import Depth
 
 FILES_PANEL = "Files and memory"  # section in the help
 LEVELS = 255.0  # grey levels between black and white, whatever the depth of the file

@@ -15,9 +15,9 @@ from pathlib import Path
 from tempfile import gettempdir
 
 from nlfilter_torch.photo.cli.workers import DEATHS, Workers, is_death, worker_pool
+from nlfilter_torch.photo.declared.rows import RowSource
 from nlfilter_torch.photo.files.rows import ZarrRows, write_band, zarr_package
 from nlfilter_torch.photo.files.writing import claimed, part_beside
-from nlfilter_torch.photo.picture.pictures import RowSource
 from nlfilter_torch.photo.picture.tiles import Comparison, Tiling
 
 TASK_PIXELS = 1 << 20  # that a worker computes before it is given others, if there are enough of them

@@ -16,13 +16,13 @@ from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.edits.applying import apply_recipe, edit_of, left_by_crop
 from nlfilter_torch.photo.edits.recipe import edit_regions, edit_tiling
-from nlfilter_torch.photo.files.photographs import Photograph
 from nlfilter_torch.photo.files.rows import StoredPicture
 from nlfilter_torch.photo.picture.changes import blend_edited
 from nlfilter_torch.photo.picture.drawn import M, Painter
 from nlfilter_torch.photo.picture.edit import Rows
 from nlfilter_torch.photo.picture.in_memory import InMemory
 from nlfilter_torch.photo.picture.painting import TensorPainter
+from nlfilter_torch.photo.picture.photographs import Photograph
 from nlfilter_torch.photo.picture.pictures import Picture
 from nlfilter_torch.photo.picture.source import Source
 from nlfilter_torch.photo.picture.tiled import Tiled
@@ -114,7 +114,7 @@ class RecipeJob:
                 recipes = developed.recipes if tiled.counted is None else developed._seen(tiled, RowPainter())
                 whole = edit_tiling(passes, source, recipes[0].steps, self.source)
             with whole as tiling:
-                yield picture.unmarked(tiling)
+                yield replace(tiling, nodata=picture.nodata)
 
     def _masks(self, job: Job) -> list[StoredPicture]:
         """The masks, which are read by rows; raises ValueError if one has another size than the photograph."""

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from nlfilter_torch.photo.cli.options import parse_sliders
 from nlfilter_torch.photo.declared.declaration import Edit, Scribble, ScribbleRole
-from nlfilter_torch.photo.files.photographs import check_depth
+from nlfilter_torch.photo.files.formats import check_depth
 from nlfilter_torch.photo.files.rows import StoredPicture
 from nlfilter_torch.photo.picture.drawn import Drawn
 from nlfilter_torch.photo.picture.pictures import LazyRows, Picture, mask_of, transparency

@@ -18,11 +18,11 @@ from nlfilter_torch.photo.cli.options import note
 from nlfilter_torch.photo.cli.scribbles import Overlay, overlays
 from nlfilter_torch.photo.declared.declaration import Edit
 from nlfilter_torch.photo.declared.presets import Recipe
-from nlfilter_torch.photo.files.photographs import Photograph, write_photograph
 from nlfilter_torch.photo.picture.colour import hundredths_of_lab
 from nlfilter_torch.photo.picture.drawn import Drawn
 from nlfilter_torch.photo.picture.edit import MARKS, PhotoEdit, Rows
 from nlfilter_torch.photo.picture.in_memory import InMemory, edit_image
+from nlfilter_torch.photo.picture.photographs import Photograph, write_photograph
 from nlfilter_torch.photo.selections.scribbled_colours import frame_places
 from nlfilter_torch.photo.selections.stray import stray_parts
 

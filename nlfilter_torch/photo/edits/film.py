@@ -23,10 +23,11 @@ from nlfilter_torch.operator.landmarks import assign_landmarks
 from nlfilter_torch.operator.options import Construction
 from nlfilter_torch.operator.scaling import PixelScaling
 from nlfilter_torch.operator.spectrum import RitzPairs
+from nlfilter_torch.photo.declared.rows import RowSource
 from nlfilter_torch.photo.declared.steps import Step, acting_steps
 from nlfilter_torch.photo.edits.applying import fit_step
 from nlfilter_torch.photo.picture.drawn import Drawn
-from nlfilter_torch.photo.picture.pictures import Picture, RowSource
+from nlfilter_torch.photo.picture.pictures import Picture
 from nlfilter_torch.photo.picture.sampling import CHUNK, ColumnCache, GuidePicture, Pilot
 from nlfilter_torch.photo.picture.source import Fitted, Guide, Planes, Source, seeded
 from nlfilter_torch.photo.picture.statistics import Block, ShiftedSums, Sums

@@ -15,9 +15,10 @@ from torch import Tensor
 
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.core.workers import in_order
+from nlfilter_torch.photo.declared.rows import RowSource
 from nlfilter_torch.photo.declared.steps import Step, acting_steps
 from nlfilter_torch.photo.edits.applying import fit_step, scribbles_of
-from nlfilter_torch.photo.picture.pictures import LazyRows, Picture, RowSource, Tile
+from nlfilter_torch.photo.picture.pictures import LazyRows, Picture, Tile
 from nlfilter_torch.photo.picture.resizing import resized
 from nlfilter_torch.photo.picture.sampling import ColumnCache, GuidePicture, Report, in_silence
 from nlfilter_torch.photo.picture.source import Fitted

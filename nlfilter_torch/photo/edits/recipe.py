@@ -8,10 +8,11 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.core.workers import single_threaded
+from nlfilter_torch.photo.declared.rows import RowSource
 from nlfilter_torch.photo.declared.steps import Step, acting_steps
 from nlfilter_torch.photo.edits.applying import fit_step, scribbles_of
 from nlfilter_torch.photo.picture.changes import blend_edited
-from nlfilter_torch.photo.picture.pictures import Picture, Rows, RowSource, Tile, mask_of
+from nlfilter_torch.photo.picture.pictures import Picture, Rows, Tile, mask_of
 from nlfilter_torch.photo.picture.tiled import Tiled
 from nlfilter_torch.photo.picture.tiled_scribbles import RowPainter
 from nlfilter_torch.photo.picture.tiles import Passes, Tiling, between_steps, inner, tile_by_tile

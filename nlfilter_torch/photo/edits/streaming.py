@@ -4,10 +4,11 @@ import numpy as np
 import torch
 
 from nlfilter_torch.core.workers import single_threaded
+from nlfilter_torch.photo.declared.rows import RowSource
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.edits.applying import fit_step, scribbles_of
 from nlfilter_torch.photo.picture.drawn import Drawn
-from nlfilter_torch.photo.picture.pictures import Picture, RowSource, RowTarget
+from nlfilter_torch.photo.picture.pictures import Picture, RowTarget
 from nlfilter_torch.photo.picture.sampling import Report, in_silence
 from nlfilter_torch.photo.picture.tiled import Tiled
 from nlfilter_torch.photo.picture.tiled_scribbles import RowPainter

@@ -4,7 +4,6 @@ import sys
 import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from mmap import mmap
 from pathlib import Path
 from typing import NamedTuple, Protocol
@@ -12,16 +11,12 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from nlfilter_torch.photo.files.extras import NO_EXTRAS, Extras
+from nlfilter_torch.photo.files.metadata import Metadata, UnhandledImage
 
 if sys.platform == "linux":
     from mmap import MADV_DONTNEED
 
-Channels = NDArray[np.generic]  # (H, W, S), in the dtype of the file
-
-
-class UnhandledImage(ValueError):
-    """A valid image file of an unsupported kind."""
+Stored = NDArray[np.generic]  # (H, W, S), in the dtype of the file
 
 
 @contextmanager
@@ -44,24 +39,6 @@ def quiet() -> Iterator[None]:
         yield
 
 
-@dataclass(frozen=True)
-class Metadata:
-    """What a file says about its picture.
-
-    Attributes:
-        icc: colour profile, or None.
-        exif: EXIF block with orientation 1, or None.
-        extras: the rest.
-    """
-
-    icc: bytes | None = None
-    exif: bytes | None = None
-    extras: Extras = NO_EXTRAS
-
-
-NO_METADATA = Metadata()
-
-
 class Decoded(NamedTuple):
     """The content of an image file.
 
@@ -71,7 +48,7 @@ class Decoded(NamedTuple):
         metadata: what the file says about them once they are upright.
     """
 
-    channels: Channels
+    channels: Stored
     orientation: int
     metadata: Metadata
 
@@ -89,13 +66,13 @@ def release(data: bytes | mmap) -> None:
         data.madvise(MADV_DONTNEED)
 
 
-def bands(rows: Iterable[Channels], height: int) -> Iterator[Channels]:
+def bands(rows: Iterable[Stored], height: int) -> Iterator[Stored]:
     """Regroup rows (h, W, S) into pieces of the same ``height``, the last one possibly shorter.
 
     >>> [len(band) for band in bands([np.zeros((3, 1, 1)), np.zeros((4, 1, 1))], 2)]
     [2, 2, 2, 1]
     """
-    waiting: list[Channels] = []
+    waiting: list[Stored] = []
     for piece in rows:
         waiting.append(piece)
         while sum(map(len, waiting)) >= height:

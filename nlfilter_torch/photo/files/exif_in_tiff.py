@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import BinaryIO
 
 from nlfilter_torch.photo.files.exif import PREFIX, parsed, refreshed
-from nlfilter_torch.photo.files.extras import RESOLUTION, STORAGE, Tag
+from nlfilter_torch.photo.files.metadata import RESOLUTION, STORAGE, Tag
 from nlfilter_torch.photo.files.tables import (
     EXIF,
     GPS,

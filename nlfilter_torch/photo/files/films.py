@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlfilter_torch.core.warning import warn
-from nlfilter_torch.photo.files.photographs import first_bytes
+from nlfilter_torch.photo.files.formats import first_bytes
 from nlfilter_torch.photo.files.writing import check_file, claimed, link_target, part_beside
 
 if TYPE_CHECKING:

@@ -12,10 +12,21 @@ import imagecodecs
 import numpy as np
 from PIL import JpegImagePlugin
 
+from nlfilter_torch.photo.declared.rows import Stored
 from nlfilter_torch.photo.files import exif as exif_tags
-from nlfilter_torch.photo.files import xmp
-from nlfilter_torch.photo.files.decoded import Channels, Metadata, UnhandledImage, bands, quiet
-from nlfilter_torch.photo.files.extras import Extras, Part, sound, turned
+from nlfilter_torch.photo.files.decoded import bands, quiet
+from nlfilter_torch.photo.files.metadata import (
+    GAIN_MAP,
+    MOTION,
+    PICTURES,
+    Extras,
+    Metadata,
+    Part,
+    UnhandledImage,
+    sound,
+    turned,
+    upright_packet,
+)
 
 QUALITY = 95
 XMP_KEY = b"http://ns.adobe.com/xap/1.0/\0"
@@ -34,8 +45,8 @@ BEHIND = 1 << 26  # bytes behind the first picture that are looked at
 THUMBNAILS = (b"8BIM\x04\x0c", b"8BIM\x04\x09")  # of Photoshop
 NAMES = {
     EXTENSION_KEY: "an extension of XMP",
-    b"MPF\0": xmp.PICTURES,
-    b"urn:iso:std:iso:ts:21496:-1": xmp.GAIN_MAP,
+    b"MPF\0": PICTURES,
+    b"urn:iso:std:iso:ts:21496:-1": GAIN_MAP,
     b"JFXX\0": "the thumbnail of JFIF",
     b"Photoshop 3.0\0": "the fields and thumbnail of Photoshop",
     b"JP": "content credentials",
@@ -105,7 +116,7 @@ class Jpeg:
         """Of the channels."""
         return np.dtype(np.uint8)
 
-    def decode(self, path: Path) -> Channels:
+    def decode(self, path: Path) -> Stored:
         """The channels (H, W, S) as stored."""
         # Not Image.open, which refuses pictures of more than 179 megapixels whatever the memory.
         with quiet():
@@ -113,7 +124,7 @@ class Jpeg:
         with image:
             return np.asarray(image).reshape(self.size[1], self.size[0], self.samples)
 
-    def decode_into(self, data: bytes | mmap, out: Channels) -> None:
+    def decode_into(self, data: bytes | mmap, out: Stored) -> None:
         """Decode the channels (H, W, S) into an array, such as a file mapped into memory."""
         if not self.whole:  # libjpeg fills what is missing
             raise EOFError("it ends too early")
@@ -163,7 +174,7 @@ def _metadata(contents: list[tuple[int, bytes]], behind: bytes) -> tuple[int, Me
         elif APP <= marker < APP + 16 and marker != ADOBE:
             left_out.append(_described(marker, content))
     orientation, exif, damaged = exif_tags.read_upright(exif_tags.PREFIX + b"".join(blocks) if blocks else None)
-    packet, stated = xmp.upright(packet, orientation)
+    packet, stated = upright_packet(packet, orientation)
     dpi = sound(dpi) or sound(exif_tags.resolution(exif))
     extras = Extras(
         packet,
@@ -198,16 +209,16 @@ def _behind(content: bytes) -> Iterator[str]:
         return
     further, film = b"\xff\xd8\xff" in content, b"ftyp" in content
     if further:
-        yield xmp.PICTURES
+        yield PICTURES
     if film:
-        yield xmp.MOTION
+        yield MOTION
     if not further and not film:
         yield "the bytes behind the picture"
 
 
 def write_jpeg(
     stream: BinaryIO,
-    rows: Iterable[Channels],
+    rows: Iterable[Stored],
     shape: tuple[int, int, int],
     metadata: Metadata,
     quality: int = QUALITY,

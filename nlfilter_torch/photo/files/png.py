@@ -16,10 +16,20 @@ from typing import BinaryIO, NamedTuple
 import imagecodecs
 import numpy as np
 
-from nlfilter_torch.photo.files import colours, xmp
+from nlfilter_torch.photo.declared.rows import Stored
 from nlfilter_torch.photo.files import exif as exif_tags
-from nlfilter_torch.photo.files.decoded import Channels, Metadata, UnhandledImage, bands, release
-from nlfilter_torch.photo.files.extras import Extras, Part, sound, turned
+from nlfilter_torch.photo.files.decoded import bands, release
+from nlfilter_torch.photo.files.metadata import (
+    Extras,
+    Metadata,
+    Part,
+    UnhandledImage,
+    check_colour_numbers,
+    check_png_colours,
+    sound,
+    turned,
+    upright_packet,
+)
 
 SIGNATURE = b"\x89PNG\r\n\x1a\n"
 XMP_KEY = b"XML:com.adobe.xmp"
@@ -95,7 +105,7 @@ class Png:
     metadata: Metadata
     parts: tuple[Chunk, ...]
 
-    def decode_into(self, data: bytes | mmap, out: Channels) -> None:
+    def decode_into(self, data: bytes | mmap, out: Stored) -> None:
         """Decode the channels (H, W, S) of a file without interlacing into an array."""
         with tempfile.TemporaryFile() as stream:
             self._copy_pixels(data, stream)
@@ -104,7 +114,7 @@ class Png:
             with mmap(stream.fileno(), 0, access=ACCESS_READ) as pixels:
                 imagecodecs.png_decode(pixels, out=out[..., 0] if self.samples == 1 else out)
 
-    def decode(self, data: bytes | mmap) -> Channels:
+    def decode(self, data: bytes | mmap) -> Stored:
         """The channels (H, W, S) as stored."""
         shape = (self.size[1], self.size[0], self.samples)
         if self.in_passes:
@@ -152,13 +162,13 @@ def open_png(path: Path, data: bytes | mmap) -> Png:
 
 
 def _check_colours(path: Path, contents: dict[bytes, bytes]) -> None:
-    """Check the colours of a file without a profile, see :mod:`nlfilter_torch.photo.files.colours`."""
+    """Check the colours of a file without a profile, see :func:`check_png_colours`."""
     if numbers := contents.get(b"cICP"):
-        colours.check_numbers(path, *numbers[:2])
+        check_colour_numbers(path, *numbers[:2])
     elif b"sRGB" not in contents:
         gamma = contents.get(b"gAMA")
         corners = contents.get(b"cHRM")
-        colours.check_png(
+        check_png_colours(
             path,
             None if gamma is None else struct.unpack(">I", gamma)[0] / 100_000,
             None if corners is None else [number / 100_000 for number in struct.unpack(">8I", corners)],
@@ -171,7 +181,7 @@ def _metadata(contents: list[tuple[bytes, bytes]]) -> tuple[int, Metadata]:
     texts = {key: text for name, content in contents for key, text in _text(name, content)}
     exif, packet = by_name.get(b"eXIf"), texts.get(XMP_KEY)
     orientation, exif, damaged = exif_tags.read_upright(exif or _from_hexadecimal(texts.get(RAW_KEY + b"exif")))
-    packet, left_out = xmp.upright(packet or _from_hexadecimal(texts.get(RAW_KEY + b"xmp")), orientation)
+    packet, left_out = upright_packet(packet or _from_hexadecimal(texts.get(RAW_KEY + b"xmp")), orientation)
     kept = []
     for name, content in contents:
         if name in STORAGE or name in READ or (name in TEXTS and _key(content) in KEYS):
@@ -237,7 +247,7 @@ def _described(name: bytes, content: bytes) -> str:
 
 def _interlaced(
     data: bytes | mmap, parts: tuple[Chunk, ...], shape: tuple[int, int, int], dtype: np.dtype[np.generic]
-) -> Channels:
+) -> Stored:
     """The channels of an interlaced file, each pass of which is decoded as a file of its own.
 
     imagecodecs decodes interlaced files, but libpng then prints a warning.
@@ -287,7 +297,7 @@ def write_chunk(stream: BinaryIO, name: bytes, *content: bytes) -> None:
 
 def write_png(
     stream: BinaryIO,
-    rows: Iterable[Channels],
+    rows: Iterable[Stored],
     shape: tuple[int, int, int],
     dtype: np.dtype[np.generic],
     metadata: Metadata,
@@ -301,7 +311,7 @@ def write_png(
     for name, content in _written(metadata):
         write_chunk(stream, name, content)
     packer = zlib.compressobj(6, strategy=zlib.Z_FILTERED)
-    above: Channels | None = None
+    above: Stored | None = None
     for band in bands(rows, max(1, BAND // length)):
         # libpng chooses the filters, which need the row above.
         part = np.ascontiguousarray(band if above is None else np.concatenate([above, band]))

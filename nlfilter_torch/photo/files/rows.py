@@ -9,7 +9,7 @@ Needs the ``cli`` extra, and the ``zarr`` extra for zarr. A file appears complet
 import math
 import shutil
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from mmap import ACCESS_READ, mmap
@@ -20,11 +20,11 @@ from typing import Protocol
 import numpy as np
 import psutil
 
+from nlfilter_torch.photo.declared.rows import NodataRows, RowSource, Stored
 from nlfilter_torch.photo.files import jpeg, png, tiff
-from nlfilter_torch.photo.files.decoded import NO_METADATA, Channels, Metadata, bands, decoding
-from nlfilter_torch.photo.files.exif import of_part
-from nlfilter_torch.photo.files.extras import note_left_out
-from nlfilter_torch.photo.files.photographs import (
+from nlfilter_torch.photo.files.decoded import bands, decoding
+from nlfilter_torch.photo.files.exif import of_part, upright
+from nlfilter_torch.photo.files.formats import (
     TooLarge,
     check_type,
     encode,
@@ -34,11 +34,10 @@ from nlfilter_torch.photo.files.photographs import (
     read_channels,
     with_thumbnail,
 )
-from nlfilter_torch.photo.files.scratch import Scratch, upright_copy
+from nlfilter_torch.photo.files.metadata import NO_METADATA, Metadata, note_left_out
+from nlfilter_torch.photo.files.scratch import Scratch
 from nlfilter_torch.photo.files.tiff import TiffRows
 from nlfilter_torch.photo.files.writing import check_file, claimed, link_target, name_beside, open_beside, part_beside
-from nlfilter_torch.photo.picture.pictures import NodataRows, Rows, RowSource
-from nlfilter_torch.photo.picture.tiles import Tiling
 
 ZARR = ".zarr"
 CHUNK = 256  # side of the chunks of a new zarr array
@@ -85,10 +84,6 @@ class StoredPicture:
         """The rows, with one more channel if pixels have no data; see :class:`NodataRows`."""
         return self.rows if self.nodata is None else NodataRows(self.rows, self.nodata)
 
-    def unmarked(self, tiling: Tiling) -> Tiling:
-        """Edited rows of :attr:`marked` without that channel."""
-        return tiling if self.nodata is None else replace(tiling, nodata=self.nodata)
-
     def in_colour(self) -> "StoredPicture":
         """Return shape and metadata of the colour version, without pixels; the profile of a grey picture is dropped."""
         height, width, samples = self.shape
@@ -104,7 +99,7 @@ class StoredPicture:
         rows = self._empty((*size, *self.rows.shape[2:]))
         return replace(self, rows=rows, metadata=replace(self.metadata, exif=of_part(self.metadata.exif, size[::-1])))
 
-    def _empty(self, shape: tuple[int, ...]) -> Channels:
+    def _empty(self, shape: tuple[int, ...]) -> Stored:
         """Rows of a shape and the same dtype, which take no memory."""
         return np.broadcast_to(np.zeros((), self.rows.dtype), shape)
 
@@ -165,14 +160,27 @@ def check_place(path: Path, depth: str, picture: StoredPicture, memory: int) -> 
         )
 
 
-def write_picture(path: Path, rows: Rows | Tiling, depth: str, like: StoredPicture, quality: int | None = None) -> None:
+def write_picture(
+    path: Path,
+    rows: Iterable[tuple[slice, Stored]],
+    depth: str,
+    like: StoredPicture,
+    quality: int | None = None,
+    fill: Callable[[Path], None] | None = None,
+) -> None:
     """Write rows as they are computed, with the shape, profile and metadata of another picture.
 
-    ``quality`` is that of JPEG files; None is the default.
+    Args:
+        path: file, or folder of a zarr array.
+        rows: (h, W, S), in order, with their position.
+        depth: dtype to write.
+        like: the other picture.
+        quality: of JPEG files; None is the default.
+        fill: writes the rows to the zarr array in a folder, in place of this process; None is this process.
     """
     shape, dtype = like.shape, np.dtype(depth)
     if path.suffix.lower() == ZARR:
-        _write_zarr(path, rows, dtype, like)
+        _write_zarr(path, rows, dtype, like, fill)
         return
     kind = check_type(path, depth, like.alpha)
     with open_beside(path) as stream:
@@ -234,6 +242,20 @@ def _unpacked(path: Path, stack: ExitStack) -> StoredPicture | None:
     return StoredPicture(scratch, picture.samples in (2, 4), 0, picture.metadata)
 
 
+def upright_copy(rows: TiffRows | Scratch, orientation: int, step: int, stack: ExitStack) -> Scratch:
+    """The upright picture of rows with an EXIF orientation, of which ``step`` are read at a time."""
+    height, width, samples = rows.shape
+    turned = orientation >= 5
+    scratch = Scratch((width, height, samples) if turned else rows.shape, rows.dtype, stack)
+    with scratch.array() as copy:
+        for start in range(0, height, step):
+            stop = min(start + step, height)
+            # These orientations begin with the last row or column.
+            place = slice(height - stop, height - start) if orientation in (3, 4, 6, 7) else slice(start, stop)
+            copy[(slice(None), place) if turned else place] = upright(rows[slice(start, stop)], orientation)
+    return scratch
+
+
 def zarr_package() -> ModuleType:
     """The package zarr; raises ValueError if it is not installed."""
     try:
@@ -264,10 +286,10 @@ class ZarrArray(Protocol):
     def attrs(self) -> Mapping[str, object]:
         """Attributes, as in JSON."""
 
-    def __getitem__(self, rows: slice, /) -> Channels:
+    def __getitem__(self, rows: slice, /) -> Stored:
         """Read rows."""
 
-    def __setitem__(self, place: tuple[slice, slice], values: Channels, /) -> None:
+    def __setitem__(self, place: tuple[slice, slice], values: Stored, /) -> None:
         """Write rows and columns."""
 
 
@@ -289,7 +311,7 @@ class ZarrRows:
         except (FileNotFoundError, KeyError, TypeError) as error:
             raise ValueError(f"{self.path} is not a zarr array ({error}); choose the folder of one") from error
 
-    def __getitem__(self, rows: slice) -> Channels:
+    def __getitem__(self, rows: slice) -> Stored:
         now = tuple(self._open().shape)
         if now != self.shape:
             raise ValueError(
@@ -311,7 +333,7 @@ def _open_zarr(path: Path) -> StoredPicture:
     return StoredPicture(rows, alpha, cached, attributes=dict(rows.array.attrs))
 
 
-def write_band(array: ZarrArray, start: int, rows: Channels) -> None:
+def write_band(array: ZarrArray, start: int, rows: Stored) -> None:
     """Write rows (h, W, S) to a zarr array from row ``start`` on, where a chunk begins."""
     values, width = rows.reshape(len(rows), *array.shape[1:]), array.chunks[1]
     # One chunk per call: zarr writes several in parallel and continues with the others after one fails.
@@ -319,7 +341,13 @@ def write_band(array: ZarrArray, start: int, rows: Channels) -> None:
         array[start : start + len(values), left : left + width] = values[:, left : left + width]
 
 
-def _write_zarr(path: Path, rows: Rows | Tiling, dtype: np.dtype[np.generic], like: StoredPicture) -> None:
+def _write_zarr(
+    path: Path,
+    rows: Iterable[tuple[slice, Stored]],
+    dtype: np.dtype[np.generic],
+    like: StoredPicture,
+    fill: Callable[[Path], None] | None,
+) -> None:
     """Write an array under another name, which replaces an existing array only when it is complete."""
     shape = tuple(like.rows.shape)
     path = link_target(path)
@@ -330,8 +358,8 @@ def _write_zarr(path: Path, rows: Rows | Tiling, dtype: np.dtype[np.generic], li
             store=beside, shape=shape, chunks=chunks, dtype=dtype, attributes=like.attributes or {}
         )
         with claimed(beside):
-            if isinstance(rows, Tiling) and rows.passes.processes is not None:
-                rows.passes.processes.fill(rows, beside)
+            if fill is not None:
+                fill(beside)
             else:
                 start = 0
                 for band in bands((part for _, part in rows), CHUNK):

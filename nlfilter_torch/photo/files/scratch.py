@@ -1,27 +1,55 @@
-"""Pictures in temporary files, which take space on the disk rather than memory."""
+"""Rows in temporary files, which take space on the disk rather than memory."""
 
 import math
 import shutil
 import tempfile
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from typing import Protocol
+from dataclasses import dataclass, field
+from threading import Lock
+from typing import BinaryIO
 
 import numpy as np
 
-from nlfilter_torch.photo.files.decoded import Channels
-from nlfilter_torch.photo.files.exif import upright
-from nlfilter_torch.photo.picture.pictures import FileRows
+from nlfilter_torch.photo.declared.rows import Stored
 
 
-class StoredRows(Protocol):
-    """Rows as they are stored."""
+@dataclass(frozen=True)
+class FileRows:
+    """Rows in an open file, which are read when they are needed.
 
-    shape: tuple[int, int, int]
+    They are not mapped into memory: the system counts what was read of a mapped file as memory of the process.
+
+    Attributes:
+        stream: the file, which holds nothing else.
+        shape: (H, W) or (H, W, S).
+        dtype: of the rows.
+        lock: held while the place in the file matters.
+    """
+
+    stream: BinaryIO
+    shape: tuple[int, ...]
     dtype: np.dtype[np.generic]
+    lock: Lock = field(default_factory=Lock)
 
-    def __getitem__(self, rows: slice, /) -> Channels:
-        """Read rows (h, W, S)."""
+    def __getitem__(self, rows: slice) -> Stored:
+        """The rows from ``rows.start`` to ``rows.stop``."""
+        start, stop, _ = rows.indices(self.shape[0])
+        length = math.prod(self.shape[1:]) * self.dtype.itemsize
+        with self.lock:
+            self.stream.seek(start * length)
+            data = self.stream.read((stop - start) * length)
+        return np.frombuffer(data, self.dtype).reshape(-1, *self.shape[1:])
+
+    def part(self, rows: range, columns: range) -> Stored:
+        """Some rows and columns (h, w, S) of (H, W, S), without reading the others."""
+        pixel = math.prod(self.shape[2:]) * self.dtype.itemsize
+        data = bytearray()
+        with self.lock:
+            for row in rows:
+                self.stream.seek((row * self.shape[1] + columns.start) * pixel)
+                data += self.stream.read(len(columns) * pixel)
+        return np.frombuffer(data, self.dtype).reshape(len(rows), len(columns), *self.shape[2:])
 
 
 class Scratch:
@@ -47,23 +75,9 @@ class Scratch:
         self.rows = FileRows(self.stream, shape, dtype)
 
     @contextmanager
-    def array(self) -> Iterator[Channels]:
+    def array(self) -> Iterator[Stored]:
         """The file as an array (H, W, S) to write to, which is not in memory after the block."""
         yield np.memmap(self.stream, dtype=self.dtype, mode="r+", shape=self.shape)
 
-    def __getitem__(self, rows: slice) -> Channels:
+    def __getitem__(self, rows: slice) -> Stored:
         return self.rows[rows]
-
-
-def upright_copy(rows: StoredRows, orientation: int, step: int, stack: ExitStack) -> Scratch:
-    """The upright picture of rows with an EXIF orientation, of which ``step`` are read at a time."""
-    height, width, samples = rows.shape
-    turned = orientation >= 5
-    scratch = Scratch((width, height, samples) if turned else rows.shape, rows.dtype, stack)
-    with scratch.array() as copy:
-        for start in range(0, height, step):
-            stop = min(start + step, height)
-            # These orientations begin with the last row or column.
-            place = slice(height - stop, height - start) if orientation in (3, 4, 6, 7) else slice(start, stop)
-            copy[(slice(None), place) if turned else place] = upright(rows[slice(start, stop)], orientation)
-    return scratch

@@ -12,10 +12,23 @@ import numpy as np
 import tifffile
 
 from nlfilter_torch.core.warning import warn
+from nlfilter_torch.photo.declared.rows import Stored
 from nlfilter_torch.photo.files import exif as exif_tags
-from nlfilter_torch.photo.files import exif_in_tiff, xmp
-from nlfilter_torch.photo.files.decoded import Channels, CheckSize, Decoded, Metadata, UnhandledImage, bands, decoding
-from nlfilter_torch.photo.files.extras import GROUND, RESOLUTION, STORAGE, Extras, Tag, sound, turned, turned_tag
+from nlfilter_torch.photo.files import exif_in_tiff
+from nlfilter_torch.photo.files.decoded import CheckSize, Decoded, bands, decoding
+from nlfilter_torch.photo.files.metadata import (
+    GROUND,
+    RESOLUTION,
+    STORAGE,
+    Extras,
+    Metadata,
+    Tag,
+    UnhandledImage,
+    sound,
+    turned,
+    turned_tag,
+    upright_packet,
+)
 from nlfilter_torch.photo.files.tables import LONG, ORIENTATION, RATIONAL, SHORT, Tables
 
 # tifffile logs problems with a file. Without a handler Python would print them beside our error message.
@@ -109,7 +122,7 @@ def _native(page: tifffile.TiffPage) -> np.dtype[np.generic]:
     return np.dtype(page.dtype).newbyteorder("=")
 
 
-def plain(page: tifffile.TiffPage, channels: Channels) -> Channels:
+def plain(page: tifffile.TiffPage, channels: Stored) -> Stored:
     """Convert channels (H, W, S) of a page, or some of its rows, to black as 0 and no premultiplied alpha."""
     channels = channels.astype(_native(page), copy=True)
     if page.photometric == tifffile.PHOTOMETRIC.MINISWHITE:
@@ -132,7 +145,7 @@ def read_metadata(file: tifffile.TiffFile, stream: BinaryIO, depth: str) -> tupl
         packet = next((tables.raw(field) for field in fields if field.code == XMP), None)
         ratios = {field.code: tables.ratio(field) for field in fields if field.code in RESOLUTION[:2]}
         units = [tables.number(field) for field in fields if field.code == RESOLUTION[2]]
-    packet, left_out = xmp.upright(packet, orientation)
+    packet, left_out = upright_packet(packet, orientation)
     left_out += [exif_in_tiff.MOVED] * moved + ["smaller versions and masks"] * any(f.code == SUB_FILES for f in fields)
     scale = exif_tags.SCALES.get((units or [INCH])[0] or 0)
     pair = None if scale is None or len(ratios) < 2 else sound([ratios[code] * scale for code in RESOLUTION[:2]])
@@ -156,7 +169,7 @@ def read_metadata(file: tifffile.TiffFile, stream: BinaryIO, depth: str) -> tupl
 
 def write_rows(
     stream: BinaryIO,
-    rows: Iterable[Channels],
+    rows: Iterable[Stored],
     shape: tuple[int, int, int],
     dtype: np.dtype[np.generic],
     alpha: bool,
@@ -175,7 +188,7 @@ def write_rows(
     return write(stream, _tiles(rows, width), plain_shape, dtype, alpha, metadata, big, **options)
 
 
-def _tiles(rows: Iterable[Channels], width: int) -> Iterator[Channels]:
+def _tiles(rows: Iterable[Stored], width: int) -> Iterator[Stored]:
     """Cut rows (h, W, S) into square tiles, padded with zeros, without the last axis if S = 1."""
     for band in bands(rows, TILE_SIZE):
         for left in range(0, width, TILE_SIZE):
@@ -186,7 +199,7 @@ def _tiles(rows: Iterable[Channels], width: int) -> Iterator[Channels]:
 
 def write(
     stream: BinaryIO,
-    data: Channels | Iterator[Channels],
+    data: Stored | Iterator[Stored],
     shape: tuple[int, ...],
     dtype: np.dtype[np.generic],
     alpha: bool,
@@ -246,7 +259,7 @@ def _resolution(extras: Extras, tags: Iterable[Tag]) -> _Resolution:
     return {} if extras.dpi is None else _Resolution(resolution=extras.dpi, resolutionunit=INCH)
 
 
-def _unmultiplied(channels: Channels) -> Channels:
+def _unmultiplied(channels: Stored) -> Stored:
     """Divide premultiplied colours by their alpha; black where alpha is 0."""
     colour, alpha = channels[..., :-1].astype(np.float64), channels[..., -1:].astype(np.float64)
     integer = np.issubdtype(channels.dtype, np.integer)
@@ -286,7 +299,7 @@ class TiffRows:
         # (height, width) of a strip or tile; the declared height of a strip may exceed the picture's.
         self.segment = (page.tilelength, page.tilewidth) if page.is_tiled else (page.rowsperstrip, page.imagewidth)
         self.segment = (min(self.segment[0], self.shape[0]), self.segment[1])
-        self.bands: dict[int, Channels] = {}
+        self.bands: dict[int, Stored] = {}
 
     def __reduce__(self) -> tuple[type["TiffRows"], tuple[Path]]:
         return TiffRows, (self.path.absolute(),)  # another process opens the file again
@@ -308,7 +321,7 @@ class TiffRows:
         rows = 0 if self._raw else (CACHED_BANDS + 1) * self.segment[0]
         return rows * self.shape[1] * self.shape[2] * self.dtype.itemsize
 
-    def __getitem__(self, rows: slice) -> Channels:
+    def __getitem__(self, rows: slice) -> Stored:
         """Read the rows from ``rows.start`` to ``rows.stop``.
 
         Raises:
@@ -330,14 +343,14 @@ class TiffRows:
         contiguous: bool = self.page.is_contiguous and self.page.planarconfig == tifffile.PLANARCONFIG.CONTIG
         return contiguous and self.page.compression == tifffile.COMPRESSION.NONE and not self.page.is_tiled
 
-    def _read_raw(self, first: int, last: int) -> Channels:
+    def _read_raw(self, first: int, last: int) -> Stored:
         length = self.shape[1] * self.shape[2] * self.dtype.itemsize
         self.stream.seek(self.page.dataoffsets[0] + first * length)
         data = self.stream.read((last - first) * length)
         stored = np.dtype(self.page.dtype).newbyteorder(self.file.byteorder)
         return np.frombuffer(data, stored).reshape(last - first, *self.shape[1:])
 
-    def _decode(self, first: int, last: int) -> Channels:
+    def _decode(self, first: int, last: int) -> Stored:
         height = self.segment[0]
         wanted = range(first // height, -(-last // height))
         for band in wanted:
@@ -348,7 +361,7 @@ class TiffRows:
             del self.bands[band]
         return whole[first - wanted.start * height : last - wanted.start * height]
 
-    def _band(self, band: int) -> Channels:
+    def _band(self, band: int) -> Stored:
         """Decode one row of tiles, or one strip, (h, W, S)."""
         height, width, samples = self.shape
         top = band * self.segment[0]

@@ -1,45 +1,27 @@
 """Pictures read a few rows at a time: memory maps, zarr arrays, tifffile files, anything that can be sliced."""
 
-import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property, partial
-from threading import Lock
-from typing import BinaryIO, Protocol
+from typing import Protocol
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from torch import Tensor
 
 from nlfilter_torch.core.checks import warn_of_scale
 from nlfilter_torch.operator.features import reduce_channels
 from nlfilter_torch.operator.hidden import REACH, fill_nearby
+from nlfilter_torch.photo.declared.rows import WHITE, RowSource, Stored, is_hidden
 
-WHITE = {"uint8": 255, "uint16": 65535}  # the integer that stands for 1.0
 KINDS = ("uint8", "uint16", "float16", "float32", "float64")
-Stored = NDArray[np.generic]  # rows (h, W, S) of a picture, in the dtype of its file
 Rows = Iterator[tuple[slice, Stored]]  # with their position in the picture
 CHUNK_ROWS = 64  # of rows that are only searched
 STATISTICS_PIXELS = 1 << 15  # in a block of a pass; independent of the tile size, so that sums agree bit by bit
 
 
 FLOAT32: np.dtype[np.generic] = np.dtype(np.float32)
-
-
-class RowSource(Protocol):
-    """Rows (H, W) or (H, W, S) to read; a slice of them can be converted to a numpy array."""
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """(H, W) or (H, W, S)."""
-
-    @property
-    def dtype(self) -> np.dtype[np.generic]:
-        """A numpy dtype."""
-
-    def __getitem__(self, rows: slice, /) -> ArrayLike:
-        """The rows from ``rows.start`` to ``rows.stop``."""
 
 
 @dataclass(frozen=True)
@@ -64,88 +46,6 @@ class LazyRows:
         """Whether a value is not 0; reads a few rows at a time."""
         height = self.shape[0]
         return any(self[start : min(start + CHUNK_ROWS, height)].any() for start in range(0, height, CHUNK_ROWS))
-
-
-@dataclass(frozen=True)
-class FileRows:
-    """Rows in an open file, which are read when they are needed.
-
-    They are not mapped into memory: the system counts what was read of a mapped file as memory of the process.
-
-    Attributes:
-        stream: the file, which holds nothing else.
-        shape: (H, W) or (H, W, S).
-        dtype: of the rows.
-        lock: held while the place in the file matters.
-    """
-
-    stream: BinaryIO
-    shape: tuple[int, ...]
-    dtype: np.dtype[np.generic]
-    lock: Lock = field(default_factory=Lock)
-
-    def __getitem__(self, rows: slice) -> Stored:
-        """The rows from ``rows.start`` to ``rows.stop``."""
-        start, stop, _ = rows.indices(self.shape[0])
-        length = math.prod(self.shape[1:]) * self.dtype.itemsize
-        with self.lock:
-            self.stream.seek(start * length)
-            data = self.stream.read((stop - start) * length)
-        return np.frombuffer(data, self.dtype).reshape(-1, *self.shape[1:])
-
-    def part(self, rows: range, columns: range) -> Stored:
-        """Some rows and columns (h, w, S) of (H, W, S), without reading the others."""
-        pixel = math.prod(self.shape[2:]) * self.dtype.itemsize
-        data = bytearray()
-        with self.lock:
-            for row in rows:
-                self.stream.seek((row * self.shape[1] + columns.start) * pixel)
-                data += self.stream.read(len(columns) * pixel)
-        return np.frombuffer(data, self.dtype).reshape(len(rows), len(columns), *self.shape[2:])
-
-
-@dataclass(frozen=True)
-class NodataRows:
-    """Rows of a picture without transparency, and one more channel: 0 where they hold no data, white elsewhere.
-
-    Attributes:
-        rows: (H, W) or (H, W, S).
-        nodata: the value of pixels without data, see :func:`lacks_data`.
-    """
-
-    rows: RowSource
-    nodata: float
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """(H, W, S + 1)."""
-        height, width, *samples = self.rows.shape
-        return height, width, (samples[0] if samples else 1) + 1
-
-    @property
-    def dtype(self) -> np.dtype[np.generic]:
-        """Of the rows."""
-        return self.rows.dtype
-
-    def __getitem__(self, rows: slice) -> Stored:
-        """The rows from ``rows.start`` to ``rows.stop``."""
-        stored = np.asarray(self.rows[rows])
-        stored = stored.reshape(*stored.shape[:2], -1)
-        white = stored.dtype.type(WHITE.get(stored.dtype.name, 1))
-        counts = np.where(lacks_data(stored, self.nodata), stored.dtype.type(0), white)
-        return np.concatenate([stored, counts[..., None]], axis=2)
-
-
-def lacks_data(stored: Stored, nodata: float) -> NDArray[np.bool_]:
-    """Where pixels (..., S) hold no data, (...).
-
-    These are the pixels all of whose channels have the value ``nodata``; of floats, all pixels with such a channel.
-    """
-    if stored.dtype.kind != "f":
-        return (stored == nodata).all(-1)
-    with np.errstate(over="ignore"):  # a value that the dtype does not hold
-        value = np.asarray(nodata).astype(stored.dtype)
-    return np.any(np.isnan(stored) if np.isnan(nodata) else np.equal(stored, value), axis=-1)
 
 
 class RowTarget(Protocol):
@@ -329,11 +229,6 @@ def stored_as(values: Tensor, kind: str) -> Stored:
     return np.ascontiguousarray(rows.astype(kind))
 
 
-def is_hidden(stored: Stored) -> NDArray[np.bool_]:
-    """Where pixels (..., S), whose last channel is transparency, are hidden, (...)."""
-    return np.less_equal(stored[..., -1], 0)
-
-
 def put_back(values: Stored, colours: Stored, hidden: NDArray[np.bool_]) -> None:
     """Put the stored colours (n, C) of the hidden pixels (h, W) of a picture back into its rows (h, W, D).
 
@@ -344,21 +239,6 @@ def put_back(values: Stored, colours: Stored, hidden: NDArray[np.bool_]) -> None
         planes = torch.from_numpy(colours.astype(np.float64) / white).T[None, :, None]
         colours = stored_as(planes, values.dtype.name)[0]
     values[hidden] = colours
-
-
-def keep_apart(values: Stored, hidden: NDArray[np.bool_], nodata: float) -> None:
-    """Move the values of pixels (h, W, C) that are not hidden by a step if they say that there is no data."""
-    if np.isnan(nodata):
-        return
-    taken = lacks_data(values, nodata) & ~hidden
-    if not taken.any():
-        return
-    if values.dtype.kind != "f":
-        values[taken] = nodata + 1 if nodata < np.iinfo(values.dtype.name).max else nodata - 1
-        return
-    pixels, value = values[taken], np.asarray(nodata).astype(values.dtype)
-    beside = np.nextafter(value, np.asarray(0 if nodata else 1).astype(values.dtype))
-    values[taken] = np.where(pixels == value, beside, pixels)
 
 
 def transparency(tile: Tile, kind: str) -> Stored:

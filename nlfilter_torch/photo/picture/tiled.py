@@ -17,10 +17,11 @@ from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.core.workers import Result, in_order, single_threaded
 from nlfilter_torch.operator.eigenvalue_bound import is_bounded
 from nlfilter_torch.operator.hidden import fill_nearby
+from nlfilter_torch.photo.declared.rows import RowSource, Stored
 from nlfilter_torch.photo.picture.counted import CountedPixels, counted_pixels
 from nlfilter_torch.photo.picture.ends import ends_of
 from nlfilter_torch.photo.picture.in_memory import InMemory
-from nlfilter_torch.photo.picture.pictures import Picture, Rows, RowSource, Stored, Tile
+from nlfilter_torch.photo.picture.pictures import Picture, Rows, Tile
 from nlfilter_torch.photo.picture.pixels import Pixels, part_of, whole_image
 from nlfilter_torch.photo.picture.resizing import (
     block_counts,

@@ -9,9 +9,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from nlfilter_torch.photo.declared.rows import RowSource
 from nlfilter_torch.photo.declared.strokes import Stroke
 from nlfilter_torch.photo.picture.painting import mask_of, paint, painted_on_mask
-from nlfilter_torch.photo.picture.pictures import LazyRows, Picture, RowSource, stored_as, transparency
+from nlfilter_torch.photo.picture.pictures import LazyRows, Picture, stored_as, transparency
 from nlfilter_torch.photo.picture.pixels import Pixels, corner
 from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles
 

@@ -4,6 +4,7 @@ import math
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryFile, gettempdir
 from typing import Literal, Protocol
@@ -14,19 +15,16 @@ from torch import Tensor
 
 from nlfilter_torch.core.checks import check_choice, check_count
 from nlfilter_torch.core.workers import in_order
+from nlfilter_torch.photo.declared.rows import RowSource, Stored, is_hidden, keep_apart
+from nlfilter_torch.photo.files.scratch import FileRows
 from nlfilter_torch.photo.picture import sampling
 from nlfilter_torch.photo.picture.pictures import (
     FLOAT32,
     KINDS,
-    FileRows,
     Picture,
     Rows,
-    RowSource,
     RowTarget,
-    Stored,
     Tile,
-    is_hidden,
-    keep_apart,
     put_back,
     stored_as,
     transparency,
@@ -167,6 +165,11 @@ class Tiling:
             parts.append(self._edited(tile)[wanted])
             comparisons += self._comparison(tile.stored[wanted], parts[-1])
         return np.concatenate(parts), comparisons
+
+    @property
+    def fill(self) -> Callable[[Path], None] | None:
+        """Computes the rows by worker processes, which write them to the zarr array in a folder; None without them."""
+        return None if self.passes.processes is None else partial(self.passes.processes.fill, self)
 
     def note(self, comparisons: list[Comparison]) -> None:
         """Pass comparisons on to :attr:`compared`."""

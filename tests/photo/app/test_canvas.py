@@ -12,7 +12,7 @@ from nlfilter_torch.photo.app.brush import Brush
 from nlfilter_torch.photo.app.canvas import Canvas
 from nlfilter_torch.photo.app.overlays import Overlays
 from nlfilter_torch.photo.app.session import Session
-from nlfilter_torch.photo.files.photographs import Photograph, write_photograph
+from nlfilter_torch.photo.picture.photographs import Photograph, write_photograph
 from tests.problems import cat
 
 

@@ -20,7 +20,7 @@ from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.declared.strokes import Stroke
 from nlfilter_torch.photo.edits.applying import apply_recipe
 from nlfilter_torch.photo.edits.parts import Rectangle
-from nlfilter_torch.photo.files.photographs import Photograph, read_photograph, write_photograph
+from nlfilter_torch.photo.picture.photographs import Photograph, read_photograph, write_photograph
 from tests.problems import cat
 
 PLACE = Rectangle(range(21, 83), range(33, 120))

@@ -15,8 +15,8 @@ from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.declared.strokes import Stroke
 from nlfilter_torch.photo.edits.applying import apply_recipe
 from nlfilter_torch.photo.edits.parts import Rectangle
-from nlfilter_torch.photo.files.photographs import Photograph, read_photograph, write_photograph
 from nlfilter_torch.photo.picture.developing import balance_of, develop_image
+from nlfilter_torch.photo.picture.photographs import Photograph, read_photograph, write_photograph
 from nlfilter_torch.photo.picture.resizing import resize
 from tests.browser import difference
 from tests.problems import cat

@@ -19,7 +19,7 @@ from nlfilter_torch.photo.app.library import Library
 from nlfilter_torch.photo.app.page import EDITORS, Editor
 from nlfilter_torch.photo.declared.development import WHOLE, Development
 from nlfilter_torch.photo.declared.presets import Recipe
-from nlfilter_torch.photo.files.photographs import Photograph, write_photograph
+from nlfilter_torch.photo.picture.photographs import Photograph, write_photograph
 from tests.pages import ROOT
 from tests.problems import cat
 

@@ -15,7 +15,7 @@ from nlfilter_torch.photo.declared.colour_tables import cube_of, hald_of
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.declared.strokes import Stroke
-from nlfilter_torch.photo.files.photographs import Photograph, write_photograph
+from nlfilter_torch.photo.picture.photographs import Photograph, write_photograph
 from tests.problems import LINE, cat, difference
 
 

@@ -6,7 +6,7 @@ import pytest
 import skimage.data
 import torch
 
-from nlfilter_torch.photo.files.photographs import Photograph, write_photograph
+from nlfilter_torch.photo.picture.photographs import Photograph, write_photograph
 
 
 @pytest.fixture(scope="module")

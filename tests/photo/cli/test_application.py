@@ -12,7 +12,7 @@ import torch
 import nlfilter_torch
 import nlfilter_torch.photo
 from nlfilter_torch.photo.cli import main
-from nlfilter_torch.photo.files.photographs import Photograph, write_photograph
+from nlfilter_torch.photo.picture.photographs import Photograph, write_photograph
 from tests.commands import refusal, refused
 
 

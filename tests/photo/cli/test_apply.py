@@ -9,7 +9,7 @@ from nlfilter_torch.photo.cli import main
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.edits.applying import apply_recipe
-from nlfilter_torch.photo.files.photographs import Photograph, read_photograph, write_photograph
+from nlfilter_torch.photo.picture.photographs import Photograph, read_photograph, write_photograph
 from tests.problems import cat, difference
 from tests.recipes import COLORIZE, DEFOCUS, DETAIL, RECOLOR
 

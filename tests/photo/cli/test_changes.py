@@ -11,8 +11,8 @@ from PIL import Image
 
 from nlfilter_torch.photo.cli import main
 from nlfilter_torch.photo.cli.changes import ChangeMeter, squared_difference, write_map
-from nlfilter_torch.photo.files.photographs import Photograph, read_photograph, write_photograph
 from nlfilter_torch.photo.picture.edit import Rows
+from nlfilter_torch.photo.picture.photographs import Photograph, read_photograph, write_photograph
 
 
 def write(path: Path, noise: float, *, alpha: bool = False) -> Path:

@@ -15,8 +15,8 @@ from nlfilter_torch.photo.cli import main
 from nlfilter_torch.photo.cli.edit_job import EditJob
 from nlfilter_torch.photo.cli.scribbles import ScribbleOptions
 from nlfilter_torch.photo.declared.steps import Step
-from nlfilter_torch.photo.files.photographs import Photograph, read_photograph, write_photograph
 from nlfilter_torch.photo.picture import sampling
+from nlfilter_torch.photo.picture.photographs import Photograph, read_photograph, write_photograph
 from tests.problems import box, seeded
 
 SIZE = HEIGHT, WIDTH = 48, 64

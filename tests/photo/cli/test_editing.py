@@ -15,7 +15,8 @@ from nlfilter_torch import NonlocalFilter, nonlocal_operator, polynomial_filter
 from nlfilter_torch.photo.cli import main
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.declared.steps import Step
-from nlfilter_torch.photo.files.photographs import Depth, Photograph, read_photograph, write_photograph
+from nlfilter_torch.photo.files.formats import Depth
+from nlfilter_torch.photo.picture.photographs import Photograph, read_photograph, write_photograph
 from tests.commands import refusal, refused, small_photo
 
 PROFILE = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()

@@ -12,7 +12,7 @@ from nlfilter_torch.photo.declared.declaration import Edit, Scribble
 from nlfilter_torch.photo.declared.parameters import EDITS, MASK
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.declared.steps import Step
-from nlfilter_torch.photo.files.photographs import Photograph, write_photograph
+from nlfilter_torch.photo.picture.photographs import Photograph, write_photograph
 from tests.commands import refusal
 
 TECHNICAL = ["--bandwidth", "--spatial-bandwidth", "--patch-size", "--landmarks", "--sampling"]

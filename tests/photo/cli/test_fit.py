@@ -11,7 +11,7 @@ from nlfilter_torch.photo import apply_look
 from nlfilter_torch.photo.cli import main
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.declared.steps import Step
-from nlfilter_torch.photo.files.photographs import Photograph, read_photograph, write_photograph
+from nlfilter_torch.photo.picture.photographs import Photograph, read_photograph, write_photograph
 from nlfilter_torch.photo.picture.resizing import resize
 from tests.commands import refusal
 from tests.looks import ALPHA, CAT, CUP, SEPIA, explained, in_bytes, rgb

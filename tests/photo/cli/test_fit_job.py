@@ -8,7 +8,7 @@ from nlfilter_torch.photo import apply_look
 from nlfilter_torch.photo.cli import main
 from nlfilter_torch.photo.declared.presets import find_recipe
 from nlfilter_torch.photo.edits.applying import apply_step
-from nlfilter_torch.photo.files.photographs import Photograph, read_photograph, write_photograph
+from nlfilter_torch.photo.picture.photographs import Photograph, read_photograph, write_photograph
 from tests.looks import BENT, CUP, SEPIA, VIVID
 
 

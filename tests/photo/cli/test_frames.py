@@ -18,7 +18,7 @@ from nlfilter_torch.photo.declared.strokes import Stroke
 from nlfilter_torch.photo.edits.applying import apply_step
 from nlfilter_torch.photo.edits.film import FilmEdit
 from nlfilter_torch.photo.files.films import open_film
-from nlfilter_torch.photo.files.photographs import Photograph, read_photograph, write_photograph
+from nlfilter_torch.photo.picture.photographs import Photograph, read_photograph, write_photograph
 from nlfilter_torch.photo.picture.tiles import Passes
 from tests.films import PASSES, facts, pan, write
 

@@ -10,7 +10,7 @@ import torch
 from PIL import Image
 
 from nlfilter_torch.photo.cli import main
-from nlfilter_torch.photo.files.photographs import Photograph, write_photograph
+from nlfilter_torch.photo.picture.photographs import Photograph, write_photograph
 
 
 def test_inspect_writes_pictures_and_figures(photo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

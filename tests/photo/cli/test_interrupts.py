@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from nlfilter_torch.photo.cli import interrupts, main
-from nlfilter_torch.photo.files.photographs import read_photograph
+from nlfilter_torch.photo.picture.photographs import read_photograph
 from tests.commands import small_photo
 
 
@@ -74,7 +74,7 @@ def test_signals_while_a_file_is_written(
             raise AssertionError("the signal was lost")
         os.kill(os.getpid(), number)
 
-    monkeypatch.setattr("nlfilter_torch.photo.files.photographs.encode", interrupted)
+    monkeypatch.setattr("nlfilter_torch.photo.picture.photographs.encode", interrupted)
     try:
         signal.signal(signal.SIGINT, signal.default_int_handler)
         signal.signal(signal.SIGTERM, signal.SIG_DFL)

@@ -131,7 +131,7 @@ def write_negative(source: Path, processes: ZarrProcesses) -> None:
     with open_picture(source, 1 << 30) as stored:
         passes = Passes("uint8", folder=source.parent, processes=processes)
         tiling = Tiling(passes, Picture(stored.rows), Negative(source.with_name("died")), margin=0, rows=20)
-        write_picture(source.with_name("out.zarr"), tiling, "uint8", stored)
+        write_picture(source.with_name("out.zarr"), tiling, "uint8", stored, fill=tiling.fill)
 
 
 def check_negative(source: Path) -> None:

@@ -11,7 +11,7 @@ from nlfilter_torch.photo.cli import main
 from nlfilter_torch.photo.cli.recipe_job import RecipeJob
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.declared.steps import Step
-from nlfilter_torch.photo.files.photographs import read_photograph
+from nlfilter_torch.photo.picture.photographs import read_photograph
 from tests.problems import colour
 from tests.recipes import COLORIZE
 

@@ -11,8 +11,8 @@ from nlfilter_torch.photo.cli import main
 from nlfilter_torch.photo.cli.scribbles import Rectangle, ScribbleOptions, at_once, of_edit, overlays, selection
 from nlfilter_torch.photo.declared.declaration import Edit, Scribble
 from nlfilter_torch.photo.declared.parameters import EDITS
-from nlfilter_torch.photo.files.photographs import Photograph, write_photograph
 from nlfilter_torch.photo.files.rows import StoredPicture, open_picture
+from nlfilter_torch.photo.picture.photographs import Photograph, write_photograph
 from tests.commands import refusal
 from tests.problems import box, colour
 

@@ -11,8 +11,8 @@ from PIL import Image
 
 from nlfilter_torch.photo.cli import main
 from nlfilter_torch.photo.cli.showing import hatched
-from nlfilter_torch.photo.files.photographs import Photograph, read_photograph, write_photograph
 from nlfilter_torch.photo.picture.in_memory import InMemory
+from nlfilter_torch.photo.picture.photographs import Photograph, read_photograph, write_photograph
 from nlfilter_torch.photo.selections.stray import stray_parts
 from tests.problems import box, paint
 

@@ -12,7 +12,7 @@ from nlfilter_torch.photo.declared.looks import CHARACTERS, LOOKS
 from nlfilter_torch.photo.declared.presets import PRESETS, PURPOSES, Recipe, find_recipe
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.edits.applying import apply_recipe
-from nlfilter_torch.photo.files.photographs import Photograph, read_photograph, write_photograph
+from nlfilter_torch.photo.picture.photographs import Photograph, read_photograph, write_photograph
 from tests.recipes import INSIDE, KEEP, WHOLE
 
 

@@ -7,7 +7,7 @@ import torch
 
 from nlfilter_torch.photo import adjust_tone, enhance
 from nlfilter_torch.photo.cli import main
-from nlfilter_torch.photo.files.photographs import Photograph, read_photograph, write_photograph
+from nlfilter_torch.photo.picture.photographs import Photograph, read_photograph, write_photograph
 from tests.brightness import ALPHA
 from tests.problems import BACKGROUND, SUIT, box, colour
 

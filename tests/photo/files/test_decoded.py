@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from nlfilter_torch.photo.files.decoded import UnhandledImage, bands, decoding, quiet
+from nlfilter_torch.photo.files.decoded import bands, decoding, quiet
+from nlfilter_torch.photo.files.metadata import UnhandledImage
 
 
 def test_errors_of_decoders_are_damage() -> None:

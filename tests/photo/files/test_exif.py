@@ -10,7 +10,7 @@ import torch
 from PIL import ExifTags, Image, ImageOps
 
 from nlfilter_torch.photo.files.exif import read_upright, upright
-from nlfilter_torch.photo.files.photographs import read_photograph, write_photograph
+from nlfilter_torch.photo.picture.photographs import read_photograph, write_photograph
 from tests.files import exif_block, photograph, same, stored_values, tags
 
 

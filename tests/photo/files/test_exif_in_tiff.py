@@ -11,9 +11,9 @@ from PIL import Image
 
 from nlfilter_torch.photo.files import exif as exif_tags
 from nlfilter_torch.photo.files import exif_in_tiff, tiff
-from nlfilter_torch.photo.files.photographs import Photograph, read_photograph, write_photograph
 from nlfilter_torch.photo.files.rows import open_picture, write_picture
 from nlfilter_torch.photo.files.tables import Tables
+from nlfilter_torch.photo.picture.photographs import Photograph, read_photograph, write_photograph
 from tests.files import MAKER_NOTE, PLENTY, camera_block, fields_of, photograph, stored_values
 
 

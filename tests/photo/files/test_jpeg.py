@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from nlfilter_torch.photo.files.decoded import Metadata
-from nlfilter_torch.photo.files.extras import Extras
 from nlfilter_torch.photo.files.jpeg import open_jpeg, write_jpeg
-from nlfilter_torch.photo.files.photographs import read_photograph, write_photograph
+from nlfilter_torch.photo.files.metadata import Extras, Metadata
+from nlfilter_torch.photo.picture.photographs import read_photograph, write_photograph
 from tests.files import cat
 
 GAIN_MAP = b'<x:xmpmeta><rdf:Description hdrgm:Version="1.0" GCamera:MotionPhoto="1" xmp:Rating="4"/></x:xmpmeta>'

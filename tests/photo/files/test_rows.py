@@ -12,7 +12,7 @@ from PIL import ExifTags, Image
 from nlfilter_torch.photo.cli import editing
 from nlfilter_torch.photo.files import rows, tiff
 from nlfilter_torch.photo.files import rows as streaming_files
-from nlfilter_torch.photo.files.decoded import Metadata
+from nlfilter_torch.photo.files.metadata import Metadata
 from nlfilter_torch.photo.files.rows import StoredPicture, open_picture, write_picture
 from tests.commands import refused, small_photo
 from tests.files import PLENTY, PROFILE, cat, rows_of

@@ -9,9 +9,9 @@ from PIL import Image
 
 from nlfilter_torch.photo.files import rows, scratch
 from nlfilter_torch.photo.files.exif import upright
-from nlfilter_torch.photo.files.photographs import read_channels
-from nlfilter_torch.photo.files.rows import open_picture
-from nlfilter_torch.photo.files.scratch import Scratch, upright_copy
+from nlfilter_torch.photo.files.formats import read_channels
+from nlfilter_torch.photo.files.rows import open_picture, upright_copy
+from nlfilter_torch.photo.files.scratch import Scratch
 from tests.files import PLENTY, cat, rows_of
 
 

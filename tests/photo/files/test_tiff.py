@@ -11,9 +11,9 @@ import torch
 from PIL import Image
 
 from nlfilter_torch.photo.files.exif import upright
-from nlfilter_torch.photo.files.photographs import read_photograph, write_photograph
 from nlfilter_torch.photo.files.rows import open_picture
 from nlfilter_torch.photo.files.tiff import TiffRows
+from nlfilter_torch.photo.picture.photographs import read_photograph, write_photograph
 from tests.files import cat, photograph, rows_of, same, stored_values
 
 

@@ -10,8 +10,8 @@ import pytest
 
 from nlfilter_torch.photo.cli import main
 from nlfilter_torch.photo.files import writing as files
-from nlfilter_torch.photo.files.photographs import write_photograph
 from nlfilter_torch.photo.files.writing import check_folder, open_beside
+from nlfilter_torch.photo.picture.photographs import write_photograph
 from tests.commands import refused, small_photo
 from tests.files import photograph, stored_values
 

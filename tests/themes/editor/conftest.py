@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Browser, expect
 
-from nlfilter_torch.photo.files.photographs import Photograph, write_photograph
+from nlfilter_torch.photo.picture.photographs import Photograph, write_photograph
 from tests.browser import CHROMIUM, Editor, Tab, chromium, running
 from tests.problems import cat
 

@@ -8,7 +8,7 @@ from nlfilter_torch.photo.app.preview import PIXELS
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.edits.applying import apply_recipe
-from nlfilter_torch.photo.files.photographs import Photograph, read_photograph, write_photograph
+from nlfilter_torch.photo.picture.photographs import Photograph, read_photograph, write_photograph
 from nlfilter_torch.photo.picture.resizing import resize
 from tests.browser import Tab, running
 from tests.problems import cat

@@ -9,7 +9,7 @@ from playwright.sync_api import expect
 from nlfilter_torch.photo.cli import main
 from nlfilter_torch.photo.declared.presets import Recipe, find_recipe
 from nlfilter_torch.photo.edits.applying import apply_recipe
-from nlfilter_torch.photo.files.photographs import read_photograph
+from nlfilter_torch.photo.picture.photographs import read_photograph
 from tests.browser import Tab, difference
 from tests.problems import cat
 

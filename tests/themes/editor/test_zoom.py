@@ -9,7 +9,7 @@ import torch
 from playwright.sync_api import Browser, Page, expect
 
 from nlfilter_torch.photo.declared.presets import find_recipe
-from nlfilter_torch.photo.files.photographs import Photograph, read_photograph, write_photograph
+from nlfilter_torch.photo.picture.photographs import Photograph, read_photograph, write_photograph
 from tests.browser import POINTED, TOUCHED, Editor, Fingers, Tab, pixels_of, running
 from tests.problems import cat
 

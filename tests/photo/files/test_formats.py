@@ -14,7 +14,7 @@ import tifffile
 import torch
 from PIL import ExifTags, Image
 
-from nlfilter_torch.photo.files.photographs import Photograph, read_photograph, write_photograph
+from nlfilter_torch.photo.picture.photographs import Photograph, read_photograph, write_photograph
 from tests.files import CHANNELS, INTEGERS, PROFILE, exif_block, photograph, same, stored_values, tags
 
 LOSSLESS = [

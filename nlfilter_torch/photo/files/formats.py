@@ -5,7 +5,7 @@ Needs the ``cli`` extra (Pillow, tifffile, imagecodecs, psutil).
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from mmap import ACCESS_READ, mmap
 from pathlib import Path
@@ -13,27 +13,15 @@ from typing import BinaryIO, Literal
 
 import numpy as np
 import psutil
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
-from nlfilter_torch.core.checks import check_count
-from nlfilter_torch.operator.hidden import REACH
-from nlfilter_torch.photo.files import by_pillow, cameras, jpeg, png, tiff
+from nlfilter_torch.photo.declared.rows import Stored
+from nlfilter_torch.photo.files import codecs, jpeg, png, tiff
 from nlfilter_torch.photo.files import exif as exif_tags
-from nlfilter_torch.photo.files.decoded import Channels, CheckSize, Decoded, Metadata, UnhandledImage, decoding
+from nlfilter_torch.photo.files.decoded import CheckSize, Decoded, decoding
 from nlfilter_torch.photo.files.exif_in_tiff import shortened
-from nlfilter_torch.photo.files.extras import NO_EXTRAS, Extras, note_left_out
+from nlfilter_torch.photo.files.metadata import Metadata, UnhandledImage
 from nlfilter_torch.photo.files.writing import check_file, open_beside
-from nlfilter_torch.photo.picture.pictures import (
-    NodataRows,
-    Picture,
-    is_hidden,
-    keep_apart,
-    put_back,
-    stored_as,
-    transparency,
-)
 
 Depth = Literal["uint8", "uint16", "float16", "float32", "float64"]
 
@@ -47,140 +35,16 @@ DEPTHS: dict[str, tuple[str, ...]] = {
     "TIFF": ("uint8", "uint16", "float16", "float32", "float64"),
 }
 # Pixels. Those of libpng and libavif are what they decode.
-LONGEST_SIDE = {"WebP": 16383, "JPEG": 65500, "PNG": png.LONGEST_SIDE, "AVIF": by_pillow.LONGEST_AVIF}
-MOST_PIXELS = {"AVIF": by_pillow.MOST_AVIF}
+LONGEST_SIDE = {"WebP": 16383, "JPEG": 65500, "PNG": png.LONGEST_SIDE, "AVIF": codecs.LONGEST_AVIF}
+MOST_PIXELS = {"AVIF": codecs.MOST_AVIF}
 LONGEST_EXIF = jpeg.LONGEST  # bytes, in JPEG
-CONVERTED = 1 << 18  # pixels that are converted at a time between files and floats
 SUFFIXES = {".png": "PNG", ".jpg": "JPEG", ".jpeg": "JPEG", ".webp": "WebP", ".avif": "AVIF"}
 SUFFIXES |= {".tif": "TIFF", ".tiff": "TIFF"}
-
-
-@dataclass(frozen=True)
-class HiddenPixels:
-    """The pixels of a file that do not count: transparent ones, and those without data.
-
-    Attributes:
-        places: where they are, (H, W).
-        colours: as they are stored, (n, C).
-        nodata: the value that says that there is no data, or None.
-    """
-
-    places: NDArray[np.bool_]
-    colours: Channels
-    nodata: float | None = None
-
-    def put_back(self, channels: Channels) -> None:
-        """Put them back into the channels (H, W, S) of the file; no other pixel gets the value of those without data.
-
-        Several channels of one that is stored are colours.
-        """
-        colours = channels[..., : 3 if channels.shape[2] >= 3 else 1]
-        put_back(colours, self.colours, self.places)
-        if self.nodata is not None:
-            keep_apart(colours, self.places, self.nodata)
-
-
-@dataclass(frozen=True)
-class Photograph:
-    """An image file in memory: pixels to compute with, and the metadata to write back.
-
-    Attributes:
-        pixels: (1, C, H, W), C = 1 or 3, upright. Integer files are scaled to [0, 1]; float files keep their own
-            values. float32, or float64 for a file of 64-bit floats. Hidden pixels have colours of pixels nearby.
-        depth: How a channel is stored in the file, as the name of a numpy dtype.
-        alpha: (1, 1, H, W), scaled like the pixels, or None. It is not edited.
-        icc: The colour profile, or None. Pixels are not converted.
-        exif: The EXIF block, with orientation 1 since the pixels are upright, or None.
-        extras: XMP and print resolution.
-        hidden: The pixels that do not count, which are written back as they were, or None.
-    """
-
-    pixels: Tensor
-    depth: Depth = "uint8"
-    alpha: Tensor | None = None
-    icc: bytes | None = None
-    exif: bytes | None = None
-    extras: Extras = NO_EXTRAS
-    hidden: HiddenPixels | None = None
-
-    @property
-    def weights(self) -> Tensor | None:
-        """How much pixels count, (1, 1, H, W) in [0, 1]; None if all count, or none do."""
-        weights = self.pixels.new_ones(1, 1, *self.size) if self.alpha is None else self.alpha.clamp(0, 1)
-        if self.hidden is not None:
-            weights = weights * torch.from_numpy(~self.hidden.places)
-        return weights if 0 < float(weights.sum()) < weights.numel() else None
-
-    @property
-    def metadata(self) -> Metadata:
-        """Profile, EXIF and the rest."""
-        return Metadata(self.icc, self.exif, self.extras)
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """(H, W)."""
-        return self.pixels.shape[-2], self.pixels.shape[-1]
-
-    def with_pixels(self, pixels: Tensor) -> "Photograph":
-        """Return a copy with other pixels (1, C, H, W), from any device; a different C drops the profile."""
-        icc = self.icc if pixels.shape[1] == self.pixels.shape[1] else None
-        return replace(self, pixels=pixels.detach().to(self.pixels), icc=icc)
+PFM = ".pfm"  # of masks
 
 
 class TooLarge(MemoryError):
     """A picture that needs more memory to be edited whole than is available."""
-
-
-def read_photograph(path: str | Path, *, bytes_per_pixel: int = 0, memory: int | None = None) -> Photograph:
-    """Read an image file.
-
-    Args:
-        path: A PNG, JPEG, TIFF, WebP or AVIF file, recognised by its content: grey or RGB, with or without alpha, 8 or
-            16 bits, 10 or 12 (AVIF, read as 16) or floats (TIFF). Of several pages or pictures in a TIFF or JPEG file,
-            the first is read. With the extras ``raw`` and ``heic`` also HEIC files, and RAW files, which are recognised
-            by their suffix and read as 16 bits.
-        bytes_per_pixel: Memory that editing will need per pixel in float32, checked before decoding; doubled for files
-            of 64-bit floats.
-        memory: Bytes that may be used; None is the free memory.
-
-    Returns:
-        The photograph, turned upright.
-
-    Raises:
-        FileNotFoundError: The file does not exist.
-        ValueError: The file is empty, damaged, not an image, or of an unsupported kind.
-        TooLarge: ``bytes_per_pixel`` for all pixels exceeds the memory. It is a MemoryError.
-    """
-    path = Path(path)
-    decoded = read_channels(path, bytes_per_pixel=bytes_per_pixel, memory=memory)
-    channels, metadata = decoded.channels, decoded.metadata
-    depth = check_depth(path, channels.dtype)
-    planes, hidden = _planes_of(channels, metadata.extras.nodata, str(path))
-    colours = 3 if planes.shape[1] >= 3 else 1
-    alpha = planes[:, colours:] if planes.shape[1] > colours else None
-    return Photograph(planes[:, :colours], depth, alpha, metadata.icc, metadata.exif, metadata.extras, hidden)  # type: ignore[arg-type]
-
-
-def _planes_of(channels: Channels, nodata: float | None, name: str) -> tuple[Tensor, HiddenPixels | None]:
-    """All channels (1, S, H, W) of a picture, converted a few rows at a time to save memory, and what it hides."""
-    marked = nodata is not None and channels.shape[2] in (1, 3)
-    picture = Picture(NodataRows(channels, nodata) if marked and nodata is not None else channels, name)
-    picture.accept_any_scale()  # until it is edited
-    planes = torch.empty(1, channels.shape[2], *picture.size, dtype=picture.dtype)
-    places = np.zeros(picture.size if picture.hides else (0, 0), np.bool_)
-    rows = max(CONVERTED // picture.size[1], 4 * REACH if picture.hides else 1)
-    for tile in picture.tiles(0, rows):
-        part = slice(tile.start, tile.start + len(tile.stored))
-        planes[:, : picture.colours, part] = tile.pixels
-        if picture.hides:
-            places[part] = is_hidden(tile.stored)
-        if channels.shape[2] > picture.colours:
-            planes[:, picture.colours :, part] = torch.from_numpy(
-                transparency(tile, planes.numpy().dtype.name)
-            ).movedim(2, 0)
-    if not places.any():
-        return planes, None
-    return planes, HiddenPixels(places, channels[places][:, : picture.colours], nodata if marked else None)
 
 
 def check_depth(path: str | Path, dtype: np.dtype[np.generic]) -> str:
@@ -218,10 +82,10 @@ def read_channels(path: Path, *, bytes_per_pixel: int, memory: int | None) -> De
     """Read upright channels (H, W, S) in the stored dtype, and metadata; see :func:`read_photograph`."""
     head = first_bytes(path)
     check_size = partial(_check_size, path, bytes_per_pixel, memory)
-    if cameras.is_raw(path):
-        decoded = cameras.read_raw(path, check_size)
-    elif cameras.is_heic(head):
-        decoded = cameras.read_heic(path, check_size)
+    if codecs.is_raw(path):
+        decoded = codecs.read_raw(path, check_size)
+    elif codecs.is_heic(head):
+        decoded = codecs.read_heic(path, check_size)
     elif tiff.is_tiff(head):
         decoded = tiff.read(path, check_size)
     else:
@@ -241,10 +105,10 @@ def _read_mapped(path: Path, data: mmap, check_size: CheckSize) -> Decoded:
         photo = jpeg.open_jpeg(path, data)
         check_size(photo.size)
         return Decoded(photo.decode(path), photo.orientation, photo.metadata)
-    if by_pillow.is_webp(head):
-        return by_pillow.read_webp(path, data, check_size)
-    if by_pillow.is_avif(head):
-        return by_pillow.read_avif(path, data, check_size)
+    if codecs.is_webp(head):
+        return codecs.read_webp(path, data, check_size)
+    if codecs.is_avif(head):
+        return codecs.read_avif(path, data, check_size)
     raise UnhandledImage(f"{path} is not a PNG, JPEG, TIFF, WebP or AVIF image; convert it to one of these")
 
 
@@ -265,42 +129,10 @@ def _check_size(
     check_memory(path, *size, bytes_per_pixel * (1 + double), memory)
 
 
-def write_photograph(photograph: Photograph, path: str | Path, *, quality: int | None = None) -> None:
-    """Write an image file at the photograph's depth; the extension of the name selects the type.
-
-    Integer channels are clipped to their range and rounded. JPEG is written at quality 95 without chroma subsampling,
-    AVIF at 90, WebP and TIFF without loss. The file appears complete or not at all.
-
-    Args:
-        photograph: what to write.
-        path: name of the file.
-        quality: of a JPEG file, 1 to 100; None is 95. Other types of file ignore it.
-
-    Raises:
-        ValueError: if the quality is out of range; see also :func:`~nlfilter_torch.photo.files.check_output`.
-        OSError: The file cannot be written.
-    """
-    if quality is not None:
-        check_count(quality, "quality", most=100)
-    path = Path(path)
-    kind = check_output(path, photograph)
-    planes = [photograph.pixels] if photograph.alpha is None else [photograph.pixels, photograph.alpha]
-    rows = max(1, CONVERTED // photograph.size[1])
-    parts = zip(*(plane.split(rows, dim=2) for plane in planes), strict=True)
-    channels = np.concatenate([stored_as(torch.cat(part, dim=1), photograph.depth) for part in parts])  # (H, W, S)
-    if photograph.hidden is not None:
-        photograph.hidden.put_back(channels)
-    alpha = photograph.alpha is not None
-    with open_beside(path) as stream:
-        metadata, left_out = with_thumbnail(photograph.metadata, None if kind == "TIFF" else channels)
-        left_out += encode(stream, kind, [channels], channels.shape, channels.dtype, alpha, metadata, quality)
-    note_left_out(path, left_out)
-
-
 def encode(
     stream: BinaryIO,
     kind: str,
-    rows: Iterable[Channels],
+    rows: Iterable[Stored],
     shape: tuple[int, int, int],
     dtype: np.dtype[np.generic],
     alpha: bool,
@@ -329,11 +161,11 @@ def encode(
         if extras.dpi is not None and exif_tags.resolution(metadata.exif) is None:
             left_out.append("the print resolution")
         whole = np.concatenate(list(rows))
-        by_pillow.write_by_pillow(stream, kind, whole[..., 0] if shape[2] == 1 else whole, metadata)
+        codecs.write_by_pillow(stream, kind, whole[..., 0] if shape[2] == 1 else whole, metadata)
     return left_out
 
 
-def with_thumbnail(metadata: Metadata, channels: Channels | None) -> tuple[Metadata, list[str]]:
+def with_thumbnail(metadata: Metadata, channels: Stored | None) -> tuple[Metadata, list[str]]:
     """Metadata whose thumbnail, if they have any, shows channels (H, W, S), or is left out and named."""
     if metadata.exif is None or not exif_tags.has_thumbnail(metadata.exif):
         return metadata, []
@@ -351,14 +183,6 @@ def fitting_jpeg(metadata: Metadata) -> tuple[Metadata, list[str]]:
     if packet is not None and len(packet) > jpeg.LONGEST_XMP:
         left_out.append(f"XMP of {len(packet)} bytes, as JPEG holds at most {jpeg.LONGEST_XMP}")
     return metadata, left_out
-
-
-def check_output(path: str | Path, photograph: Photograph) -> str:
-    """Raise ValueError unless ``photograph`` can be written to ``path``; return the file type.
-
-    Call it before long work, so that the error comes early.
-    """
-    return check_type(path, photograph.depth, photograph.alpha is not None, photograph.size, photograph.metadata)
 
 
 def check_type(
@@ -409,6 +233,17 @@ def _check_jpeg_metadata(path: Path, metadata: Metadata) -> None:
             f"{path} cannot hold this picture: JPEG has at most {longest} bytes of {name}, got {len(content)}; "
             "write a PNG, TIFF or WebP file"
         )
+
+
+def write_pfm(path: Path, plane: NDArray[np.float32]) -> None:
+    """Write a plane (H, W) of floats as a PFM file, bottom row first as the format requires.
+
+    It is read as a raster mask by darktable and ART. The file appears complete or not at all.
+    """
+    height, width = plane.shape
+    with open_beside(path) as stream:
+        stream.write(f"Pf\n{width} {height}\n-1.0\n".encode())  # negative: little-endian
+        stream.write(np.ascontiguousarray(plane[::-1], "<f4").tobytes())
 
 
 def check_memory(path: Path, width: int, height: int, bytes_per_pixel: int, memory: int | None = None) -> None:

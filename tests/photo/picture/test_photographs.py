@@ -5,9 +5,8 @@ import pytest
 import torch
 
 from nlfilter_torch.photo.declared.development import Development
-from nlfilter_torch.photo.files.developed import develop_photograph
-from nlfilter_torch.photo.files.photographs import HiddenPixels, Photograph
 from nlfilter_torch.photo.picture.developing import develop_image
+from nlfilter_torch.photo.picture.photographs import HiddenPixels, Photograph, develop_photograph
 from tests.problems import colour
 
 SIZE = (40, 60)

@@ -1,8 +1,13 @@
-"""WebP and AVIF files: written by Pillow, and read by it or, beyond its limits and its 8 bits, by imagecodecs."""
+"""Files that other libraries decode: WebP and AVIF (Pillow, imagecodecs), RAW (rawpy) and HEIC (pillow-heif).
+
+WebP and AVIF are written by Pillow, and read by it or, beyond its limits and its 8 bits, by imagecodecs. RAW and HEIC
+are not written, and need the extras ``raw`` and ``heic``.
+"""
 
 import io
 import struct
-from mmap import mmap
+from contextlib import suppress
+from mmap import ACCESS_READ, mmap
 from pathlib import Path
 from typing import BinaryIO
 
@@ -10,10 +15,21 @@ import imagecodecs
 import numpy as np
 from PIL import AvifImagePlugin, Image, ImageFile
 
-from nlfilter_torch.photo.files import colours, xmp
+from nlfilter_torch.photo.declared.rows import Stored
 from nlfilter_torch.photo.files import exif as exif_tags
-from nlfilter_torch.photo.files.decoded import Channels, CheckSize, Decoded, Metadata, UnhandledImage, quiet
-from nlfilter_torch.photo.files.extras import Extras
+from nlfilter_torch.photo.files import exif_in_tiff, jpeg
+from nlfilter_torch.photo.files.decoded import CheckSize, Decoded, decoding, quiet
+from nlfilter_torch.photo.files.metadata import (
+    DEPTH,
+    GAIN_MAP,
+    PICTURES,
+    Extras,
+    Metadata,
+    UnhandledImage,
+    check_colour_numbers,
+    upright_packet,
+)
+from nlfilter_torch.photo.files.tables import EXIF, Tables
 
 ENCODING: dict[str, dict[str, object]] = {
     "WebP": {"lossless": True, "exact": True},  # exact: also where it is transparent
@@ -43,7 +59,7 @@ def read_webp(path: Path, data: bytes | mmap, check_size: CheckSize) -> Decoded:
     by_name = dict(chunks)
     check_size(_webp_size(by_name))
     upright = exif_tags.read_upright(by_name.get(b"EXIF"))
-    packet, left_out = xmp.upright(by_name.get(b"XMP "), upright.orientation)
+    packet, left_out = upright_packet(by_name.get(b"XMP "), upright.orientation)
     left_out += [f"the chunk {name.decode('latin-1').strip()}" for name in by_name if name not in WEBP_CHUNKS]
     channels = np.asarray(imagecodecs.webp_decode(data))
     metadata = Metadata(by_name.get(b"ICCP"), upright.block, Extras(packet, left_out=(*left_out, *upright.left_out)))
@@ -87,15 +103,15 @@ def read_avif(path: Path, data: bytes | mmap, check_size: CheckSize) -> Decoded:
         # The block as stored: image.info may hold one that Pillow wrote anew.
         block, orientation = image._decoder.get_info()[4:6]
         upright = exif_tags.read_upright(block, orientation)
-        packet, left_out = xmp.upright(image.info.get("xmp"), upright.orientation)
-        left_out += [xmp.GAIN_MAP] * (b"tmap" in data[:HEAD])
+        packet, left_out = upright_packet(image.info.get("xmp"), upright.orientation)
+        left_out += [GAIN_MAP] * (b"tmap" in data[:HEAD])
         channels = _decoded(image, data)
         extras = Extras(packet, left_out=(*left_out, *upright.left_out))
         metadata = Metadata(image.info.get("icc_profile"), upright.block, extras)
         return Decoded(channels.reshape(*channels.shape[:2], -1), upright.orientation, metadata)
 
 
-def _decoded(image: ImageFile.ImageFile, data: bytes | mmap) -> Channels:
+def _decoded(image: ImageFile.ImageFile, data: bytes | mmap) -> Stored:
     """The pixels (H, W) or (H, W, S) of an open AVIF file, as 16 bits if it has 10 or 12."""
     if (bits := _bits_of_avif(data)) > 8:  # Pillow would reduce them to 8
         levels = imagecodecs.avif_decode(data)
@@ -117,10 +133,10 @@ def _check_avif_size(path: Path, data: bytes | mmap) -> None:
 
 
 def _check_colours(path: Path, data: bytes | mmap) -> None:
-    """Check the colours of an AVIF file without a profile, see :mod:`nlfilter_torch.photo.files.colours`."""
+    """Check the colours of an AVIF file without a profile, see :func:`check_colour_numbers`."""
     _, marker, numbers = data[:HEAD].partition(b"colrnclx")
     if marker and len(numbers) >= 4:
-        colours.check_numbers(path, *struct.unpack(">HH", numbers[:4]))
+        check_colour_numbers(path, *struct.unpack(">HH", numbers[:4]))
 
 
 def _bits_of_avif(data: bytes | mmap) -> int:
@@ -131,7 +147,7 @@ def _bits_of_avif(data: bytes | mmap) -> int:
     return (12 if flags & 0x20 else 10) if flags & 0x40 else 8
 
 
-def write_by_pillow(stream: BinaryIO, kind: str, channels: Channels, metadata: Metadata) -> None:
+def write_by_pillow(stream: BinaryIO, kind: str, channels: Stored, metadata: Metadata) -> None:
     """Write channels (H, W) or (H, W, S) of 8 bits as a WebP or AVIF file."""
     block = metadata.exif or b""
     # Pillow writes a block with an orientation anew. It gets it under another number, which is then set right.
@@ -145,3 +161,90 @@ def write_by_pillow(stream: BinaryIO, kind: str, channels: Channels, metadata: M
     if block:
         whole[place : place + len(block.removeprefix(exif_tags.PREFIX))] = block.removeprefix(exif_tags.PREFIX)
     stream.write(whole)
+
+
+#: Suffixes of RAW files, most of which begin like TIFF files.
+RAWS = (
+    *(".3fr", ".arw", ".cr2", ".cr3", ".crw", ".dcr", ".dng", ".erf", ".fff", ".iiq", ".kdc", ".mef", ".mos", ".mrw"),
+    *(".nef", ".nrw", ".orf", ".pef", ".raf", ".raw", ".rw2", ".rwl", ".sr2", ".srf", ".srw", ".x3f"),
+)
+BRANDS = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1")
+
+
+def is_raw(path: Path) -> bool:
+    """Whether a path has the suffix of a RAW file."""
+    return path.suffix.lower() in RAWS
+
+
+def is_heic(head: bytes) -> bool:
+    """Whether a file with these first bytes is HEIC."""
+    return head[4:8] == b"ftyp" and head[8:12] in BRANDS and b"avif" not in head
+
+
+def read_raw(path: Path, check_size: CheckSize) -> Decoded:
+    """Read upright 16-bit channels in sRGB, with the camera's white balance and no brightening."""
+    try:
+        import rawpy
+    except ImportError as error:
+        raise ValueError(
+            f"{path} is a RAW file and needs the package rawpy, which is not installed; install nlfilter-torch[raw]"
+        ) from error
+    try:
+        with rawpy.imread(str(path)) as raw:
+            check_size((raw.sizes.iwidth, raw.sizes.iheight))
+            channels = raw.postprocess(output_bps=16, use_camera_wb=True, no_auto_bright=True)
+            exif, moved = _own_exif(path)
+            with suppress(rawpy.LibRawError, ValueError, EOFError):  # no preview, or an unreadable one
+                preview = raw.extract_thumb() if exif is None or not _has_details(exif) else None
+                if preview is not None and preview.format == rawpy.ThumbFormat.JPEG:
+                    exif = jpeg.open_jpeg(path, bytes(preview.data)).metadata.exif or exif
+    except rawpy.LibRawError as error:
+        raise UnhandledImage(
+            f"{path} cannot be read as a RAW file, or is damaged; copy it again, or convert it to DNG or TIFF"
+        ) from error
+    # The pixels are upright, and of another size than the preview.
+    exif = exif_tags.read_upright(exif, 1, channels.shape[1::-1]).block
+    return Decoded(channels, 1, Metadata(exif=exif, extras=Extras(left_out=(exif_in_tiff.MOVED,) * moved)))
+
+
+def _own_exif(path: Path) -> tuple[bytes | None, bool]:
+    """The EXIF block of a RAW file that is a TIFF file, and whether its maker note was moved."""
+    try:
+        with path.open("rb") as stream, mmap(stream.fileno(), 0, access=ACCESS_READ) as data:
+            return exif_in_tiff.block_of(Tables(data))
+    except (ValueError, struct.error):
+        return None, False
+
+
+def _has_details(exif: bytes) -> bool:
+    tables = exif_tags.parsed(exif)
+    return tables is not None and any(field.code == EXIF for field in tables.fields(tables.first))
+
+
+def read_heic(path: Path, check_size: CheckSize) -> Decoded:
+    """Read upright channels of 8 bits, or of 16 if the file has more."""
+    try:
+        import pillow_heif
+    except ImportError as error:
+        raise ValueError(
+            f"{path} is an HEIC file and needs the package pillow-heif, which is not installed; "
+            "install nlfilter-torch[heic]"
+        ) from error
+    with decoding(path):
+        picture = pillow_heif.open_heif(path, convert_hdr_to_8bit=False)
+        check_size(picture.size)
+        info = picture.info
+        numbers = info.get("nclx_profile")
+        if numbers and not info.get("icc_profile"):
+            check_colour_numbers(path, numbers["color_primaries"], numbers["transfer_characteristics"])
+        channels = np.asarray(picture)
+        if channels.dtype == np.uint16:  # the lower bits are empty
+            channels = np.rint(channels * (65535 / (65536 - (1 << (16 - info["bit_depth"]))))).astype(np.uint16)
+        # The pixels are upright already.
+        upright = exif_tags.read_upright(info.get("exif"), 1)
+        packet, left_out = upright_packet(info.get("xmp"))
+        left_out += [PICTURES] * (len(picture) > 1) + [DEPTH] * bool(info.get("depth_images"))
+        left_out += [PICTURES] * bool(info.get("aux"))
+        extras = Extras(packet, left_out=(*left_out, *upright.left_out))
+        metadata = Metadata(info.get("icc_profile"), upright.block, extras)
+        return Decoded(channels.reshape(*channels.shape[:2], -1), 1, metadata)

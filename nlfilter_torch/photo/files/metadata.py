@@ -1,0 +1,288 @@
+"""Metadata of image files: colour profile, EXIF, XMP, print resolution, tags of TIFF, and what is not copied."""
+
+import re
+from collections.abc import Iterable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from nlfilter_torch.core.warning import warn
+from nlfilter_torch.photo.files.tables import LENGTHS
+
+JPEG_LIMIT = 65_000  # bytes of XMP that fit in a JPEG segment; longer packets are not written
+RESOLUTION = (282, 283, 296)  # horizontal, vertical, and their unit
+SWAPPED = {282: 283, 283: 282}
+# Tags that say how a TIFF file stores its pixels. The output has its own.
+STORAGE = frozenset((*range(254, 260), 262, *range(263, 267), 273, *range(277, 280), 284, 288, 289, 292, 293))
+STORAGE |= {317, 320, 321, *range(322, 329), 332, 333, 334, 336, 338, 339, 347, *range(512, 522), *range(529, 533)}
+STORAGE |= {32995, 32996, 32997, 32998, 34675}
+#: Tags of GeoTIFF and GDAL: where the pixels lie on the ground, notes, and the value without data.
+GROUND = (33550, 33922, 34264, 34735, 34736, 34737)
+GDAL_NOTES, NODATA = 42112, 42113
+OF_A_DEPTH = (NODATA, 280, 281, 290, 291, 301, 340, 341)  # hold levels, or a value for each level
+FRACTIONS = (5, 10)  # types of two numbers
+
+
+@dataclass(frozen=True)
+class Tag:
+    """A tag of a TIFF file as it is stored.
+
+    Attributes:
+        code: its number.
+        kind: number of its type.
+        data: its values.
+        order: "<" or ">", the byte order of the values.
+    """
+
+    code: int
+    kind: int
+    data: bytes
+    order: str
+
+    @property
+    def count(self) -> int:
+        """Number of values."""
+        return len(self.data) // LENGTHS[self.kind]
+
+    def stored(self, order: str) -> tuple[int, int, int, bytes, bool]:
+        """The tag in a byte order, as tifffile takes it."""
+        unit = LENGTHS[self.kind] // (2 if self.kind in FRACTIONS else 1)
+        data = self.data if order == self.order else np.frombuffer(self.data, f"V{unit}").view(f"u{unit}")
+        return self.code, self.kind, 0, data if isinstance(data, bytes) else data.byteswap().tobytes(), True
+
+
+class Part(NamedTuple):
+    """A part of a file that only files of the same type can hold.
+
+    Attributes:
+        kind: that type.
+        name: what it is, in words.
+        data: its bytes.
+    """
+
+    kind: str
+    name: str
+    data: bytes
+
+
+@dataclass(frozen=True)
+class Extras:
+    """Metadata of a file to write back.
+
+    Attributes:
+        xmp: an XMP packet, or None.
+        dpi: pixels per inch, horizontal and vertical, or None.
+        tags: of a TIFF file, which only TIFF files can hold.
+        size: (H, W) of the picture that the tags describe, or None if there are none.
+        depth: of that picture.
+        parts: of the file, which only files of the same type can hold.
+        left_out: names of what was in the file and is not copied.
+    """
+
+    xmp: bytes | None = None
+    dpi: tuple[float, float] | None = None
+    tags: tuple[Tag, ...] = ()
+    size: tuple[int, int] | None = None
+    depth: str = ""
+    parts: tuple[Part, ...] = ()
+    left_out: tuple[str, ...] = ()
+
+    @property
+    def nodata(self) -> float | None:
+        """The value of pixels without data, by the tag of GDAL; None without one."""
+        for tag in self.tags:
+            if tag.code == NODATA:
+                with suppress(ValueError):  # not a number
+                    return float(tag.data.split(b"\0")[0].decode("ascii", "replace").replace(",", "."))
+        return None
+
+    def tags_for(self, size: tuple[int, int], depth: str) -> tuple[Tag, ...]:
+        """The tags that are true of a picture of a size (H, W) and depth."""
+        return tuple(
+            tag
+            for tag in self.tags
+            if (tag.code not in GROUND or size == self.size) and (tag.code not in OF_A_DEPTH or depth == self.depth)
+        )
+
+    def lacking_tags(self, kept: Iterable[Tag] = ()) -> list[str]:
+        """Names of the tags that are not among those kept."""
+        gone = [tag.code for tag in self.tags if tag not in kept and not (tag.code in RESOLUTION and self.dpi)]
+        return [] if not gone else [f"the TIFF {'tag' if len(gone) == 1 else 'tags'} {', '.join(map(str, gone))}"]
+
+
+NO_EXTRAS = Extras()
+
+
+def note_left_out(path: Path, names: Sequence[str]) -> None:
+    """Warn that a file was written without something that the input holds."""
+    if names:
+        warn(f"{path} is written without some metadata of the input: {', '.join(dict.fromkeys(names))}")
+
+
+def turned(pair: tuple[float, float], orientation: int) -> tuple[float, float]:
+    """A horizontal and a vertical number after a picture stored with an EXIF orientation was turned upright."""
+    return pair[::-1] if orientation >= 5 else pair
+
+
+def turned_tag(tag: Tag, orientation: int) -> Tag:
+    """A tag of a picture that was turned upright: a quarter turn swaps the two resolutions."""
+    return replace(tag, code=SWAPPED.get(tag.code, tag.code)) if orientation >= 5 else tag
+
+
+def sound(pair: Sequence[object] | None) -> tuple[float, float] | None:
+    """Return a print resolution if it is two valid numbers, else None."""
+    try:
+        x, y = (float(value) for value in pair or ())  # type: ignore[arg-type]
+    except (TypeError, ValueError, ZeroDivisionError):  # of damaged files
+        return None
+    return (x, y) if all(1 <= value <= 60_000 for value in (x, y)) else None  # 1 without a unit is not a resolution
+
+
+@dataclass(frozen=True)
+class Metadata:
+    """What a file says about its picture.
+
+    Attributes:
+        icc: colour profile, or None.
+        exif: EXIF block with orientation 1, or None.
+        extras: the rest.
+    """
+
+    icc: bytes | None = None
+    exif: bytes | None = None
+    extras: Extras = NO_EXTRAS
+
+
+NO_METADATA = Metadata()
+
+
+class UnhandledImage(ValueError):
+    """A valid image file of an unsupported kind."""
+
+
+# --- XMP packets
+
+# Pixels are turned upright when read, but XMP may repeat the original orientation.
+XMP_ORIENTATION = re.compile(rb"(tiff:Orientation\s*(?:=\s*[\"']|>)\s*)[1-8]")
+MOTION = "the video of a motion photo"
+PICTURES = "further pictures"
+GAIN_MAP = "a gain map"
+DEPTH = "a depth map"
+GOOGLE = b"http://ns.google.com/photos/1.0/"
+#: Statements by their namespace: the usual prefix, the names (None for all), and what they state to be in the file.
+XMP_STATEMENTS: dict[bytes, tuple[bytes, bytes | None, str]] = {
+    b"http://ns.adobe.com/hdr-gain-map/1.0/": (b"hdrgm", None, GAIN_MAP),
+    b"http://ns.apple.com/HDRGainMap/1.0/": (b"HDRGainMap", None, GAIN_MAP),
+    GOOGLE + b"camera/": (b"GCamera", rb"(?:MotionPhoto|MicroVideo)\w*", MOTION),
+    GOOGLE + b"container/": (b"Container", None, PICTURES),
+    GOOGLE + b"container/item/": (b"Item", None, PICTURES),
+    GOOGLE + b"depthmap/": (b"GDepth", None, DEPTH),
+    GOOGLE + b"image/": (b"GImage", None, PICTURES),
+    GOOGLE + b"audio/": (b"GAudio", None, "sound"),
+    b"http://ns.google.com/photos/dd/1.0/device/": (b"Device", None, PICTURES),
+    b"http://ns.apple.com/pixeldatainfo/1.0/": (b"apdi", None, PICTURES),
+    b"http://ns.adobe.com/xmp/note/": (b"xmpNote", b"HasExtendedXMP", "an extension of XMP"),
+}
+REGIONS = "regions of the picture such as faces, as it is turned"
+#: Statements about places in the picture.
+XMP_PLACES: dict[bytes, tuple[bytes, bytes | None, str]] = {
+    b"http://www.metadataworkinggroup.com/schemas/regions/": (b"mwg-rs", None, REGIONS),
+    b"http://ns.microsoft.com/photo/1.2/": (b"MP", b"RegionInfo", REGIONS),
+    b"http://ns.apple.com/faceinfo/1.0/": (b"apple-fi", None, REGIONS),
+}
+
+
+def upright_packet(xmp: bytes | None, orientation: int = 1) -> tuple[bytes | None, list[str]]:
+    """An XMP packet of an upright picture, and what was in it and is left out.
+
+    Args:
+        xmp: as it stands in the file. Its orientation is set to 1, and statements about other pictures are left out.
+        orientation: of the picture as it is stored; of a turned one, places in it are left out.
+    """
+    if not isinstance(xmp, bytes) or not xmp.strip(b"\0 \r\n\t"):
+        return None, []
+    xmp = XMP_ORIENTATION.sub(rb"\g<1>1", xmp)
+    named = []
+    statements = XMP_STATEMENTS | (XMP_PLACES if orientation > 1 else {})
+    for namespace, (usual, names, content) in statements.items():
+        declared = re.findall(rb"xmlns:([\w.-]+)\s*=\s*[\"']" + re.escape(namespace) + rb"[\"']", xmp)
+        for prefix in dict.fromkeys([*declared, usual]):
+            shorter = _without(xmp, prefix, names or rb"[\w.-]+")
+            if shorter != xmp:
+                named.append(content)
+                xmp = shorter
+    return (_without_declarations(xmp) if named else xmp), named
+
+
+def _without(xmp: bytes, prefix: bytes, names: bytes) -> bytes:
+    """The packet without attributes and elements of these names."""
+    name = re.escape(prefix) + rb":(" + names + rb")"
+    # One space before it, since many of them at a time would take quadratic time in packets with padding.
+    xmp = re.sub(rb"\s" + name + rb"\s*=\s*(?:\"[^\"]*\"|'[^']*')", b"", xmp)
+    end = rb"</" + re.escape(prefix) + rb":\1\s*>"
+    return re.sub(rb"<" + name + rb"(?=[\s/>])(?:[^<>]*/>|[^<>]*>.*?" + end + rb")\s*", b"", xmp, flags=re.DOTALL)
+
+
+def _without_declarations(xmp: bytes) -> bytes:
+    """The packet without declarations of these namespaces that are not used any more."""
+    for namespace in XMP_STATEMENTS | XMP_PLACES:
+        declaration = rb"\sxmlns:([\w.-]+)\s*=\s*[\"']" + re.escape(namespace) + rb"[\"']"
+        for prefix in re.findall(declaration, xmp):
+            rest = re.sub(declaration, b"", xmp)
+            xmp = xmp if re.search(rb"[\s<]" + re.escape(prefix) + rb":", rest) else rest
+    return xmp
+
+
+# --- colours that a file describes by numbers in place of a profile, which the output does not describe
+
+# Numbers of ITU-T H.273 (CICP).
+PRIMARIES = {1: "sRGB", 4: "BT.470", 5: "BT.601", 6: "BT.601", 7: "SMPTE 240M", 9: "BT.2020", 11: "DCI-P3"}
+PRIMARIES |= {12: "Display P3"}
+TRANSFERS = {5: "a gamma of 2.8", 8: "linear light", 16: "PQ", 17: "SMPTE 428", 18: "HLG"}
+USUAL_PRIMARIES = (0, 1, 2)  # reserved, of sRGB, and unspecified
+USUAL_TRANSFERS = (0, 1, 2, 4, 6, 13, 14, 15)  # likewise, and curves close to that of sRGB, which viewers treat alike
+HDR = (16, 18)
+
+# Of PNG files.
+SRGB = (0.3127, 0.329, 0.64, 0.33, 0.3, 0.6, 0.15, 0.06)  # x and y of white, red, green and blue
+NEAR = 0.01
+GAMMA = 1 / 2.2
+NEAR_GAMMA = 0.05  # share
+
+
+def check_colour_numbers(path: Path, primaries: int, transfer: int) -> None:
+    """Warn if colours described by these numbers are not close to sRGB.
+
+    Raises:
+        UnhandledImage: if they are those of an HDR picture.
+    """
+    if transfer in HDR:
+        raise UnhandledImage(
+            f"{path} is an HDR picture ({TRANSFERS[transfer]}), which is not supported; convert it to sRGB, or to a "
+            "TIFF file with a colour profile"
+        )
+    unusual = [] if primaries in USUAL_PRIMARIES else [PRIMARIES.get(primaries, f"primaries number {primaries}")]
+    if transfer not in USUAL_TRANSFERS:
+        unusual.append(TRANSFERS.get(transfer, f"transfer function number {transfer}"))
+    _warn_of_colours(path, unusual)
+
+
+def check_png_colours(path: Path, gamma: float | None, chromaticities: Sequence[float] | None) -> None:
+    """Warn if the chunks gAMA and cHRM of a PNG file describe other colours than sRGB; None if a chunk is missing."""
+    unusual = []
+    if chromaticities is not None and max(abs(a - b) for a, b in zip(chromaticities, SRGB, strict=True)) > NEAR:
+        unusual.append("other primaries than sRGB")
+    if gamma is not None and gamma > 0 and abs(gamma / GAMMA - 1) > NEAR_GAMMA:
+        unusual.append(f"a gamma of {1 / gamma:.2g}")
+    _warn_of_colours(path, unusual)
+
+
+def _warn_of_colours(path: Path, unusual: Sequence[str]) -> None:
+    if unusual:
+        warn(
+            f"{path} has {' and '.join(unusual)} without a colour profile, which the output will not say, so that its "
+            "colours will look different; convert the photograph to sRGB, or embed a profile, before the edit"
+        )
