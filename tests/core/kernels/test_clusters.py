@@ -6,13 +6,17 @@ import torch
 from nlfilter_torch import nonlocal_operator
 from nlfilter_torch.core.kernels.clusters import lloyd
 from nlfilter_torch.operator import landmarks
-from tests.native import by_torch, random
+from tests.native import LEVELS, by_torch, random
+from tests.pairwise import pairwise
 
 
-@pytest.mark.parametrize("batch", [1, 3])
-@pytest.mark.parametrize("size", [1, 25])
-@pytest.mark.parametrize(("points", "marks"), [(1, 1), (5, 3), (64, 7), (65, 20), (1000, 50)])
-def test_landmarks(level: int, batch: int, size: int, points: int, marks: int) -> None:
+@pytest.mark.parametrize(
+    ("level", "batch", "size", "points_and_marks"),
+    pairwise(LEVELS, [1, 3], [1, 25], [(1, 1), (5, 3), (64, 7), (65, 20), (1000, 50)]),
+    indirect=["level"],
+)
+def test_landmarks(level: int, batch: int, size: int, points_and_marks: tuple[int, int]) -> None:
+    points, marks = points_and_marks
     cloud = random(batch, size, points)
     pivots = landmarks._pivots(cloud, marks, torch.Generator().manual_seed(1))
     expected = by_torch(landmarks._pivots, cloud, marks, torch.Generator().manual_seed(1))
@@ -26,20 +30,22 @@ def test_landmarks(level: int, batch: int, size: int, points: int, marks: int) -
     assert assignment.max() < max(marks // 2, 1) or marks <= 3
 
 
+IMAGES = {
+    "constant": torch.full((5, 8), 0.5),
+    "large constant": torch.full((48, 64), 0.5),
+    "checkerboard": ((torch.arange(16)[:, None] + torch.arange(24)) % 2).float(),
+    "stripes": (torch.arange(24) % 4 / 4).expand(16, 24),
+    "repeated patch": torch.rand(4, 6, generator=torch.Generator().manual_seed(0)).repeat(4, 4),
+}
+
+
 @pytest.mark.parametrize(
-    "image",
-    [
-        torch.full((5, 8), 0.5),
-        torch.full((48, 64), 0.5),
-        ((torch.arange(16)[:, None] + torch.arange(24)) % 2).float(),
-        (torch.arange(24) % 4 / 4).expand(16, 24),
-        torch.rand(4, 6, generator=torch.Generator().manual_seed(0)).repeat(4, 4),
-    ],
-    ids=["constant", "large constant", "checkerboard", "stripes", "repeated patch"],
+    ("level", "name", "spatial_bandwidth", "marks"),
+    pairwise(LEVELS, list(IMAGES), [2.0, 5.0], [3, 10, 25]),
+    indirect=["level"],
 )
-@pytest.mark.parametrize("spatial_bandwidth", [2.0, 5.0])
-@pytest.mark.parametrize("marks", [3, 10, 25])
-def test_ties_are_broken_by_one_rule(level: int, image: torch.Tensor, spatial_bandwidth: float, marks: int) -> None:
+def test_ties_are_broken_by_one_rule(level: int, name: str, spatial_bandwidth: float, marks: int) -> None:
+    image = IMAGES[name]
     filtered = random(1, 1, *image.shape)
 
     def build() -> tuple[torch.Tensor, torch.Tensor]:

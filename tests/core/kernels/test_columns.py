@@ -8,13 +8,22 @@ from torch import Tensor
 
 from nlfilter_torch.core.low_rank import OuterProduct
 from nlfilter_torch.operator.nystrom import inverse_cholesky, nystrom_factor
-from tests.native import by_torch, random
+from tests.native import LEVELS, by_torch, random
+from tests.pairwise import pairwise
 
 
-@pytest.mark.parametrize("completion", ["diagonal", "none"])
-@pytest.mark.parametrize("pixels", [1, 7, 31, 64, 65, 1000, 8256, 20_011])
-@pytest.mark.parametrize(("size", "marks"), [(1, 1), (9, 2), (25, 5), (27, 6), (3, 100)])
-def test_columns(level: int, completion: Any, pixels: int, size: int, marks: int) -> None:
+@pytest.mark.parametrize(
+    ("level", "completion", "pixels", "size_and_marks"),
+    pairwise(
+        LEVELS,
+        ["diagonal", "none"],
+        [1, 7, 31, 64, 65, 1000, 8256, 20_011],
+        [(1, 1), (9, 2), (25, 5), (27, 6), (3, 100)],
+    ),
+    indirect=["level"],
+)
+def test_columns(level: int, completion: Any, pixels: int, size_and_marks: tuple[int, int]) -> None:
+    size, marks = size_and_marks
     z = random(2, size, marks, seed=1)
     x = random(2, size, pixels) * 0.7
     x[:, :, : min(pixels, marks)] = z[:, :, : min(pixels, marks)]  # columns that rounding may make longer than 1
@@ -34,13 +43,15 @@ def test_columns_of_a_whitening_without_a_triangle(level: int) -> None:
     torch.testing.assert_close(nystrom_factor(x, z, whitening, "none")[0], expected.float(), atol=1e-6, rtol=0)
 
 
-@pytest.mark.parametrize("completion", ["diagonal", "none"])
-@pytest.mark.parametrize("pixels", [1, 65, 2100])
-@pytest.mark.parametrize(("size", "marks"), [(1, 1), (9, 2), (27, 6), (3, 100), (6, 150)])
-@pytest.mark.parametrize("rank", [None, 9])
+@pytest.mark.parametrize(
+    ("level", "completion", "pixels", "size_and_marks", "rank"),
+    pairwise(LEVELS, ["diagonal", "none"], [1, 65, 2100], [(1, 1), (9, 2), (27, 6), (3, 100), (6, 150)], [None, 9]),
+    indirect=["level"],
+)
 def test_derivatives_of_columns(
-    level: int, completion: Any, pixels: int, size: int, marks: int, rank: int | None
+    level: int, completion: Any, pixels: int, size_and_marks: tuple[int, int], rank: int | None
 ) -> None:
+    size, marks = size_and_marks
     z = random(2, size, marks, seed=1)
     x = random(2, size, pixels) * 0.7
     x[:, :, : min(pixels, marks)] = z[:, :, : min(pixels, marks)]  # columns that rounding may make longer than 1

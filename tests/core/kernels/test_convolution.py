@@ -8,12 +8,19 @@ from torch import Tensor
 
 from nlfilter_torch.core.kernels import convolution, definitions_only
 from tests.native import random
+from tests.pairwise import pairwise
 
 
-@pytest.mark.parametrize("size", [(1, 1), (3, 4), (4, 5), (13, 40), (37, 65)])
-@pytest.mark.parametrize("dilation", [1, 2, 3, 5])
-@pytest.mark.parametrize(("channels", "outputs"), [(16, 16), (48, 48), (32, 28), (16, 1), (6, 48)])
-def test_convolution(size: tuple[int, int], dilation: int, channels: int, outputs: int) -> None:
+@pytest.mark.parametrize(
+    ("size", "dilation", "planes"),
+    pairwise(
+        [(1, 1), (3, 4), (4, 5), (13, 40), (37, 65)],
+        [1, 2, 3, 5],
+        [(16, 16), (48, 48), (32, 28), (16, 1), (6, 48)],
+    ),
+)
+def test_convolution(size: tuple[int, int], dilation: int, planes: tuple[int, int]) -> None:
+    channels, outputs = planes
     inputs = (
         random(2, channels, *size),
         random(outputs, channels, 3, 3, seed=1) / (3 * channels**0.5),

@@ -5,11 +5,21 @@ import torch
 
 from nlfilter_torch.core.kernels import definitions_only, grams
 from nlfilter_torch.core.kernels.grams import sum_grams
-from tests.native import by_torch, random, sizes
+from tests.native import LEVELS, by_torch, random
+from tests.pairwise import pairwise
 
 
-@pytest.mark.parametrize(("pixels", "marks"), sizes([1, 17, 1024, 1025, 9000], [1, 3, 6, 7, 50, 400], 3_000_000))
-@pytest.mark.parametrize("count", [1, 2, 4])
+@pytest.mark.parametrize(
+    ("level", "pixels", "marks", "count"),
+    pairwise(
+        LEVELS,
+        [1, 17, 1024, 1025, 9000],
+        [1, 3, 6, 7, 50, 400],
+        [1, 2, 4],
+        possible=lambda _, pixels, marks, __: pixels * marks <= 3_000_000,  # smaller sizes have full blocks of either
+    ),
+    indirect=["level"],
+)
 def test_grams(level: int, pixels: int, marks: int, count: int) -> None:
     factor, scaling, remainder = random(2, marks, pixels), random(2, pixels, seed=1).exp(), random(2, pixels).sigmoid()
     result = sum_grams(factor, scaling, remainder, count)

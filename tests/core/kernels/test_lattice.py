@@ -24,8 +24,10 @@ def exact(values: Tensor, lattice: Tensor) -> Tensor:
     return by_torch(interpolate, values.double(), lattice.double())
 
 
-@pytest.mark.parametrize("nodes", [2, 9, 17, 33])
-@pytest.mark.parametrize(("batch", "lattices", "pixels"), [(1, 1, 1), (2, 2, 67), (3, 1, 1237), (1, 1, 40_001)])
+@pytest.mark.parametrize(
+    ("nodes", "batch", "lattices", "pixels"),
+    [(2, 2, 2, 67), (2, 1, 1, 40_001), (9, 3, 1, 1237), (17, 1, 1, 1), (33, 2, 2, 67), (33, 1, 1, 40_001)],
+)
 def test_interpolation(level: int, nodes: int, batch: int, lattices: int, pixels: int) -> None:
     values, lattice = colours(batch, pixels), random(lattices, 3, nodes, nodes, nodes, seed=1)
     result = interpolate(values, lattice)

@@ -1,5 +1,6 @@
 """Products with few rows equal plain matrix products, whether divided into parts or not."""
 
+from collections.abc import Callable
 from contextlib import nullcontext
 
 import pytest
@@ -11,26 +12,20 @@ from nlfilter_torch.core.communicator import ALONE
 from nlfilter_torch.core.kernels import definitions_only, tall_skinny
 from nlfilter_torch.core.kernels.tall_skinny import gather, moment, spread
 from nlfilter_torch.operator.scaling import KernelMatrix, _sweep, weighted_moment
-from tests.native import by_torch, random, sizes
+from tests.native import LEVELS, by_torch, random
+from tests.pairwise import pairwise
 
 
 def doubles(*shape: int) -> Tensor:
     return torch.randn(*shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
 
 
-@pytest.fixture(params=[1, 2, 3])
-def several_threads(request: pytest.FixtureRequest):
-    before = torch.get_num_threads()
-    torch.set_num_threads(request.param)
-    yield
-    torch.set_num_threads(before)
-
-
-@pytest.mark.usefixtures("several_threads")
-@pytest.mark.parametrize("pixels", [1, 7, 64, SWEPT, 2 * SWEPT + 5])
-@pytest.mark.parametrize("rows", [1, 3, 5, 30])
-@pytest.mark.parametrize("batch", [1, 2])
-def test_equal_to_matrix_products(pixels: int, rows: int, batch: int):
+@pytest.mark.parametrize(
+    ("count", "pixels", "rows", "batch"),
+    pairwise([1, 2, 3], [1, 7, 64, SWEPT, 2 * SWEPT + 5], [1, 3, 5, 30], [1, 2]),
+)
+def test_equal_to_matrix_products(count: int, pixels: int, rows: int, batch: int, threads: Callable[[int], None]):
+    threads(count)
     factor, vectors, images = doubles(batch, 6, pixels), doubles(batch, rows, 6), doubles(batch, rows, pixels)
     gathered = images @ factor.mT
     torch.testing.assert_close(spread(vectors, factor), vectors @ factor)
@@ -40,15 +35,17 @@ def test_equal_to_matrix_products(pixels: int, rows: int, batch: int):
     torch.testing.assert_close(moment(factor, images), gathered.mT)
 
 
-@pytest.mark.usefixtures("several_threads")
-def test_factors_of_any_layout():
+@pytest.mark.parametrize("count", [1, 3])
+def test_factors_of_any_layout(count: int, threads: Callable[[int], None]):
+    threads(count)
     factor, vectors, images = doubles(1, 64, 6).mT, doubles(1, 6, 2).mT, doubles(1, 64, 2).mT
     torch.testing.assert_close(spread(vectors, factor), vectors @ factor)
     torch.testing.assert_close(gather(images, factor), images @ factor.mT)
 
 
-@pytest.mark.usefixtures("several_threads")
-def test_derivatives_of_any_order():
+@pytest.mark.parametrize("count", [1, 3])
+def test_derivatives_of_any_order(count: int, threads: Callable[[int], None]):
+    threads(count)
     leaves = [part.requires_grad_() for part in (doubles(1, 2, 3), doubles(1, 3, 8), doubles(1, 2, 8))]
     torch.autograd.gradgradcheck(lambda rows, factor, _: spread(rows, factor), leaves)
     torch.autograd.gradgradcheck(lambda _, factor, images: gather(images, factor), leaves)
@@ -58,7 +55,16 @@ def swept(factor: Tensor, diagonal: Tensor, total: Tensor) -> tuple[Tensor, Tens
     return _sweep(KernelMatrix(factor, diagonal), total)
 
 
-@pytest.mark.parametrize(("pixels", "marks"), sizes([1, 7, 255, 8256, 40_000], [1, 3, 50, 900]))
+def fits(_: int, pixels: int, marks: int) -> bool:
+    """Whether not both are large; all other sizes have full blocks of either kind."""
+    return pixels * marks <= 8_000_000
+
+
+@pytest.mark.parametrize(
+    ("level", "pixels", "marks"),
+    pairwise(LEVELS, [1, 7, 255, 8256, 40_000], [1, 3, 50, 900], possible=fits),
+    indirect=["level"],
+)
 def test_sweep(level: int, pixels: int, marks: int) -> None:
     factor = random(2, marks, pixels).abs()
     factor = factor / factor.square().sum(1, keepdim=True).sqrt() * torch.linspace(0, 1, pixels)
@@ -72,9 +78,11 @@ def test_sweep(level: int, pixels: int, marks: int) -> None:
     assert error <= 2 * usual + 1e-5 * exact[1].abs().max(), (error, usual)
 
 
-@pytest.mark.parametrize("pixels", [1, 9, 63, 4128, 4129, 30_001])
-@pytest.mark.parametrize("rows", [1, 2, 3, 8])
-@pytest.mark.parametrize("marks", [1, 2, 3, 5, 100])
+@pytest.mark.parametrize(
+    ("level", "pixels", "rows", "marks"),
+    pairwise(LEVELS, [1, 9, 63, 4128, 4129, 30_001], [1, 2, 3, 8], [1, 2, 3, 5, 100]),
+    indirect=["level"],
+)
 def test_products_with_few_rows(level: int, pixels: int, rows: int, marks: int) -> None:
     batch = 1 if pixels in (1, 4129, 30_001) else 2
     factor, vectors, images = random(batch, marks, pixels), random(batch, rows, marks), random(batch, rows, pixels)
@@ -88,7 +96,11 @@ def test_products_with_few_rows(level: int, pixels: int, rows: int, marks: int) 
     assert ((result - factor.double() @ images.double().mT).abs() <= size).all()
 
 
-@pytest.mark.parametrize(("pixels", "marks"), sizes([1, 300, 8256, 40_000], [1, 3, 50, 900]))
+@pytest.mark.parametrize(
+    ("level", "pixels", "marks"),
+    pairwise(LEVELS, [1, 300, 8256, 40_000], [1, 3, 50, 900], possible=fits),
+    indirect=["level"],
+)
 def test_weighted_moments(level: int, pixels: int, marks: int) -> None:
     arguments = random(2, marks, pixels), random(2, pixels, seed=1).exp(), ALONE, random(2, marks, 1).double()
     factor, weights, total = (t.double() for t in arguments if isinstance(t, Tensor))
