@@ -71,20 +71,6 @@ def test_every_kind_of_index(index: Any, images: list[int]) -> None:
         assert len(batch[index]) == len(images)
 
 
-@pytest.mark.parametrize("index", ["0", 1.0, None, True, torch.tensor([True]), torch.ones(1, 1).long(), torch.ones(3)])
-def test_other_indices_are_refused(index: Any) -> None:
-    with pytest.raises(TypeError, match=r"index must be .* or of 3 bools, got .*; pass 0"):
-        BATCH[index]
-
-
-@pytest.mark.parametrize("index", [3, -4, [0, 3], torch.tensor([-4])])
-def test_images_that_do_not_exist_are_refused(index: Any) -> None:
-    with pytest.raises(IndexError, match=r"index must be from -3 to 2, got (3|-4); see len"):
-        BATCH[index]
-    with pytest.raises(IndexError, match="absent, as there are no images"):
-        BATCH[:0][0]
-
-
 def test_iteration_gives_each_image() -> None:
     assert [len(operator) for operator in BATCH] == [1, 1, 1]
     assert torch.equal(torch.cat([operator @ GUIDES[:1] for operator in BATCH]), BATCH @ GUIDES[:1])
@@ -212,27 +198,3 @@ def test_batches_of_several_images_and_of_none() -> None:
 
 
 FIRST = build(GUIDES[:1])
-
-
-@pytest.mark.parametrize(
-    ("other", "message"),
-    [
-        (build(GUIDES, num_landmarks=9), "the same number of landmarks to be joined, got 8 and 9"),
-        (build(GUIDES[..., 1:]), "the same number of pixels to be joined, got 120 and 110"),
-        (build(GUIDES.mT), r"the same size to be joined, got 10 and 12"),
-        (FIRST.to(torch.float64), "the same dtype to be joined, got torch.float32 and torch.float64"),
-        (FIRST.to("meta"), "the same device to be joined, got cpu and meta"),
-        (build(GUIDES, patch_size=3), r"the same landmarks to be joined, got \(1, 25, 8\) and \(3, 9, 8\)"),
-        (build(GUIDES, patch_weights=torch.ones(5, 5)), "the same patch_weights to be joined, got different values"),
-        (build(GUIDES, guide_channels="all"), "the same guide_channels to be joined, got 'luminance' and 'all'"),
-    ],
-)
-def test_operators_that_differ_are_refused(other: NonlocalOperator, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        NonlocalOperator.cat([FIRST, other])
-
-
-@pytest.mark.parametrize("batches", [[], FIRST, "operators", [FIRST, None], [FIRST, FIRST.spectrum()], None])
-def test_anything_but_a_list_of_operators_is_refused(batches: Any) -> None:
-    with pytest.raises(TypeError, match=r"batches must be a"):
-        NonlocalOperator.cat(batches)

@@ -1,9 +1,5 @@
 """Sliders, layers and the response of sliders, compared with the dense reference and with each other."""
 
-import re
-from collections.abc import Callable
-from typing import Any
-
 import numpy as np
 import pytest
 import torch
@@ -317,62 +313,6 @@ def test_patch_weights_in_half_precision_do_not_overflow() -> None:
         for weights in (torch.full((5, 5), 3000.0).half(), torch.ones(5, 5))
     )
     torch.testing.assert_close(result, expected, atol=1e-6, rtol=0)
-
-
-GUIDE = noise(2, 1, 8, 9)
-
-
-OPERATOR = nonlocal_operator(GUIDE, num_landmarks=20)
-
-
-IMAGE = noise(2, 3, 8, 9)
-
-
-NAN, INFINITY = float("nan"), float("inf")
-
-
-def raises(call: Callable[[], object], error: type[Exception], message: str) -> None:
-    """Check for ``<argument> must <requirement>, got <value>; <remedy>`` on one line that begins with ``message``."""
-    with pytest.raises(error) as caught:
-        call()
-    result = str(caught.value)
-    assert result.startswith(message), result
-    assert re.fullmatch(r"\w+ must .+, got .+; .+", result), result
-    assert not re.search(r"\n|[^.]\.$", result), result
-
-
-TWO = "must have at least two entries, got 1"
-
-
-BAD_SLIDERS: list[tuple[Any, type[Exception], str]] = [
-    ([1.0, 1.0], TypeError, "must be a torch.Tensor, got list; convert"),
-    (torch.tensor([1, 1]), TypeError, "must have a floating-point dtype, got torch.int64"),
-    (torch.ones(1), ValueError, TWO),
-    (torch.ones(2, 1), ValueError, TWO),
-    (torch.ones(2, 1, 8, 9), ValueError, TWO),
-    (torch.tensor(1.0), ValueError, "must have shape (k+1,) or (B, k+1) or (B, k+1, H, W), got ()"),
-    (torch.ones(2, 4, 9), ValueError, "must have shape (k+1,) or (B, k+1) or (B, k+1, H, W), got (2, 4, 9)"),
-    (torch.tensor([1.0, NAN]), ValueError, "must be finite, got 1 NaN"),
-    (torch.ones(3, 4), ValueError, "must have the batch size of the layers, 2, got 3"),
-    (torch.ones(2, 4, 9, 8), ValueError, "must have the height and width of the image, 8x9, got 9x8"),
-]
-
-
-@pytest.mark.parametrize(("alpha", "error", "message"), BAD_SLIDERS)
-def test_bad_sliders(alpha: Any, error: type[Exception], message: str) -> None:
-    raises(lambda: polynomial_filter(OPERATOR, IMAGE, alpha), error, f"alpha {message}")
-
-
-def test_bad_sliders_of_a_response() -> None:
-    raises(lambda: polynomial_response(torch.ones(3), torch.ones(1)), ValueError, f"alpha {TWO}")
-    per_pixel = torch.ones(2, 4, 8, 9)
-    message = "alpha must have shape (k+1,) or (B, k+1), got (2, 4, 8, 9)"
-    raises(lambda: polynomial_response(torch.ones(3), per_pixel), ValueError, message)
-
-
-def test_bad_order() -> None:
-    raises(lambda: detail_layers(OPERATOR, IMAGE, order=0), ValueError, "order must be at least 1, got 0")
-    raises(lambda: detail_layers(OPERATOR, IMAGE, order=2.0), TypeError, "order must be an int, got float")
 
 
 def test_sliders_of_regions_blend_their_edits() -> None:

@@ -205,36 +205,6 @@ def test_half_precision_and_autocast_change_the_dtype_alone() -> None:
     assert fit_alpha(operator, image.half(), target.half()).dtype == torch.float16
 
 
-@pytest.mark.parametrize(
-    ("changes", "error", "message"),
-    [
-        (
-            {"target": torch.rand(1, 1, 8, 9)},
-            ValueError,
-            r"target must have the height and width of the image, 8x8, got 8x9",
-        ),
-        ({"target": torch.rand(1, 3, 8, 8)}, ValueError, r"target must have 1 channel\(s\), got 3"),
-        ({"target": torch.rand(3, 1, 8, 8)}, ValueError, r"target must have batch size 1 or 2, got 3"),
-        ({"target": torch.ones(1, 1, 8, 8, dtype=torch.uint8)}, TypeError, "target must have a floating-point dtype"),
-        ({"image": torch.rand(2, 1, 9, 8)}, ValueError, "image must have the height and width of the operator"),
-        ({"mask": torch.zeros(1, 1, 8, 8)}, ValueError, "mask must hold a pixel of positive weight"),
-        ({"mask": -torch.ones(1, 1, 8, 8)}, ValueError, "mask must be non-negative, got -1"),
-        ({"mask": torch.ones(1, 2, 8, 8)}, ValueError, r"mask must have 1 channel\(s\), got 2"),
-        ({"mask": torch.ones(1, 1, 4, 8)}, ValueError, "mask must have the height and width of the image"),
-        ({"order": 0}, ValueError, "order must be at least 1, got 0"),
-        ({"ridge": -1.0}, ValueError, "ridge must be at least 0 and finite, got -1"),
-        ({"ridge": "much"}, TypeError, "ridge must be a number, got str"),
-        ({"rounding": float("nan")}, ValueError, "rounding must be at least 0 and finite, got nan"),
-    ],
-)
-def test_bad_input_is_one_clear_sentence(changes: dict[str, object], error: type[Exception], message: str) -> None:
-    image = noise(2, 1, 8, 8, dtype=torch.float32)
-    arguments = {"image": image, "target": image} | changes
-    operator = nonlocal_operator(image, num_landmarks=10)
-    with pytest.raises(error, match=message):
-        fit_alpha(operator, arguments.pop("image"), arguments.pop("target"), **arguments)  # type: ignore[arg-type]
-
-
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize(("level", "bandwidth"), [(0.5, "auto"), (-5.0, 1000.0)])
 def test_layers_that_are_tiny_multiples_of_others_rest(

@@ -1,6 +1,5 @@
 """Refinement of logits and masks: against dense mean-field steps, kinds of input, and bad bandwidths."""
 
-import re
 from typing import Any
 
 import numpy as np
@@ -184,39 +183,3 @@ def test_batches() -> None:
         torch.testing.assert_close(both[n : n + 1], single)
     assert refine(logits[:1], guide, num_landmarks=30).shape == refine(logits, guide[:1], num_landmarks=30).shape
     assert refine(logits[:0], guide[:0]).shape == (0, 3, *SIZE)
-
-
-IMAGE, LOGITS, MASK = noise(2, 3, 8, 9), noise(2, 4, 8, 9), noise(2, 1, 8, 9)
-BAD: list[tuple[dict[str, Any], type[Exception], str]] = [
-    ({"logits": LOGITS[0]}, ValueError, "logits must have shape"),
-    ({"logits": LOGITS * float("nan")}, ValueError, "logits must be finite"),
-    ({"logits": LOGITS[..., :4]}, ValueError, "logits must have the height and width of the guide, 8x9, got 8x4"),
-    ({"logits": LOGITS.expand(2, 4, 8, 9).repeat(2, 1, 1, 1)}, ValueError, "logits must have batch size 1 or that"),
-    ({"guide": IMAGE * float("inf")}, ValueError, "guide must be finite"),
-    ({"kind": "labels"}, ValueError, "kind must be one of 'logits', 'probabilities', 'mask', 'trimap', got 'labels'"),
-    ({"kind": "mask"}, ValueError, "logits must have 1 channel"),
-    ({"logits": MASK, "kind": "probabilities"}, ValueError, "logits must have at least 2 channels as probabilities"),
-    ({"logits": 3 + LOGITS, "kind": "probabilities"}, ValueError, "logits must be in [0, 1], got values from 3"),
-    ({"logits": 0.5 + 0 * MASK, "kind": "trimap"}, ValueError, "logits must have a pixel that is 0 or 1 in every"),
-    ({"confidence": 0 * MASK}, ValueError, "confidence must have a pixel that is trusted in every image, got none in"),
-    ({"confidence": MASK - 1}, ValueError, "confidence must be in [0, 1], got values from -"),
-    ({"confidence": MASK[..., :4]}, ValueError, "confidence must have the height and width of the logits, 8x9"),
-    ({"steps": 0}, ValueError, "steps must be at least 1, got 0"),
-    ({"strength": -1.0}, ValueError, "strength must be at least 0 and finite, got -1.0"),
-    ({"margin": 0.0}, ValueError, "margin must be positive and finite, got 0.0"),
-    ({"caution": "much"}, ValueError, "caution must be one of 'auto', got 'much'; pass it, a number or None"),
-    ({"compatibility": torch.eye(3)}, ValueError, "compatibility must have shape (4, 4), got (3, 3); pass a row"),
-    ({"compatibility": torch.eye(4) * float("nan")}, ValueError, "compatibility must be finite"),
-    ({"spatial_bandwidth": "wide"}, ValueError, "spatial_bandwidth must be one of 'auto', got 'wide'"),
-    (
-        {"guide": nonlocal_operator(IMAGE, num_landmarks=9), "spatial_bandwidth": 3.0},
-        ValueError,
-        "spatial_bandwidth must be left out if guide is an operator, got 3.0; pass it to nonlocal_operator",
-    ),
-]
-
-
-@pytest.mark.parametrize(("wrong", "error", "message"), BAD)
-def test_errors(wrong: dict[str, Any], error: type[Exception], message: str) -> None:
-    with pytest.raises(error, match=f"^{re.escape(message)}"):
-        refine(**({"logits": LOGITS, "guide": IMAGE} | wrong))

@@ -211,30 +211,6 @@ def test_unpainted_pixels_have_a_gradient_too(spectrum: Spectrum) -> None:
     assert (mask.grad[mask == 0] != 0).any()
 
 
-@pytest.mark.parametrize(
-    ("changes", "sentence"),
-    [
-        ({"stroke_mask": torch.zeros(1, 1, 20, 24)}, r"stroke_mask must hold a painted pixel in every image, got none"),
-        ({"stroke_mask": torch.full((1, 1, 20, 24), 2.0)}, r"stroke_mask must be in \[0, 1\], got values from 2 to 2"),
-        ({"stroke_mask": torch.ones(1, 2, 20, 24)}, r"stroke_mask must have 1 channel\(s\), got 2"),
-        (
-            {"stroke_mask": torch.ones(1, 1, 20, 25)},
-            r"stroke_mask must have the height and width of the spectrum, 20x24",
-        ),
-        ({"strokes": torch.ones(1, 1, 10, 12)}, r"strokes must have the height and width .* 20x24, got 10x12"),
-        ({"strokes": torch.ones(3, 1, 20, 24), "stroke_mask": torch.ones(2, 1, 20, 24)}, r"batch size 1 or 3, got 2"),
-        ({"strength": 1.5}, r"strength must be in \[0, 1\], got 1.5"),
-        ({"strength": -0.1}, r"strength must be in \[0, 1\], got -0.1"),
-        ({"reach": 1.0}, r"reach must be in \[0, 1\), got 1.0"),
-        ({"smoothness": 0.0}, r"smoothness must be positive and finite, got 0"),
-    ],
-)
-def test_bad_input(spectrum: Spectrum, changes: dict, sentence: str) -> None:
-    arguments = {"strokes": noise(1, 1, 20, 24), "stroke_mask": spots(*PLACES), **changes}
-    with pytest.raises(ValueError, match=sentence):
-        propagate_strokes(spectrum, **arguments)
-
-
 @pytest.mark.parametrize("recorded", [False, True])
 def test_isolated_pixels_do_not_make_values_nan(recorded: bool) -> None:
     """The columns of isolated pixels are zero, and so is their captured variance."""

@@ -164,30 +164,3 @@ def test_description() -> None:
 
 def map_of(*shape: int) -> Tensor:
     return torch.zeros(shape)
-
-
-@pytest.mark.parametrize(
-    ("call", "error", "message"),
-    [
-        (lambda: NonlocalBlock(0), ValueError, "channels must be at least 1"),
-        (lambda: NonlocalBlock(4, inner_channels=2.0), TypeError, "inner_channels must be an int"),
-        (lambda: NonlocalBlock(4, embedding_channels=0), ValueError, "embedding_channels must be at least 1"),
-        (lambda: NonlocalBlock(4, num_landmarks=0), ValueError, "num_landmarks must be at least 1"),
-        (lambda: NonlocalBlock(4, landmarks="grid"), ValueError, "landmarks must be"),
-        (lambda: NonlocalBlock(4, norm="layer"), ValueError, "norm must be one of 'batch', 'none'"),
-        (lambda: NonlocalBlock(4, temperature=0.0), ValueError, "temperature must be positive"),
-        (lambda: NonlocalBlock(4, spatial_bandwidth=-1.0), ValueError, "spatial_bandwidth must be positive"),
-        (lambda: NonlocalBlock(4, learn="alpha"), ValueError, "learn must hold only names from 'temperature'"),
-        (lambda: NonlocalBlock(4, learn="spatial_bandwidth"), ValueError, "spatial_bandwidth must be a number of pix"),
-        (lambda: NonlocalBlock(4)(None), TypeError, r"x must be a torch.Tensor, got NoneType"),
-        (lambda: NonlocalBlock(4)(map_of(1, 3, 5, 5)), ValueError, r"x must have 4 channel\(s\), got 3"),
-        (lambda: NonlocalBlock(4)(map_of(4, 5)), ValueError, r"x must have shape \(B, C, N\), .* got \(4, 5\)"),
-        (lambda: NonlocalBlock(4)(map_of(1, 4, 0, 5)), ValueError, "x must have shape .* with at least one pixel"),
-        (lambda: NonlocalBlock(4)(map_of(1, 4, 5).double()), TypeError, "x must have the dtype of the block"),
-        (lambda: NonlocalBlock(4)(map_of(1, 4, 5) / 0), ValueError, "x must be finite, got 20 NaN"),
-        (lambda: NonlocalBlock(4, spatial_bandwidth=3.0)(map_of(1, 4, 5)), ValueError, "x must have places"),
-    ],
-)
-def test_errors_name_the_argument(call: Any, error: type[Exception], message: str) -> None:
-    with pytest.raises(error, match=message):
-        call()

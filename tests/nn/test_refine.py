@@ -2,7 +2,6 @@
 
 from typing import Any
 
-import pytest
 import torch
 
 from nlfilter_torch import Refine, nonlocal_operator, refine
@@ -60,25 +59,3 @@ def test_learning_lowers_the_loss() -> None:
         optimiser.step()
         losses.append(loss.item())
     assert losses[-1] < 0.9 * losses[0]
-
-
-@pytest.mark.parametrize(
-    ("options", "error", "message"),
-    [
-        ({"learn": ("steps",)}, ValueError, "learn must hold only names from 'strength', 'margin'"),
-        ({"learn": ("spatial_bandwidth",)}, TypeError, "spatial_bandwidth must be a number, got str"),
-        ({"learn": ("margin",), "margin": None}, TypeError, "margin must be a number, got NoneType"),
-        ({"learn": ("compatibility",)}, ValueError, "classes must be the number of classes to learn compatibility"),
-        ({"learn": ("compatibility",), "classes": 1}, ValueError, "classes must be at least 2, got 1"),
-        ({"kind": "image"}, ValueError, "kind must be one of"),
-        ({"strength": 0.0}, ValueError, "strength must be positive"),
-        ({"caution": -1.0}, ValueError, "caution must be positive"),
-        ({"steps": 0}, ValueError, "steps must be at least 1"),
-        ({"photometric_bandwidth": "wide"}, ValueError, "photometric_bandwidth must be one of 'auto', got 'wide'"),
-        ({"spatial_bandwidth": "wide"}, ValueError, "spatial_bandwidth must be one of 'auto', got 'wide'"),
-        ({"spatial_bandwidth": -1.0}, ValueError, "spatial_bandwidth must be positive"),
-    ],
-)
-def test_errors(options: dict[str, Any], error: type[Exception], message: str) -> None:
-    with pytest.raises(error, match=f"^{message}"):
-        Refine(**options)

@@ -208,34 +208,6 @@ def test_an_operator_of_features_has_no_guide() -> None:
     assert operator.diagnostics().photometric_bandwidth == [1.0]
 
 
-@pytest.mark.parametrize(
-    ("changes", "error", "sentence"),
-    [
-        ({"features": [1.0]}, TypeError, r"features must be a torch.Tensor"),
-        ({"features": noise(3, 12)}, ValueError, r"features must have shape \(B, D, N\)"),
-        ({"features": noise(1, 3, 12).round().int()}, TypeError, r"features must have a floating-point dtype"),
-        ({"features": noise(1, 3, 12) * torch.nan}, ValueError, r"features must be finite"),
-        ({"size": 12}, TypeError, r"size must be integers, such as \(H, W\), .*, got 12; pass \(12,\)"),
-        ({"size": ()}, TypeError, r"size must be integers, such as .*, got \(\); pass \(12,\)"),
-        ({"size": (3, 2, 2.0)}, TypeError, r"size must be integers, .*, got \(3, 2, 2.0\)"),
-        ({"size": (3, 2, 3)}, ValueError, r"size must have one pixel for each of the 12 points, got 3x2x3"),
-        ({"size": (3, 5)}, ValueError, r"size must have one pixel for each of the 12 points, got 3x5"),
-        ({"size": (-3, -4)}, ValueError, r"size must have one pixel for each"),
-        ({"weights": torch.ones(11)}, ValueError, r"weights must have shape \(12,\) or \(1, 12\), got \(11,\)"),
-        ({"weights": torch.zeros(12)}, ValueError, r"weights must be positive at some pixel .*\[0\]"),
-        ({"weights": torch.full((12,), 1e7)}, ValueError, r"weights must be 0, or from 1e-06 to 1e\+06"),
-        ({"weights": torch.ones(12, dtype=torch.complex64)}, TypeError, "weights must have a floating-point dtype"),
-        ({"weights": 4.0}, TypeError, r"weights must be a torch.Tensor"),
-        ({"landmarks": 5}, ValueError, r"num_landmarks"),
-    ],
-)
-def test_wrong_arguments_are_refused_in_one_sentence(changes: dict[str, Any], error: type, sentence: str) -> None:
-    arguments = {"features": noise(1, 3, 12), "size": (3, 4), "num_landmarks": 4, **changes}
-    features = arguments.pop("features")
-    with pytest.raises(error, match=sentence):
-        operator_from_features(features, **arguments)
-
-
 def test_points_in_no_order_are_one_row() -> None:
     operator = operator_from_features(noise(1, 3, 12), size=(12,), num_landmarks=4)
     assert operator.size == (1, 12)

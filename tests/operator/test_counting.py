@@ -190,24 +190,6 @@ def test_equal_weights_are_none() -> None:
     assert hidden_points(ones.flatten(1)) is None
 
 
-@pytest.mark.parametrize(
-    ("weights", "error", "sentence"),
-    [
-        (torch.zeros(2, 1, 6, 7), ValueError, r"weights must be positive at some pixel of every image, .*\[0, 1\]"),
-        (torch.ones(2, 6, 7), ValueError, r"weights must have shape \(2, 1, 6, 7\).*got \(2, 6, 7\)"),
-        (torch.ones(2, 1, 7, 6), ValueError, r"weights must have shape"),
-        (-torch.ones(2, 1, 6, 7), ValueError, r"weights must be 0, or from 1e-06 to 1e\+06, got -1 to -1"),
-        (torch.full((2, 1, 6, 7), torch.nan), ValueError, "weights must be 0, or from"),
-        (torch.ones(2, 1, 6, 7) > 0, TypeError, "weights must have a floating-point dtype"),
-        ([1.0], TypeError, "weights must be a torch.Tensor, got list"),
-    ],
-)
-def test_wrong_weights_are_refused_in_one_sentence(weights: Any, error: type, sentence: str) -> None:
-    for function in (nonlocal_operator, estimate_bandwidth):
-        with pytest.raises(error, match=sentence):
-            function(noise(2, 1, 6, 7), weights=weights)
-
-
 def test_strokes_on_hidden_pixels_alone_are_refused() -> None:
     image, weights, strokes = noise(1, 1, 8, 8), torch.ones(1, 1, 8, 8), torch.zeros(1, 1, 8, 8).double()
     weights[..., 4:] = 0

@@ -1,7 +1,6 @@
 """Landmarks that are held by an assignment or passed as features: smooth, kept exactly, refused if they do not fit."""
 
 import io
-import re
 from collections.abc import Callable
 
 import numpy as np
@@ -194,32 +193,5 @@ def test_num_landmarks_is_ignored_where_landmarks_are_passed() -> None:
         assert torch.equal(operator.factor, expected.factor)
 
 
-@pytest.mark.parametrize(
-    ("call", "error", "message"),
-    [
-        (lambda: built(GUIDE, landmarks=HELD.landmarks[:, 1:]), ValueError, r"landmarks must have shape \(B, 25, M\)"),
-        (lambda: built(GUIDE, landmarks=HELD, patch_size=3), None, ""),
-        (lambda: built(GUIDE[..., 1:], landmarks=HELD, patch_size=3), ValueError, r"landmarks must have shape \(B, 9,"),
-        (lambda: built(GUIDE, landmarks=HELD.landmarks[0]), ValueError, r"landmarks must have shape \(B, D, N\)"),
-        (lambda: built(GUIDE, landmarks=HELD.landmarks[..., :0]), ValueError, r"landmarks must have shape \(B, D, N\)"),
-        (lambda: built(GUIDE, landmarks=HELD.landmarks.long()), TypeError, "landmarks must have a floating-point"),
-        (lambda: built(GUIDE, landmarks=HELD.landmarks * float("nan")), ValueError, "landmarks must be finite"),
-        (lambda: built(GUIDE, landmarks=HELD.landmarks.tolist()), ValueError, "landmarks must be one of .* got list"),
-        (
-            lambda: built(GUIDE[:1], landmarks=HELD.assignment),
-            ValueError,
-            "landmarks must be an assignment of 36 points",
-        ),
-        (lambda: built(GUIDE[..., 1:], landmarks=HELD.assignment), ValueError, "landmarks must be an assignment of 30"),
-        (lambda: built(GUIDE, landmarks=HELD.landmarks.to("meta")), ValueError, "landmarks must be on the device"),
-    ],
-)
-def test_bad_landmarks_are_one_clear_sentence(
-    call: Callable[[], object], error: type[Exception] | None, message: str
-) -> None:
-    if error is None:
-        call()
-        return
-    with pytest.raises(error, match=message) as caught:
-        call()
-    assert re.fullmatch(r"\w+ must .+, got .+; .+", str(caught.value))
+def test_an_assignment_fits_any_patch_size() -> None:
+    assert built(GUIDE, landmarks=HELD, patch_size=3).landmarks.shape == (2, 9, 8)

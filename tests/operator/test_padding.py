@@ -1,8 +1,5 @@
 """Batches of images of different sizes."""
 
-from typing import Any
-
-import pytest
 import torch
 
 from nlfilter_torch import NonlocalFilter, pad_images
@@ -35,20 +32,3 @@ def test_a_layer_filters_each_as_if_alone() -> None:
     batch, weights = pad_images(images)
     for image, result in zip(images, layer(batch, weights=weights), strict=True):
         torch.testing.assert_close(result[:, : image.shape[1], : image.shape[2]], layer(image), atol=1e-9, rtol=0)
-
-
-@pytest.mark.parametrize(
-    ("images", "error", "sentence"),
-    [
-        ([], TypeError, "images must be a list of one or more tensors"),
-        (torch.ones(2, 3, 4, 4), TypeError, "images must be a list of one or more tensors, got Tensor"),
-        ([torch.ones(3, 4, 4), None], TypeError, "images must be a torch.Tensor, got NoneType"),
-        ([torch.ones(3, 4, 4, dtype=torch.uint8)], TypeError, "images must have a floating-point dtype"),
-        ([torch.ones(3, 4, 4), torch.ones(1, 4, 4)], ValueError, r"same channels.*got \(3, 4, 4\), \(1, 4, 4\)"),
-        ([torch.ones(4, 4)], ValueError, r"images must have shape \(C, H, W\)"),
-        ([torch.ones(3, 4, 4), torch.ones(3, 4, 4).double()], ValueError, "dtype"),
-    ],
-)
-def test_other_lists_are_refused_in_one_sentence(images: Any, error: type, sentence: str) -> None:
-    with pytest.raises(error, match=sentence):
-        pad_images(images)

@@ -2,7 +2,6 @@
 
 import pytest
 import torch
-from torch import Tensor
 
 from nlfilter_torch import NonlocalDenoiser
 from nlfilter_torch.core.inner import EVERYWHERE
@@ -273,30 +272,6 @@ def test_precisions() -> None:
     assert double.dtype == torch.float64
     # Rounding may assign a pixel to another landmark.
     assert (double - denoise(image, noise_level=0.1)).abs().mean() < 1e-3
-
-
-@pytest.mark.parametrize(
-    ("image", "noise", "error", "message"),
-    [
-        (torch.zeros(8, 8), 0.1, ValueError, "noisy must have shape"),
-        (torch.full((1, 1, 8, 8), torch.nan), 0.1, ValueError, "noisy must be finite"),
-        (torch.zeros(1, 3, 8, 8), -0.1, ValueError, "noise must be at least 0"),
-        (torch.zeros(1, 3, 8, 8), torch.full((1, 1, 8, 8), torch.nan), ValueError, "noise must be finite"),
-        (torch.zeros(1, 3, 8, 8), torch.full((1, 1, 8, 8), -1.0), ValueError, "noise must be at least 0"),
-        (torch.zeros(1, 3, 8, 8), torch.zeros(1, 1, 8, 9), ValueError, "noise must have the height and width"),
-        (
-            torch.zeros(1, 3, 8, 8),
-            torch.zeros(1, 2, 8, 8),
-            ValueError,
-            "noise must have 1 channel or as many as the image",
-        ),
-        (torch.zeros(1, 3, 8, 8), torch.zeros(3), ValueError, "noise must be a number or have shape"),
-        (torch.zeros(1, 3, 8, 8), "much", TypeError, "noise must be a number"),
-    ],
-)
-def test_bad_input(image: Tensor, noise: object, error: type[Exception], message: str) -> None:
-    with pytest.raises(error, match=message):
-        TRAINED_ONE(image, noise)
 
 
 def test_the_edit_refuses_what_it_cannot_take() -> None:

@@ -87,20 +87,3 @@ def test_frames_are_read_one_at_a_time() -> None:
     assert seen == []
     next(edited)
     assert seen == [0]
-
-
-@pytest.mark.parametrize(
-    ("arguments", "sentence"),
-    [
-        ({"references": []}, "references must hold at least one frame, got none"),
-        ({"references": pan(2, 1, 20, 20), "spatial_bandwidth": 5.0}, "references must hold a single frame if"),
-        (
-            {"references": [*pan(1, 1, 20, 20), *pan(1, 1, 20, 21)]},
-            "references must have the height and width of the first",
-        ),
-        ({"references": [torch.rand(2, 1, 9, 9)]}, "references must have batch size 1, got 2"),
-    ],
-)
-def test_bad_references(arguments: dict, sentence: str) -> None:
-    with pytest.raises(ValueError, match=sentence):
-        filter_frames([], ALPHA, **arguments)

@@ -83,23 +83,6 @@ def test_looks_differ_within_a_batch() -> None:
     assert torch.allclose(both[1:], apply_look(CUP, matrix=SEPIA), atol=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"matrix": (1.0, 0.0)}, "matrix must be 9 numbers"),
-        ({"red": (0.0, 1.0)}, "red, green and blue must be equally many"),
-        ({"bands": (1.0, 1.0)}, "bands must have the shape"),
-        ({"texture": (1.0,)}, "texture must have the shape"),
-        ({"alpha": (1.0,)}, "alpha must have the shape"),
-        ({"local": (1.0,)}, "local must have the shape"),
-        ({"stretch": (1.0,)}, "stretch must have the shape"),
-    ],
-)
-def test_bad_parts_are_refused(options: dict[str, tuple[float, ...]], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        apply_look(CAT, **options)  # type: ignore[arg-type]
-
-
 def test_complex_numbers_are_refused() -> None:
     with pytest.raises(TypeError, match=r"stretch must be real numbers, got torch\.complex64; pass"):
         apply_look(CAT, stretch=torch.zeros(3, dtype=torch.complex64))

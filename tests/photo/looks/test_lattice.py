@@ -80,17 +80,3 @@ def test_lattices_are_arguments_as_tensors_and_as_numbers() -> None:
     weights = torch.tensor([0.299, 0.587, 0.114]).view(1, 3, 1, 1)
     wanted = (weights * lattice_change(CAT[:, :1].expand(-1, 3, -1, -1), lattice[0])).sum(1, keepdim=True)
     torch.testing.assert_close(grey - CAT[:, :1], wanted, atol=1e-6, rtol=0)
-
-
-@pytest.mark.parametrize(
-    ("lattice", "message"),
-    [
-        (torch.zeros(3, 4, 4, 5), r"lattice must have the shape \(3, n, n, n\)"),
-        (torch.zeros(3, 1, 1, 1), r"lattice must have the shape \(3, n, n, n\)"),
-        ((0.0, 1.0), "or be as many numbers, got 2; add or drop some"),
-        (torch.full((3, 2, 2, 2), torch.nan), "lattice must be finite"),
-    ],
-)
-def test_bad_lattices_are_refused(lattice: Tensor | tuple[float, ...], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        apply_look(CAT, lattice=lattice)

@@ -134,20 +134,6 @@ def test_gradients_reach_what_is_painted(image: torch.Tensor) -> None:
     torch.autograd.gradcheck(edited, (shares,))
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"added": torch.cat([BRUSH, BRUSH], dim=1)}, "added must have a channel for each of the 1 regions, got 2"),
-        ({"removed": torch.cat([BRUSH, BRUSH], dim=1)}, "removed must have 1 channel or one for each of the 1 regions"),
-        ({"added": 2 * BRUSH}, r"added must be in \[0, 1\], got values from 0 to 2"),
-        ({"removed": BRUSH[..., :9]}, "removed must have the height and width of the image"),
-    ],
-)
-def test_errors(image: torch.Tensor, arguments: dict[str, torch.Tensor], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        region_mask(image, SCRIBBLE, **arguments)
-
-
 def test_an_edit_needs_something_that_is_painted(image: torch.Tensor) -> None:
     with pytest.raises(TypeError, match=r"scribbles must be a torch.Tensor, got NoneType; paint some, or pass added"):
         region_mask(image, None)

@@ -146,26 +146,6 @@ def test_masks_of_a_reduced_picture_follow_the_borders_of_the_large_one(monkeypa
     assert not torch.equal(mask, whole)
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"scribbles": torch.zeros(1, 1, *SIZE)}, "scribbles must hold a painted pixel"),
-        ({"scribbles": 2 * torch.ones(1, 1, *SIZE)}, r"scribbles must be in \[0, 1\]"),
-        ({"scribbles": torch.ones(1, 1, 9, 9)}, "scribbles must have the height and width of the image"),
-        ({"background": torch.zeros(1, 1, *SIZE)}, "background must hold a painted pixel"),
-        ({"background": box(18, 20, size=SIZE)}, "background must hold a painted pixel outside the scribbles"),
-        ({"background": torch.ones(1, 3, *SIZE)}, "background must have 1 channel or one for each of the 1 regions"),
-        ({"reach": 1.0}, "reach must be"),
-        ({"photometric_bandwidth": -1.0}, "photometric_bandwidth must be positive"),
-        ({"image": torch.ones(1, 2, *SIZE)}, "image must have 1 or 3 channels"),
-    ],
-)
-def test_errors(change: dict[str, Any], message: str) -> None:
-    arguments = {"image": square()[0], "scribbles": box(18, 20, size=SIZE), **change}
-    with pytest.raises(ValueError, match=message):
-        region_mask(**arguments)
-
-
 def test_no_spatial_term_finds_what_is_alike_anywhere() -> None:
     image, _ = square(40, 96)
     image = torch.cat([image, image], dim=3)
