@@ -95,7 +95,7 @@ def read_avif(path: Path, data: bytes | mmap, check_size: CheckSize) -> Decoded:
     with quiet():
         image = AvifImagePlugin.AvifImageFile(path)
     with image:
-        if (frames := getattr(image, "n_frames", 1)) > 1:
+        if (frames := image.n_frames) > 1:
             raise UnhandledImage(f"{path} is an animation of {frames} frames; save one of them as a picture")
         check_size(image.size)
         if "icc_profile" not in image.info:

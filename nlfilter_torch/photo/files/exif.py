@@ -14,23 +14,36 @@ from itertools import product
 from typing import NamedTuple, TypeVar
 
 import numpy as np
+import tifffile
 from numpy.typing import NDArray
 from PIL import Image
+from PIL.ExifTags import Base
 
-from nlfilter_torch.photo.files.tables import EXIF, INTEGERS, ORIENTATION, POINTERS, SHORT, Field, Range, Tables
+from nlfilter_torch.photo.files.tables import (
+    EXIF,
+    INTEGERS,
+    ORIENTATION,
+    POINTERS,
+    RESOLUTION,
+    SHORT,
+    Field,
+    Range,
+    Tables,
+)
 
 Scalar = TypeVar("Scalar", bound=np.generic)
 
 PREFIX = b"Exif\0\0"
-SIZES = ((256, 257), (282, 283), (40962, 40963), (41486, 41487))  # horizontal and vertical; swapped by a quarter turn
-RESOLUTION = (282, 283, 296)  # horizontal, vertical, and their unit
-SCALES = {2: 1.0, 3: 2.54}  # of inch and centimetre
-IN_PIXELS = (256, 40962)  # of these
-IN_EXIF = (40962, 40963)  # those that cameras write
-AREAS = (37396, 41492)  # places of the main subject: centre, and perhaps diameter, or width and height
+IN_EXIF = (Base.ExifImageWidth, Base.ExifImageHeight)  # those that cameras write
+IN_PIXELS = (Base.ImageWidth, Base.ExifImageWidth)
+FOCAL_PLANE = (Base.FocalPlaneXResolution, Base.FocalPlaneYResolution)
+#: Horizontal and vertical; swapped by a quarter turn.
+SIZES = ((Base.ImageWidth, Base.ImageLength), IN_EXIF, RESOLUTION[:2], FOCAL_PLANE)
+SCALES: dict[int, float] = {tifffile.RESUNIT.INCH: 1.0, tifffile.RESUNIT.CENTIMETER: 2.54}
+AREAS = (37396, Base.SubjectLocation)  # places of the main subject: centre, and perhaps diameter, or width and height
 HIDDEN = 0xFFFE  # the number of no tag
-COMPRESSION, PLACE, LENGTH = 259, 513, 514  # of a thumbnail
-JPEG = 6  # a compression
+COMPRESSION, PLACE, LENGTH = Base.Compression, Base.JpegIFOffset, Base.JpegIFByteCount  # of a thumbnail
+OJPEG = tifffile.COMPRESSION.OJPEG
 THUMBNAIL_SIDES = (160, 80, 40)  # the longest side of thumbnails, until one fits
 QUALITIES = (85, 70, 50, 30)  # of each
 
@@ -233,10 +246,10 @@ def refreshed(block: bytes, picture: NDArray[np.generic] | None) -> bytes:
         return block
     fields = {field.code: field for field in tables.fields(start)}
     place, length = (tables.number(fields[code]) if code in fields else None for code in (PLACE, LENGTH))
-    compression = tables.number(fields[COMPRESSION]) if COMPRESSION in fields else JPEG
+    compression = tables.number(fields[COMPRESSION]) if COMPRESSION in fields else OJPEG
     room = (place or 0, (place or 0) + (length or 0))
     free = room[1] <= len(tables.data) and not _overlaps(room, tables.ranges())
-    jpeg = None if picture is None or compression != JPEG or not free else _small_jpeg(picture, length or 0)
+    jpeg = None if picture is None or compression != OJPEG or not free else _small_jpeg(picture, length or 0)
     if free:
         tables.data[slice(*room)] = (jpeg or b"").ljust(length or 0, b"\0")
     if jpeg is None:

@@ -9,8 +9,10 @@ from collections.abc import Container
 from dataclasses import dataclass
 from typing import BinaryIO
 
+from PIL.ExifTags import Base
+
 from nlfilter_torch.photo.files.exif import PREFIX, parsed, refreshed
-from nlfilter_torch.photo.files.metadata import RESOLUTION, STORAGE, Tag
+from nlfilter_torch.photo.files.metadata import STORAGE, Tag
 from nlfilter_torch.photo.files.tables import (
     EXIF,
     GPS,
@@ -20,13 +22,17 @@ from nlfilter_torch.photo.files.tables import (
     MAKER_NOTE,
     ORIENTATION,
     POINTERS,
+    RESOLUTION,
     Field,
     Tables,
 )
 
 # Fields of the first table that describe the photograph and belong to the EXIF block.
-DESCRIPTIVE = (269, 270, 271, 272, ORIENTATION, 285, 305, 306, 315, 316, 18246, 18249, *range(40091, 40096), 33432)
-DESCRIPTIVE += (EXIF, GPS)
+DESCRIPTIVE = (
+    *(ORIENTATION, EXIF, GPS, Base.DocumentName, Base.ImageDescription, Base.Make, Base.Model, Base.PageName),
+    *(Base.Software, Base.DateTime, Base.Artist, Base.HostComputer, Base.Rating, Base.RatingPercent, Base.Copyright),
+    *(Base.XPTitle, Base.XPComment, Base.XPAuthor, Base.XPKeywords, Base.XPSubject),
+)
 NEAR = 1 << 20  # bytes of a TIFF file in which tables can keep their place
 START = 16  # of tables that are moved, after the longest header
 MOVED = "the offsets inside the maker note, which is moved"

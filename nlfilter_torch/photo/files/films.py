@@ -382,8 +382,8 @@ def _encoder(film: Film, output: "OutputContainer", path: Path) -> "VideoStream"
         )
     context = target.codec_context
     context.time_base = film.stream.time_base or 1 / Fraction(rate)
-    for entry in ("color_primaries", "color_trc", "colorspace"):
-        setattr(context, entry, getattr(source, entry))
+    context.color_primaries, context.color_trc = source.color_primaries, source.color_trc
+    context.colorspace = source.colorspace
     context.color_range = film.range
     if source.sample_aspect_ratio:
         context.sample_aspect_ratio = source.sample_aspect_ratio

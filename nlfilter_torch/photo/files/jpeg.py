@@ -53,7 +53,6 @@ NAMES = {
 }
 BARE = (0x01, *range(0xD0, 0xD8))  # markers without content
 MARKER = re.compile(rb"\xff+[^\0\xd0-\xd7\xff]")  # in the pixels: not a byte of 255, nor a restart
-COLOURS = {1: 1, 3: 3}  # channels
 BLOCK = 8  # side of the squares of pixels that are coded
 INCH, CENTIMETRE = 1, 2  # units of the density
 STRIP = 64  # rows that are coded at a time; a multiple of BLOCK
@@ -143,7 +142,7 @@ def open_jpeg(path: Path, data: bytes | mmap) -> Jpeg:
     if frame is None:
         raise EOFError("it has no picture")
     bits, height, width, samples = struct.unpack_from(">BHHB", data, frame.start)
-    if samples not in COLOURS:
+    if samples not in (1, 3):
         kind = "CMYK" if samples == 4 else f"{samples}-channel"
         raise UnhandledImage(f"{path} is stored in {kind} colours, which are not supported; convert it to grey or RGB")
     if bits != 8:

@@ -8,22 +8,28 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from PIL.ExifTags import Base
+from tifffile import DATATYPE, TIFF
 
 from nlfilter_torch.core.warning import warn
-from nlfilter_torch.photo.files.tables import LENGTHS
+from nlfilter_torch.photo.files.tables import LENGTHS, RESOLUTION
 
-JPEG_LIMIT = 65_000  # bytes of XMP that fit in a JPEG segment; longer packets are not written
-RESOLUTION = (282, 283, 296)  # horizontal, vertical, and their unit
-SWAPPED = {282: 283, 283: 282}
+SWAPPED: dict[int, int] = {Base.XResolution: Base.YResolution, Base.YResolution: Base.XResolution}
 # Tags that say how a TIFF file stores its pixels. The output has its own.
 STORAGE = frozenset((*range(254, 260), 262, *range(263, 267), 273, *range(277, 280), 284, 288, 289, 292, 293))
 STORAGE |= {317, 320, 321, *range(322, 329), 332, 333, 334, 336, 338, 339, 347, *range(512, 522), *range(529, 533)}
 STORAGE |= {32995, 32996, 32997, 32998, 34675}
 #: Tags of GeoTIFF and GDAL: where the pixels lie on the ground, notes, and the value without data.
-GROUND = (33550, 33922, 34264, 34735, 34736, 34737)
+GEO_KEYS = ("GeoKeyDirectoryTag", "GeoDoubleParamsTag", "GeoAsciiParamsTag")
+TIES = ("ModelPixelScaleTag", "ModelTiepointTag", "ModelTransformationTag")
+GROUND = tuple(int(TIFF.TAGS[name]) for name in (*TIES, *GEO_KEYS))
 GDAL_NOTES, NODATA = 42112, 42113
-OF_A_DEPTH = (NODATA, 280, 281, 290, 291, 301, 340, 341)  # hold levels, or a value for each level
-FRACTIONS = (5, 10)  # types of two numbers
+#: Tags that hold levels, or a value for each level.
+OF_A_DEPTH = (
+    *(NODATA, Base.MinSampleValue, Base.MaxSampleValue, Base.SMinSampleValue, Base.SMaxSampleValue),
+    *(Base.GrayResponseUnit, Base.GrayResponseCurve, Base.TransferFunction),
+)
+FRACTIONS = (DATATYPE.RATIONAL, DATATYPE.SRATIONAL)  # types of two numbers
 
 
 @dataclass(frozen=True)

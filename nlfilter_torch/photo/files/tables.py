@@ -6,14 +6,27 @@ from collections.abc import Container, Iterator
 from dataclasses import dataclass
 from mmap import mmap
 
+from PIL.ExifTags import Base
+from tifffile import DATATYPE, TIFF
+
 Data = bytes | bytearray | mmap
 Range = tuple[int, int]  # first byte, and the one after the last
 
-ORIENTATION, EXIF, GPS, INTEROP, MAKER_NOTE = 274, 34665, 34853, 40965, 37500
+ORIENTATION, EXIF, GPS, INTEROP = Base.Orientation, Base.ExifOffset, Base.GPSInfo, Base.ExifInteroperabilityOffset
+MAKER_NOTE = Base.MakerNote
+RESOLUTION = (Base.XResolution, Base.YResolution, Base.ResolutionUnit)
 POINTERS = (EXIF, GPS, INTEROP)  # fields that point to a nested table
-LENGTHS = {1: 1, 2: 1, 3: 2, 4: 4, 5: 8, 6: 1, 7: 1, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8, 13: 4, 16: 8, 17: 8, 18: 8}
-SHORT, LONG, RATIONAL, LONG8 = 3, 4, 5, 16  # types
-INTEGERS = {1: "B", 3: "H", 4: "I", 13: "I", 16: "Q", 18: "Q"}  # unsigned types
+LENGTHS = {kind: struct.calcsize("<" + form) for kind, form in TIFF.DATA_FORMATS.items()}  # of a value
+SHORT, LONG, RATIONAL, LONG8 = DATATYPE.SHORT, DATATYPE.LONG, DATATYPE.RATIONAL, DATATYPE.LONG8
+#: Unsigned types, as :mod:`struct` calls them.
+INTEGERS: dict[int, str] = {
+    DATATYPE.BYTE: "B",
+    SHORT: "H",
+    LONG: "I",
+    DATATYPE.IFD: "I",
+    LONG8: "Q",
+    DATATYPE.IFD8: "Q",
+}
 HEADERS = {b"II*\0": "<", b"MM\0*": ">", b"II+\0": "<", b"MM\0+": ">"}
 HEADERS |= {b"IIRO": "<", b"IIRS": "<", b"IIU\0": "<", b"MMOR": ">"}  # RAW files of Olympus and Panasonic
 

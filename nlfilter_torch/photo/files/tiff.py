@@ -18,7 +18,6 @@ from nlfilter_torch.photo.files import exif_in_tiff
 from nlfilter_torch.photo.files.decoded import CheckSize, Decoded, bands, decoding
 from nlfilter_torch.photo.files.metadata import (
     GROUND,
-    RESOLUTION,
     STORAGE,
     Extras,
     Metadata,
@@ -29,12 +28,11 @@ from nlfilter_torch.photo.files.metadata import (
     turned_tag,
     upright_packet,
 )
-from nlfilter_torch.photo.files.tables import LONG, ORIENTATION, RATIONAL, SHORT, Tables
+from nlfilter_torch.photo.files.tables import LONG, ORIENTATION, RATIONAL, RESOLUTION, SHORT, Tables
 
 # tifffile logs problems with a file. Without a handler Python would print them beside our error message.
 logging.getLogger("tifffile").addHandler(logging.NullHandler())
 XMP, SUB_FILES = 700, 330  # tags
-INCH = 2  # unit of the resolution
 TILE_SIZE = 256  # side of the tiles that are written
 MAX_CLASSIC_BYTES = 4_000_000_000  # bytes of pixels above which a BigTIFF is written
 _ASSOCIATED = tifffile.EXTRASAMPLE.ASSOCALPHA
@@ -102,7 +100,7 @@ def check_page(path: Path, page: tifffile.TiffPage) -> None:
     by_jpeg = page.compression in (tifffile.COMPRESSION.JPEG, tifffile.COMPRESSION.OJPEG)
     handled = {kinds.MINISWHITE, kinds.MINISBLACK, kinds.RGB} | ({kinds.YCBCR} if by_jpeg else set())
     if page.photometric not in handled:
-        name = getattr(page.photometric, "name", page.photometric)
+        name = page.photometric.name if isinstance(page.photometric, kinds) else page.photometric
         raise UnhandledImage(f"{path} is stored in {name} colours, which are not supported; convert it to grey or RGB")
     bits = page.bitspersample if isinstance(page.bitspersample, int) else max(page.bitspersample)
     if page.dtype is None or bits != 8 * page.dtype.itemsize:
@@ -147,7 +145,7 @@ def read_metadata(file: tifffile.TiffFile, stream: BinaryIO, depth: str) -> tupl
         units = [tables.number(field) for field in fields if field.code == RESOLUTION[2]]
     packet, left_out = upright_packet(packet, orientation)
     left_out += [exif_in_tiff.MOVED] * moved + ["smaller versions and masks"] * any(f.code == SUB_FILES for f in fields)
-    scale = exif_tags.SCALES.get((units or [INCH])[0] or 0)
+    scale = exif_tags.SCALES.get((units or [tifffile.RESUNIT.INCH])[0] or 0)
     pair = None if scale is None or len(ratios) < 2 else sound([ratios[code] * scale for code in RESOLUTION[:2]])
     if units == [1] and set(ratios.values()) == {1.0}:  # says nothing
         tags = [tag for tag in tags if tag.code not in RESOLUTION]
@@ -249,14 +247,14 @@ def write(
 
 def _resolution(extras: Extras, tags: Iterable[Tag]) -> _Resolution:
     """The resolution as stored in a TIFF file, or else in dpi."""
-    kinds = dict(zip(RESOLUTION, (RATIONAL, RATIONAL, SHORT), strict=True))
+    kinds: dict[int, int] = dict(zip(RESOLUTION, (RATIONAL, RATIONAL, SHORT), strict=True))
     stored = {tag.code: tag for tag in tags if tag.kind == kinds.get(tag.code) and tag.count == 1}
     values = [struct.unpack(stored[code].order + "II", stored[code].data) for code in RESOLUTION[:2] if code in stored]
     unit = stored.get(RESOLUTION[2])
     if len(values) == 2:
-        number = INCH if unit is None else struct.unpack(unit.order + "H", unit.data)[0]
+        number = tifffile.RESUNIT.INCH if unit is None else struct.unpack(unit.order + "H", unit.data)[0]
         return _Resolution(resolution=(values[0], values[1]), resolutionunit=number)
-    return {} if extras.dpi is None else _Resolution(resolution=extras.dpi, resolutionunit=INCH)
+    return {} if extras.dpi is None else _Resolution(resolution=extras.dpi, resolutionunit=tifffile.RESUNIT.INCH)
 
 
 def _unmultiplied(channels: Stored) -> Stored:
