@@ -21,7 +21,7 @@ from nlfilter_torch.core.kernels import definitions_only
 from nlfilter_torch.photo import apply_look, fit_look
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.edits.applying import apply_step
-from nlfilter_torch.photo.looks.lattice import lattice_change
+from nlfilter_torch.photo.looks.look_filter import lattice_change
 
 ALPHA = (2.2, 1.6, 1.3, 1.02)
 SLIDERS = "sliders of this library"

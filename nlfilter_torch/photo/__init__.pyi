@@ -11,14 +11,14 @@ from .edits.colorize import colorize as colorize
 from .edits.defocus import defocus as defocus
 from .edits.denoise import denoise as denoise
 from .edits.detail import enhance as enhance
+from .edits.fit_look import FittedLook as FittedLook
+from .edits.fit_look import fit_look as fit_look
 from .edits.frames import filter_frames as filter_frames
 from .edits.look import apply_look as apply_look
 from .edits.recolor import recolor as recolor
 from .edits.sharpen import sharpen as sharpen
 from .edits.streaming import stream as stream
 from .edits.tone import adjust_tone as adjust_tone
-from .look_fitting.fit_look import FittedLook as FittedLook
-from .look_fitting.fit_look import fit_look as fit_look
 from .looks.look_module import Look as Look
 from .picture.drawn import Drawn as Drawn
 from .picture.photographs import Photograph as Photograph

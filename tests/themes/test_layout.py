@@ -16,7 +16,6 @@ PHOTO_ROOMS = (
     "selections",
     "looks",
     "edits",
-    "look_fitting",
     "plotting",
     "app",
     "cli",

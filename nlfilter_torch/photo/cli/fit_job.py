@@ -19,11 +19,11 @@ from nlfilter_torch.photo.declared.colour_tables import CUBE_NODES, HALD_LEVEL, 
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.edits.applying import apply_step
 from nlfilter_torch.photo.edits.colour_part import colour_part, colour_table, table_error
+from nlfilter_torch.photo.edits.fit_look import FittedLook, fit_look
 from nlfilter_torch.photo.files.formats import check_type
 from nlfilter_torch.photo.files.writing import check_file, open_beside
-from nlfilter_torch.photo.look_fitting.alignment import align, explained, inside_frame
-from nlfilter_torch.photo.look_fitting.fit_look import FittedLook, fit_look
-from nlfilter_torch.photo.look_fitting.pairs import check_belong
+from nlfilter_torch.photo.looks.alignment import align, explained_share, inside_frame
+from nlfilter_torch.photo.looks.edited_pixels import check_belong
 from nlfilter_torch.photo.picture.changes import blend_edited
 from nlfilter_torch.photo.picture.photographs import Photograph, read_photograph, write_photograph
 from nlfilter_torch.photo.picture.resizing import resize
@@ -98,7 +98,7 @@ class FitJob:
         if self.before.is_dir():
             _note_unpaired(self.before, {path.stem for _, path in paths})
             _note_unpaired(self.after, {path.stem for path, _ in paths})
-        share = explained(*judged) if whole and judged is not None else None
+        share = explained_share(*judged) if whole and judged is not None else None
         for look, path in zip(looks, results, strict=True):
             _report(look, look.fitted if share is None else share, path, alone=alone)
         if whole and judged is not None:
@@ -279,7 +279,7 @@ def _tell_where(before: Tensor, after: Tensor, result: Tensor, stride: float) ->
     """Say where the rest of the change is, if it is in a few places; a pixel is ``stride`` pixels of the photograph."""
     rest = (after - result).square().mean(1, keepdim=True) * inside_frame(before[0], after[0])
     rest = avg_pool2d(rest, SQUARE, ceil_mode=True)[0, 0]
-    if explained(before, after, result) > ENOUGH or rest.numel() < 1 / FEW:
+    if explained_share(before, after, result) > ENOUGH or rest.numel() < 1 / FEW:
         return
     largest = rest.flatten().topk(max(1, int(FEW * rest.numel())))
     if float(largest.values.sum() / rest.sum()) < MOST:
@@ -342,7 +342,7 @@ class Tables:
         """Say what a table carries of the change between two pictures, and how exact it is, if there is one."""
         if self.cube is None and self.hald is None:
             return
-        share = explained(before, after, apply_step(colour_part(look.step), before).clamp(0, 1))
+        share = explained_share(before, after, apply_step(colour_part(look.step), before).clamp(0, 1))
         error = table_error(look.step, CUBE_NODES, before)
         carried = f"{self.cube or self.hald} carries {100 * share:.1f} % of the change"
         typer.echo(f"table: {carried}; {CUBE_NODES}^3 colours are off by {error:.2f} levels of 255")

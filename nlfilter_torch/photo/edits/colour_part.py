@@ -5,7 +5,7 @@ from torch import Tensor
 from nlfilter_torch.photo.declared.shared_parameters import LOOK
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.edits.applying import apply_step
-from nlfilter_torch.photo.looks.lattice import colours_of_nodes
+from nlfilter_torch.photo.looks.look_filter import colours_of_nodes
 
 NAMES = ("red", "green", "blue", "matrix", "saturation", "lattice", "amount")
 

@@ -15,8 +15,15 @@ from nlfilter_torch.photo.declared.declaration import Edit
 from nlfilter_torch.photo.declared.shared_parameters import LOOK
 from nlfilter_torch.photo.edits.synthesis import Polynomial
 from nlfilter_torch.photo.looks.histogram import LocalCurves, Stretch, ramps, tones
-from nlfilter_torch.photo.looks.lattice import lattice_of
-from nlfilter_torch.photo.looks.look_filter import BAND_MARGIN, acts, band_change, check_part, pointwise, texture_change
+from nlfilter_torch.photo.looks.look_filter import (
+    BAND_MARGIN,
+    acts,
+    band_change,
+    check_part,
+    lattice_of,
+    pointwise,
+    texture_change,
+)
 from nlfilter_torch.photo.picture.drawn import Drawn, M
 from nlfilter_torch.photo.picture.edit import FilteredEdit, Rows
 from nlfilter_torch.photo.picture.in_memory import edit_image

@@ -22,11 +22,10 @@ from torch import Tensor
 from nlfilter_torch.operator.features import reduce_channels
 from nlfilter_torch.photo.picture.resizing import block_counts, block_means
 
-DARKEST = 1 / 255  # colours are divided by their largest channel, or by this if it is smaller
-KINDS = 3  # of automatic levels
-FLAT = 1 / 255  # range of a picture that is not stretched
-LIMITS = (1.5, 2.0, 3.0, 5.0)  # clip limits relative to an even histogram; also the steepest slopes of curves
-STRENGTHS = 2 * len(LIMITS)  # of tone curves of luminance, and of the largest channel
+LEVEL = 1 / 255  # pictures of a smaller range are not stretched, and colours are divided by no smaller value
+KINDS_OF_LEVELS = 3  # of automatic levels
+CONTRAST_LIMITS = (1.5, 2.0, 3.0, 5.0)  # clip limits relative to an even histogram; also the steepest slopes of curves
+STRENGTHS = 2 * len(CONTRAST_LIMITS)  # of tone curves of luminance, and of the largest channel
 SHADES = 33
 TILES = 8  # along both sides
 FINE = 16  # blocks along the short side of a tile that histograms are first taken of
@@ -59,7 +58,7 @@ class Stretch:
     def of(ends: tuple[Tensor, Tensor]) -> "Stretch":
         """The range between the least and the largest :func:`tones` of a picture, (B, 2 + C, 1, 1) each."""
         width = ends[1] - ends[0]
-        flat = width < FLAT
+        flat = width < LEVEL
         return Stretch(ends[0].masked_fill(flat, 0.0), width.masked_fill(flat, 1.0))
 
     def largest(self, values: Tensor) -> Tensor:
@@ -67,15 +66,15 @@ class Stretch:
         return (values - self.darkest[:, 1:2]) / self.width[:, 1:2]
 
     def changes(self, image: Tensor) -> Tensor:
-        """Changes (B, KINDS, C, H, W) of an image (B, C, H, W) by each kind of levels."""
+        """Changes (B, KINDS_OF_LEVELS, C, H, W) of an image (B, C, H, W) by each kind of levels."""
         before = tones(image)
         moved = (before - self.darkest) / self.width - before
-        scaled = moved[:, 1:2] * image / before[:, 1:2].clamp(min=DARKEST)
+        scaled = moved[:, 1:2] * image / before[:, 1:2].clamp(min=LEVEL)
         return torch.stack([moved[:, :1].expand_as(image), scaled, moved[:, 2:]], dim=1)
 
     def change(self, image: Tensor, strengths: Tensor) -> Tensor:
-        """The sum (B, C, H, W) of all kinds, weighted by strengths (KINDS,) or (B, KINDS)."""
-        return (strengths.to(image).reshape(-1, KINDS, 1, 1, 1) * self.changes(image)).sum(1)
+        """The sum (B, C, H, W) of all kinds, weighted by strengths (KINDS_OF_LEVELS,) or (B, KINDS_OF_LEVELS)."""
+        return (strengths.to(image).reshape(-1, KINDS_OF_LEVELS, 1, 1, 1) * self.changes(image)).sum(1)
 
 
 def ramps(image: Tensor, stretch: Stretch) -> Tensor:
@@ -116,7 +115,7 @@ class LocalCurves:
 
     @staticmethod
     def of(size: tuple[int, int], stretch: Stretch, reduced: Callable[[int], Tensor]) -> "LocalCurves":
-        """The curves of a picture of size (H, W), one for each of :data:`LIMITS`.
+        """The curves of a picture of size (H, W), one for each of :data:`CONTRAST_LIMITS`.
 
         ``reduced`` returns :func:`block_means` of its :func:`ramps` for blocks of so many pixels, (B, 2 (K - 1), h, w).
         """
@@ -128,7 +127,7 @@ class LocalCurves:
         histogram = passed - F.pad(passed[:, :, 1:], (0, 0, 0, 0, 0, 1))
         straight = torch.linspace(0, 1, SHADES).to(means).view(-1, 1, 1)
         changes = []
-        for limit in LIMITS:
+        for limit in CONTRAST_LIMITS:
             most = histogram.clamp(max=limit / SHADES)
             shared = most + (1 - most.sum(2, keepdim=True)) / SHADES
             changes.append(shared.cumsum(2) - shared / 2 - straight)
@@ -136,7 +135,7 @@ class LocalCurves:
 
     def weighed(self, strength: Tensor) -> "LocalCurves":
         """The sum of all curves as one, weighted by strengths (2 S,) or (B, 2 S)."""
-        weights = strength.to(self.changes).reshape(-1, 2, len(LIMITS), 1, 1, 1)
+        weights = strength.to(self.changes).reshape(-1, 2, len(CONTRAST_LIMITS), 1, 1, 1)
         return LocalCurves((weights * self.changes).sum(2, keepdim=True), self.size, self.stretch)
 
     def rectangle(self, image: Tensor, corner: tuple[int, int]) -> Tensor:
@@ -154,7 +153,7 @@ class LocalCurves:
         light = brightness(image.unsqueeze(2))
         places = _stretched(light, self.stretch).squeeze(2)
         added, scaled = self._changes_of(places, rows, columns).unbind(1)
-        colours = (image / light[:, 1:, 0].clamp(min=DARKEST)).unsqueeze(1)
+        colours = (image / light[:, 1:, 0].clamp(min=LEVEL)).unsqueeze(1)
         added = added.unsqueeze(2).expand(-1, -1, image.shape[1], -1)
         return torch.cat([added, scaled.unsqueeze(2) * colours], dim=1)
 

@@ -14,37 +14,38 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.core.checks import check_dtype, check_finite, check_tensor
+from nlfilter_torch.core.kernels.lattice import interpolate
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.operator.features import pad_border, reduce_channels
+from nlfilter_torch.photo.declared.declaration import MAX_NODES, nodes_of
 from nlfilter_torch.photo.looks.histogram import (
-    DARKEST,
-    KINDS,
+    KINDS_OF_LEVELS,
+    LEVEL,
     STRENGTHS,
     LocalCurves,
     Stretch,
     mean_ramps,
     tones,
 )
-from nlfilter_torch.photo.looks.lattice import lattice_change
 from nlfilter_torch.photo.picture.ends import ends_of
 
 BLURS = 6  # each twice as wide as the one before
 BAND_MARGIN = 2 * (2**BLURS - 1)  # pixels around a pixel that the widest depends on
-FLAT = 0.15  # standard deviation of luminance around a pixel at which half of a band counts as texture
+ROUGH = 0.15  # standard deviation of luminance around a pixel at which half of a band counts as texture
 LookPart = Literal["alpha", "bands", "texture", "curves", "matrix", "saturation", "stretch", "local", "lattice"]
 #: Parts of a look, with their shapes for one image; a letter is any length from 2 on, the same wherever it stands.
-SHAPES: dict[str, tuple[int | str, ...]] = {
+PART_SHAPES: dict[str, tuple[int | str, ...]] = {
     "alpha": ("k+1",),
     "bands": (BLURS + 1,),
     "texture": (BLURS,),
     "curves": (3, "K"),
     "matrix": (3, 3),
     "saturation": ("K",),
-    "stretch": (KINDS,),
+    "stretch": (KINDS_OF_LEVELS,),
     "local": (STRENGTHS,),
     "lattice": (3, "n", "n", "n"),
 }
-NAMES: tuple[LookPart, ...] = get_args(LookPart)
+LOOK_PARTS: tuple[LookPart, ...] = get_args(LookPart)
 #: Values at which these parts change nothing; they are not computed then.
 IDLE = {"alpha": 1.0, "bands": 1.0, "texture": 1.0, "stretch": 0.0, "local": 0.0, "lattice": 0.0}
 
@@ -53,7 +54,7 @@ IDLE = {"alpha": 1.0, "bands": 1.0, "texture": 1.0, "stretch": 0.0, "local": 0.0
 def filter_look(
     image: Tensor, parts: Mapping[str, Tensor], detail: Callable[[Tensor, Tensor], Tensor] | None
 ) -> Tensor:
-    """An image (B, 3, H, W) under a look of all :data:`NAMES`, whose parts may differ between the images.
+    """An image (B, 3, H, W) under a look of all :data:`LOOK_PARTS`, whose parts may differ between the images.
 
     Differentiable in everything. ``apply_look`` says what the parts are. ``detail`` is :func:`polynomial_filter` with
     W, a function of luminance and sliders, and needed only if ``alpha`` :func:`acts`.
@@ -68,9 +69,9 @@ def filter_look(
     if "texture" in acting:
         result = result + texture_change(image, parts["texture"])
     if "stretch" in acting:
-        result = result + range_of(image).change(image, parts["stretch"])
+        result = result + stretch_of(image).change(image, parts["stretch"])
     if "local" in acting:
-        curves = local_curves(image, range_of(image)).weighed(parts["local"])
+        curves = local_curves(image, stretch_of(image)).weighed(parts["local"])
         result = result + curves.rectangle(image, (0, 0)).sum(1)
     if "alpha" in acting:
         assert detail is not None  # for mypy
@@ -83,7 +84,7 @@ def check_part(value: Tensor, name: str, batch: int) -> None:
     check_tensor(value, name)
     check_dtype(value, name, f"convert it with {name}.float()")
     check_finite(value, name)
-    shape, wanted = tuple(value.shape), SHAPES[name]
+    shape, wanted = tuple(value.shape), PART_SHAPES[name]
     own = shape[-len(wanted) :]
     fits = len(own) == len(wanted) and all(
         length >= 2 if isinstance(size, str) else length == size for length, size in zip(own, wanted, strict=True)
@@ -101,7 +102,7 @@ def acts(gains: Tensor, idle: float = 1.0) -> bool:
     return gains.requires_grad or bool((gains != idle).any())
 
 
-def range_of(image: Tensor) -> Stretch:
+def stretch_of(image: Tensor) -> Stretch:
     """Range of the brightness of an image (B, 3, H, W)."""
     return Stretch.of(ends_of(tones(image)))
 
@@ -131,7 +132,7 @@ def below_largest(image: Tensor) -> Tensor:
 def saturation_hats(image: Tensor, count: int) -> Tensor:
     """Weights (B, K, H, W) of the HSV saturation in K evenly spaced hat functions on [0, 1]."""
     largest, least = image.amax(1, keepdim=True), image.amin(1, keepdim=True)
-    share = ((largest - least) / largest.clamp(min=DARKEST)).clamp(0, 1)
+    share = ((largest - least) / largest.clamp(min=LEVEL)).clamp(0, 1)
     steps = torch.arange(count).to(image).view(-1, 1, 1)
     return (1 - (share * (count - 1) - steps).abs()).clamp(min=0)
 
@@ -145,7 +146,7 @@ def tone_curve(image: Tensor, curves: Tensor) -> Tensor:
     return (low + (high - low) * (place - below)).view_as(image)
 
 
-def bands_of(image: Tensor) -> Iterator[Tensor]:
+def blur_bands(image: Tensor) -> Iterator[Tensor]:
     """The band that each blur removes from an image (B, C, H, W), and finally the rest."""
     height, width = image.shape[-2:]
     left, margin = pad_border(image, BAND_MARGIN), BAND_MARGIN
@@ -168,7 +169,7 @@ def _blur(image: Tensor, dim: int, step: int) -> Tensor:
 def band_change(image: Tensor, gains: Tensor, mean: Tensor) -> Tensor:
     """Change of an image by gains (7,) or (B, 7) of its bands; the last band is taken about the mean (B, 1, 1, 1)."""
     change = torch.zeros_like(image)
-    for number, band in enumerate(bands_of(image)):
+    for number, band in enumerate(blur_bands(image)):
         gain = (gains[..., number].to(image) - 1).reshape(-1, 1, 1, 1)
         change = change + gain * (band - mean if number == BLURS else band)
     return change
@@ -178,12 +179,12 @@ def textures_of(image: Tensor) -> Iterator[Tensor]:
     """Six bands (B, 1, H, W) of an image's luminance, attenuated where it varies much around a pixel, as at edges."""
     light = reduce_channels(image, "luminance")
     low = torch.cat([light, light.square()], dim=1)
-    for number, band in enumerate(bands_of(low)):
+    for number, band in enumerate(blur_bands(low)):
         if number == BLURS:
             return
         low = low - band  # the blurred luminance, and its blurred square
         variance = (low[:, 1:] - low[:, :1].square()).clamp(min=0)
-        yield band[:, :1] * (FLAT**2 / (variance + FLAT**2))
+        yield band[:, :1] * (ROUGH**2 / (variance + ROUGH**2))
 
 
 def texture_change(image: Tensor, gains: Tensor) -> Tensor:
@@ -192,3 +193,36 @@ def texture_change(image: Tensor, gains: Tensor) -> Tensor:
     for number, texture in enumerate(textures_of(image)):
         change = change + (gains[..., number].to(image) - 1).reshape(-1, 1, 1, 1) * texture
     return change
+
+
+def lattice_change(image: Tensor, lattice: Tensor) -> Tensor:
+    """Changes (B, 3, H, W) of an image of that shape, by those at the nodes, (3, n, n, n) or (B, 3, n, n, n).
+
+    The nodes are evenly spaced on [0, 1] along red, green and blue, in this order. Colours outside change as the
+    nearest inside. Differentiable in both.
+    """
+    lattices = lattice.to(image).view(-1, *lattice.shape[-4:])
+    return interpolate(image.flatten(2), lattices).view_as(image)
+
+
+def lattice_of(numbers: Tensor) -> Tensor:
+    """A lattice (..., 3, n, n, n) from its numbers in a row, (..., 3 n^3)."""
+    nodes = nodes_of(numbers.shape[-1])
+    if nodes is None:
+        raise ValueError(
+            f"lattice must have the shape (3, n, n, n), n from 2 to {MAX_NODES}, or be as many numbers, "
+            f"got {numbers.shape[-1]}; add or drop some"
+        )
+    return numbers.unflatten(-1, (3, nodes, nodes, nodes))
+
+
+def colours_of_nodes(nodes: int) -> Tensor:
+    """Colours (3, n, n, n) of the nodes, in float64."""
+    steps = torch.arange(nodes, dtype=torch.float64) / (nodes - 1)
+    return torch.stack(torch.meshgrid(steps, steps, steps, indexing="ij"))
+
+
+def resampled(lattice: Tensor, nodes: int) -> Tensor:
+    """A lattice (3, n, n, n) with another number of nodes, (3, m, m, m)."""
+    flat = colours_of_nodes(nodes).flatten(1)[None, :, None]
+    return lattice_change(flat, lattice.double())[0, :, 0].view(3, nodes, nodes, nodes)

@@ -26,9 +26,8 @@ from nlfilter_torch.operator.options import (
     SpatialBandwidth,
 )
 from nlfilter_torch.photo.declared.shading import LANDMARKS, LEVELS, NEAR
-from nlfilter_torch.photo.looks.histogram import KINDS, STRENGTHS
-from nlfilter_torch.photo.looks.lattice import NODES
-from nlfilter_torch.photo.looks.look_filter import BLURS, NAMES, LookPart, acts, check_part, filter_look
+from nlfilter_torch.photo.looks.histogram import KINDS_OF_LEVELS, STRENGTHS
+from nlfilter_torch.photo.looks.look_filter import BLURS, LOOK_PARTS, LookPart, acts, check_part, filter_look
 
 
 class Look(nn.Module):
@@ -79,7 +78,7 @@ class Look(nn.Module):
         self,
         parts: Mapping[str, Tensor] | None = None,
         *,
-        learn: LookPart | Collection[LookPart] = NAMES,
+        learn: LookPart | Collection[LookPart] = LOOK_PARTS,
         knots: int = 17,
         patch_size: int = OperatorOptions.patch_size,
         photometric_bandwidth: float | Tensor | Literal["auto"] = LEVELS / 255,
@@ -94,9 +93,9 @@ class Look(nn.Module):
         group: object = OperatorOptions.group,
     ) -> None:
         super().__init__()
-        names = check_learn(learn, NAMES)
+        names = check_learn(learn, LOOK_PARTS)
         initial = {} if parts is None else dict(parts)
-        check_learn(list(initial), NAMES, "parts")
+        check_learn(list(initial), LOOK_PARTS, "parts")
         check_count(knots, "knots", least=2)
         start = {
             "alpha": torch.ones(4),
@@ -105,9 +104,9 @@ class Look(nn.Module):
             "curves": torch.linspace(0, 1, knots).expand(3, -1),
             "matrix": torch.eye(3),
             "saturation": torch.ones(5),
-            "stretch": torch.zeros(KINDS),
+            "stretch": torch.zeros(KINDS_OF_LEVELS),
             "local": torch.zeros(STRENGTHS),
-            "lattice": torch.zeros(3, NODES, NODES, NODES),
+            "lattice": torch.zeros(3, 9, 9, 9),
         } | initial
         for name, value in start.items():
             check_part(value, name, 1)
@@ -168,7 +167,7 @@ class Look(nn.Module):
         check_image(image, "image", channels=3)
         passed = (alpha, bands, texture, curves, matrix, saturation, stretch, local, lattice)
         parts: dict[str, Tensor] = {
-            name: getattr(self, name) if part is None else part for name, part in zip(NAMES, passed, strict=True)
+            name: getattr(self, name) if part is None else part for name, part in zip(LOOK_PARTS, passed, strict=True)
         }
         exact = image.to(working_dtype(image))
         if operator is None and acts(parts["alpha"]):

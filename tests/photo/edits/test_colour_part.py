@@ -5,7 +5,7 @@ import torch
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.edits.applying import apply_step
 from nlfilter_torch.photo.edits.colour_part import colour_part, colour_table, table_error
-from nlfilter_torch.photo.looks.lattice import colours_of_nodes
+from nlfilter_torch.photo.looks.look_filter import colours_of_nodes
 from tests.looks import ALPHA, BANDS, BENT, CAT, LOCAL, SEPIA, STRETCH, VIVID
 
 LOOK = Step("look", red=BENT, matrix=SEPIA, saturation=VIVID, amount=0.8)

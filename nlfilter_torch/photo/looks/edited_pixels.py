@@ -1,11 +1,12 @@
-"""Pixels of a photograph before and after an edit, with what each part of a look changes of them."""
+"""Pairs of photographs before and after an edit, and their pixels with what each part of a look changes of them."""
 
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator
 from functools import cached_property
 
 import torch
 from torch import Tensor
 
+from nlfilter_torch.core.checks import check_image, check_photograph, check_same_device, check_same_size
 from nlfilter_torch.core.precision import working_dtype
 from nlfilter_torch.filtering.filters import detail_layers
 from nlfilter_torch.filtering.fit import HALF_LEVEL, OFF_LEVEL
@@ -13,52 +14,18 @@ from nlfilter_torch.operator.build import operator_from_guide, sampled_operator
 from nlfilter_torch.operator.features import reduce_channels
 from nlfilter_torch.operator.options import OperatorOptions
 from nlfilter_torch.photo.declared.steps import Step
-from nlfilter_torch.photo.look_fitting.alignment import inside_frame
-from nlfilter_torch.photo.look_fitting.look_sums import MOST, Layout, Sums, columns_of, sample, sums_of
+from nlfilter_torch.photo.looks.alignment import inside_frame
 from nlfilter_torch.photo.looks.histogram import LocalCurves
-from nlfilter_torch.photo.looks.look_filter import bands_of, local_curves, range_of, textures_of
+from nlfilter_torch.photo.looks.look_filter import blur_bands, local_curves, stretch_of, textures_of
+from nlfilter_torch.photo.looks.look_sums import SAMPLED, PixelSample, sample, squares
 from nlfilter_torch.photo.picture.resizing import resize
 from nlfilter_torch.photo.picture.source import seeded
 from nlfilter_torch.photo.picture.viewing import viewed_size
 
-INSIDE = 0.9  # value of a mask above which a pixel counts as part of the region
-
-
-@dataclass(frozen=True)
-class PixelSample:
-    """Pixels of a photograph before and after an edit.
-
-    Attributes:
-        places: row-major indices (P,) of the pixels.
-        before: (3, P).
-        after: (3, P).
-        weighed: columns of the parts of a look that depend on the surroundings of a pixel, as for :func:`columns_of`.
-        weights: (3, P); 0 for values that are clipped after the edit.
-        shown: weights (P,) of the pixels regardless of clipping.
-    """
-
-    places: Tensor
-    before: Tensor
-    after: Tensor
-    weighed: dict[str, Tensor]
-    weights: Tensor
-    shown: Tensor
-
-    def every(self, step: int) -> "PixelSample":
-        """Each ``step``-th of the pixels, with ``step`` times their weights."""
-        weighed = {name: columns[..., ::step] for name, columns in self.weighed.items()}
-        places, before, after = (planes[..., ::step] for planes in (self.places, self.before, self.after))
-        return PixelSample(places, before, after, weighed, self.weights[:, ::step] * step, self.shown[::step] * step)
-
-    def sums(self, layout: Layout, subsets: list[Tensor]) -> list[Sums]:
-        """Sums over subsets of the pixels, given by their indices (P',)."""
-        sums = []
-        for subset in subsets:
-            before = self.before[..., subset]
-            weighed = {name: columns[..., subset] for name, columns in self.weighed.items()}
-            columns = columns_of(before, weighed, layout)
-            sums.append(sums_of(columns, self.after[..., subset] - before, self.weights[..., subset]))
-        return sums
+Pair = tuple[Tensor, ...]  # before and after an edit, and masks of regions, if any
+AGREEING = 0.5  # least correlation of the luminance of a photograph with that of its edit
+GREYS = 256  # shades, for :func:`means_of_shades`
+SELECTED = 0.9  # value of a mask above which a pixel counts as part of the region
 
 
 class EditedPhotograph:
@@ -88,7 +55,7 @@ class EditedPhotograph:
         free = ((after > 0) & (after < 1)).to(dtype) * inside
         size = (before.shape[-2], before.shape[-1])
         self.size = viewed_size(size, step["viewing_size"])
-        self.stretch = range_of(before[None])  # not of its reduction, which has fewer extremes
+        self.stretch = stretch_of(before[None])  # not of its reduction, which has fewer extremes
         levels = after * 255
         #: Half the step between the values of the edited photograph, or 0.
         self.rounding = HALF_LEVEL if bool(((levels - levels.round()).abs() < OFF_LEVEL).all()) else 0.0
@@ -111,7 +78,7 @@ class EditedPhotograph:
     @cached_property
     def bands(self) -> list[Tensor]:
         """Bands of blurs before the edit, and the rest, (3, N) each."""
-        bands = [band[0].flatten(1) for band in bands_of(self.image)]
+        bands = [band[0].flatten(1) for band in blur_bands(self.image)]
         return [*bands[:-1], bands[-1] - self.luminance.mean()]
 
     @cached_property
@@ -141,7 +108,7 @@ class EditedPhotograph:
         are mostly clipped, and with masks, as the sample has few pixels of a small region.
         """
         count = self.free.shape[1]
-        if count <= MOST or self.masks is not None or float(self.free.amax(0).mean()) < 0.5:
+        if count <= SAMPLED or self.masks is not None or float(self.free.amax(0).mean()) < 0.5:
             return None
         places = sample(torch.ones_like(self.free[0]))
         generator = self.generator.clone_state()  # the landmarks are those of :attr:`layers`
@@ -157,16 +124,14 @@ class EditedPhotograph:
         for shown in self._shown():
             places = sample(shown, most)
             share = int((shown > 0).sum()) / max(len(places), 1)
-            before, after, free = (planes[:, places] for planes in (self.before, self.after, self.free))
-            weights = shown[places] * share
-            samples.append(PixelSample(places, before, after, {}, weights * free, weights))
+            samples.append(self._sampled(places, shown * self.free, shown, share, {}))
         return samples
 
     def _shown(self) -> list[Tensor]:
         """Weights of the pixels, clipped or not, (N,) for each region."""
         if self.masks is None:
             return [self.inside]
-        masks = ((self.masks.to(self.free).flatten(1) - INSIDE) / (1 - INSIDE)).clamp(0, 1)
+        masks = ((self.masks.to(self.free).flatten(1) - SELECTED) / (1 - SELECTED)).clamp(0, 1)
         return [self.inside * mask for mask in masks]
 
     def _pixels(self, shown: Tensor, layers: Tensor) -> PixelSample:
@@ -182,7 +147,7 @@ class EditedPhotograph:
         weights = shown * self.free
         share = float((weights.amax(0) > 0).sum()) / max(int((weights[:, places].amax(0) > 0).sum()), 1)
         rows, columns = places // self.size[1], places % self.size[1]
-        before, after = self.before[:, places], self.after[:, places]
+        before = self.before[:, places]
         weighed = {
             "bands": torch.stack([band[:, places] for band in self.bands], dim=1),
             "texture": torch.stack([texture[places] for texture in self.texture]),
@@ -190,4 +155,93 @@ class EditedPhotograph:
             "local": self.local.at(before[None], rows, columns)[0].transpose(0, 1),
             "alpha": layers,
         }
-        return PixelSample(places, before, after, weighed, weights[:, places] * share, shown[places] * share)
+        return self._sampled(places, weights, shown, share, weighed)
+
+    def _sampled(
+        self, places: Tensor, weights: Tensor, shown: Tensor, share: float, weighed: dict[str, Tensor]
+    ) -> PixelSample:
+        """The pixels at places (P,) with so many times their weights."""
+        return PixelSample(
+            self.before[:, places],
+            self.after[:, places],
+            weighed,
+            weights[:, places] * share,
+            shown[places] * share,
+            squares(places, self.size[1]),
+            torch.zeros_like(places),
+        )
+
+
+def images_of(pairs: Iterable[Pair]) -> Iterator[tuple[Tensor, Tensor, Tensor | None]]:
+    """Each image of the pairs, in colour: (3, H, W) before and after the edit, and masks (K, H, W)."""
+    number, first = 0, None
+    for pair in pairs:
+        _check_pair(pair, number, first)
+        before, after = pair[:2]
+        first = before.new_empty(0) if first is None else first  # on its device, without its pixels
+        masks = pair[2] if len(pair) == 3 else None
+        names = _names(number)
+        for i in range(before.shape[0]):
+            image, edited = before[i].expand(3, -1, -1), after[i % after.shape[0]].expand(3, -1, -1)
+            check_belong(image, edited, *names)
+            yield image, edited, None if masks is None else masks[i % masks.shape[0]]
+            number += 1
+
+
+def _names(number: int) -> tuple[str, str]:
+    """Names in errors of the two photographs of a pair."""
+    return f"before of pair {number + 1}", f"after of pair {number + 1}"
+
+
+def _check_pair(pair: Pair, number: int, first: Tensor | None) -> None:
+    """Raise unless a pair holds two photographs of the same shape, and masks of their size, if any.
+
+    All of them have to be on the device of the first photograph before the edit, if there was one.
+    """
+    if not isinstance(pair, tuple | list) or len(pair) not in (2, 3):
+        raise TypeError(
+            f"pairs must hold tuples of two photographs, or these and masks, got {type(pair).__name__}; "
+            "pass [(before, after)]"
+        )
+    before, after, *masks = pair
+    names = _names(number)
+    check_photograph(before, names[0])
+    if first is not None:
+        check_same_device(before, first, names[0], "first pair")
+    check_photograph(after, names[1], channels=before.shape[1], batch=before.shape[0])
+    check_same_size(after, (before.shape[-2], before.shape[-1]), names[1], names[0], before)
+    if before.shape[1] not in (1, 3):
+        raise ValueError(f"{names[0]} must have 1 or 3 channels, got {before.shape[1]}; pass grey or RGB")
+    for mask in masks:
+        if mask is not None:
+            check_image(mask, "masks", batch=before.shape[0])
+            check_same_size(mask, (before.shape[-2], before.shape[-1]), "masks", names[0], before)
+
+
+def check_belong(before: Tensor, after: Tensor, first: str, second: str) -> None:
+    """Raise unless an image (3, H, W) can be an edit of another one.
+
+    Edits keep most of what is dark and light, or at least (negatives, false colours) most of what luminance says: its
+    correlation with the means of the edited luminance of every shade, and the other way round.
+    """
+    if bool((before == after).all()):
+        return  # says that the look leaves it as it is
+    shown = inside_frame(before, after) & ((after > 0) & (after < 1)).any(0)
+    if not bool(shown.any()):
+        raise ValueError(f"{second} must have pixels that are not clipped to black or white, got none; edit it less")
+    grey, edited = (reduce_channels(image[None], "luminance")[0, 0, shown].double() for image in (before, after))
+    if min(float(grey.std(correction=0)), float(edited.std(correction=0))) < 1 / 255:
+        return  # nothing to compare
+    shared = float(((means_of_shades(grey, edited) - edited.mean()).square().mean() / edited.var(correction=0)).sqrt())
+    if len(grey) >= 4 * GREYS and shared < AGREEING:
+        raise ValueError(
+            f"{second} must be an edit of {first}, but their brightness agrees only to {100 * shared:.0f} % "
+            f"(at least {100 * AGREEING:.0f} % is needed); check that they show the same picture"
+        )
+
+
+def means_of_shades(grey: Tensor, values: Tensor) -> Tensor:
+    """For each pixel, the mean (P,) of the values (P,) of all pixels whose luminance (P,) is of the same shade."""
+    shades = (grey.clamp(0, 1) * (GREYS - 1)).round().long()
+    counts = torch.zeros(GREYS).to(values).index_add(0, shades, torch.ones_like(values)).clamp(min=1)
+    return (torch.zeros(GREYS).to(values).index_add(0, shades, values) / counts)[shades]

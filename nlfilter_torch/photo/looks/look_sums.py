@@ -1,4 +1,4 @@
-"""Sums over the pixels of edited photographs: all that fitting a look needs to know of them.
+"""Pixels of edited photographs, and sums over them: all that fitting a look needs to know of a photograph.
 
 A look is linear in its parameters, so the fit needs only the sums of products of its columns, one for each parameter.
 For every channel these are a tone curve's hat functions, the three colours, the distance from the largest of them at
@@ -6,23 +6,23 @@ each saturation, the bands of blurs, the changes by automatic levels and by loca
 filter. See :mod:`nlfilter_torch.photo.looks.look_filter`.
 """
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
 
 import torch
 from torch import Tensor
 
-from nlfilter_torch.photo.looks.histogram import KINDS, STRENGTHS
+from nlfilter_torch.photo.looks.histogram import KINDS_OF_LEVELS, STRENGTHS
 from nlfilter_torch.photo.looks.look_filter import BLURS, below_largest, saturation_hats
 
 Parts = tuple[str, ...]  # of a look; ``tone`` is one curve for all channels, ``curves`` one for each
-MOST = 1 << 16  # pixels of a pair that sums are taken over
-SHADES = 256  # of grey, for :func:`means_of_shades`
+SAMPLED = 1 << 16  # pixels of a pair that sums are taken over
+SQUARES = 3  # a single pair is divided into so many parts along each side, which are the folds
 
 
 @dataclass(frozen=True)
-class Layout:
-    """Layout of the columns of each channel.
+class PartLayout:
+    """Layout of the columns of each channel, by the parts of a look.
 
     Attributes:
         knots: K of a tone curve.
@@ -43,7 +43,7 @@ class Layout:
             "saturation": self.factors,
             "bands": BLURS + 1,
             "texture": BLURS,
-            "stretch": KINDS,
+            "stretch": KINDS_OF_LEVELS,
             "local": STRENGTHS,
             "alpha": self.sliders,
         }
@@ -83,7 +83,7 @@ class Layout:
 
 
 @dataclass(frozen=True)
-class Sums:
+class LookSums:
     """Sums over pixels, for each channel.
 
     Attributes:
@@ -96,9 +96,9 @@ class Sums:
     cross: Tensor
     power: Tensor
 
-    def __add__(self, other: "Sums") -> "Sums":
+    def __add__(self, other: "LookSums") -> "LookSums":
         """Add the sums of two sets of pixels."""
-        return Sums(self.gram + other.gram, self.cross + other.cross, self.power + other.power)
+        return LookSums(self.gram + other.gram, self.cross + other.cross, self.power + other.power)
 
     def left(self, coefficients: Tensor) -> float:
         """Sum of squares of the change that coefficients (3, F) leave unexplained."""
@@ -111,13 +111,68 @@ class Sums:
         return 1.0 - self.left(coefficients) / max(float(self.power.sum()), 1e-30)
 
 
+@dataclass(frozen=True)
+class PixelSample:
+    """Pixels of photographs before and after an edit.
+
+    Attributes:
+        before: (3, P).
+        after: (3, P).
+        weighed: columns of the parts of a look that depend on the surroundings of a pixel, as for :func:`columns_of`;
+            empty for pixels that only colours are fitted to.
+        weights: (3, P); 0 for values that are clipped after the edit.
+        shown: weights (P,) of the pixels regardless of clipping.
+        square: number of the part of the picture that a pixel is in, (P,), see :func:`squares`.
+        fold: number of the fold that its pair is in, (P,).
+    """
+
+    before: Tensor
+    after: Tensor
+    weighed: dict[str, Tensor]
+    weights: Tensor
+    shown: Tensor
+    square: Tensor
+    fold: Tensor
+
+    def at(self, places: Tensor | slice) -> "PixelSample":
+        """Some of the pixels."""
+        weighed = {name: columns[..., places] for name, columns in self.weighed.items()}
+        planes = {own.name: getattr(self, own.name)[..., places] for own in fields(self) if own.name != "weighed"}
+        return PixelSample(weighed=weighed, **planes)
+
+    @staticmethod
+    def joined(samples: Sequence["PixelSample"]) -> "PixelSample":
+        """The pixels of several samples with columns of the same parts."""
+        weighed = {name: torch.cat([sample.weighed[name] for sample in samples], dim=-1) for name in samples[0].weighed}
+        planes = {
+            own.name: torch.cat([getattr(sample, own.name) for sample in samples], dim=-1)
+            for own in fields(PixelSample)
+            if own.name != "weighed"
+        }
+        return PixelSample(weighed=weighed, **planes)
+
+    def every(self, step: int) -> "PixelSample":
+        """Each ``step``-th of the pixels, with ``step`` times their weights."""
+        few = self.at(slice(None, None, step))
+        return replace(few, weights=few.weights * step, shown=few.shown * step)
+
+    def columns(self, layout: PartLayout) -> Tensor:
+        """See :func:`columns_of`."""
+        return columns_of(self.before, self.weighed, layout)
+
+    def sums(self, layout: PartLayout) -> list[LookSums]:
+        """Sums over the pixels of each square, one after the other to save memory."""
+        parts = (self.at((self.square == i).nonzero().squeeze(1)) for i in self.square.unique())
+        return [sums_of(part.columns(layout), part.after - part.before, part.weights) for part in parts]
+
+
 def sample(weights: Tensor, most: int | None = None) -> Tensor:
     """Indices (P,), ascending, of the pixels that sums are taken over, from weights (H, W).
 
-    They are all pixels of positive weight, or ``most`` of them (None: :data:`MOST`): one at random of each run of equal
-    length.
+    They are all pixels of positive weight, or ``most`` of them (None: :data:`SAMPLED`): one at random of each run of
+    equal length.
     """
-    most = MOST if most is None else most
+    most = SAMPLED if most is None else most
     places = weights.flatten().nonzero().squeeze(1)
     if len(places) <= most:
         return places
@@ -125,14 +180,18 @@ def sample(weights: Tensor, most: int | None = None) -> Tensor:
     return places[((torch.arange(most) + random) * (len(places) / most)).long().to(places.device)]
 
 
-def means_of_shades(grey: Tensor, values: Tensor) -> Tensor:
-    """For each pixel, the mean (P,) of the values (P,) of all pixels whose luminance (P,) is of the same shade."""
-    shades = (grey.clamp(0, 1) * (SHADES - 1)).round().long()
-    counts = torch.zeros(SHADES).to(values).index_add(0, shades, torch.ones_like(values)).clamp(min=1)
-    return (torch.zeros(SHADES).to(values).index_add(0, shades, values) / counts)[shades]
+def squares(places: Tensor, width: int) -> Tensor:
+    """Number of the part of a picture that each pixel (P,) is in: their bounding box is divided into equal parts."""
+    if len(places) == 0:
+        return places
+    rows, columns = (
+        (numbers - numbers.min()) * SQUARES // (numbers.max() - numbers.min() + 1)
+        for numbers in (places // width, places % width)
+    )
+    return rows * SQUARES + columns
 
 
-def columns_of(image: Tensor, weighed: Mapping[str, Tensor], layout: Layout) -> Tensor:
+def columns_of(image: Tensor, weighed: Mapping[str, Tensor], layout: PartLayout) -> Tensor:
     """Columns (3, F, P), in float64: what a unit of each parameter changes at some pixels.
 
     Args:
@@ -150,9 +209,9 @@ def columns_of(image: Tensor, weighed: Mapping[str, Tensor], layout: Layout) -> 
     return torch.cat([columns[part].double().expand(3, -1, -1) for part in layout.lengths], dim=1)
 
 
-def sums_of(columns: Tensor, change: Tensor, weights: Tensor) -> Sums:
+def sums_of(columns: Tensor, change: Tensor, weights: Tensor) -> LookSums:
     """Sums over pixels with columns (3, F, P), change (3, P) and weights (3, P)."""
     columns, change, weights = (values.double() for values in (columns, change, weights))
     weighed = columns * weights.unsqueeze(1)
     cross = (weighed @ change.unsqueeze(2)).squeeze(2)
-    return Sums(weighed @ columns.mT, cross, (weights * change.square()).sum(1))
+    return LookSums(weighed @ columns.mT, cross, (weights * change.square()).sum(1))

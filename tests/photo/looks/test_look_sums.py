@@ -1,10 +1,10 @@
-"""Sums over pixels, the columns they are of, and the sample they are taken over."""
+"""LookSums over pixels, the columns they are of, and the sample they are taken over."""
 
 import pytest
 import torch
 
-from nlfilter_torch.photo.look_fitting.look_sums import Layout, Sums, columns_of, means_of_shades, sample, sums_of
 from nlfilter_torch.photo.looks.look_filter import pointwise
+from nlfilter_torch.photo.looks.look_sums import LookSums, PartLayout, columns_of, sample, sums_of
 from tests.looks import BENT, CAT, SEPIA, VIVID
 
 
@@ -21,15 +21,9 @@ def test_sums_of_samples_are_those_of_all_pixels() -> None:
     assert torch.equal(sample(whole[:50]), whole[:50].flatten().nonzero().squeeze(1))
 
 
-def test_means_are_those_of_pixels_of_the_same_shade() -> None:
-    grey = torch.tensor([0.2, 0.8, 0.2, 1.3, 1.0], dtype=torch.float64)
-    values = torch.tensor([1.0, 5.0, 2.0, 3.0, 4.0], dtype=torch.float64)
-    assert means_of_shades(grey, values).tolist() == [1.5, 5.0, 1.5, 3.5, 3.5]
-
-
 def test_columns_and_parameters_are_the_change_of_a_look() -> None:
     image = CAT[0, :, 10:30, 10:30].double().flatten(1)
-    layout = Layout(knots=17, factors=5, sliders=4)
+    layout = PartLayout(knots=17, factors=5, sliders=4)
     lengths = {"bands": (3, 7), "texture": (6,), "stretch": (3, 3), "local": (3, 8), "alpha": (4,)}
     others = {part: torch.zeros(*shape, 400) for part, shape in lengths.items()}
     columns = columns_of(image, others, layout)
@@ -54,12 +48,12 @@ def test_sums_of_two_sets_of_pixels_add_up() -> None:
     columns, change, weights = (torch.rand(3, *shape, 30, generator=generator) for shape in ((5,), (), ()))
     parts = [sums_of(columns[..., k], change[..., k], weights[..., k]) for k in (slice(12), slice(12, 30))]
     total, whole = parts[0] + parts[1], sums_of(columns, change, weights)
-    for name in Sums.__dataclass_fields__:
+    for name in LookSums.__dataclass_fields__:
         torch.testing.assert_close(getattr(total, name), getattr(whole, name))
 
 
 def test_parameters_of_a_part_act_on_its_columns_alone() -> None:
-    layout = Layout(knots=17, factors=5, sliders=4)
+    layout = PartLayout(knots=17, factors=5, sliders=4)
     spread = layout.spread(("tone", "matrix"))
     assert spread.shape == (3, layout.columns, 17 + 9)
     assert torch.equal(spread[0, layout.place("curves"), :17], torch.eye(17, dtype=torch.float64))

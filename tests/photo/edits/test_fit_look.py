@@ -15,11 +15,10 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.operator.features import reduce_channels
-from nlfilter_torch.photo import apply_look, fit_look
+from nlfilter_torch.photo import fit_look
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.declared.steps import Step
-from nlfilter_torch.photo.edits.applying import apply_step
-from tests.looks import ALPHA, CAT, CUP, FEW, SEPIA, SUIT, explained, in_bytes, rgb, single_look
+from tests.looks import CAT, CUP, FEW, SEPIA, SUIT, explained, in_bytes, rgb, single_look
 
 
 def equalized(image: Tensor) -> Tensor:
@@ -52,19 +51,6 @@ def test_parts_that_depend_on_the_picture_explain_another_photograph(
         look = single_look(fit_look(pairs[:2], parts=chosen, step=FEW))
         shares.append(explained(*pairs[2], look.apply(SUIT)))
     assert shares[0] > least > most > shares[1], shares
-
-
-@pytest.mark.parametrize("count", [1, 2])
-def test_sliders_are_found_through_eight_bits(count: int) -> None:
-    images = (rgb("chelsea", slice(0, 300, 2), slice(0, 450, 2)), rgb("coffee", slice(0, 300, 2), slice(0, 450, 2)))
-    step = Step("detail", alpha=ALPHA, limits="none", threshold=0.0, landmarks=150)
-    pairs = [(image, in_bytes(apply_step(step, image))) for image in images[:count]]
-    look = single_look(fit_look(iter(pairs), step=Step("look", landmarks=150)))
-    assert look.parts == ("alpha",)
-    assert look.step.edit == "detail"
-    assert look.step["alpha"] == pytest.approx(ALPHA, abs=1e-3)
-    assert look.fitted > 0.99
-    assert torch.allclose(look.apply(images[0]).clamp(0, 1), pairs[0][1], atol=1.01 / 255)
 
 
 @pytest.mark.parametrize(
@@ -126,37 +112,6 @@ def test_pairs_are_read_once_and_not_kept() -> None:
     assert len(alive) == 15
     assert not any(alive)
     assert look.left_out > 0.95
-
-
-def test_regions_have_looks_of_their_own() -> None:
-    masks = torch.zeros(1, 2, *CAT.shape[-2:])
-    masks[:, 0, :, :50], masks[:, 1, :, 50:] = 1, 1
-    bright, sepia = in_bytes(CAT**0.6), in_bytes(apply_look(CAT, matrix=SEPIA))
-    looks = fit_look([(CAT, torch.where(masks[:, :1] > 0, bright, sepia), masks)], step=FEW)
-    assert isinstance(looks, tuple)
-    left, right = (look.apply(CAT) for look in looks)
-    assert explained(CAT[..., :50], bright[..., :50], left[..., :50]) > 0.98
-    assert explained(CAT[..., 50:], sepia[..., 50:], right[..., 50:]) > 0.98
-
-
-def test_a_region_may_be_missing_in_some_pairs() -> None:
-    sky = torch.zeros(1, 2, *CAT.shape[-2:])
-    sky[:, 0, :40], sky[:, 1, 40:] = 1, 1
-    ground = torch.stack([torch.zeros_like(sky[:, 0]), torch.ones_like(sky[:, 0])], dim=1)
-    bright, sepia = in_bytes(CAT**0.6), in_bytes(apply_look(CAT, matrix=SEPIA))
-    pairs = [
-        (CUP, in_bytes(apply_look(CUP, matrix=SEPIA)), ground),
-        (CAT, torch.where(sky[:, :1] > 0, bright, sepia), sky),
-    ]
-    looks = fit_look(pairs, step=FEW)
-    assert isinstance(looks, tuple)
-    upper, lower = (look.apply(CAT) for look in looks)
-    assert explained(CAT[..., :40, :], bright[..., :40, :], upper[..., :40, :]) > 0.98
-    assert explained(CAT[..., 40:, :], sepia[..., 40:, :], lower[..., 40:, :]) > 0.98
-    with pytest.raises(
-        ValueError, match="masks must hold a pixel that is not clipped in every region, got none in reg"
-    ):
-        fit_look([(*pairs[0][:2], ground)], step=FEW)
 
 
 @pytest.mark.parametrize(("colour", "width"), [(1.0, 5), (0.0, 8), (0.9, 8)])

@@ -1,4 +1,4 @@
-"""The look that explains edits best, from the sums of :mod:`nlfilter_torch.photo.look_fitting.look_sums`.
+"""The look that explains edits best, from the sums of :mod:`nlfilter_torch.photo.looks.look_sums`.
 
 Which parts a look has, and how strong a ridge keeps them close to the identity, is chosen by cross-validation: pairs
 are left out, or parts of the picture if there is a single pair. A least-squares problem with bounds keeps curves from
@@ -10,9 +10,10 @@ from dataclasses import dataclass, replace
 from functools import reduce
 
 import torch
+from scipy.optimize import nnls
 from torch import Tensor
 
-from nlfilter_torch.photo.look_fitting.look_sums import Layout, Parts, Sums
+from nlfilter_torch.photo.looks.look_sums import LookSums, PartLayout, Parts
 
 #: What a look may consist of, the simplest first. ``tone`` is one curve for all channels, ``curves`` one for each.
 CHOICES: tuple[Parts, ...] = (
@@ -51,9 +52,9 @@ RIDGES = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0)
 # saturation have the latter only.
 ROUGHNESS = {"tone": 10.0, "curves": 10.0, "saturation": 0.0}
 SLACK, FAINT = 1.1, 0.0003  # a simpler look is chosen if its risk is at most SLACK times the smallest one plus FAINT
-SMALL = 1.0  # weight of the mean change of all pairs in the power that the error of a pair is divided by
 MILD = 30.0  # the smallest ridge for several pairs is their risk divided by this
-STIFFEST = 0.03  # limit of the ridge of tone curves and saturation that follows from the risk of several pairs
+STIFF, STIFF_ALONE = 3e-3, 1e-2  # smallest ridge of tone curves and saturation, for several pairs and for one
+STIFFEST_CURVES = 0.03  # limit of the ridge of tone curves and saturation that follows from the risk of several pairs
 UNEXPLAINED = 0.05  # risk of a single pair above which tone curves are chosen only if they are worth it, see WORTH
 WORTH = 1.5  # looks without tone curves are preferred if their risk is at most this multiple of the best one
 SHRINK = 0.5  # a look from a single pair is weakened by this multiple of the share that it leaves unexplained
@@ -73,6 +74,7 @@ class Candidate:
             less.
         ridge: the one that was chosen.
         stiff: its smallest value for tone curves and saturation.
+        lattice: changes (3, n, n, n) by colour, of what the other parts leave; None if there are none.
     """
 
     parts: Parts
@@ -82,14 +84,15 @@ class Candidate:
     risk: float
     ridge: float = 0.0
     stiff: float = 0.0
+    lattice: Tensor | None = None
 
-    def fitted_to(self, sums: Sums, layout: Layout) -> Tensor:
+    def fitted_to(self, sums: LookSums, layout: PartLayout) -> Tensor:
         """Coefficients (3, F) of the look with the same parts and ridge, fitted to other sums."""
         return fit_parts(sums, self.parts, layout, self.ridge, self.stiff)
 
 
-def choose(
-    folds: Sequence[Sums], layout: Layout, choices: Sequence[Parts], stiff: float, *, alone: bool = False
+def cross_validated(
+    folds: Sequence[LookSums], layout: PartLayout, choices: Sequence[Parts], *, alone: bool
 ) -> dict[Parts, Candidate]:
     """Choose the ridge for each choice of parts by cross-validation: each fold in turn is left out.
 
@@ -100,21 +103,23 @@ def choose(
         folds: sums of pairs, or of parts of a picture.
         layout: of the columns.
         choices: of parts.
-        stiff: see :func:`fit_parts`.
         alone: whether the folds are parts of one picture, for which ridges are larger.
     """
+    stiff = STIFF_ALONE if alone else STIFF
     candidates = {parts: _candidate(folds, layout, parts, stiff, RIDGES) for parts in choices}
     risk = min(candidate.risk for candidate in candidates.values())
     if risk <= stiff:
         return candidates
     ridges = tuple(ridge for ridge in RIDGES if ridge >= (risk if alone else risk / MILD)) or RIDGES[-1:]
-    stiff = risk if alone else max(stiff, min(risk, STIFFEST))
+    stiff = risk if alone else max(stiff, min(risk, STIFFEST_CURVES))
     return {parts: _candidate(folds, layout, parts, stiff, ridges) for parts in choices}
 
 
-def _candidate(folds: Sequence[Sums], layout: Layout, parts: Parts, stiff: float, ridges: Sequence[float]) -> Candidate:
+def _candidate(
+    folds: Sequence[LookSums], layout: PartLayout, parts: Parts, stiff: float, ridges: Sequence[float]
+) -> Candidate:
     """The look with some parts and the best of several ridges."""
-    total = reduce(Sums.__add__, folds)
+    total = reduce(LookSums.__add__, folds)
     powers = torch.stack([sums.power.sum() for sums in folds])
     spread = layout.spread(parts)
     products = [_products(sums, spread) for sums in folds]
@@ -126,7 +131,7 @@ def _candidate(folds: Sequence[Sums], layout: Layout, parts: Parts, stiff: float
     solved = torch.linalg.solve(ridged + _floor(other_grams), other_crosses.expand(len(ridges), -1, -1))
     changes = torch.einsum("rfp,fpq,rfq->rf", solved, grams, solved)
     changes = changes - 2 * torch.einsum("rfp,fp->rf", solved, crosses)
-    risks = ((changes + powers) / (powers + SMALL * powers.mean().clamp(min=1e-30))).mean(1)
+    risks = ((changes + powers) / (powers + powers.mean().clamp(min=1e-30))).mean(1)
     best = int(risks.argmin())
     coefficients = fit_parts(total, parts, layout, ridges[best], stiff)
     left_out = -float(changes[best].sum()) / max(float(total.power.sum()), 1e-30)
@@ -135,7 +140,7 @@ def _candidate(folds: Sequence[Sums], layout: Layout, parts: Parts, stiff: float
     )
 
 
-def fit_parts(sums: Sums, parts: Parts, layout: Layout, ridge: float, stiff: float = 0.0) -> Tensor:
+def fit_parts(sums: LookSums, parts: Parts, layout: PartLayout, ridge: float, stiff: float = 0.0) -> Tensor:
     """Coefficients (3, F) of the look with some parts that explains most.
 
     ``ridge`` is the weight of the distance from the identity. ``stiff`` is its smallest value for tone curves and
@@ -154,7 +159,7 @@ def simplest(candidates: Mapping[Parts, Candidate]) -> Candidate:
 
 
 def choose_from_one(
-    folds: Sequence[Sums], layout: Layout, choices: Sequence[Parts], stiff: float
+    folds: Sequence[LookSums], layout: PartLayout, choices: Sequence[Parts]
 ) -> tuple[Candidate, dict[Parts, Candidate]]:
     """The look of a single pair, and the best one for each choice of parts.
 
@@ -163,19 +168,19 @@ def choose_from_one(
     brightness in this picture, are chosen only if they explain much more than other parts do; and the look is weakened
     in proportion to the share that it leaves unexplained.
     """
-    candidates = choose(folds, layout, choices, stiff, alone=True)
+    candidates = cross_validated(folds, layout, choices, alone=True)
     best = simplest(candidates)
     straight = {parts: candidate for parts, candidate in candidates.items() if not CURVED & set(parts)}
     other = simplest(straight) if straight else best
     best = other if UNEXPLAINED < other.risk <= WORTH * best.risk else best
     strength = 1 - SHRINK * min(max(1 - best.left_out, 0.0), 1.0)
     coefficients = strength * best.coefficients
-    fitted = reduce(Sums.__add__, folds).explained(coefficients)
+    fitted = reduce(LookSums.__add__, folds).explained(coefficients)
     return replace(best, coefficients=coefficients, fitted=fitted), candidates
 
 
 def added_by_parts(
-    best: Candidate, folds: Sequence[Sums], layout: Layout, stiff: float, *, alone: bool = False
+    best: Candidate, folds: Sequence[LookSums], layout: PartLayout, *, alone: bool
 ) -> dict[str, tuple[float, float]]:
     """What each part of a look adds to the share that is explained, of fitted and of left-out data, the most first.
 
@@ -189,7 +194,7 @@ def added_by_parts(
             if part not in shares:
                 parts = tuple(other for other in best.parts if other in shares or other == part)
                 whole = len(parts) == len(best.parts)
-                trials[part] = best if whole else choose(folds, layout, [parts], stiff, alone=alone)[parts]
+                trials[part] = best if whole else cross_validated(folds, layout, [parts], alone=alone)[parts]
         part = max(trials, key=lambda name: trials[name].left_out)
         reached = trials[part].fitted, trials[part].left_out
         shares[part] = reached[0] - total[0], reached[1] - total[1]
@@ -197,13 +202,13 @@ def added_by_parts(
     return shares
 
 
-def _products(sums: Sums, spread: Tensor) -> tuple[Tensor, Tensor]:
+def _products(sums: LookSums, spread: Tensor) -> tuple[Tensor, Tensor]:
     """Gram matrix (P, P) of the parameters, and their products with the change, (P,)."""
     gram = torch.einsum("cfp,cfg,cgq->pq", spread, sums.gram, spread)
     return gram, torch.einsum("cfp,cf->p", spread, sums.cross)
 
 
-def _penalties(gram: Tensor, parts: Parts, layout: Layout) -> tuple[Tensor, Tensor]:
+def _penalties(gram: Tensor, parts: Parts, layout: PartLayout) -> tuple[Tensor, Tensor]:
     """Penalties (P, P) on the distance of the parameters from the identity, in proportion to the Gram matrix.
 
     The first holds those of all parts but tone curves and saturation, whose penalties the second holds.
@@ -230,7 +235,7 @@ def _floor(gram: Tensor) -> Tensor:
     return torch.diag_embed((1e-12 * diagonal.amax(-1, keepdim=True) + 1e-12).expand_as(diagonal))
 
 
-def _solve(gram: Tensor, cross: Tensor, parts: Parts, layout: Layout) -> Tensor:
+def _solve(gram: Tensor, cross: Tensor, parts: Parts, layout: PartLayout) -> Tensor:
     """Solve the least-squares problem for the parameters (P,), under the constraint that no curve falls."""
     free = torch.linalg.solve(gram, cross)
     rows = []
@@ -244,32 +249,12 @@ def _solve(gram: Tensor, cross: Tensor, parts: Parts, layout: Layout) -> Tensor:
     slack = rises @ free + 1 / (layout.knots - 1)  # the parameters are changes of the identity
     if bool((slack >= 0).all()):
         return free
-    moves = torch.linalg.solve(gram, rises.mT)
-    return free + moves @ nonnegative(rises @ moves, -slack)
-
-
-def nonnegative(matrix: Tensor, vector: Tensor) -> Tensor:
-    """The x >= 0 that minimises ``x^T A x / 2 - b^T x``, for A positive semi-definite, after Lawson and Hanson."""
-    count = len(vector)
-    x, free = torch.zeros_like(vector), torch.zeros(count, dtype=torch.bool)
-    least = 1e-10 * vector.abs().max().clamp(min=1e-30)
-    for _ in range(10 * count):
-        slope = torch.where(free, -torch.inf, vector - matrix @ x)
-        if bool(slope.max() <= least):
-            break
-        free[slope.argmax()] = True
-        while True:
-            wanted = torch.zeros_like(x)
-            inner = matrix[free][:, free]
-            jitter = 1e-13 * inner.diagonal().max() * torch.eye(len(inner), dtype=inner.dtype)
-            wanted[free] = torch.linalg.solve(inner + jitter, vector[free])
-            blocked = free & (wanted <= 0)
-            if not bool(blocked.any()):
-                x = wanted
-                break
-            x = x + (x[blocked] / (x[blocked] - wanted[blocked])).min() * (wanted - x)
-            free &= x > 1e-14 * x.max()
-            x = torch.where(free, x, 0.0)
-            if not bool(free.any()):
-                break
-    return x
+    # With the Gram matrix L L^T and y = L^T (x - free), the least |y| is sought with which no curve falls. It is a
+    # combination of the directions of the rises, with weights (Lagrange multipliers) that are not negative.
+    root = torch.linalg.cholesky(gram)
+    directions = torch.linalg.solve_triangular(root, rises.mT, upper=False)
+    # The default driver, gelsy, gives wrong solutions now and then (torch 2.13): its pivots are not initialised.
+    needed = torch.linalg.lstsq(directions.mT, -slack.unsqueeze(1), driver="gelsd").solution.squeeze(1)
+    weights, _ = nnls(directions.numpy(), needed.numpy(), maxiter=10 * len(rises))
+    move = directions @ torch.from_numpy(weights)
+    return free + torch.linalg.solve_triangular(root.mT, move.unsqueeze(1), upper=True).squeeze(1)

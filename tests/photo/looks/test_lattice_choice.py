@@ -1,5 +1,7 @@
 """Pixels kept for the lattice, and lattices of looks."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from torch import Tensor
@@ -8,17 +10,15 @@ from nlfilter_torch.photo import fit_look
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.edits.applying import apply_step
-from nlfilter_torch.photo.look_fitting.kept_pixels import (
-    COLOURS,
-    KEPT,
-    KeptPixels,
+from nlfilter_torch.photo.looks.edited_pixels import EditedPhotograph
+from nlfilter_torch.photo.looks.lattice_choice import (
+    COLOUR_PARTS,
+    THINNED,
     ThinnedPixels,
     coloured,
     is_of_colours,
-    nondecreasing,
 )
-from nlfilter_torch.photo.look_fitting.look_pixels import EditedPhotograph
-from nlfilter_torch.photo.look_fitting.look_sums import Layout, columns_of
+from nlfilter_torch.photo.looks.look_sums import PartLayout
 from tests.looks import CAT, CUP, FEW, SUIT, explained, in_bytes, single_look
 
 
@@ -83,41 +83,33 @@ def test_greys_never_get_darker_even_if_those_of_the_edit_do() -> None:
     assert float(greys.diff().min()) >= -1e-5
 
 
-def test_the_nearest_values_that_do_not_fall() -> None:
-    values = torch.tensor([0.0, 2.0, 1.0, 3.0, 2.5, 2.0, 5.0], dtype=torch.float64)
-    weights = torch.tensor([1.0, 1.0, 3.0, 1.0, 1.0, 1.0, 1.0], dtype=torch.float64)
-    wanted = torch.tensor([0.0, 1.25, 1.25, 2.5, 2.5, 2.5, 5.0], dtype=torch.float64)
-    torch.testing.assert_close(nondecreasing(values, weights), wanted)
-
-
 def test_never_more_pixels_than_enough_are_kept(monkeypatch: pytest.MonkeyPatch) -> None:
     kept = ThinnedPixels()
-    assert KEPT >= 1 << 16
-    monkeypatch.setattr("nlfilter_torch.photo.look_fitting.kept_pixels.KEPT", 15_000)
+    assert THINNED >= 1 << 16
+    monkeypatch.setattr("nlfilter_torch.photo.looks.lattice_choice.THINNED", 15_000)
     for number, image in enumerate((CAT, CUP, SUIT, CAT, CUP)):
         photograph = EditedPhotograph(image[0], image[0] ** 0.7, None, FEW, 3, None)
         (pixels,) = photograph.regions()
-        kept.add(pixels, number, photograph.size[1])
-        total = sum(float(sample.shown.sum()) for sample, _, _ in kept.samples)
+        kept.add(replace(pixels, fold=torch.full_like(pixels.fold, number)))
+        total = float(kept.all().shown.sum())
         assert total == pytest.approx(8000 * (number + 1), rel=0.01)
-        assert sum(len(square) for _, _, square in kept.samples) <= 15_000
+        assert len(kept.all().shown) <= 15_000
     assert kept.step == 4
+    assert kept.all().fold.unique().tolist() == [0, 1, 2, 3, 4]
 
 
-def test_details_have_more_pixels_under_the_same_look() -> None:
+def test_colours_under_a_look_are_those_of_its_columns() -> None:
     photograph = EditedPhotograph(CUP[0], by_hue(CUP)[0], None, FEW, 3, None)
-    kept, layout = KeptPixels(), Layout(17, 5, 4)
-    kept.add(photograph.regions()[0].every(4), photograph.colours(5000)[0], 0, photograph.size[1])
-    assert (len(kept.sample), len(kept.colours)) == (2000, 5000)
-    weights = [sum(float(pixels.shown.sum()) for pixels, _, _ in part.samples) for part in (kept.sample, kept.colours)]
-    assert weights[0] == pytest.approx(weights[1], rel=0.01)
+    layout = PartLayout(17, 5, 4)
+    pixels, more = photograph.regions()[0].every(4), photograph.colours(5000)[0]
+    assert (len(pixels.shown), len(more.shown)) == (2000, 5000)
+    assert float(pixels.shown.sum()) == pytest.approx(float(more.shown.sum()), rel=0.01)
     coefficients = torch.randn(3, layout.columns, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     coefficients[:, layout.place("saturation")] = coefficients[:1, layout.place("saturation")]  # for all channels
-    others = [layout.place(name) for name in layout.lengths if name not in COLOURS]
+    others = [layout.place(name) for name in layout.lengths if name not in COLOUR_PARTS]
     for place in others:
         coefficients[:, place] = 0
-    (pixels, _, _) = kept.sample.samples[0]
-    change = torch.einsum("cf,cfp->cp", coefficients, columns_of(pixels.before, pixels.weighed, layout))
+    change = torch.einsum("cf,cfp->cp", coefficients, pixels.columns(layout))
     shown = coloured(pixels.before.double(), coefficients, layout)
     torch.testing.assert_close(shown, pixels.before + change)
 

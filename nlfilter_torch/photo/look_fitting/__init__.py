@@ -1,1 +1,0 @@
-"""Finding the look of pairs of photographs, before and after an edit."""
