@@ -2,7 +2,6 @@
 
 import inspect
 from collections.abc import Callable
-from dataclasses import fields
 from typing import Any
 
 import numpy as np
@@ -31,10 +30,9 @@ FUNCTIONS: dict[type[PhotoEdit], Callable[..., Tensor]] = {
 
 def settings_of(edit: type[PhotoEdit], **settings: Any) -> Any:
     """The edit with the defaults of its function where no other settings are named."""
-    names = {field.name for field in fields(edit)}
     parameters = inspect.signature(FUNCTIONS[edit]).parameters.values()
-    defaults = {p.name: p.default for p in parameters if p.name in names and p.default is not inspect.Parameter.empty}
-    return edit(**(defaults | settings))
+    defaults = {p.name: p.default for p in parameters if p.default is not inspect.Parameter.empty}
+    return edit.of(defaults | settings)
 
 
 def stream(

@@ -25,7 +25,7 @@ from benchmarks.memory import forget_peak, resident
 from benchmarks.training.figures import Figure, table
 from benchmarks.training.refinement_scenes import CLASSES, Scene, mean_iou, opencv_guided, scene
 from nlfilter_torch import NonlocalFilter, Refine, refine
-from nlfilter_torch.filtering.refine import FLOOR, RefineOptions, build_operator
+from nlfilter_torch.filtering.refine import FILTER, FLOOR, MARGIN, build_operator
 
 SIZE, QUICK_SIZE = (192, 192), (48, 48)
 SCENES = 12
@@ -129,9 +129,8 @@ def compared(scenes: list[Scene], limit: float | None) -> Iterator[Figure]:
 
 def chosen_bandwidths(each: Scene) -> tuple[float, float]:
     """The photometric and the spatial bandwidth that refine chooses for a scene."""
-    options = RefineOptions()
-    scale = float(options.margin or 0) / float(_margin(each.logits))
-    recipe = build_operator(each.image, (scale * each.logits).log_softmax(1), None, options).kernel.recipe
+    scale = MARGIN / float(_margin(each.logits))
+    recipe = build_operator(each.image, (scale * each.logits).log_softmax(1), None, FILTER).kernel.recipe
     spatial = recipe.spatial_bandwidth
     assert spatial is not None
     return float(recipe.photometric_bandwidth), float(spatial[0])

@@ -106,23 +106,6 @@ def uncompiled(function: Callable[P, R]) -> Callable[P, R]:
     return wrapper
 
 
-def uncompiled_with(*options: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """Run a function uncompiled, as by :func:`uncompiled`, if one of these keyword arguments is not None."""
-
-    def decorate(function: Callable[P, R]) -> Callable[P, R]:
-        whole = uncompiled(function)
-
-        @functools.wraps(function)
-        def wrapper(*args: P.args, **kwargs: P.kwargs) -> R:
-            if torch.compiler.is_compiling() and any(kwargs.get(name) is not None for name in options):
-                return whole(*args, **kwargs)
-            return function(*args, **kwargs)
-
-        return wrapper
-
-    return decorate
-
-
 @runtime_checkable
 class Unformed(Protocol):
     """A gradient that is stored as something smaller, such as the factors of a product."""

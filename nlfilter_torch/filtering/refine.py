@@ -27,10 +27,10 @@ from nlfilter_torch.core.communicator import ALONE, Communicator
 from nlfilter_torch.core.layouts import in_format_of
 from nlfilter_torch.core.precision import full_precision, per_image, working_dtype
 from nlfilter_torch.core.torch_internals import is_hidden
-from nlfilter_torch.operator.build import nonlocal_operator
+from nlfilter_torch.operator.build import checked_operator
 from nlfilter_torch.operator.features import estimate_bandwidth
 from nlfilter_torch.operator.operator import NonlocalOperator
-from nlfilter_torch.operator.options import AUTO, GuideChannels, Sampling, SpatialBandwidth
+from nlfilter_torch.operator.options import AUTO, SAMPLING, FilterOptions, GuideChannels, Sampling, SpatialBandwidth
 
 Kind = Literal["logits", "probabilities", "mask", "trimap"]
 KINDS = ("logits", "probabilities", "mask", "trimap")
@@ -55,38 +55,28 @@ class MeanField:
     caution: float | Tensor | Literal["auto"] | None = AUTO
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class RefineOptions(MeanField):
-    """How an input is refined with a guide; see :func:`refine` for the meaning of the options."""
-
-    patch_size: int = 1
-    photometric_bandwidth: float | Tensor | Literal["auto"] = AUTO
-    spatial_bandwidth: SpatialBandwidth | Literal["auto"] | None = AUTO
-    num_landmarks: int = 250
-    landmarks: Sampling = "kmeans"
-    guide_channels: GuideChannels = "all"
-    generator: torch.Generator | None = None
+#: The filter by default.
+FILTER = FilterOptions(patch_size=1, spatial_bandwidth=AUTO, num_landmarks=250, guide_channels="all")
 
 
-@full_precision
 def refine(
     logits: Tensor,
     guide: Tensor | NonlocalOperator,
     *,
     kind: Kind = "logits",
     confidence: Tensor | None = None,
-    steps: int = RefineOptions.steps,
-    strength: float | Tensor = RefineOptions.strength,
-    margin: float | Tensor | None = RefineOptions.margin,
-    compatibility: Tensor | None = RefineOptions.compatibility,
-    caution: float | Tensor | Literal["auto"] | None = RefineOptions.caution,
-    patch_size: int = RefineOptions.patch_size,
-    photometric_bandwidth: float | Tensor | Literal["auto"] = RefineOptions.photometric_bandwidth,
-    spatial_bandwidth: SpatialBandwidth | Literal["auto"] | None = RefineOptions.spatial_bandwidth,
-    num_landmarks: int = RefineOptions.num_landmarks,
-    landmarks: Sampling = RefineOptions.landmarks,
-    guide_channels: GuideChannels = RefineOptions.guide_channels,
-    generator: torch.Generator | None = RefineOptions.generator,
+    steps: int = MeanField.steps,
+    strength: float | Tensor = MeanField.strength,
+    margin: float | Tensor | None = MeanField.margin,
+    compatibility: Tensor | None = MeanField.compatibility,
+    caution: float | Tensor | Literal["auto"] | None = MeanField.caution,
+    patch_size: int = FILTER.patch_size,
+    photometric_bandwidth: float | Tensor | Literal["auto"] = AUTO,
+    spatial_bandwidth: SpatialBandwidth | Literal["auto"] | None = AUTO,
+    num_landmarks: int = FILTER.num_landmarks,
+    landmarks: Sampling = SAMPLING,
+    guide_channels: GuideChannels = FILTER.guide_channels,
+    generator: torch.Generator | None = None,
 ) -> Tensor:
     """Align coarse logits, probabilities, a mask or a trimap with the edges of an image.
 
@@ -140,36 +130,40 @@ def refine(
         >>> int(((coarse > 0.5) != bright).sum()), int(((refined > 0.5) != bright).sum())  # wrong pixels
         (32, 0)
     """
-    options = RefineOptions(
-        steps=steps,
-        strength=strength,
-        margin=margin,
-        compatibility=compatibility,
-        caution=caution,
-        patch_size=patch_size,
-        photometric_bandwidth=photometric_bandwidth,
-        spatial_bandwidth=spatial_bandwidth,
-        num_landmarks=num_landmarks,
-        landmarks=landmarks,
-        guide_channels=guide_channels,
-        generator=generator,
-    )
+    options = FILTER.updated(locals())
+    method = MeanField(steps=steps, strength=strength, margin=margin, compatibility=compatibility, caution=caution)
+    return refined(logits, guide, kind, confidence, method, options)
+
+
+@full_precision
+def refined(
+    logits: Tensor,
+    guide: Tensor | NonlocalOperator,
+    kind: Kind,
+    confidence: Tensor | None,
+    method: MeanField,
+    options: FilterOptions,
+) -> Tensor:
+    """:func:`refine`, with the options of its steps and those of its filter as one value each."""
     _check_input(logits, kind)
     confidence = _checked_confidence(logits, kind, confidence)
     communicator = guide.communicator if isinstance(guide, NonlocalOperator) else ALONE
     images = _check_guide(logits, guide, options)
-    _check_options(options, logits, images)
-    options = _with_caution(options, isinstance(guide, NonlocalOperator))
-    unary = _scaled(_as_logits(logits, kind), confidence, options.margin, communicator)
+    _check_options(method, options, logits, images)
+    if isinstance(method.caution, str):
+        chosen = isinstance(options.photometric_bandwidth, str) and isinstance(options.spatial_bandwidth, str)
+        caution = None if chosen and not isinstance(guide, NonlocalOperator) else CAUTION
+        method = replace(method, caution=caution)
+    unary = _scaled(_as_logits(logits, kind), confidence, method.margin, communicator)
     if not isinstance(guide, NonlocalOperator):
         guide = build_operator(guide, unary, confidence, options)
-    energies = mean_field(guide, unary, confidence, options)
+    energies = mean_field(guide, unary, confidence, method)
     return in_format_of(_as_kind(energies, logits, kind), logits)
 
 
-def mean_field(operator: NonlocalOperator, unary: Tensor, confidence: Tensor | None, options: MeanField) -> Tensor:
+def mean_field(operator: NonlocalOperator, unary: Tensor, confidence: Tensor | None, method: MeanField) -> Tensor:
     """Refine logarithms of probabilities (B, K, H, W), and return new ones."""
-    strength = per_image(options.strength, unary, 4)
+    strength = per_image(method.strength, unary, 4)
     start = unary.exp()
     trusted = unary if confidence is None else confidence * unary
     probabilities = start
@@ -178,14 +172,14 @@ def mean_field(operator: NonlocalOperator, unary: Tensor, confidence: Tensor | N
         known = extended[:, -1:].clamp(min=FLOOR)
         probabilities = confidence * start + (1 - confidence) * extended[:, :-1] / known
     energies = trusted
-    for _ in range(options.steps):
+    for _ in range(method.steps):
         message = operator @ probabilities
-        if options.compatibility is not None:
-            message = torch.einsum("ij,bjhw->bihw", options.compatibility.to(message), message)
+        if method.compatibility is not None:
+            message = torch.einsum("ij,bjhw->bihw", method.compatibility.to(message), message)
         energies = trusted + strength * message
         probabilities = energies.softmax(1)
-    if options.caution is not None and not isinstance(options.caution, str):
-        share = _share_of_result(start, probabilities, confidence, options.caution, operator.communicator)
+    if method.caution is not None and not isinstance(method.caution, str):
+        share = _share_of_result(start, probabilities, confidence, method.caution, operator.communicator)
         energies = torch.lerp(trusted.expand_as(energies), energies, share)
     return energies.log_softmax(1)
 
@@ -215,11 +209,10 @@ def _share_of_result(
     return ratio.square().reshape(-1, 1, 1, 1)
 
 
-def build_operator(guide: Tensor, unary: Tensor, confidence: Tensor | None, options: RefineOptions) -> NonlocalOperator:
+def build_operator(guide: Tensor, unary: Tensor, confidence: Tensor | None, options: FilterOptions) -> NonlocalOperator:
     """Build the operator of a guide, with bandwidths from guide and input where they are ``"auto"``."""
-    photometric, spatial = options.photometric_bandwidth, options.spatial_bandwidth
-    if isinstance(photometric, str):
-        photometric = PHOTOMETRIC * estimate_bandwidth(guide)
+    photometric = options.bandwidth_or(lambda: PHOTOMETRIC * estimate_bandwidth(guide))
+    spatial = options.spatial_bandwidth
     if isinstance(spatial, str):
         spatial = _transition_bandwidth(unary.detach(), None if confidence is None else confidence.detach())
         if len(guide) == 1 < len(spatial):
@@ -228,17 +221,10 @@ def build_operator(guide: Tensor, unary: Tensor, confidence: Tensor | None, opti
             spatial = spatial.squeeze(0)
     count = options.num_landmarks
     # The default, which nobody chose, needs no warning where an image has fewer pixels.
-    if isinstance(count, int) and count == RefineOptions.num_landmarks:
+    if isinstance(count, int) and count == FILTER.num_landmarks:
         count = min(count, guide.shape[2] * guide.shape[3])
-    return nonlocal_operator(
-        guide,
-        patch_size=options.patch_size,
-        photometric_bandwidth=photometric,
-        spatial_bandwidth=spatial,
-        num_landmarks=count,
-        landmarks=options.landmarks,
-        guide_channels=options.guide_channels,
-        generator=options.generator,
+    return checked_operator(
+        guide, replace(options, photometric_bandwidth=photometric, spatial_bandwidth=spatial, num_landmarks=count)
     )
 
 
@@ -299,14 +285,6 @@ def _known(trimap: Tensor) -> Tensor:
     return (trimap <= 0) | (trimap >= 1)
 
 
-def _with_caution(options: RefineOptions, built: bool) -> RefineOptions:
-    """Choose the caution where it is ``"auto"``; ``built`` says whether the operator was passed."""
-    if not isinstance(options.caution, str):
-        return options
-    chosen = isinstance(options.photometric_bandwidth, str) and isinstance(options.spatial_bandwidth, str)
-    return replace(options, caution=None if chosen and not built else CAUTION)
-
-
 def _check_input(values: Tensor, kind: Kind) -> None:
     """Raise unless the input is what its kind says."""
     check_choice(kind, "kind", KINDS, "say what the first argument is")
@@ -341,12 +319,16 @@ def _checked_confidence(values: Tensor, kind: Kind, confidence: Tensor | None) -
     return confidence
 
 
-def _check_guide(values: Tensor, guide: Tensor | NonlocalOperator, options: RefineOptions) -> int:
+def _check_guide(values: Tensor, guide: Tensor | NonlocalOperator, options: FilterOptions) -> int:
     """Raise unless the guide fits the input; return the number of images."""
     if isinstance(guide, NonlocalOperator):
         batch, size, part = len(guide.factor), guide.size, guide.factor
-        for name in ("photometric_bandwidth", "spatial_bandwidth"):
-            if (value := getattr(options, name)) is not AUTO:
+        bandwidths = {
+            "photometric_bandwidth": options.photometric_bandwidth,
+            "spatial_bandwidth": options.spatial_bandwidth,
+        }
+        for name, value in bandwidths.items():
+            if value is not AUTO:
                 raise ValueError(
                     f"{name} must be left out if guide is an operator, got {described(value)}; "
                     "pass it to nonlocal_operator"
@@ -362,24 +344,24 @@ def _check_guide(values: Tensor, guide: Tensor | NonlocalOperator, options: Refi
     return batch if len(values) == 1 else len(values)
 
 
-def _check_options(options: RefineOptions, values: Tensor, images: int) -> None:
+def _check_options(method: MeanField, options: FilterOptions, values: Tensor, images: int) -> None:
     """Raise unless the options of the mean-field steps are valid."""
-    check_count(options.steps, "steps", most=1000)
-    check_values(options.strength, "strength", "not negative", images)
-    for name in ("margin", "caution"):
-        value = getattr(options, name)
-        if name == "caution" and isinstance(value, str):
-            check_choice(value, name, (AUTO,), "pass it, a number or None")
-        elif value is not None:
-            check_positive(value, name, images)
+    check_count(method.steps, "steps", most=1000)
+    check_values(method.strength, "strength", "not negative", images)
+    if method.margin is not None:
+        check_positive(method.margin, "margin", images)
+    if isinstance(method.caution, str):
+        check_choice(method.caution, "caution", (AUTO,), "pass it, a number or None")
+    elif method.caution is not None:
+        check_positive(method.caution, "caution", images)
     if isinstance(options.spatial_bandwidth, str):
         check_choice(options.spatial_bandwidth, "spatial_bandwidth", (AUTO,), "pass it, a number of pixels or None")
-    if options.compatibility is not None:
-        check_dtype(options.compatibility, "compatibility", "convert it with .float()")
-        check_finite(options.compatibility, "compatibility")
+    if method.compatibility is not None:
+        check_dtype(method.compatibility, "compatibility", "convert it with .float()")
+        check_finite(method.compatibility, "compatibility")
         classes = max(values.shape[1], 2)
-        if tuple(options.compatibility.shape) != (classes, classes):
+        if tuple(method.compatibility.shape) != (classes, classes):
             raise ValueError(
-                f"compatibility must have shape ({classes}, {classes}), got {tuple(options.compatibility.shape)}; "
+                f"compatibility must have shape ({classes}, {classes}), got {tuple(method.compatibility.shape)}; "
                 "pass a row and a column for each class"
             )

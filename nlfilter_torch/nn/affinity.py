@@ -13,19 +13,19 @@ from nlfilter_torch.core.precision import working_dtype
 from nlfilter_torch.nn.held import HeldAssignment, HeldFeatures, Hold
 from nlfilter_torch.nn.parameters import Learnable, UnitWindow, check_learn, positive_option
 from nlfilter_torch.operator.assignment import Assignment
-from nlfilter_torch.operator.build import nonlocal_operator
+from nlfilter_torch.operator.build import checked_operator
 from nlfilter_torch.operator.features import GuideFeatures, estimate_bandwidth, unit_window
 from nlfilter_torch.operator.landmarks import assign_landmarks
 from nlfilter_torch.operator.operator import NonlocalOperator
-from nlfilter_torch.operator.option_checks import check_options, count_of
+from nlfilter_torch.operator.option_checks import check_options
 from nlfilter_torch.operator.options import (
     AUTO,
     SAMPLING,
     Completion,
+    FilterOptions,
     GuideChannels,
     HasLandmarks,
     Landmarks,
-    OperatorOptions,
     Sampling,
 )
 
@@ -80,36 +80,28 @@ class NonlocalAffinity(Learnable):
     def __init__(
         self,
         *,
-        patch_size: int = OperatorOptions.patch_size,
+        patch_size: int = FilterOptions.patch_size,
         photometric_bandwidth: float | Literal["auto"] = AUTO,
         spatial_bandwidth: float | None = None,
-        num_landmarks: int = OperatorOptions.num_landmarks,
-        landmarks: Landmarks = OperatorOptions.landmarks,
-        completion: Completion = OperatorOptions.completion,
-        guide_channels: GuideChannels = OperatorOptions.guide_channels,
-        patch_weights: Tensor | None = OperatorOptions.patch_weights,
-        tolerance: float | None = OperatorOptions.tolerance,
-        generator: torch.Generator | None = OperatorOptions.generator,
-        group: Any = OperatorOptions.group,
+        num_landmarks: int = FilterOptions.num_landmarks,
+        landmarks: Landmarks = FilterOptions.landmarks,
+        completion: Completion = FilterOptions.completion,
+        guide_channels: GuideChannels = FilterOptions.guide_channels,
+        patch_weights: Tensor | None = FilterOptions.patch_weights,
+        tolerance: float | None = FilterOptions.tolerance,
+        generator: torch.Generator | None = FilterOptions.generator,
+        group: Any = FilterOptions.group,
         hold: Hold | None = None,
         learn: AffinityOption | Collection[AffinityOption] = (),
     ) -> None:
         super().__init__()
         names = check_learn(learn, tuple(self.learnable))
-        check_options(
-            OperatorOptions(
-                num_landmarks=num_landmarks,
-                landmarks=landmarks,
-                completion=completion,
-                guide_channels=guide_channels,
-                tolerance=tolerance,
-                generator=generator,
-            )
-        )
+        options = FilterOptions.of(locals())
+        check_options(options)
         check_group(group)
         window = unit_window(patch_size, patch_weights).detach()  # learned only with learn=("patch_weights",)
         self.patch_size = patch_size
-        self.num_landmarks = num_landmarks if isinstance(landmarks, str) else count_of(landmarks)
+        self.num_landmarks = options.landmark_count
         self.landmarks: Sampling = landmarks if isinstance(landmarks, str) else SAMPLING
         self.completion: Completion = completion
         self.guide_channels: GuideChannels = guide_channels
@@ -265,21 +257,20 @@ class NonlocalAffinity(Learnable):
         weights: Tensor | None,
     ) -> NonlocalOperator:
         """Build the operator with the options of the layer, and these landmarks."""
-        return nonlocal_operator(
-            guide,
+        options = FilterOptions(
             patch_size=self.patch_size,
             photometric_bandwidth=bandwidth,
             spatial_bandwidth=self.spatial_bandwidth,
-            num_landmarks=self.num_landmarks if isinstance(landmarks, str) else count_of(landmarks),
+            num_landmarks=self.num_landmarks,
             landmarks=landmarks,
             completion=self.completion,
             guide_channels=self.guide_channels,
             patch_weights=self._weights(),
-            weights=weights,
             tolerance=self.tolerance,
             generator=self.generator,
             group=self.group,
         )
+        return checked_operator(guide, options, weights)
 
     def extra_repr(self) -> str:
         """The options of the operator."""

@@ -12,8 +12,8 @@ from nlfilter_torch.core.checks import check_choice, check_count, check_dtype, c
 from nlfilter_torch.core.precision import full_precision, working_dtype
 from nlfilter_torch.nn.parameters import Learnable, check_learn, positive_option
 from nlfilter_torch.operator.build import operator_from_points
-from nlfilter_torch.operator.option_checks import check_construction
-from nlfilter_torch.operator.options import SAMPLING, Construction, Sampling
+from nlfilter_torch.operator.option_checks import check_options
+from nlfilter_torch.operator.options import SAMPLING, FilterOptions, Sampling
 
 Norm = Literal["batch", "none"]
 BlockOption = Literal["temperature", "spatial_bandwidth"]
@@ -94,7 +94,7 @@ class NonlocalBlock(Learnable):
         check_count(inner, "inner_channels")
         check_count(embedding, "embedding_channels")
         check_choice(landmarks, "landmarks", get_args(Sampling))
-        check_construction(Construction(num_landmarks=num_landmarks, landmarks=landmarks))
+        check_options(FilterOptions(num_landmarks=num_landmarks, landmarks=landmarks))
         check_choice(norm, "norm", ("batch", "none"))
         if spatial_bandwidth is None and "spatial_bandwidth" in names:
             raise ValueError(
@@ -132,8 +132,8 @@ class NonlocalBlock(Learnable):
         size = x.shape[2:]
         points = x.flatten(2)
         features = self._features(self.embedding(points), size)
-        method = Construction(num_landmarks=min(self.num_landmarks, points.shape[2]), landmarks=self.landmarks)
-        operator = operator_from_points(features, (prod(size[:-1]), size[-1]), method)
+        options = FilterOptions(num_landmarks=min(self.num_landmarks, points.shape[2]), landmarks=self.landmarks)
+        operator = operator_from_points(features, (prod(size[:-1]), size[-1]), options)
         values = self.value(points)
         attended = (operator @ values.unflatten(2, operator.size)).flatten(2)
         added: Tensor = self.norm(self.output(attended))

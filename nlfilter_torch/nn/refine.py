@@ -1,7 +1,7 @@
 """A layer that aligns coarse logits or masks with the edges of an image."""
 
 from collections.abc import Collection
-from functools import partial
+from dataclasses import replace
 from types import MappingProxyType
 from typing import Literal, get_args
 
@@ -9,11 +9,11 @@ import torch
 from torch import Tensor, nn
 
 from nlfilter_torch.core.checks import check_choice, check_count, check_positive
-from nlfilter_torch.filtering.refine import KINDS, MARGIN, STRENGTH, Kind, RefineOptions, refine
+from nlfilter_torch.filtering.refine import FILTER, KINDS, MARGIN, STRENGTH, Kind, MeanField, refined
 from nlfilter_torch.nn.parameters import Learnable, check_learn, positive_option
 from nlfilter_torch.operator.operator import NonlocalOperator
 from nlfilter_torch.operator.option_checks import check_bandwidths, check_options
-from nlfilter_torch.operator.options import AUTO, GuideChannels, OperatorOptions, Sampling
+from nlfilter_torch.operator.options import AUTO, SAMPLING, FilterOptions, GuideChannels, Sampling
 
 RefineOption = Literal["strength", "margin", "compatibility", "photometric_bandwidth", "spatial_bandwidth"]
 LEARNABLE: tuple[RefineOption, ...] = get_args(RefineOption)
@@ -67,16 +67,16 @@ class Refine(Learnable):
         self,
         *,
         kind: Kind = "logits",
-        steps: int = RefineOptions.steps,
+        steps: int = MeanField.steps,
         strength: float = STRENGTH,
         margin: float | None = MARGIN,
         caution: float | Literal["auto"] | None = AUTO,
-        patch_size: int = RefineOptions.patch_size,
+        patch_size: int = FILTER.patch_size,
         photometric_bandwidth: float | Literal["auto"] = AUTO,
         spatial_bandwidth: float | Literal["auto"] | None = AUTO,
-        num_landmarks: int = RefineOptions.num_landmarks,
-        landmarks: Sampling = RefineOptions.landmarks,
-        guide_channels: GuideChannels = RefineOptions.guide_channels,
+        num_landmarks: int = FILTER.num_landmarks,
+        landmarks: Sampling = SAMPLING,
+        guide_channels: GuideChannels = FILTER.guide_channels,
         classes: int | None = None,
         learn: RefineOption | Collection[RefineOption] = ("strength", "margin"),
     ) -> None:
@@ -88,7 +88,8 @@ class Refine(Learnable):
             check_choice(caution, "caution", (AUTO,), "pass it, a number or None")
         elif caution is not None:
             check_positive(caution, "caution")
-        check_options(OperatorOptions(num_landmarks=num_landmarks, landmarks=landmarks, guide_channels=guide_channels))
+        options = FilterOptions.of(locals())
+        check_options(options)
         self.kind: Kind = kind
         self.steps = steps
         self.caution = caution
@@ -98,7 +99,10 @@ class Refine(Learnable):
         self.guide_channels: GuideChannels = guide_channels
         self.start_positive("strength", strength, names)
         self.start_positive("margin", margin, names, other=type(None))
-        _check_bandwidths(photometric_bandwidth, spatial_bandwidth)
+        if isinstance(spatial_bandwidth, str):
+            check_choice(spatial_bandwidth, "spatial_bandwidth", (AUTO,), "pass it, a number of pixels or None")
+            options = replace(options, spatial_bandwidth=None)
+        check_bandwidths(options)
         self.start_positive("photometric_bandwidth", photometric_bandwidth, names, other=str)
         self.start_positive(
             "spatial_bandwidth", spatial_bandwidth, names, other=type(None) if spatial_bandwidth is None else str
@@ -119,28 +123,24 @@ class Refine(Learnable):
             guide: the image, or its operator, which replaces the layer's own options of the operator.
             confidence: (B, 1, H, W) in [0, 1], as for :func:`refine`.
         """
-        refined = partial(
-            refine,
-            logits,
-            guide,
-            kind=self.kind,
-            confidence=confidence,
+        method = MeanField(
             steps=self.steps,
             strength=self.strength,
             margin=self.margin,
             compatibility=self.compatibility,
             caution=self.caution,
         )
-        if isinstance(guide, NonlocalOperator):
-            return refined()
-        return refined(
-            patch_size=self.patch_size,
-            photometric_bandwidth=self.photometric_bandwidth,
-            spatial_bandwidth=self.spatial_bandwidth,
-            num_landmarks=self.num_landmarks,
-            landmarks=self.landmarks,
-            guide_channels=self.guide_channels,
-        )
+        options = FILTER
+        if not isinstance(guide, NonlocalOperator):
+            options = FilterOptions(
+                patch_size=self.patch_size,
+                photometric_bandwidth=self.photometric_bandwidth,
+                spatial_bandwidth=self.spatial_bandwidth,
+                num_landmarks=self.num_landmarks,
+                landmarks=self.landmarks,
+                guide_channels=self.guide_channels,
+            )
+        return refined(logits, guide, self.kind, confidence, method, options)
 
     def extra_repr(self) -> str:
         """The options."""
@@ -150,10 +150,3 @@ class Refine(Learnable):
             f"photometric_bandwidth={self.shown('photometric_bandwidth')}, "
             f"spatial_bandwidth={self.shown('spatial_bandwidth')}, num_landmarks={self.num_landmarks}"
         )
-
-
-def _check_bandwidths(photometric: float | str, spatial: float | str | None) -> None:
-    """Raise unless these are bandwidths of the layer."""
-    if isinstance(spatial, str):
-        check_choice(spatial, "spatial_bandwidth", (AUTO,), "pass it, a number of pixels or None")
-    check_bandwidths(photometric, None if isinstance(spatial, str) else spatial)

@@ -22,7 +22,7 @@ from nlfilter_torch.nn.affinity import AffinityOption, NonlocalAffinity
 from nlfilter_torch.nn.held import Hold
 from nlfilter_torch.nn.parameters import check_learn
 from nlfilter_torch.operator.operator import NonlocalOperator
-from nlfilter_torch.operator.options import AUTO, Completion, GuideChannels, Landmarks, OperatorOptions
+from nlfilter_torch.operator.options import AUTO, Completion, FilterOptions, GuideChannels, Landmarks
 
 SliderOption = Literal["alpha", "residual"]
 LEARNABLE: tuple[SliderOption, ...] = ("alpha", "residual")
@@ -204,35 +204,24 @@ class NonlocalFilter(nn.Module):
         *,
         residual: float | None = None,
         learn: SliderOption | AffinityOption | Collection[SliderOption | AffinityOption] = ALPHA,
-        patch_size: int = OperatorOptions.patch_size,
+        patch_size: int = FilterOptions.patch_size,
         photometric_bandwidth: float | Literal["auto"] = AUTO,
         spatial_bandwidth: float | None = None,
-        num_landmarks: int = OperatorOptions.num_landmarks,
-        landmarks: Landmarks = OperatorOptions.landmarks,
-        completion: Completion = OperatorOptions.completion,
-        guide_channels: GuideChannels = OperatorOptions.guide_channels,
-        patch_weights: Tensor | None = OperatorOptions.patch_weights,
-        tolerance: float | None = OperatorOptions.tolerance,
-        generator: torch.Generator | None = OperatorOptions.generator,
-        group: Any = OperatorOptions.group,
+        num_landmarks: int = FilterOptions.num_landmarks,
+        landmarks: Landmarks = FilterOptions.landmarks,
+        completion: Completion = FilterOptions.completion,
+        guide_channels: GuideChannels = FilterOptions.guide_channels,
+        patch_weights: Tensor | None = FilterOptions.patch_weights,
+        tolerance: float | None = FilterOptions.tolerance,
+        generator: torch.Generator | None = FilterOptions.generator,
+        group: Any = FilterOptions.group,
         hold: Hold | None = None,
     ) -> None:
+        arguments = locals()
         super().__init__()
         names = check_learn(learn, (*LEARNABLE, *BUILDING))
         self.affinity = NonlocalAffinity(
-            patch_size=patch_size,
-            photometric_bandwidth=photometric_bandwidth,
-            spatial_bandwidth=spatial_bandwidth,
-            num_landmarks=num_landmarks,
-            landmarks=landmarks,
-            completion=completion,
-            guide_channels=guide_channels,
-            patch_weights=patch_weights,
-            tolerance=tolerance,
-            generator=generator,
-            group=group,
-            hold=hold,
-            learn=[name for name in BUILDING if name in names],
+            hold=hold, learn=[name for name in BUILDING if name in names], **vars(FilterOptions.of(arguments))
         )
         self.sliders = PolynomialSliders(alpha, residual=residual, learn=[name for name in LEARNABLE if name in names])
 

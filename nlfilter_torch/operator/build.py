@@ -3,7 +3,7 @@
 import math
 from dataclasses import replace
 from functools import partial
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import torch
 from torch import Tensor
@@ -20,7 +20,7 @@ from nlfilter_torch.core.checks import (
     warn_of_scale,
 )
 from nlfilter_torch.core.communicator import ALONE, Communicator, all_gather_shapes
-from nlfilter_torch.core.precision import full_precision, trainable, uncompiled, uncompiled_with, working_dtype
+from nlfilter_torch.core.precision import full_precision, trainable, uncompiled, working_dtype
 from nlfilter_torch.core.torch_internals import is_hidden, outside_transforms, refuse_transforms
 from nlfilter_torch.core.warning import warn
 from nlfilter_torch.operator.assignment import Assignment, Layout
@@ -44,17 +44,15 @@ from nlfilter_torch.operator.features import (
     unit_window,
 )
 from nlfilter_torch.operator.held import landmarks_by
-from nlfilter_torch.operator.landmarks import assign_landmarks
 from nlfilter_torch.operator.nystrom import inverse_cholesky
 from nlfilter_torch.operator.operator import Kernel, NonlocalOperator
-from nlfilter_torch.operator.option_checks import check_bandwidths, check_construction, check_options, landmark_count
+from nlfilter_torch.operator.option_checks import check_bandwidths, check_options, landmark_count
 from nlfilter_torch.operator.options import (
+    AUTO,
     Completion,
-    Construction,
+    FilterOptions,
     GuideChannels,
     Landmarks,
-    OperatorOptions,
-    Sampling,
     SpatialBandwidth,
     bandwidths_of,
 )
@@ -83,24 +81,21 @@ def _largest(guide: Tensor) -> Tensor:
     return torch.stack([torch.stack(image.aminmax()).abs().amax() for image in guide])  # faster on CPUs
 
 
-@uncompiled_with("generator", "group", "weights")
-@outside_transforms
-@full_precision
 def nonlocal_operator(
     guide: Tensor,
     *,
-    patch_size: int = OperatorOptions.patch_size,
-    photometric_bandwidth: float | Tensor | Literal["auto"] = OperatorOptions.photometric_bandwidth,
-    spatial_bandwidth: SpatialBandwidth | None = OperatorOptions.spatial_bandwidth,
-    num_landmarks: int = OperatorOptions.num_landmarks,
-    landmarks: Landmarks = OperatorOptions.landmarks,
-    completion: Completion = OperatorOptions.completion,
-    guide_channels: GuideChannels = OperatorOptions.guide_channels,
-    patch_weights: Tensor | None = OperatorOptions.patch_weights,
+    patch_size: int = FilterOptions.patch_size,
+    photometric_bandwidth: float | Tensor | Literal["auto"] = AUTO,
+    spatial_bandwidth: SpatialBandwidth | None = None,
+    num_landmarks: int = FilterOptions.num_landmarks,
+    landmarks: Landmarks = FilterOptions.landmarks,
+    completion: Completion = FilterOptions.completion,
+    guide_channels: GuideChannels = FilterOptions.guide_channels,
+    patch_weights: Tensor | None = FilterOptions.patch_weights,
     weights: Tensor | None = None,
-    tolerance: float | None = OperatorOptions.tolerance,
-    generator: torch.Generator | None = OperatorOptions.generator,
-    group: Any = OperatorOptions.group,
+    tolerance: float | None = FilterOptions.tolerance,
+    generator: torch.Generator | None = FilterOptions.generator,
+    group: Any = FilterOptions.group,
 ) -> NonlocalOperator:
     """Build the global filter of an image: patches, landmarks, Nystrom factor, completion and balancing.
 
@@ -161,7 +156,7 @@ def nonlocal_operator(
         >>> bool((operator.row_sums() - 1).abs().max() < 1e-4)
         True
     """
-    options = OperatorOptions(
+    options = FilterOptions(  # written out: older versions of torch's compiler do not know ``locals()``
         patch_size=patch_size,
         photometric_bandwidth=photometric_bandwidth,
         spatial_bandwidth=spatial_bandwidth,
@@ -174,32 +169,51 @@ def nonlocal_operator(
         generator=generator,
         group=group,
     )
+    return checked_operator(guide, options, weights)
+
+
+def checked_operator(guide: Tensor, options: FilterOptions, weights: Tensor | None = None) -> NonlocalOperator:
+    """:func:`nonlocal_operator`, with its options as one value."""
+    return (_checked_uncompiled if _is_uncompiled(options, weights) else _checked)(guide, options, weights)
+
+
+@outside_transforms
+@full_precision
+def _checked(guide: Tensor, options: FilterOptions, weights: Tensor | None) -> NonlocalOperator:
     _check_guide(guide, options)
     if weights is not None:
-        weights = check_pixel_weights(weights, guide, group)
+        weights = check_pixel_weights(weights, guide, options.group)
         guide = torch.where(weights > 0, guide, 0.0)  # large values there are no mistake
-    if not is_hidden(guide) and _is_small(photometric_bandwidth):
+    bandwidth = cast(float | Tensor | str, options.photometric_bandwidth)  # None was refused
+    if not is_hidden(guide) and _is_small(bandwidth):
         warn_of_scale(guide, "guide")
-    warn_of_units(guide, photometric_bandwidth)
+    warn_of_units(guide, bandwidth)
     operator = _from_guide(guide, options, weights)
-    if completion == "diagonal" and weights is None and operator.communicator.size == 1:
-        warn_of_scale_of_features(operator.scaling, guide, photometric_bandwidth)
+    if options.completion == "diagonal" and weights is None and operator.communicator.size == 1:
+        warn_of_scale_of_features(operator.scaling, guide, bandwidth)
     return operator
 
 
-def operator_from_guide(guide: Tensor, options: OperatorOptions, weights: Tensor | None = None) -> NonlocalOperator:
+_checked_uncompiled = uncompiled(_checked)
+
+
+def _is_uncompiled(options: FilterOptions, weights: Tensor | None) -> bool:
+    """Whether an operator depends on what cannot be compiled."""
+    return options.generator is not None or options.group is not None or weights is not None
+
+
+def operator_from_guide(guide: Tensor, options: FilterOptions, weights: Tensor | None = None) -> NonlocalOperator:
     """:func:`nonlocal_operator` for a guide whose scale has been checked: without the warning about values above 16.
 
     ``weights`` (B, 1, H, W) are in range, have the dtype of the guide, and are not 0 in all pixels of an image. Where
     they are 0, patches read the guide as it is: :func:`fill_nearby` has filled it.
     """
-    drawn = options.generator is not None or options.group is not None or weights is not None  # none can be compiled
-    return (_built_uncompiled if drawn else _built)(guide, options, weights)
+    return (_built_uncompiled if _is_uncompiled(options, weights) else _built)(guide, options, weights)
 
 
 @outside_transforms
 @full_precision
-def _built(guide: Tensor, options: OperatorOptions, weights: Tensor | None) -> NonlocalOperator:
+def _built(guide: Tensor, options: FilterOptions, weights: Tensor | None) -> NonlocalOperator:
     _check_guide(guide, options)
     return _from_guide(guide, options, weights, filled=True)
 
@@ -207,7 +221,7 @@ def _built(guide: Tensor, options: OperatorOptions, weights: Tensor | None) -> N
 _built_uncompiled = uncompiled(_built)
 
 
-def _check_guide(guide: Tensor, options: OperatorOptions) -> None:
+def _check_guide(guide: Tensor, options: FilterOptions) -> None:
     """Raise an error for an invalid guide or option."""
     if isinstance(guide, NonlocalOperator):
         raise TypeError("guide must be a torch.Tensor, got a NonlocalOperator, which is built already; use it as it is")
@@ -221,7 +235,7 @@ def _check_guide(guide: Tensor, options: OperatorOptions) -> None:
     check_image(guide, "guide", empty=True, dimensions=(4, 5))
     check_options(options)
     axes, window = guide.ndim - 2, options.patch_weights
-    check_bandwidths(options.photometric_bandwidth, options.spatial_bandwidth, guide.shape[0], axes)
+    check_bandwidths(options, guide.shape[0], axes)
     if isinstance(window, Tensor) and window.ndim in (2, 3) and window.ndim != axes:
         raise ValueError(
             f"patch_weights must have the {axes} axes of the guide, got {tuple(window.shape)}; "
@@ -230,7 +244,7 @@ def _check_guide(guide: Tensor, options: OperatorOptions) -> None:
 
 
 def _from_guide(
-    guide: Tensor, options: OperatorOptions, weights: Tensor | None = None, *, filled: bool = False
+    guide: Tensor, options: FilterOptions, weights: Tensor | None = None, *, filled: bool = False
 ) -> NonlocalOperator:
     """Build an operator from a checked guide, checked options and weights (B, 1, H, W).
 
@@ -261,7 +275,7 @@ def _from_guide(
 def _bandwidth(
     guide: Tensor,
     halo: tuple[int, int],
-    options: OperatorOptions,
+    options: FilterOptions,
     communicator: Communicator,
     weights: Tensor | None,
     counts: Tensor | None,
@@ -283,12 +297,12 @@ def operator_from_features(
     *,
     size: tuple[int, ...],
     weights: Tensor | None = None,
-    num_landmarks: int = Construction.num_landmarks,
-    landmarks: Landmarks = Construction.landmarks,
-    completion: Completion = Construction.completion,
-    tolerance: float | None = Construction.tolerance,
-    generator: torch.Generator | None = Construction.generator,
-    group: Any = Construction.group,
+    num_landmarks: int = FilterOptions.num_landmarks,
+    landmarks: Landmarks = FilterOptions.landmarks,
+    completion: Completion = FilterOptions.completion,
+    tolerance: float | None = FilterOptions.tolerance,
+    generator: torch.Generator | None = FilterOptions.generator,
+    group: Any = FilterOptions.group,
 ) -> NonlocalOperator:
     """Build the filter of any points from their features: landmarks, Nystrom factor, completion and balancing.
 
@@ -325,15 +339,8 @@ def operator_from_features(
         >>> bool((smoothed - 1).abs().max() < 1e-4)
         True
     """
-    method = Construction(
-        num_landmarks=num_landmarks,
-        landmarks=landmarks,
-        completion=completion,
-        tolerance=tolerance,
-        generator=generator,
-        group=group,
-    )
-    operator = _from_points(features, size, method, weights)
+    options = FilterOptions.of(locals())
+    operator = _from_points(features, size, options, weights)
     _warn_of_coverage(operator)
     return operator
 
@@ -342,27 +349,27 @@ def operator_from_features(
 @outside_transforms
 @full_precision
 def operator_from_points(
-    features: Tensor, size: tuple[int, ...], method: Construction, weights: Tensor | None = None
+    features: Tensor, size: tuple[int, ...], options: FilterOptions, weights: Tensor | None = None
 ) -> NonlocalOperator:
     """:func:`operator_from_features` where a user did not choose the points: without the warning about landmarks."""
-    return _from_points(features, size, method, weights)
+    return _from_points(features, size, options, weights)
 
 
 def _from_points(
-    features: Tensor, size: tuple[int, ...], method: Construction, weights: Tensor | None
+    features: Tensor, size: tuple[int, ...], options: FilterOptions, weights: Tensor | None
 ) -> NonlocalOperator:
     """Check and build, outside of transforms; leaving them twice would hide what is transformed."""
-    refuse_transforms(features=features, weights=weights, landmarks=method.landmarks)
+    refuse_transforms(features=features, weights=weights, landmarks=options.landmarks)
     check_features(features, "features", empty=True)
-    check_construction(method)
+    check_options(options)
     shape = check_size(size, features.shape[2])
     features = features.to(working_dtype(features))
     if weights is not None:
         weights = check_weights(weights, features)
-    communicator = all_gather_shapes(features.unflatten(2, shape), method.group)
+    communicator = all_gather_shapes(features.unflatten(2, shape), options.group)
     if weights is not None:
         check_counted(communicator.max(weights.amax(1)))
-    return _assemble(features, shape, method, weights=weights, communicator=communicator)
+    return _assemble(features, shape, options, weights=weights, communicator=communicator)
 
 
 def _warn_of_coverage(operator: NonlocalOperator) -> None:
@@ -392,37 +399,29 @@ def _copy(value: float | Tensor) -> float | Tensor:
 def sampled_operator(
     guide: Tensor,
     places: Tensor,
-    *,
-    patch_size: int,
-    photometric_bandwidth: float | Tensor | str,
-    spatial_bandwidth: SpatialBandwidth | None,
-    num_landmarks: int,
-    landmarks: Sampling,
-    generator: torch.Generator,
+    options: FilterOptions,
 ) -> NonlocalOperator:
     """:func:`nonlocal_operator` of some pixels of a guide, each of which stands for as many others.
 
     Landmarks are those of the whole guide (1, 1, H, W); results at these pixels equal those of the whole guide, up to
     the error of sums over a sample. ``places`` (n,) are row-major indices of pixels that are spread evenly over the
-    picture. The images of the operator have the size (1, n).
+    picture, and ``options`` choose the landmarks. The images of the operator have the size (1, n).
     """
-    method = Construction(num_landmarks=num_landmarks, landmarks=landmarks, generator=generator)
-    check_construction(method)
-    if isinstance(photometric_bandwidth, str):
-        photometric_bandwidth = estimate_bandwidth(guide)
-    window = unit_window(patch_size, None).to(guide)
-    recipe = GuideFeatures(window, photometric_bandwidth, spatial_bandwidth, "luminance")
+    check_options(options)
+    check_bandwidths(options)
+    bandwidth = options.bandwidth_or(lambda: estimate_bandwidth(guide))
+    recipe = GuideFeatures.of(options, bandwidth, guide.dtype, guide.device)
     features, size = recipe(guide), (guide.shape[2], guide.shape[3])
-    chosen, _ = assign_landmarks(features, size, num_landmarks, landmarks, generator, layout=recipe.layout)
+    chosen, _ = landmarks_by(options, features, size, options.num_landmarks, layout=recipe.layout)
     count = len(places)
     weights = guide.new_full((1, count), features.shape[2] / count)
-    return _assemble(features[:, :, places], (1, count), method, recipe=recipe, weights=weights, chosen=chosen)
+    return _assemble(features[:, :, places], (1, count), options, recipe=recipe, weights=weights, chosen=chosen)
 
 
 def _assemble(
     features: Tensor,
     size: tuple[int, ...],
-    method: Construction,
+    options: FilterOptions,
     *,
     recipe: GuideFeatures | None = None,
     weights: Tensor | None = None,
@@ -431,31 +430,31 @@ def _assemble(
 ) -> NonlocalOperator:
     """Build an operator from features (B, D, N), which ``recipe`` computed if they come from a guide.
 
-    Landmarks (B, D, M) are chosen by the method unless they are already ``chosen``.
+    Landmarks (B, D, M) are chosen by the options unless they are already ``chosen``.
     """
     whole = communicator.whole(size)
     hidden = hidden_points(weights)
-    points, tolerance = math.prod(whole), method.tolerance
+    points, tolerance = math.prod(whole), options.tolerance
     if hidden is not None and communicator.size == 1:
         points = int((~hidden).sum(1).min())
-    count = landmark_count(method, points)
+    count = landmark_count(options, points)
     if features.shape[0] == 0:
-        return _empty(features, size, count, method.completion, recipe)
+        return _empty(features, size, count, options.completion, recipe)
     in_graph, assignment = torch.compiler.is_compiling(), None  # never with a generator, weights or a group
     if chosen is None:
         layout = None if recipe is None else recipe.layout
-        chosen, assignment = _landmarks(method, features, whole, count, communicator, weights, layout)
+        chosen, assignment = _landmarks(options, features, whole, count, communicator, weights, layout)
     inverse = inverse_cholesky(chosen)
     alone = not in_graph and communicator.size == 1  # ranks send each other nothing that only diagnostics need
     sample = communicator.columns(features.detach(), _places(math.prod(whole), features)) if alone else None
-    kernel = Kernel(chosen, inverse, method.completion, features=recipe, assignment=assignment, sample=sample)
+    kernel = Kernel(chosen, inverse, options.completion, features=recipe, assignment=assignment, sample=sample)
     factor, diagonal = whole_kernel = kernel.factor(features)
     if hidden is not None:  # set aside, with row sums of 1
         factor, diagonal = factor * ~hidden.unsqueeze(1), torch.where(hidden, 1.0, diagonal)
-    completed, watched = method.completion == "diagonal", not is_hidden(factor)
+    completed, watched = options.completion == "diagonal", not is_hidden(factor)
 
     if in_graph:  # where nothing may depend on the number of pixels
-        worst, goal, bound = 0.0, tolerance or TOLERANCE[factor.dtype], method.landmarks != "kmeans"
+        worst, goal, bound = 0.0, tolerance or TOLERANCE[factor.dtype], options.landmarks != "kmeans"
         factor, diagonal, balancing, before = sinkhorn_in_graph(factor, diagonal, goal, completed, bound)
     else:
         balanced = partial(
@@ -475,7 +474,7 @@ def _assemble(
     remainder = scaling * (scaling * diagonal)  # in this order: without completion d^2 may overflow
     gram = shifted_gram(factor, root_weighted(scaling, weights), remainder, communicator)
     allowed = slack(factor.dtype, worst)
-    if watched and is_bounded(method.landmarks, points, count) and exceeds(gram, balancing.moment, allowed):
+    if watched and is_bounded(options.landmarks, points, count) and exceeds(gram, balancing.moment, allowed):
         limit = limiter(gram, KernelMatrix(factor, diagonal, weights, communicator).moment(scaling), allowed)
         factor, kernel = limit.to(factor) @ factor, replace(kernel, limiter=limit.to(factor))
         before = tuple(torch.linalg.solve(limit.detach(), total) for total in before)  # preserves u . total
@@ -503,7 +502,7 @@ def _assemble(
 
 
 def _landmarks(
-    method: Construction,
+    options: FilterOptions,
     features: Tensor,
     size: tuple[int, ...],
     count: int,
@@ -512,11 +511,11 @@ def _landmarks(
     layout: Layout | None,
 ) -> tuple[Tensor, Assignment | None]:
     """:func:`landmarks_by`, from the points that count alone where weights are 0."""
-    if weights is None or communicator.size > 1 or not isinstance(method.landmarks, str):
-        return landmarks_by(method, features, size, count, communicator, weights, layout)
+    if weights is None or communicator.size > 1 or not isinstance(options.landmarks, str):
+        return landmarks_by(options, features, size, count, communicator, weights, layout)
     if layout is None and hidden_points(weights) is None:
-        return landmarks_by(method, features, size, count, communicator, weights)
-    return assign_among_counted(features, size, count, method.landmarks, method.generator, weights, layout)
+        return landmarks_by(options, features, size, count, communicator, weights)
+    return assign_among_counted(features, size, count, options.landmarks, options.generator, weights, layout)
 
 
 def _places(points: int, features: Tensor) -> Tensor:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from functools import reduce
 from itertools import product
 from types import EllipsisType
-from typing import Any
+from typing import Any, cast
 
 import torch
 import torch.nn.functional as F
@@ -30,7 +30,7 @@ from nlfilter_torch.core.precision import Gradients, full_precision, once_differ
 from nlfilter_torch.core.torch_internals import for_each_gradient, is_hidden
 from nlfilter_torch.operator.assignment import Layout
 from nlfilter_torch.operator.hidden import fill_hidden
-from nlfilter_torch.operator.options import GuideChannels, SpatialBandwidth, bandwidths_of
+from nlfilter_torch.operator.options import FilterOptions, GuideChannels, SpatialBandwidth, bandwidths_of
 
 LUMINANCE = (0.299, 0.587, 0.114)  # shares of red, green and blue
 FAINT_WEIGHT = 1e-12  # in place of patch weights of 0
@@ -102,6 +102,15 @@ class GuideFeatures:
     photometric_bandwidth: float | Tensor
     spatial_bandwidth: SpatialBandwidth | None
     guide_channels: GuideChannels
+
+    @staticmethod
+    def of(
+        options: FilterOptions, bandwidth: float | Tensor, dtype: torch.dtype, device: torch.device | None = None
+    ) -> "GuideFeatures":
+        """The features by options that were checked, with the Gaussian window and this photometric bandwidth."""
+        window = unit_window(options.patch_size, None).to(device, dtype)
+        spatial = cast(SpatialBandwidth | None, options.spatial_bandwidth)  # words were refused
+        return GuideFeatures(window, bandwidth, spatial, options.guide_channels)
 
     @property
     def layout(self) -> Layout | None:

@@ -8,11 +8,11 @@ from torch import Tensor
 from nlfilter_torch.core.communicator import ALONE, Communicator
 from nlfilter_torch.operator.assignment import Assignment, Layout
 from nlfilter_torch.operator.landmarks import assign_landmarks, choose_in_graph, landmarks_of
-from nlfilter_torch.operator.options import Construction
+from nlfilter_torch.operator.options import FilterOptions
 
 
 def landmarks_by(
-    method: Construction,
+    options: FilterOptions,
     features: Tensor,
     size: tuple[int, ...],
     count: int,
@@ -20,18 +20,18 @@ def landmarks_by(
     weights: Tensor | None = None,
     layout: Layout | None = None,
 ) -> tuple[Tensor, Assignment | None]:
-    """Landmarks (B, D, M) for features (B, D, N) of an image of ``size``, by the ``landmarks`` of a construction.
+    """Landmarks (B, D, M) for features (B, D, N) of an image of ``size``, by the ``landmarks`` of some options.
 
     Also returns of which points they are made; None for landmarks that were passed as features.
 
     Raises:
         ValueError: if the landmarks do not fit the features.
     """
-    landmarks = method.landmarks
+    landmarks = options.landmarks
     if isinstance(landmarks, str):
         if torch.compiler.is_compiling():  # never with a generator, weights or a group
             return choose_in_graph(features, size, count, landmarks, layout)
-        return assign_landmarks(features, size, count, landmarks, method.generator, communicator, weights, layout)
+        return assign_landmarks(features, size, count, landmarks, options.generator, communicator, weights, layout)
     batch, points = features.shape[0], math.prod(size)
     if isinstance(landmarks, Assignment):
         _check_assignment(landmarks, batch, points)

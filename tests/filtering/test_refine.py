@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.autograd import gradcheck
 
 from nlfilter_torch import nonlocal_operator, refine
-from nlfilter_torch.filtering.refine import RefineOptions, build_operator
+from nlfilter_torch.filtering.refine import FILTER, build_operator
 from tests import reference
 from tests.images import photograph, two_colours
 from tests.problems import noise, picture
@@ -71,7 +71,7 @@ def test_scale_of_logits_does_not_matter() -> None:
 @pytest.mark.parametrize("name", ["photometric_bandwidth", "spatial_bandwidth", "both"])
 def test_bad_bandwidths_do_not_make_it_worse(name: str, factor: float) -> None:
     image, truth, logits = scene()
-    recipe = build_operator(image, logits.log_softmax(1), None, RefineOptions()).kernel.recipe
+    recipe = build_operator(image, logits.log_softmax(1), None, FILTER).kernel.recipe
     photometric, spatial = recipe.photometric_bandwidth, recipe.spatial_bandwidth
     assert spatial is not None
     refined = refine(

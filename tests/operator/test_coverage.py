@@ -12,7 +12,7 @@ from torch import Tensor
 from nlfilter_torch import NonlocalOperator, nonlocal_operator, operator_from_features
 from nlfilter_torch.operator.build import operator_from_points
 from nlfilter_torch.operator.coverage import LARGEST_SHARE, LEAST_POINTS, SAMPLED, sampled_points, share_above
-from nlfilter_torch.operator.options import Construction
+from nlfilter_torch.operator.options import FilterOptions
 from tests.problems import noise, seeded
 
 
@@ -121,7 +121,7 @@ def test_clusters_without_a_landmark_are_warned_of_once_with_the_remedy() -> Non
     )
     assert caught[0].filename == __file__
     operator_from_features(features.to("meta"), size=(4096,), num_landmarks=40)
-    operator_from_points(features, (4096,), Construction(num_landmarks=40))
+    operator_from_points(features, (4096,), FilterOptions(num_landmarks=40))
     operator_from_features(features[:, :, : LEAST_POINTS - 1], size=(LEAST_POINTS - 1,), num_landmarks=5)
     operator_from_features(features, size=(4096,), num_landmarks=64)
 

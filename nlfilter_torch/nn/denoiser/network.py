@@ -26,7 +26,7 @@ from nlfilter_torch.nn.denoiser.profile import NoiseProfile
 from nlfilter_torch.nn.denoiser.tiles import in_tiles
 from nlfilter_torch.nn.denoiser.weights import read_weights
 from nlfilter_torch.operator.build import operator_from_points
-from nlfilter_torch.operator.options import Construction
+from nlfilter_torch.operator.options import FilterOptions
 
 TRAINED = Path(__file__).with_name("denoiser.safetensors")
 
@@ -226,7 +226,7 @@ class NonlocalDenoiser(nn.Module):
         operator = operator_from_points(
             torch.cat([guide.flatten(2) / alike, places.expand(len(guide), -1, -1)], dim=1),
             (height, width),
-            Construction(num_landmarks=max(1, height * width // pixels)),
+            FilterOptions(num_landmarks=max(1, height * width // pixels)),
         )
         # Cumulative sums: the sliders increase to 1 for the smooth layer, so that the filter computes means of pixels.
         sliders = logits.unflatten(1, (ORDER + 1, LEVELS)).softmax(1).cumsum(1)[:, :, (0, 1, 1)]

@@ -23,7 +23,7 @@ from nlfilter_torch.filtering.filters import detail_layers, weigh_layers
 from nlfilter_torch.operator.build import operator_from_points
 from nlfilter_torch.operator.features import GuideFeatures, estimate_bandwidth, reduce_channels, unit_window
 from nlfilter_torch.operator.operator import NonlocalOperator
-from nlfilter_torch.operator.options import Construction, GuideChannels
+from nlfilter_torch.operator.options import FilterOptions, GuideChannels
 from nlfilter_torch.photo.declared.declaration import Edit
 from nlfilter_torch.photo.declared.parameters import DETAIL, MASK
 from nlfilter_torch.photo.declared.presets import Recipe
@@ -67,10 +67,10 @@ def sampled_operator(
     """The operator for every ``stride``-th pixel of a guide; patches around these are taken at full resolution."""
     features = GuideFeatures(unit_window(patch_size, None).to(guide), bandwidth, distance, channels)
     size = (guide.shape[-2] // stride, guide.shape[-1] // stride)
-    method = Construction(
+    options = FilterOptions(
         num_landmarks=min(detail["landmarks"], size[0] * size[1]), landmarks=detail["sampling"], generator=seeded()
     )
-    return operator_from_points(features(guide, stride=stride), size, method)
+    return operator_from_points(features(guide, stride=stride), size, options)
 
 
 class AtKnots:

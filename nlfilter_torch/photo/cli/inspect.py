@@ -89,11 +89,11 @@ def inspect(source: options.Source, folder: Folder, seed: options.Seed = 0, **va
 def build_operator(guide: "Tensor", step: "Step", seed: int = 0) -> "NonlocalOperator":
     """The operator of a guide (1, 1, H, W), with the filter parameters of a step."""
     from nlfilter_torch.operator.build import operator_from_guide
-    from nlfilter_torch.operator.options import OperatorOptions
+    from nlfilter_torch.operator.options import FilterOptions
     from nlfilter_torch.photo.picture.source import seeded
 
     parameters = step.filter_options((guide.shape[-2], guide.shape[-1]))
-    return operator_from_guide(guide, OperatorOptions(**parameters, generator=seeded(seed)))
+    return operator_from_guide(guide, FilterOptions(**parameters, generator=seeded(seed)))
 
 
 def summarize(operator: "NonlocalOperator", spectrum: "Spectrum", guide: "Tensor") -> dict[str, float]:

@@ -224,7 +224,9 @@ class Parameter:
         """Return a length in pixels for an image of that size: the one given to the function, or the default."""
         return cast(float, self.argument_of(self.default, size)) if value is None else float(value)
 
-    def distance(self, value: "float | Tensor | str | None", size: Sequence[int]) -> "float | Tensor | None":
+    def distance(
+        self, value: "float | Tensor | Sequence[float | Tensor] | str | None", size: Sequence[int]
+    ) -> "float | Tensor | None":
         """Return a distance in pixels for a picture (H, W): the function's argument, or for None :attr:`share` if any.
 
         It is relative so that a preview and the photograph agree. The word ``"none"`` gives None, for no limit.

@@ -16,13 +16,13 @@ from nlfilter_torch.core.inner import Inner
 from nlfilter_torch.core.rational import rational_form
 from nlfilter_torch.core.torch_internals import is_unreadable
 from nlfilter_torch.operator.features import blur, blur_margin
-from nlfilter_torch.operator.options import Completion, GuideChannels, Sampling
+from nlfilter_torch.operator.options import Completion, FilterOptions, GuideChannels, Sampling
 from nlfilter_torch.photo.declared.declaration import Edit
 from nlfilter_torch.photo.declared.parameters import ABSTRACT
 from nlfilter_torch.photo.picture.colour import merge_luminance, split_luminance
 from nlfilter_torch.photo.picture.drawn import Drawn, M
-from nlfilter_torch.photo.picture.edit import FilteredEdit
-from nlfilter_torch.photo.picture.in_memory import edit_image
+from nlfilter_torch.photo.picture.edit import PhotoEdit
+from nlfilter_torch.photo.picture.in_memory import edited
 from nlfilter_torch.photo.picture.pixels import whole_image
 from nlfilter_torch.photo.picture.source import Fitted, Guide, Pixels, Planes, Source
 from nlfilter_torch.photo.picture.viewing import fit_change, viewed_size
@@ -90,40 +90,25 @@ def abstract(
         >>> bool((abstract(image, power=0.0, num_landmarks=50) - image).abs().max() < 1e-5)
         True
     """
-    edit = Abstract(
-        power=power,
-        edges=edges,
-        edge_width=edge_width,
-        tones=tones,
-        viewing_size=viewing_size,
-        photometric_bandwidth=photometric_bandwidth,
-        spatial_bandwidth=spatial_bandwidth,
-        patch_size=patch_size,
-        num_landmarks=num_landmarks,
-        landmarks=landmarks,
-        completion=completion,
-        guide_channels=guide_channels,
-        generator=generator,
-    )
-    return edit_image(edit, image)
+    return edited(Abstract, locals())
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Abstract(FilteredEdit):
+class Abstract(PhotoEdit):
     """The edit of :func:`abstract`."""
 
     declared: ClassVar[Edit] = ABSTRACT
     relative: ClassVar[bool] = True
+    filtering: ClassVar[FilterOptions] = FilterOptions(guide_channels="all")
     power: float | Tensor
     edges: float
     edge_width: float | None
     tones: int | None
     viewing_size: float
-    guide_channels: GuideChannels = "all"
 
     def fit(self, source: Source[M], drawn: Drawn[M]) -> Fitted:
         """Fit the flattened picture, with lines and tones."""
-        check_count(self.num_landmarks, "num_landmarks")
+        check_count(self.options.num_landmarks, "num_landmarks")
         ABSTRACT.check(source.batch, power=self.power, edges=self.edges, edge_width=self.edge_width)
         ABSTRACT.check(source.batch, viewing_size=self.viewing_size)
         width = ABSTRACT["edge_width"].pixels(self.edge_width, source.size)

@@ -17,20 +17,20 @@ only where this reduces the chroma.
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import ClassVar, Generic, Literal, cast
 
 import torch
 from torch import Tensor
 
-from nlfilter_torch.core.checks import check_count, check_patch_size, check_positive
+from nlfilter_torch.core.checks import check_count, check_patch_size, check_positive, check_values
 from nlfilter_torch.core.precision import per_image, squarable
 from nlfilter_torch.filtering.masks import segment
 from nlfilter_torch.filtering.scribbles import fit_strokes
 from nlfilter_torch.operator.columns import Columns
 from nlfilter_torch.operator.features import reduce_channels
-from nlfilter_torch.operator.options import OperatorOptions
+from nlfilter_torch.operator.options import FilterOptions
 from nlfilter_torch.operator.spectrum import Spectrum
 from nlfilter_torch.photo.declared.declaration import Edit
 from nlfilter_torch.photo.declared.parameters import COLORIZE
@@ -43,7 +43,7 @@ from nlfilter_torch.photo.picture.colour import (
 )
 from nlfilter_torch.photo.picture.drawn import Drawn, M
 from nlfilter_torch.photo.picture.edit import PhotoEdit, Rows
-from nlfilter_torch.photo.picture.in_memory import edit_image
+from nlfilter_torch.photo.picture.in_memory import edited
 from nlfilter_torch.photo.picture.pixels import part_of
 from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles, scribbled_blocks
 from nlfilter_torch.photo.picture.source import (
@@ -175,18 +175,7 @@ def colorize(
         >>> bool((colour[:, 2] > colour[:, 0])[..., :10].all()), bool((colour[:, 0] > colour[:, 2])[..., 14:].all())
         (True, True)
     """
-    edit = Colorize(
-        method=method,
-        strength=strength,
-        time=time,
-        photometric_bandwidth=photometric_bandwidth,
-        spatial_bandwidth=spatial_bandwidth,
-        patch_size=patch_size,
-        num_landmarks=num_landmarks,
-        viewing_size=viewing_size,
-        generator=generator,
-    )
-    return edit_image(edit, grey, Drawn({"stroke_mask": stroke_mask}, strokes), name="grey", channels=1)
+    return edited(Colorize, locals())
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -194,15 +183,11 @@ class Colorize(PhotoEdit):
     """The edit of :func:`colorize`."""
 
     declared: ClassVar[Edit] = COLORIZE
+    image_channels: ClassVar[int | None] = 1
     method: Method
     strength: float | Tensor
     time: float | Tensor = 1.0
-    photometric_bandwidth: float | Tensor
-    spatial_bandwidth: float | Tensor | None
-    patch_size: int
-    num_landmarks: int
     viewing_size: float
-    generator: torch.Generator | None = None
 
     def notes(self, rows: Rows) -> Iterator[str]:
         """Note that a photograph in colour loses its own colours."""
@@ -224,10 +209,11 @@ class Colorize(PhotoEdit):
             steps = (source.size[0] / small[0], source.size[1] / small[1])
             scribbles = blocks_of(scribbles, viewed, source.size, steps)
         ratio = viewed.measured(bandwidth_ratio)
-        distance = COLORIZE["spatial_bandwidth"].distance(self.spatial_bandwidth, small)
-        mean = per_image(cast(float | Tensor, distance), ratio, 1)  # not None, whose place a share of the size takes
+        options = self.filter_options(small, fewer_landmarks=True)
+        # Not None, whose place a share of the size takes, and a single one.
+        mean = per_image(cast(float | Tensor, options.spatial_bandwidth), ratio, 1)
         bandwidths = (mean / ratio.sqrt()).to(viewed.dtype), (mean * ratio.sqrt()).to(viewed.dtype)
-        operators = Operators(self, viewed, bandwidths)
+        operators = Operators(options, viewed, bandwidths)
         wanted = squarable(split_luminance(scribbles.shown.unsqueeze(2))[1]).squeeze(2)  # (B, 3, n)
         if self.method == "kmeans":
             return _coloured(source, viewed, self._segments(operators, scribbles, wanted))
@@ -243,11 +229,12 @@ class Colorize(PhotoEdit):
             )
         COLORIZE.check(source.batch, strength=self.strength)
         check_positive(self.time, "time", source.batch)
-        check_positive(self.photometric_bandwidth, "photometric_bandwidth", source.batch)
-        if self.spatial_bandwidth is not None:
-            check_positive(self.spatial_bandwidth, "spatial_bandwidth", source.batch)
-        check_patch_size(self.patch_size)
-        check_count(self.num_landmarks, "num_landmarks")
+        options = self.options
+        check_values(options.photometric_bandwidth, "photometric_bandwidth", "positive", source.batch)
+        if options.spatial_bandwidth is not None:
+            check_values(options.spatial_bandwidth, "spatial_bandwidth", "positive", source.batch)
+        check_patch_size(options.patch_size)
+        check_count(options.num_landmarks, "num_landmarks")
         COLORIZE.check(viewing_size=self.viewing_size)
 
     def _segments(self, operators: "Operators[M]", scribbles: Scribbles, wanted: Tensor) -> Planes:
@@ -263,12 +250,12 @@ class Operators(Generic[M]):
     """The operators of a picture for the stages of a regression.
 
     Attributes:
-        settings: of the edit.
+        options: of the filter, with the bandwidths of a stage whose factors are 1.
         viewed: the picture at the viewing size.
         bandwidths: vertical and horizontal bandwidth, (B,) each.
     """
 
-    settings: Colorize
+    options: FilterOptions
     viewed: Source[M]
     bandwidths: tuple[Tensor, Tensor]
 
@@ -279,15 +266,10 @@ class Operators(Generic[M]):
 
     def of(self, stage: Stage) -> Operator:
         """Build the operator of a stage."""
-        options = OperatorOptions(
-            photometric_bandwidth=stage.photometric * self.settings.photometric_bandwidth,
+        options = replace(
+            self.options,
+            photometric_bandwidth=stage.photometric * self.options.bandwidth_or(lambda: 1.0),
             spatial_bandwidth=(stage.spatial * self.bandwidths[0], stage.spatial * self.bandwidths[1]),
-            patch_size=self.settings.patch_size,
-            num_landmarks=min(self.settings.num_landmarks, self.pixels),
-            landmarks="kmeans",
-            completion="diagonal",
-            guide_channels="luminance",
-            generator=self.settings.generator,
         )
         return self.viewed.operator(Guide(options, colorize_guide, TEXTURE_MARGIN, 5, spectral=True))
 

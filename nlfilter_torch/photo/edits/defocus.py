@@ -14,7 +14,7 @@ from nlfilter_torch.operator.options import Completion, Sampling
 from nlfilter_torch.photo.declared.declaration import Edit
 from nlfilter_torch.photo.declared.parameters import DEFOCUS
 from nlfilter_torch.photo.picture.drawn import Drawn, M
-from nlfilter_torch.photo.picture.in_memory import edit_image
+from nlfilter_torch.photo.picture.in_memory import edited
 from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles
 from nlfilter_torch.photo.picture.source import Fitted, Source
 from nlfilter_torch.photo.selections.by_hand import ByHand, check_drawn
@@ -93,21 +93,7 @@ def defocus(
         >>> bool(blurred[..., :18].std() < image[..., :18].std() / 2)
         True
     """
-    edit = Defocus(
-        radius=radius,
-        aperture=aperture,
-        reach=reach,
-        extent=extent,
-        photometric_bandwidth=photometric_bandwidth,
-        spatial_bandwidth=spatial_bandwidth,
-        patch_size=patch_size,
-        num_landmarks=num_landmarks,
-        landmarks=landmarks,
-        completion=completion,
-        generator=generator,
-    )
-    masks = {"focus_region": focus_region, "background": background, "added": added, "removed": removed}
-    return edit_image(edit, image, Drawn.of(masks))
+    return edited(Defocus, locals())
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -21,7 +21,7 @@ from nlfilter_torch.nn.denoiser.network import NonlocalDenoiser, deviation_of, l
 from nlfilter_torch.nn.denoiser.noise import Noise, is_noise_map
 from nlfilter_torch.nn.denoiser.profile import NoiseProfile
 from nlfilter_torch.nn.denoiser.tiles import STEP
-from nlfilter_torch.operator.options import Completion, GuideChannels, Sampling
+from nlfilter_torch.operator.options import Completion, FilterOptions, GuideChannels, Sampling
 from nlfilter_torch.photo.declared.declaration import Edit
 from nlfilter_torch.photo.declared.parameters import DENOISE
 from nlfilter_torch.photo.edits.hot_pixels import HotPixels, hot_pixels_of
@@ -29,8 +29,8 @@ from nlfilter_torch.photo.edits.noise import noise_of, profile_of
 from nlfilter_torch.photo.edits.synthesis import remainder
 from nlfilter_torch.photo.picture.changes import change_in_parts
 from nlfilter_torch.photo.picture.drawn import Drawn, M
-from nlfilter_torch.photo.picture.edit import FilteredEdit, Rows
-from nlfilter_torch.photo.picture.in_memory import edit_image
+from nlfilter_torch.photo.picture.edit import PhotoEdit, Rows
+from nlfilter_torch.photo.picture.in_memory import edited
 from nlfilter_torch.photo.picture.pixels import whole_image
 from nlfilter_torch.photo.picture.seen import Seen, range_of
 from nlfilter_torch.photo.picture.source import Fitted, Guide, Operator, Pixels, Planes, Source
@@ -108,26 +108,11 @@ def denoise(
         >>> bool((denoise(noisy) - clean).std() < 0.03), bool((denoise(noisy, method="rule") - clean).std() < 0.06)
         (True, True)
     """
-    edit = Denoise(
-        noise_level=noise_level,
-        strength=strength,
-        brightness=brightness,
-        colour=colour,
-        method=method,
-        photometric_bandwidth=photometric_bandwidth,
-        spatial_bandwidth=spatial_bandwidth,
-        patch_size=patch_size,
-        num_landmarks=num_landmarks,
-        landmarks=landmarks,
-        completion=completion,
-        guide_channels=guide_channels,
-        generator=generator,
-    )
-    return edit_image(edit, image)
+    return edited(Denoise, locals())
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Denoise(FilteredEdit):
+class Denoise(PhotoEdit):
     """The edit of :func:`denoise`; ``noise_level`` may also be the estimated noise.
 
     ``hot_pixels`` are those of the picture, or None if they are not known.
@@ -135,13 +120,13 @@ class Denoise(FilteredEdit):
 
     declared: ClassVar[Edit] = DENOISE
     relative: ClassVar[bool] = True
+    filtering: ClassVar[FilterOptions] = FilterOptions(guide_channels="all")
     reports_change: ClassVar[bool] = True
     noise_level: float | Tensor | Noise | NoiseProfile | None
     strength: float | Tensor
     method: Method
     brightness: float | Tensor = DENOISE.defaults["brightness"]
     colour: float | Tensor = DENOISE.defaults["colour"]
-    guide_channels: GuideChannels = "all"
     working: WorkingRange | None = None
     hot_pixels: HotPixels | None = None
 
@@ -162,7 +147,7 @@ class Denoise(FilteredEdit):
         return replace(fitted.then(in_parts), repaired=repaired)
 
     def _fit(self, source: Source[M]) -> Fitted:
-        check_count(self.num_landmarks, "num_landmarks")
+        check_count(self.options.num_landmarks, "num_landmarks")
         is_map = is_noise_map(self.noise_level, source.size)
         if not isinstance(self.noise_level, (Noise, NoiseProfile)) and not is_map:
             DENOISE.check(source.batch, noise_level=self.noise_level)
@@ -191,7 +176,7 @@ class Denoise(FilteredEdit):
     def _fit_rule(self, source: Source[M], level: Tensor) -> Fitted:
         assumed, pixels = level.clamp(min=NEGLIGIBLE_NOISE), source.size[0] * source.size[1]
         options = self.filter_options(source.size, fewer_landmarks=True)
-        if self.photometric_bandwidth is None:
+        if self.options.photometric_bandwidth is None:
             options = replace(options, photometric_bandwidth=assumed)
         operator = source.operator(Guide(options, blur=GUIDE_BLUR))
         layers = operator.layers(whole_image, ORDER)  # (B, ORDER+1, C, H, W)

@@ -32,8 +32,8 @@ from nlfilter_torch.photo.picture.changes import (
     sum_of,
 )
 from nlfilter_torch.photo.picture.drawn import Drawn, M
-from nlfilter_torch.photo.picture.edit import FilteredEdit
-from nlfilter_torch.photo.picture.in_memory import edit_image
+from nlfilter_torch.photo.picture.edit import PhotoEdit
+from nlfilter_torch.photo.picture.in_memory import edited
 from nlfilter_torch.photo.picture.limits import Limits
 from nlfilter_torch.photo.picture.pixels import corner, whole_image
 from nlfilter_torch.photo.picture.resizing import enlarged
@@ -122,32 +122,11 @@ def enhance(
         >>> enhance(image, torch.tensor([3.0, 3.0, 4.0, 1.05]), region, num_landmarks=50).shape
         torch.Size([1, 3, 24, 24])
     """
-    edit = Detail(
-        alpha=alpha,
-        outside=outside,
-        residual=residual,
-        channels=channels,
-        reach=reach,
-        extent=extent,
-        mask_bandwidth=mask_bandwidth,
-        threshold=threshold,
-        limits=limits,
-        viewing_size=viewing_size,
-        photometric_bandwidth=photometric_bandwidth,
-        spatial_bandwidth=spatial_bandwidth,
-        patch_size=patch_size,
-        num_landmarks=num_landmarks,
-        landmarks=landmarks,
-        completion=completion,
-        guide_channels=guide_channels,
-        generator=generator,
-    )
-    masks = {"regions": regions, "negative": negative, "added": added, "removed": removed}
-    return edit_image(edit, image, Drawn.of(masks))
+    return edited(Detail, locals())
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Detail(FilteredEdit):
+class Detail(PhotoEdit):
     """The edit of :func:`enhance`."""
 
     alpha: Tensor
@@ -165,21 +144,20 @@ class Detail(FilteredEdit):
 
     @classmethod
     def of(cls, arguments: Arguments) -> Self:
-        """Create the edit from :meth:`Step.arguments`."""
-        return cls(**{**arguments, "alpha": torch.as_tensor(arguments["alpha"])})
+        """Create the edit; a step has its sliders as a tuple."""
+        alpha = arguments["alpha"]
+        return super().of({**arguments, "alpha": torch.tensor(alpha) if isinstance(alpha, tuple) else alpha})
 
     def selection(self) -> RegionMask:
         """The masks of the regions; with a generator, both filters draw from the same state."""
-        generator = self.generator
-        return RegionMask(
-            reach=self.reach,
-            extent=self.extent,
+        generator = self.options.generator
+        options = replace(
+            RegionMask.filtering,
             photometric_bandwidth=self.mask_bandwidth,
-            spatial_bandwidth=None,
-            num_landmarks=min(self.num_landmarks, MASK.defaults["num_landmarks"]),
+            num_landmarks=min(self.options.num_landmarks, MASK.defaults["num_landmarks"]),
             generator=generator.clone_state() if isinstance(generator, torch.Generator) else None,
-            names=("regions", "negative"),
         )
+        return RegionMask(reach=self.reach, extent=self.extent, options=options, names=("regions", "negative"))
 
     def fit(self, source: Source[M], drawn: Drawn[M]) -> Fitted:
         """Fit the change of detail of a picture, or of its regions."""
@@ -195,7 +173,7 @@ class Detail(FilteredEdit):
     def _check(self, batch: int, masks: Mapping[str, object], alpha: Tensor, outside: Tensor | None) -> None:
         """Raise an error for an invalid setting."""
         check_alpha(alpha)
-        check_count(self.num_landmarks, "num_landmarks")
+        check_count(self.options.num_landmarks, "num_landmarks")
         DETAIL.check(batch, channels=self.channels, limits=self.limits, viewing_size=self.viewing_size)
         DETAIL.check(batch, threshold=self.threshold, residual=self.residual)
         marked = "regions" in masks or "added" in masks

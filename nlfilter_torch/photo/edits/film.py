@@ -18,9 +18,8 @@ from torch import Tensor
 from nlfilter_torch.core.blocks import stratified
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.operator.build import operator_from_points
-from nlfilter_torch.operator.features import GuideFeatures, estimate_bandwidth, reduce_channels, unit_window
-from nlfilter_torch.operator.landmarks import assign_landmarks
-from nlfilter_torch.operator.options import Construction
+from nlfilter_torch.operator.features import GuideFeatures, estimate_bandwidth, reduce_channels
+from nlfilter_torch.operator.held import landmarks_by
 from nlfilter_torch.operator.scaling import PixelScaling
 from nlfilter_torch.operator.spectrum import RitzPairs
 from nlfilter_torch.photo.declared.rows import RowSource
@@ -196,16 +195,10 @@ def learn_filter(pictures: Sequence[Picture], guide: Guide) -> LearntFilter:
     The coordinates of a pixel are relative to its own picture. The weights of the pixels of all pictures sum to the
     number of pixels of a single picture.
     """
-    options = dict(vars(guide.options))
-    channels, bandwidth = options.pop("guide_channels", "luminance"), options.pop("photometric_bandwidth", "auto")
-    window = unit_window(options.pop("patch_size", 5), None).to(pictures[0].dtype)
-    spatial, generator = options.pop("spatial_bandwidth", None), options.pop("generator", None)
-    generator = seeded() if generator is None else generator
-    if isinstance(bandwidth, str):
-        guides = (reduce_channels(guide(whole(picture)), channels) for picture in pictures)
-        bandwidth = average([estimate_bandwidth(compared, guide_channels=channels) for compared in guides])
-    del options["patch_weights"]  # which no edit sets
-    recipe = GuideFeatures(window, bandwidth, spatial, channels)
+    options = guide.options
+    generator = seeded() if options.generator is None else options.generator
+    bandwidth = options.bandwidth_or(lambda: average([_bandwidth_of(picture, guide) for picture in pictures]))
+    recipe = GuideFeatures.of(options, bandwidth, pictures[0].dtype)
     count = min(pictures[0].pixels, max(1, REFERENCE_PIXELS // len(pictures)))
     drawn = torch.Generator().manual_seed(generator.initial_seed() % (1 << 63))
     features, images = [], []
@@ -216,19 +209,23 @@ def learn_filter(pictures: Sequence[Picture], guide: Guide) -> LearntFilter:
         images.append(image.flatten(2)[:, :, places])
     points, colours = torch.cat(features, dim=2), torch.cat(images, dim=2)
     weights = torch.full((1, points.shape[2]), pictures[0].pixels / points.shape[2], dtype=points.dtype)
-    options["num_landmarks"] = min(options.get("num_landmarks", 100), points.shape[2])
-    if len(pictures) == 1 and count == pictures[0].pixels and options["landmarks"] == "kmeans":  # as for any picture
-        options["landmarks"], _ = assign_landmarks(
-            points, pictures[0].size, options["num_landmarks"], "kmeans", generator, layout=recipe.layout
-        )
-    method = Construction(generator=generator, **options)
-    built = operator_from_points(points, (points.shape[2],), method, weights[0])
+    options = replace(options, num_landmarks=min(options.num_landmarks, points.shape[2]), generator=generator)
+    if len(pictures) == 1 and count == pictures[0].pixels and options.landmarks == "kmeans":  # as for any picture
+        chosen, _ = landmarks_by(options, points, pictures[0].size, options.num_landmarks, layout=recipe.layout)
+        options = replace(options, landmarks=chosen)
+    built = operator_from_points(points, (points.shape[2],), options, weights[0])
     pixels = (built.factor, built.diagonal, colours, weights)
     cuts = zip(*(part.split(CHUNK, dim=-1) for part in pixels), strict=True)
     blocks = [Block(factor, diagonal, image, weight) for factor, diagonal, image, weight in cuts]
     empty = Block(built.factor[..., :0], built.diagonal[..., :0], colours[..., :0], weights[..., :0])
     kernel = replace(built.kernel, features=recipe)
     return LearntFilter(Pilot(kernel, empty, built.balancing.moment, 0), built.balancing, blocks)
+
+
+def _bandwidth_of(picture: Picture, guide: Guide) -> Tensor:
+    """The photometric bandwidth for a picture."""
+    compared = reduce_channels(guide(whole(picture)), guide.options.guide_channels)
+    return estimate_bandwidth(compared, guide_channels=guide.options.guide_channels)
 
 
 def whole(picture: Picture) -> Tensor:

@@ -13,7 +13,7 @@ from nlfilter_torch.core.precision import working_dtype
 from nlfilter_torch.filtering.fitted import FittedFilter, fit_filter
 from nlfilter_torch.operator.build import operator_from_guide
 from nlfilter_torch.operator.features import reduce_channels
-from nlfilter_torch.operator.options import Completion, OperatorOptions, Sampling, SpatialBandwidth
+from nlfilter_torch.operator.options import Completion, FilterOptions, Sampling, SpatialBandwidth
 from nlfilter_torch.photo.declared.parameters import DETAIL
 from nlfilter_torch.photo.edits.detail import Channels
 from nlfilter_torch.photo.picture.changes import activity, limit_by_activity, split_sliders
@@ -77,6 +77,7 @@ def filter_frames(
         >>> [frame.shape for frame in edited]
         [torch.Size([1, 3, 16, 20]), torch.Size([1, 3, 16, 20]), torch.Size([1, 3, 16, 20])]
     """
+    options = FilterOptions.of(locals())
     check_alpha(alpha, dimensions=(1,))
     DETAIL.check(channels=channels)
     if not isinstance(frames, Iterable) or (isinstance(frames, Tensor) and frames.ndim == 0):
@@ -85,7 +86,7 @@ def filter_frames(
         )
     if residual is not None:
         check_values(residual, "residual", "finite")
-    _check_references(references, spatial_bandwidth)
+    _check_references(references, options)
     DETAIL.check(limits=limits, threshold=threshold, viewing_size=viewing_size)
     # References are stacked vertically to one image, at the cost of a few patches across the seams.
     viewed = viewed_size((references[0].shape[-2], references[0].shape[-1]), viewing_size)
@@ -93,15 +94,6 @@ def filter_frames(
     working = range_of(InMemory(stacked))
     stacked = stacked if working is None else working.seen(stacked)
     grey = reduce_channels(stacked, "luminance")
-    options = OperatorOptions(
-        photometric_bandwidth=photometric_bandwidth,
-        spatial_bandwidth=spatial_bandwidth,
-        patch_size=patch_size,
-        num_landmarks=num_landmarks,
-        landmarks=landmarks,
-        completion=completion,
-        generator=generator,
-    )
     operator = operator_from_guide(grey, options)
     fitted = fit_filter(operator, stacked if channels == "all" else grey, order=alpha.shape[-1] - 1)
     planes = whole_image if channels == "all" else luminance
@@ -110,13 +102,13 @@ def filter_frames(
     return map(edit, frames)
 
 
-def _check_references(references: Sequence[Tensor], spatial_bandwidth: SpatialBandwidth | None) -> None:
+def _check_references(references: Sequence[Tensor], options: FilterOptions) -> None:
     """Raise unless these are frames to which a filter can be fitted."""
     if not isinstance(references, Sequence):
         raise TypeError(f"references must be a list of frames, got {type(references).__name__}; wrap it in a list")
     if len(references) == 0:
         raise ValueError("references must hold at least one frame, got none; pass the first of the film")
-    if len(references) > 1 and spatial_bandwidth is not None:
+    if len(references) > 1 and options.spatial_bandwidth is not None:
         raise ValueError(
             f"references must hold a single frame if spatial_bandwidth is given, got {len(references)}; "
             "pass one frame, or no spatial_bandwidth"

@@ -25,8 +25,8 @@ from nlfilter_torch.photo.looks.look_filter import (
     texture_change,
 )
 from nlfilter_torch.photo.picture.drawn import Drawn, M
-from nlfilter_torch.photo.picture.edit import FilteredEdit, Rows
-from nlfilter_torch.photo.picture.in_memory import edit_image
+from nlfilter_torch.photo.picture.edit import PhotoEdit, Rows
+from nlfilter_torch.photo.picture.in_memory import edit_image, edited
 from nlfilter_torch.photo.picture.pixels import corner, whole_image
 from nlfilter_torch.photo.picture.source import Fitted, Guide, Pixels, Planes, Source, luminance
 from nlfilter_torch.photo.picture.viewing import fit_change
@@ -108,34 +108,11 @@ def apply_look(
         >>> apply_look(image, matrix=sepia).shape
         torch.Size([1, 3, 24, 24])
     """
-    edit = LookEdit(
-        alpha=alpha,
-        bands=bands,
-        texture=texture,
-        red=red,
-        green=green,
-        blue=blue,
-        matrix=matrix,
-        saturation=saturation,
-        stretch=stretch,
-        local=local,
-        lattice=lattice,
-        amount=amount,
-        viewing_size=viewing_size,
-        photometric_bandwidth=photometric_bandwidth,
-        spatial_bandwidth=spatial_bandwidth,
-        patch_size=patch_size,
-        num_landmarks=num_landmarks,
-        landmarks=landmarks,
-        completion=completion,
-        guide_channels=guide_channels,
-        generator=generator,
-    )
-    return edit_image(edit, image)
+    return edited(LookEdit, locals())
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class LookEdit(FilteredEdit):
+class LookEdit(PhotoEdit):
     """The edit of :func:`apply_look`."""
 
     declared: ClassVar[Edit] = LOOK

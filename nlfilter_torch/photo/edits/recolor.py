@@ -16,7 +16,7 @@ from nlfilter_torch.photo.declared.parameters import RECOLOR
 from nlfilter_torch.photo.looks.look_filter import acts
 from nlfilter_torch.photo.picture.colour import dot, merge_luminance, split_luminance
 from nlfilter_torch.photo.picture.drawn import Drawn, M
-from nlfilter_torch.photo.picture.in_memory import edit_image
+from nlfilter_torch.photo.picture.in_memory import edited
 from nlfilter_torch.photo.picture.pixels import whole_image
 from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles
 from nlfilter_torch.photo.picture.source import Fitted, Pixels, Source
@@ -101,22 +101,9 @@ def recolor(
         >>> torch.equal(blue[..., :8], image[..., :8]), bool((blue[:, 2] > blue[:, 0])[..., 14:].all())
         (True, True)
     """
-    edit = Recolor(
-        brightness=brightness,
-        reach=reach,
-        extent=extent,
-        photometric_bandwidth=photometric_bandwidth,
-        spatial_bandwidth=spatial_bandwidth,
-        patch_size=patch_size,
-        num_landmarks=num_landmarks,
-        landmarks=landmarks,
-        completion=completion,
-        generator=generator,
-    )
     if added is not None:
         check_image(added, "added", channels=4)
-    masks = {"stroke_mask": stroke_mask, "keep": keep, "added": added, "removed": removed}
-    return edit_image(edit, image, Drawn.of(masks, strokes), channels=3)
+    return edited(Recolor, locals())
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -124,6 +111,7 @@ class Recolor(ObjectEdit):
     """The edit of :func:`recolor`."""
 
     declared: ClassVar[Edit] = RECOLOR
+    image_channels: ClassVar[int | None] = 3
     brightness: float | Tensor = RECOLOR.defaults["brightness"]
 
     def check_channels(self, channels: int) -> None:

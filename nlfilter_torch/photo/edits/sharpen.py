@@ -17,8 +17,8 @@ from nlfilter_torch.photo.declared.parameters import SHARPEN
 from nlfilter_torch.photo.edits.noise import noise_of
 from nlfilter_torch.photo.picture.changes import VARIANCE_SIGMA, activity
 from nlfilter_torch.photo.picture.drawn import Drawn, M
-from nlfilter_torch.photo.picture.edit import FilteredEdit
-from nlfilter_torch.photo.picture.in_memory import edit_image
+from nlfilter_torch.photo.picture.edit import PhotoEdit
+from nlfilter_torch.photo.picture.in_memory import edited
 from nlfilter_torch.photo.picture.limits import Limits
 from nlfilter_torch.photo.picture.source import Fitted, Guide, Pixels, Planes, Source, luminance
 from nlfilter_torch.photo.picture.viewing import fit_change
@@ -81,24 +81,11 @@ def sharpen(
         >>> sharp.shape, bool(sharp.std() > image.std())
         (torch.Size([1, 3, 32, 32]), True)
     """
-    edit = Sharpen(
-        amount=amount,
-        guide_blur=guide_blur,
-        limits=limits,
-        viewing_size=viewing_size,
-        photometric_bandwidth=photometric_bandwidth,
-        spatial_bandwidth=spatial_bandwidth,
-        patch_size=patch_size,
-        num_landmarks=num_landmarks,
-        landmarks=landmarks,
-        completion=completion,
-        generator=generator,
-    )
-    return edit_image(edit, image)
+    return edited(Sharpen, locals())
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Sharpen(FilteredEdit):
+class Sharpen(PhotoEdit):
     """The edit of :func:`sharpen`."""
 
     declared: ClassVar[Edit] = SHARPEN

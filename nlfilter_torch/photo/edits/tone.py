@@ -13,8 +13,8 @@ from nlfilter_torch.photo.declared.declaration import Edit
 from nlfilter_torch.photo.declared.parameters import TONE
 from nlfilter_torch.photo.edits.synthesis import Polynomial
 from nlfilter_torch.photo.picture.drawn import Drawn, M
-from nlfilter_torch.photo.picture.edit import FilteredEdit
-from nlfilter_torch.photo.picture.in_memory import edit_image
+from nlfilter_torch.photo.picture.edit import PhotoEdit
+from nlfilter_torch.photo.picture.in_memory import edited
 from nlfilter_torch.photo.picture.limits import Limits
 from nlfilter_torch.photo.picture.source import Fitted, Guide, Pixels, Source, luminance
 from nlfilter_torch.photo.picture.viewing import fit_change
@@ -75,26 +75,11 @@ def adjust_tone(
         >>> bool((strong.mean((2, 3)) - image.mean((2, 3))).abs().max() < 1e-5), bool(strong.std() > image.std())
         (True, True)
     """
-    edit = Tone(
-        contrast=contrast,
-        clarity=clarity,
-        order=order,
-        limits=limits,
-        viewing_size=viewing_size,
-        photometric_bandwidth=photometric_bandwidth,
-        spatial_bandwidth=spatial_bandwidth,
-        patch_size=patch_size,
-        num_landmarks=num_landmarks,
-        landmarks=landmarks,
-        completion=completion,
-        guide_channels=guide_channels,
-        generator=generator,
-    )
-    return edit_image(edit, image)
+    return edited(Tone, locals())
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Tone(FilteredEdit):
+class Tone(PhotoEdit):
     """The edit of :func:`adjust_tone`."""
 
     declared: ClassVar[Edit] = TONE
@@ -108,7 +93,7 @@ class Tone(FilteredEdit):
     def fit(self, source: Source[M], drawn: Drawn[M]) -> Fitted:
         """Fit the change of contrast of a picture."""
         check_order(self.order)
-        check_count(self.num_landmarks, "num_landmarks")
+        check_count(self.options.num_landmarks, "num_landmarks")
         TONE.check(source.batch, contrast=self.contrast, limits=self.limits, viewing_size=self.viewing_size)
         TONE.check(source.batch, clarity=self.clarity)
         return fit_change(source, self._change, luminance, self.viewing_size, self.limits)

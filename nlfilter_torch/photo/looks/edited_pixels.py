@@ -1,6 +1,7 @@
 """Pairs of photographs before and after an edit, and their pixels with what each part of a look changes of them."""
 
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from functools import cached_property
 
 import torch
@@ -12,7 +13,7 @@ from nlfilter_torch.filtering.filters import detail_layers
 from nlfilter_torch.filtering.fit import HALF_LEVEL, OFF_LEVEL
 from nlfilter_torch.operator.build import operator_from_guide, sampled_operator
 from nlfilter_torch.operator.features import reduce_channels
-from nlfilter_torch.operator.options import OperatorOptions
+from nlfilter_torch.operator.options import FilterOptions
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.looks.alignment import inside_frame
 from nlfilter_torch.photo.looks.histogram import LocalCurves
@@ -67,8 +68,8 @@ class EditedPhotograph:
         self.image, self.order = before[None], order
         self.before, self.after = before.flatten(1), after.flatten(1)
         self.free, self.inside, self.masks = free.flatten(1), inside.flatten(), masks
-        self.options = step.filter_options(self.size)
         self.generator = generator or seeded()
+        self.options = FilterOptions(**step.filter_options(self.size), generator=self.generator)
 
     @cached_property
     def luminance(self) -> Tensor:
@@ -94,7 +95,7 @@ class EditedPhotograph:
     @cached_property
     def layers(self) -> Tensor:
         """Detail layers of luminance before the edit, (k+1, N)."""
-        operator = operator_from_guide(self.luminance, OperatorOptions(**self.options, generator=self.generator))
+        operator = operator_from_guide(self.luminance, self.options)
         return detail_layers(operator, self.luminance, order=self.order)[0, :, 0].flatten(1)
 
     def regions(self) -> list[PixelSample]:
@@ -111,8 +112,9 @@ class EditedPhotograph:
         if count <= SAMPLED or self.masks is not None or float(self.free.amax(0).mean()) < 0.5:
             return None
         places = sample(torch.ones_like(self.free[0]))
-        generator = self.generator.clone_state()  # the landmarks are those of :attr:`layers`
-        operator = sampled_operator(self.luminance, places, **self.options, generator=generator)
+        # The landmarks are those of :attr:`layers`.
+        options = replace(self.options, generator=self.generator.clone_state())
+        operator = sampled_operator(self.luminance, places, options)
         luminance = self.luminance.flatten(2)[:, :, None, places]
         layers = detail_layers(operator, luminance, order=self.order)[0, :, 0].flatten(1)
         inside = self.inside[places] > 0

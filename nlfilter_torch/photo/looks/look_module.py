@@ -20,8 +20,8 @@ from nlfilter_torch.operator.options import (
     AUTO,
     SAMPLING,
     Completion,
+    FilterOptions,
     GuideChannels,
-    OperatorOptions,
     Sampling,
     SpatialBandwidth,
 )
@@ -80,18 +80,19 @@ class Look(nn.Module):
         *,
         learn: LookPart | Collection[LookPart] = LOOK_PARTS,
         knots: int = 17,
-        patch_size: int = OperatorOptions.patch_size,
+        patch_size: int = FilterOptions.patch_size,
         photometric_bandwidth: float | Tensor | Literal["auto"] = LEVELS / 255,
         spatial_bandwidth: SpatialBandwidth | Literal["auto"] | None = AUTO,
         num_landmarks: int = LANDMARKS,
         landmarks: Sampling = SAMPLING,
-        completion: Completion = OperatorOptions.completion,
-        guide_channels: GuideChannels = OperatorOptions.guide_channels,
-        patch_weights: Tensor | None = OperatorOptions.patch_weights,
-        tolerance: float | None = OperatorOptions.tolerance,
-        generator: torch.Generator | None = OperatorOptions.generator,
-        group: object = OperatorOptions.group,
+        completion: Completion = FilterOptions.completion,
+        guide_channels: GuideChannels = FilterOptions.guide_channels,
+        patch_weights: Tensor | None = FilterOptions.patch_weights,
+        tolerance: float | None = FilterOptions.tolerance,
+        generator: torch.Generator | None = FilterOptions.generator,
+        group: object = FilterOptions.group,
     ) -> None:
+        arguments = locals()
         super().__init__()
         names = check_learn(learn, LOOK_PARTS)
         initial = {} if parts is None else dict(parts)
@@ -117,19 +118,7 @@ class Look(nn.Module):
                 self.register_buffer(name, own)
         if isinstance(spatial_bandwidth, str):
             check_choice(spatial_bandwidth, "spatial_bandwidth", (AUTO,), "pass it, a number of pixels or None")
-        self.spatial_bandwidth = spatial_bandwidth
-        self.options = OperatorOptions(
-            patch_size=patch_size,
-            photometric_bandwidth=photometric_bandwidth,
-            num_landmarks=num_landmarks,
-            landmarks=landmarks,
-            completion=completion,
-            guide_channels=guide_channels,
-            patch_weights=patch_weights,
-            tolerance=tolerance,
-            generator=generator,
-            group=group,
-        )
+        self.options = FilterOptions.of(arguments)
 
     def forward(
         self,
@@ -175,9 +164,8 @@ class Look(nn.Module):
         detail = None if operator is None else partial(polynomial_filter, operator)
         return in_format_of(filter_look(exact, parts, detail), image)
 
-    def _options(self, image: Tensor) -> OperatorOptions:
+    def _options(self, image: Tensor) -> FilterOptions:
         """Options of the filter for an image (B, 3, H, W)."""
-        bandwidth = self.spatial_bandwidth
-        if isinstance(bandwidth, str):
-            bandwidth = NEAR * min(image.shape[-2:])
-        return replace(self.options, spatial_bandwidth=bandwidth)
+        if not isinstance(self.options.spatial_bandwidth, str):
+            return self.options
+        return replace(self.options, spatial_bandwidth=NEAR * min(image.shape[-2:]))

@@ -3,13 +3,12 @@
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from typing import ClassVar, Literal, Self, cast
+from dataclasses import dataclass, fields, replace
+from typing import ClassVar, Self
 
-import torch
 from torch import Tensor
 
-from nlfilter_torch.operator.options import Completion, GuideChannels, OperatorOptions, Sampling
+from nlfilter_torch.operator.options import FilterOptions
 from nlfilter_torch.photo.declared.declaration import Arguments, Edit, ScribbleRole
 from nlfilter_torch.photo.picture.drawn import Drawn, M
 from nlfilter_torch.photo.picture.pixels import Fitted
@@ -44,24 +43,41 @@ class Rows:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PhotoEdit(ABC):
-    """An edit with its settings; the fields are arguments of its function.
+    """An edit with its settings; the fields are arguments of its function, and the options of its filter.
 
     Attributes:
+        options: of the filter, as the function takes them; see :meth:`filter_options`.
         declared: its name, parameters and scribbles.
         reports_change: whether the command reports how much it changed the pixels, see :meth:`summary`.
         relative: whether the edit sees a picture relative to the range that it uses, see :class:`WorkingRange`.
         gives_picture: whether the result is an edited picture; otherwise it is a mask.
+        image_channels: number of channels that an image must have for the function of the edit; None is any.
+        filtering: options of the filter that are not parameters of the edit, and differ from the usual ones.
     """
 
+    options: FilterOptions
     declared: ClassVar[Edit]
     reports_change: ClassVar[bool] = False
     relative: ClassVar[bool] = False
     gives_picture: ClassVar[bool] = True
+    image_channels: ClassVar[int | None] = None
+    filtering: ClassVar[FilterOptions] = FilterOptions()
 
     @classmethod
     def of(cls, arguments: Arguments) -> Self:
-        """Create the edit from :meth:`Step.arguments`, which were read from options or JSON."""
-        return cls(**arguments)
+        """Create the edit from arguments of its function: its ``locals()``, or :meth:`Step.arguments`."""
+        own = {setting.name: arguments[setting.name] for setting in fields(cls) if setting.name in arguments}
+        return cls(options=cls.filtering.updated(arguments), **own)
+
+    def filter_options(self, size: tuple[int, int], *, fewer_landmarks: bool = False) -> FilterOptions:
+        """Options of the filter of a picture (H, W), at which distances in shares of the picture are known.
+
+        With ``fewer_landmarks``, a picture with fewer pixels than landmarks has as many landmarks as pixels; without,
+        there is a warning when the operator is built.
+        """
+        count = min(self.options.num_landmarks, math.prod(size)) if fewer_landmarks else self.options.num_landmarks
+        distance = self.declared["spatial_bandwidth"].distance(self.options.spatial_bandwidth, size)
+        return replace(self.options, spatial_bandwidth=distance, num_landmarks=count)
 
     @abstractmethod
     def fit(self, source: Source[M], drawn: Drawn[M]) -> Fitted:
@@ -106,35 +122,3 @@ class PhotoEdit(ABC):
         """The scribbles under the names that :meth:`selection` takes."""
         scribbles = [scribble for scribble in self.declared.scribbles if scribble.argument in drawn.masks]
         return Drawn({MARKS[scribble.role]: drawn.masks[scribble.argument] for scribble in scribbles})
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class FilteredEdit(PhotoEdit):
-    """An edit with a filter; the fields are options of :func:`nonlocal_operator`."""
-
-    photometric_bandwidth: float | Tensor | str | None
-    spatial_bandwidth: float | Tensor | str | None
-    patch_size: int
-    num_landmarks: int
-    landmarks: Sampling = "kmeans"
-    completion: Completion = "diagonal"
-    guide_channels: GuideChannels = "luminance"
-    generator: torch.Generator | None = None
-
-    def filter_options(self, size: tuple[int, int], *, fewer_landmarks: bool = False) -> OperatorOptions:
-        """Options of the filter of a picture (H, W).
-
-        With ``fewer_landmarks``, a picture with fewer pixels than landmarks has as many landmarks as pixels; without,
-        there is a warning when the operator is built.
-        """
-        return OperatorOptions(
-            # Other words than "auto", and None, are refused when the operator is built.
-            photometric_bandwidth=cast(float | Tensor | Literal["auto"], self.photometric_bandwidth),
-            spatial_bandwidth=self.declared["spatial_bandwidth"].distance(self.spatial_bandwidth, size),
-            patch_size=self.patch_size,
-            num_landmarks=min(self.num_landmarks, math.prod(size)) if fewer_landmarks else self.num_landmarks,
-            landmarks=self.landmarks,
-            completion=self.completion,
-            guide_channels=self.guide_channels,
-            generator=self.generator,
-        )

@@ -21,6 +21,7 @@ from nlfilter_torch.operator.hidden import fill_nearby
 from nlfilter_torch.operator.operator import NonlocalOperator
 from nlfilter_torch.operator.pixel_matrix import PixelMatrix
 from nlfilter_torch.operator.spectrum import RitzPairs, Spectrum
+from nlfilter_torch.photo.declared.declaration import Arguments
 from nlfilter_torch.photo.picture.drawn import Drawn, M
 from nlfilter_torch.photo.picture.edit import PhotoEdit
 from nlfilter_torch.photo.picture.ends import ends_of, mean_of, usable
@@ -331,6 +332,22 @@ def fit_edit(edit: PhotoEdit, source: Source[M], drawn: Drawn[M], *, working: Wo
         return edit.fit(source, drawn)
     fitted = of_picture(edit.in_range(working).fit(Seen(source, working), drawn), working)
     return in_own_units(fitted, working) if edit.gives_picture else fitted
+
+
+def edited(edit: type[PhotoEdit], arguments: Arguments) -> Tensor:
+    """The result of an edit's function: the image, which is the first of its arguments, edited.
+
+    Every argument is named in the signature of the function alone; here they become the settings of the edit, the
+    options of its filter and its scribbles.
+
+    Args:
+        edit: the edit.
+        arguments: of its function: ``locals()`` before it has other variables.
+    """
+    name, image = next(iter(arguments.items()))
+    masks = {scribble.argument: arguments[scribble.argument] for scribble in edit.declared.scribbles}
+    drawn = Drawn.of(masks, arguments.get("strokes"))
+    return edit_image(edit.of(arguments), image, drawn, name=name, channels=edit.image_channels)
 
 
 @full_precision

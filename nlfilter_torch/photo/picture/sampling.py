@@ -8,14 +8,12 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Literal
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from nlfilter_torch.core.blocks import stratified
-from nlfilter_torch.core.checks import check_choice
 from nlfilter_torch.core.workers import in_order, single_threaded
 from nlfilter_torch.operator.assignment import Layout
 from nlfilter_torch.operator.columns import Columns
@@ -26,13 +24,12 @@ from nlfilter_torch.operator.features import (
     gradients_within,
     pad_border,
     reduce_channels,
-    unit_window,
 )
 from nlfilter_torch.operator.landmarks import candidate_pixels, condense
 from nlfilter_torch.operator.nystrom import inverse_cholesky
 from nlfilter_torch.operator.operator import Kernel
-from nlfilter_torch.operator.option_checks import check_bandwidths, check_construction, landmark_count
-from nlfilter_torch.operator.options import Completion, Construction, GuideChannels, Sampling, SpatialBandwidth
+from nlfilter_torch.operator.option_checks import check_bandwidths, check_options, landmark_count
+from nlfilter_torch.operator.options import FilterOptions, GuideChannels, Sampling
 from nlfilter_torch.operator.orientation import (
     ORIENTATIONS,
     Orientation,
@@ -270,49 +267,32 @@ class PatchReader:
         return float((slopes.double().mean((0, 1)) * weights[0, 0]).sum())
 
 
-def take_pilot(
-    picture: GuidePicture,
-    report: Report,
-    workers: int = 1,
-    *,
-    patch_size: int = 5,
-    photometric_bandwidth: float | Literal["auto"] = "auto",
-    spatial_bandwidth: SpatialBandwidth | None = None,
-    num_landmarks: int = 100,
-    landmarks: Sampling = "kmeans",
-    completion: Completion = "diagonal",
-    guide_channels: GuideChannels = "luminance",
-    generator: torch.Generator | None = None,
-) -> Pilot:
+def take_pilot(picture: GuidePicture, report: Report, workers: int = 1) -> Pilot:
     """Compute bandwidth, landmarks and an initial balancing in one pass over the picture.
 
     Bandwidth and landmarks are those of :func:`nonlocal_operator`, to rounding.
     """
-    check_choice(guide_channels, "guide_channels", ("luminance", "all"))
-    method = Construction(num_landmarks=num_landmarks, landmarks=landmarks, completion=completion, generator=generator)
-    check_construction(method)
-    window = unit_window(patch_size, None).to(picture.dtype)
-    check_bandwidths(photometric_bandwidth, spatial_bandwidth)
-    count = landmark_count(method, picture.pixels)
+    options = picture.guide.options
+    check_options(options)
+    check_bandwidths(options)
+    recipe = GuideFeatures.of(options, options.bandwidth_or(lambda: 1.0), picture.dtype)
+    count = landmark_count(options, picture.pixels)
     if picture.counted is not None:
         count = min(count, picture.counted.count)
 
-    generator = torch.Generator().manual_seed(0) if generator is None else generator
-    reader = PatchReader(picture, patch_size, guide_channels, isinstance(photometric_bandwidth, str))
-    recipe = GuideFeatures(window, 1.0, spatial_bandwidth, guide_channels)
-    recipe = (
-        recipe
-        if isinstance(photometric_bandwidth, str)
-        else replace(recipe, photometric_bandwidth=photometric_bandwidth)
+    generator = torch.Generator().manual_seed(0) if options.generator is None else options.generator
+    reader = PatchReader(
+        picture, options.patch_size, options.guide_channels, isinstance(options.photometric_bandwidth, str)
     )
-    look = Look(reader, recipe, replace(method, num_landmarks=count, generator=generator), report, workers)
+    options = replace(options, num_landmarks=count, generator=generator)
+    look = Look(reader, recipe, options, report, workers)
     sample = look.at_all() if picture.counted is None else look.at_counted(picture.counted)
     with single_threaded(workers):  # so few pixels that a second thread would wait most of the time
         points = condense(sample.subset, count, generator, sample.canonical)
-        kernel = Kernel(points, inverse_cholesky(points), completion, features=sample.recipe)
+        kernel = Kernel(points, inverse_cholesky(points), options.completion, features=sample.recipe)
         columns = kernel.factor(sample.features)
         balancing = sinkhorn_balance(
-            *columns, tolerance=PILOT_TOLERANCE, completed=completion == "diagonal", weights=sample.weights
+            *columns, tolerance=PILOT_TOLERANCE, completed=options.completion == "diagonal", weights=sample.weights
         )
         return Pilot(kernel, Block(*columns, sample.image, sample.weights), balancing.moment, sample.seed)
 
@@ -347,14 +327,14 @@ class Look:
     Attributes:
         reader: reads patches of its guide, and measures the gradient if the photometric bandwidth is automatic.
         recipe: of the features, with the photometric bandwidth unless that is automatic.
-        method: of choosing landmarks, with their number.
+        options: of choosing landmarks, with their number.
         report: called with the progress.
         workers: number of tiles looked at at once.
     """
 
     reader: PatchReader
     recipe: GuideFeatures
-    method: Construction
+    options: FilterOptions
     report: Report
     workers: int
 
@@ -365,7 +345,7 @@ class Look:
 
     def at_all(self) -> PilotSample:
         """The sample of a picture all of whose pixels count, in one pass."""
-        picture, count, generator = self.picture, self.method.num_landmarks, self._generator
+        picture, count, generator = self.picture, self.options.num_landmarks, self._generator
         drawn = candidate_pixels(picture.size, count, self._sampling, generator).cpu()
         rest = torch.Generator().manual_seed(int(drawn.sum()) % 2**32)  # ``generator`` is for the landmarks alone
         even = stratified(picture.pixels, min(PILOT, picture.pixels), rest)
@@ -395,7 +375,7 @@ class Look:
 
     def at_counted(self, counted: CountedPixels) -> PilotSample:
         """The sample of the pixels of a picture that count, in two passes, of which the second reads candidates."""
-        picture, count, generator = self.picture, self.method.num_landmarks, self._generator
+        picture, count, generator = self.picture, self.options.num_landmarks, self._generator
         rest = torch.Generator().manual_seed(generator.initial_seed() % 2**32)
         wanted = min(picture.pixels, math.ceil(PILOT * picture.pixels / counted.count))
         spread = stratified(picture.pixels, wanted, rest)
@@ -424,13 +404,13 @@ class Look:
 
     @property
     def _generator(self) -> torch.Generator:
-        assert self.method.generator is not None  # for mypy
-        return self.method.generator
+        assert self.options.generator is not None  # for mypy
+        return self.options.generator
 
     @property
     def _sampling(self) -> Sampling:
-        assert isinstance(self.method.landmarks, str)  # for mypy
-        return self.method.landmarks
+        assert isinstance(self.options.landmarks, str)  # for mypy
+        return self.options.landmarks
 
     def _read(self, wanted: Tensor) -> tuple[Tensor, Tensor, float, Tensor]:
         """What the reader returns for pixels, in their order, and its sums over the picture."""

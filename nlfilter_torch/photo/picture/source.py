@@ -19,7 +19,7 @@ from nlfilter_torch.core.kernels.grams import compute_grams
 from nlfilter_torch.core.rational import RationalForm
 from nlfilter_torch.operator.columns import Columns
 from nlfilter_torch.operator.features import blur, blur_margin, reduce_channels
-from nlfilter_torch.operator.options import OperatorOptions
+from nlfilter_torch.operator.options import FilterOptions
 from nlfilter_torch.operator.spectrum import RitzPairs
 from nlfilter_torch.photo.picture.drawn import M
 from nlfilter_torch.photo.picture.pixels import Fitted as Fitted
@@ -49,7 +49,7 @@ class Guide:
             a sample lacks.
     """
 
-    options: OperatorOptions
+    options: FilterOptions
     transform: Callable[[Tensor], Tensor] | None = None
     radius: int = 0
     channels: int | None = None

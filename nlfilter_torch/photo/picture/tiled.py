@@ -45,7 +45,6 @@ from nlfilter_torch.photo.picture.tiled_scribbles import (
 )
 from nlfilter_torch.photo.picture.tiles import TILE_PIXELS, Passes, Tiling, cacheable_pixels, rows_that_fit
 
-UNUSED_OPTIONS = ("tolerance", "group", "patch_weights")  # which no edit sets
 CACHED_SHARE = 1 / 16  # largest share of the memory for planes that an edit reuses
 FINISH_FLOATS = 64  # floats per pixel of a tile during ``Fitted.finish``: images, their transforms and products
 
@@ -192,8 +191,7 @@ class Tiled:
             self.guide_floats += picture.pixels * compared
             self.fitting_rows(num_features, count)
             picture.store(max(1, TILE_PIXELS // self.size[1]), workers)
-        used = {name: value for name, value in vars(options).items() if name not in UNUSED_OPTIONS}
-        pilot = take_pilot(picture, passes.report, workers, **used)
+        pilot = take_pilot(picture, passes.report, workers)
         sampled, count = passes.sample < picture.pixels, pilot.moment.shape[1]
         cached_pixels = cacheable_pixels(picture, passes, num_features, count, self.stored_floats(num_features))
         self.cached_floats = cached_pixels * (count + 2)

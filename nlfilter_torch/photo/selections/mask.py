@@ -13,20 +13,20 @@ from its own colour; results in tiles are therefore exact.
 import math
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import ClassVar
+from typing import ClassVar, cast
 
 import torch
 from torch import Tensor
 
-from nlfilter_torch.core.checks import check_count, check_positive
+from nlfilter_torch.core.checks import check_count, check_values
 from nlfilter_torch.core.workers import single_threaded, threads_for
-from nlfilter_torch.operator.options import Completion, OperatorOptions, Sampling, SpatialBandwidth
+from nlfilter_torch.operator.options import Completion, FilterOptions, Sampling, SpatialBandwidth
 from nlfilter_torch.photo.declared.declaration import Edit
 from nlfilter_torch.photo.declared.parameters import MASK
 from nlfilter_torch.photo.declared.shared_parameters import VIEWING_SIZE
 from nlfilter_torch.photo.picture.drawn import Drawn, M
 from nlfilter_torch.photo.picture.edit import PhotoEdit
-from nlfilter_torch.photo.picture.in_memory import edit_image
+from nlfilter_torch.photo.picture.in_memory import edited
 from nlfilter_torch.photo.picture.pixels import Pixels, corner
 from nlfilter_torch.photo.picture.resizing import enlarged
 from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles, parts_in_blocks
@@ -113,19 +113,7 @@ def region_mask(
         >>> bool(mask[..., 10:22, 10:22].min() > 0.8), bool(mask[..., :6, :].max() < 0.1)
         (True, True)
     """
-    edit = RegionMask(
-        reach=reach,
-        extent=extent,
-        photometric_bandwidth=photometric_bandwidth,
-        spatial_bandwidth=spatial_bandwidth,
-        patch_size=patch_size,
-        num_landmarks=num_landmarks,
-        landmarks=landmarks,
-        completion=completion,
-        generator=generator,
-    )
-    masks = {"scribbles": scribbles, "background": background, "added": added, "removed": removed}
-    return edit_image(edit, image, Drawn.of(masks))
+    return edited(RegionMask, locals())
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -139,14 +127,8 @@ class RegionMask(PhotoEdit):
     declared: ClassVar[Edit] = MASK
     relative: ClassVar[bool] = True
     gives_picture: ClassVar[bool] = False
+    filtering: ClassVar[FilterOptions] = FilterOptions(patch_size=1, guide_channels="all")
     reach: float | Tensor
-    photometric_bandwidth: float | Tensor
-    spatial_bandwidth: float | Tensor | None
-    num_landmarks: int
-    patch_size: int = 1
-    landmarks: Sampling = "kmeans"
-    completion: Completion = "diagonal"
-    generator: torch.Generator | None = None
     extent: Extent = MASK.defaults["extent"]
     names: tuple[str, str] = ("scribbles", "background")
 
@@ -185,35 +167,20 @@ class RegionMask(PhotoEdit):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ObjectEdit(PhotoEdit):
-    """An edit of objects that scribbles mark; the fields are those of their mask."""
+    """An edit of objects that scribbles mark; the fields and the options of the filter are those of their mask."""
 
+    filtering: ClassVar[FilterOptions] = RegionMask.filtering
     reach: float | Tensor
-    photometric_bandwidth: float | Tensor
-    spatial_bandwidth: float | Tensor | None
-    patch_size: int
-    num_landmarks: int
-    landmarks: Sampling = "kmeans"
-    completion: Completion = "diagonal"
-    generator: torch.Generator | None = None
     extent: Extent = MASK.defaults["extent"]
 
     def selection(self) -> RegionMask:
         """The masks of the objects, without the default of the spatial bandwidth, which depends on the size."""
-        return RegionMask(
-            reach=self.reach,
-            photometric_bandwidth=self.photometric_bandwidth,
-            spatial_bandwidth=self.spatial_bandwidth,
-            num_landmarks=self.num_landmarks,
-            landmarks=self.landmarks,
-            completion=self.completion,
-            generator=self.generator,
-            extent=self.extent,
-        )
+        options = replace(self.options, patch_size=RegionMask.filtering.patch_size)
+        return RegionMask(reach=self.reach, extent=self.extent, options=options)
 
     def selection_in(self, size: tuple[int, int]) -> RegionMask:
         """The masks of the objects in a picture (H, W)."""
-        distance = self.declared["spatial_bandwidth"].distance(self.spatial_bandwidth, size)
-        return replace(self.selection(), spatial_bandwidth=distance, patch_size=self.patch_size)
+        return RegionMask(reach=self.reach, extent=self.extent, options=self.filter_options(size))
 
 
 @dataclass(frozen=True, eq=False)
@@ -335,20 +302,16 @@ def _computed_regions(
     inside, background = ([without_strays(drawn, source.size) for drawn in side] for side in (inside, background))
     several = len(background) > 1
     scribbles = [_against(inside, k, background[k : k + 1] if several else background) for k in range(len(inside))]
-    check_positive(settings.photometric_bandwidth, "photometric_bandwidth", source.batch)
-    check_count(settings.num_landmarks, "num_landmarks")
-    small, steps = _reduced(source, FLOATS_PER_PIXEL + settings.num_landmarks)
+    options = settings.options
+    check_values(options.photometric_bandwidth, "photometric_bandwidth", "positive", source.batch)
+    check_count(options.num_landmarks, "num_landmarks")
+    small, steps = _reduced(source, FLOATS_PER_PIXEL + options.num_landmarks)
     everywhere = settings.extent == "everywhere"
-    distance = math.inf if everywhere else settings.spatial_bandwidth
-    options = OperatorOptions(
-        photometric_bandwidth=settings.photometric_bandwidth,
+    distance = math.inf if everywhere else options.spatial_bandwidth
+    options = replace(
+        options,
         spatial_bandwidth=_nearness(distance, source.batch, steps, small.size),
-        patch_size=settings.patch_size,
-        num_landmarks=min(settings.num_landmarks, small.size[0] * small.size[1]),
-        landmarks=settings.landmarks,
-        completion=settings.completion,
-        guide_channels="all",
-        generator=settings.generator,
+        num_landmarks=min(options.num_landmarks, small.size[0] * small.size[1]),
     )
     threads = threads_for(small.image)
     with single_threaded(threads if threads <= MOST_WAITING else 1):
@@ -392,14 +355,14 @@ def _fit_borders(small: Reduced, image: Tensor, rough: Tensor, front: Tensor, ba
 
 
 def _nearness(
-    bandwidth: float | Tensor | None, batch: int, steps: tuple[float, float], size: tuple[int, int]
+    bandwidth: SpatialBandwidth | str | None, batch: int, steps: tuple[float, float], size: tuple[int, int]
 ) -> SpatialBandwidth | None:
     """Spatial bandwidth in pixels of the reduced picture (h, w), from that in pixels of the picture."""
     if isinstance(bandwidth, float) and bandwidth == math.inf:
         return None
     if bandwidth is not None:
-        check_positive(bandwidth, "spatial_bandwidth", batch)
-        bandwidth = bandwidth / math.sqrt(steps[0] * steps[1])
+        check_values(bandwidth, "spatial_bandwidth", "positive", batch)
+        bandwidth = cast(float | Tensor, bandwidth) / math.sqrt(steps[0] * steps[1])
     return MASK["spatial_bandwidth"].distance(bandwidth, size)
 
 

@@ -11,7 +11,7 @@ from torch import Tensor
 from nlfilter_torch.filtering.scribbles import fit_strokes
 from nlfilter_torch.operator.columns import Columns
 from nlfilter_torch.operator.features import blur, blur_margin, pad_border
-from nlfilter_torch.operator.options import OperatorOptions
+from nlfilter_torch.operator.options import FilterOptions
 from nlfilter_torch.photo.picture.colour import LIGHTNESS, hundredths_of_lab
 from nlfilter_torch.photo.picture.resizing import block_means, enlarged
 from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles, scribbled_blocks
@@ -124,7 +124,7 @@ class RoughMasks:
     everywhere: bool = False
 
     @staticmethod
-    def of(picture: Reduced, options: OperatorOptions, reach: float | Tensor, everywhere: bool) -> "RoughMasks":
+    def of(picture: Reduced, options: FilterOptions, reach: float | Tensor, everywhere: bool) -> "RoughMasks":
         """Prepare a picture: build its operator, with options of :func:`nonlocal_operator`, and choose the points."""
         guide = Guide(options, region_guide, TEXTURE_MARGIN, NUM_CHANNELS, spectral=True, sampled=True)
         operator = picture.operator(guide)

@@ -11,10 +11,12 @@ from torch import Tensor
 
 from benchmarks import parameters
 from nlfilter_torch import photo
+from nlfilter_torch.operator.options import FilterOptions
 from nlfilter_torch.photo.declared.declaration import Edit, Parameter
 from nlfilter_torch.photo.declared.parameters import EDITS, MASK
 from nlfilter_torch.photo.declared.shared_parameters import FILTER
 from nlfilter_torch.photo.edits.applying import EDIT_OF
+from nlfilter_torch.photo.picture.drawn import Drawn
 from nlfilter_torch.photo.picture.edit import PhotoEdit
 from nlfilter_torch.photo.selections.mask import RegionMask
 from tests.pages import ROOT
@@ -64,10 +66,28 @@ def test_docstrings_describe_the_arguments_of_the_function_of_an_image(name: str
 def test_settings_of_an_edit_are_arguments_of_its_function(edit: type[PhotoEdit]) -> None:
     function = inspect.signature(getattr(photo, edit.declared.function or edit.declared.name)).parameters
     drawn = {"image", "grey", "strokes", *(scribble.argument for scribble in edit.declared.scribbles)}
-    settings = {field.name for field in fields(edit)} - {"names", "working", "hot_pixels"}  # of masks; measured
-    fixed = {"sharpen": {"guide_channels"}}.get(edit.declared.name, set())  # its guide is grey
-    assert settings - fixed == set(function) - drawn
-    assert {parameter.keyword for parameter in edit.declared if parameter.is_option} <= settings
+    settings = {field.name for field in fields(edit)} - {"options", "names", "working", "hot_pixels"}  # these: measured
+    options = {field.name for field in fields(FilterOptions)} & set(function)
+    assert settings | options == set(function) - drawn
+    assert {parameter.keyword for parameter in edit.declared if parameter.is_option} <= settings | options
+    for name in options - {parameter.keyword for parameter in edit.declared}:
+        assert function[name].default == vars(edit.filtering)[name], name
+
+
+@pytest.mark.parametrize("edit", [*EDIT_OF.values(), RegionMask], ids=lambda edit: edit.declared.name)
+def test_every_argument_of_a_function_reaches_its_edit(edit: type[PhotoEdit], monkeypatch: pytest.MonkeyPatch) -> None:
+    reached: dict[str, object] = {}
+
+    def received(made: PhotoEdit, image: object, drawn: Drawn[object], **_: object) -> None:
+        reached.update(vars(made) | vars(made.options) | {"image": image, "grey": image, "strokes": drawn.colours})
+        reached.update(drawn.masks)
+
+    monkeypatch.setattr("nlfilter_torch.photo.picture.in_memory.edit_image", received)
+    monkeypatch.setattr("nlfilter_torch.photo.edits.recolor.check_image", lambda *_, **__: None)
+    function = getattr(photo, edit.declared.function or edit.declared.name)
+    arguments = {name: object() for name in inspect.signature(function).parameters}
+    function(**arguments)
+    assert {name: reached[name] for name in arguments} == arguments
 
 
 @pytest.mark.parametrize("name", NAMES)

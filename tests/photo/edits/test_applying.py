@@ -188,9 +188,9 @@ def test_edits_have_the_settings_of_their_steps() -> None:
     assert tuple(EDIT_OF) == tuple(EDITS)
     edit = edit_of(Step("defocus", (IN,), radius=4.0), SIZE)
     assert vars(edit)["radius"] == 0.04 * 48
-    assert torch.equal(torch.rand(3, generator=vars(edit)["generator"]), torch.rand(3, generator=seeded()))
+    assert torch.equal(torch.rand(3, generator=edit.options.generator), torch.rand(3, generator=seeded()))
     own = torch.Generator().manual_seed(7)
-    assert vars(edit_of(Step("tone"), SIZE, generator=own))["generator"] is own
+    assert edit_of(Step("tone"), SIZE, generator=own).options.generator is own
 
 
 @pytest.mark.parametrize(

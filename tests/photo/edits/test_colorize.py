@@ -6,9 +6,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from nlfilter_torch.operator.options import FilterOptions
 from nlfilter_torch.photo import colorize
 from nlfilter_torch.photo.edits.colorize import (
-    Colorize,
     Operators,
     bandwidth_ratio,
     colorize_guide,
@@ -202,16 +202,8 @@ def test_neither_estimate_predicts_a_stroke_from_itself() -> None:
     groups, places = groups_of(mask)
     weights, source = torch.ones(1, 1, len(places)), InMemory(image)
 
-    settings = Colorize(
-        method="regression",
-        strength=1.0,
-        photometric_bandwidth=0.2,
-        spatial_bandwidth=None,
-        patch_size=1,
-        num_landmarks=30,
-        viewing_size=0,
-    )
-    operators = Operators(settings, source, (torch.tensor([9.0]), torch.tensor([9.0])))
+    options = FilterOptions(photometric_bandwidth=0.2, patch_size=1, num_landmarks=30)
+    operators = Operators(options, source, (torch.tensor([9.0]), torch.tensor([9.0])))
 
     def predictions(values: Tensor) -> tuple[Tensor, Tensor]:
         sets = [weights, *groups.weights_without_each(weights)]

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from nlfilter_torch import nonlocal_operator, polynomial_filter
-from nlfilter_torch.operator.options import OperatorOptions
+from nlfilter_torch.operator.options import FilterOptions
 from nlfilter_torch.photo.edits.synthesis import Polynomial, remainder, synthesize
 from nlfilter_torch.photo.picture.in_memory import InMemory, InMemoryOperator
 from nlfilter_torch.photo.picture.pixels import Strip, whole_image
@@ -20,7 +20,7 @@ ROWS = Strip(IMAGE[:, :, 4:9], 4 * 17, 17)
 
 
 def fitted_operator() -> InMemoryOperator:
-    return SOURCE.operator(Guide(OperatorOptions(num_landmarks=25, photometric_bandwidth=0.6)))
+    return SOURCE.operator(Guide(FilterOptions(num_landmarks=25, photometric_bandwidth=0.6)))
 
 
 @pytest.mark.parametrize("response", [torch.ones_like, torch.square, torch.sqrt])

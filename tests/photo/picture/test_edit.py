@@ -4,12 +4,13 @@ import pytest
 import torch
 from torch import Tensor
 
+from nlfilter_torch.operator.options import FilterOptions
 from nlfilter_torch.photo.declared.declaration import Edit
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.edits.applying import EDIT_OF, edit_of
 from nlfilter_torch.photo.edits.tone import Tone
 from nlfilter_torch.photo.picture.drawn import Drawn
-from nlfilter_torch.photo.picture.edit import FilteredEdit, PhotoEdit, Rows
+from nlfilter_torch.photo.picture.edit import PhotoEdit, Rows
 from nlfilter_torch.photo.picture.in_memory import InMemory
 from tests.problems import box, colour, noise
 
@@ -24,7 +25,7 @@ def test_an_edit_is_made_of_the_arguments_of_its_step() -> None:
     step = Step("tone", clarity=2.0, landmarks=30)
     edit = Tone.of(step.arguments(SIZE))
     assert isinstance(edit, Tone)
-    assert (edit.clarity, edit.contrast, edit.num_landmarks, edit.order) == (2.0, 1.2, 30, 3)
+    assert (edit.clarity, edit.contrast, edit.options.num_landmarks, edit.order) == (2.0, 1.2, 30, 3)
     assert edit.declared is step.declared
     detail = edit_of(Step("detail", alpha=(2.0, 1.0)), SIZE)
     assert torch.equal(vars(detail)["alpha"], torch.tensor([2.0, 1.0]))
@@ -96,7 +97,7 @@ def test_the_noise_of_a_picture_is_measured_once() -> None:
     assert tone.measured(source) is tone
 
 
-class Filtered(FilteredEdit):
+class Filtered(PhotoEdit):
     """An edit with a filter, for its options."""
 
     declared = Edit("example", "", tuple(EDIT_OF["tone"].declared))
@@ -106,12 +107,12 @@ class Filtered(FilteredEdit):
 
 
 def test_options_of_the_filter_fit_the_picture() -> None:
-    edit = Filtered(photometric_bandwidth="auto", spatial_bandwidth=None, patch_size=3, num_landmarks=100)
+    edit = Filtered(options=FilterOptions(patch_size=3))
     options = edit.filter_options((24, 36))
     assert (options.photometric_bandwidth, options.spatial_bandwidth) == ("auto", 2.0)  # a twelfth of the short side
     assert (options.patch_size, options.num_landmarks, options.guide_channels) == (3, 100, "luminance")
     assert edit.filter_options((5, 6)).num_landmarks == 100
     assert edit.filter_options((5, 6), fewer_landmarks=True).num_landmarks == 30
     assert edit.filter_options((24, 36), fewer_landmarks=True).num_landmarks == 100
-    far = Filtered(photometric_bandwidth=0.1, spatial_bandwidth="none", patch_size=3, num_landmarks=100)
+    far = Filtered(options=FilterOptions(spatial_bandwidth="none"))
     assert far.filter_options((24, 36)).spatial_bandwidth is None

@@ -5,7 +5,7 @@ import torch
 
 from nlfilter_torch.filtering.filters import detail_layers
 from nlfilter_torch.operator.build import nonlocal_operator
-from nlfilter_torch.operator.options import OperatorOptions
+from nlfilter_torch.operator.options import FilterOptions
 from nlfilter_torch.photo.picture.drawn import Drawn, M
 from nlfilter_torch.photo.picture.edit import PhotoEdit
 from nlfilter_torch.photo.picture.in_memory import Cache, InMemory, edit_image, kept_in, tensors_in, without_tensors
@@ -19,7 +19,7 @@ def test_the_last_operator_with_the_same_options_is_cached() -> None:
     learned, written = torch.tensor([3.0], requires_grad=True), torch.tensor([3.0])
 
     def operator(*bandwidths: float | torch.Tensor) -> object:
-        return source.operator(Guide(OperatorOptions(spatial_bandwidth=bandwidths, num_landmarks=20)))
+        return source.operator(Guide(FilterOptions(spatial_bandwidth=bandwidths, num_landmarks=20)))
 
     def tensors(*bandwidths: float) -> object:
         return operator(*(torch.tensor([bandwidth]) for bandwidth in bandwidths))
@@ -116,7 +116,7 @@ def test_scribbles_are_read_from_masks() -> None:
 def test_an_operator_in_memory_computes_planes_of_the_whole_picture() -> None:
     image = noise(1, 2, 12, 13)
     source = InMemory(image, {})
-    fitted = source.operator(Guide(OperatorOptions(num_landmarks=20)))
+    fitted = source.operator(Guide(FilterOptions(num_landmarks=20)))
     operator = nonlocal_operator(image, num_landmarks=20)
     layers = fitted.layers(whole_image, 2)(source)
     torch.testing.assert_close(layers, detail_layers(operator, image, order=2))

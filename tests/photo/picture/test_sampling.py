@@ -8,6 +8,7 @@ import torch
 
 from nlfilter_torch.operator import landmarks as landmarks_module
 from nlfilter_torch.operator.landmarks import candidate_pixels
+from nlfilter_torch.operator.options import FilterOptions
 from nlfilter_torch.photo.picture import sampling
 from nlfilter_torch.photo.picture.pictures import Picture
 from nlfilter_torch.photo.picture.sampling import ColumnCache, Draws, GuidePicture, PassOverPicture, draw
@@ -23,8 +24,8 @@ def silent(stage: str, done: int, total: int) -> None:
 @pytest.mark.usefixtures("small_blocks")
 @pytest.mark.parametrize("completion", ["diagonal", "none"])
 def test_sample_holds_about_as_many_pixels_as_asked_for_and_stands_for_all(completion: Any) -> None:
-    picture = GuidePicture(Picture(cat(90, 120)), Guide({}))
-    pilot = sampling.take_pilot(picture, silent, num_landmarks=30, completion=completion)
+    picture = GuidePicture(Picture(cat(90, 120)), Guide(FilterOptions(num_landmarks=30, completion=completion)))
+    pilot = sampling.take_pilot(picture, silent)
     guess = Guess(pilot.moment, torch.zeros(1, 0, 30, 1), lambda block, _: block.image, spectral=True)
     draw_from, moment, grams = Draws(pilot, guess.columns(pilot.sample), 3000, picture.pixels), 0.0, 0.0
     drawn = []

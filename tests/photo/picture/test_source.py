@@ -3,7 +3,7 @@
 import torch
 
 from nlfilter_torch.operator.columns import Columns
-from nlfilter_torch.operator.options import OperatorOptions
+from nlfilter_torch.operator.options import FilterOptions
 from nlfilter_torch.photo.picture.in_memory import InMemory
 from nlfilter_torch.photo.picture.source import (
     Guide,
@@ -15,7 +15,7 @@ from nlfilter_torch.photo.picture.source import (
 from tests.problems import build, colour, noise
 from tests.problems import luminance as luminance_of
 
-OPTIONS = OperatorOptions(num_landmarks=20)
+OPTIONS = FilterOptions(num_landmarks=20)
 
 
 def doubled(image: torch.Tensor) -> torch.Tensor:

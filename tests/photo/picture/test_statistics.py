@@ -5,6 +5,7 @@ import torch
 
 from nlfilter_torch import nonlocal_operator
 from nlfilter_torch.operator.columns import Columns
+from nlfilter_torch.operator.options import FilterOptions
 from nlfilter_torch.operator.pixel_matrix import PixelMatrix
 from nlfilter_torch.photo.picture import sampling
 from nlfilter_torch.photo.picture.pictures import Picture
@@ -21,8 +22,8 @@ def silent(stage: str, done: int, total: int) -> None:
 
 def test_balancing_that_does_not_settle_warns(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("nlfilter_torch.photo.picture.statistics.MAX_PASSES", 1)
-    picture = GuidePicture(Picture(cat(30, 40)), Guide({}))
-    pilot = sampling.take_pilot(picture, silent, num_landmarks=20)
+    picture = GuidePicture(Picture(cat(30, 40)), Guide(FilterOptions(num_landmarks=20)))
+    pilot = sampling.take_pilot(picture, silent)
     with pytest.warns(UserWarning, match="balancing still changed by .* after 1 passes"):
         balance_by_passes(lambda of: [of(pilot.sample)], 9 * pilot.moment, completed=True)
 

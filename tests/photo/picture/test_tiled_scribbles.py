@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from nlfilter_torch.operator.build import operator_from_guide
 from nlfilter_torch.operator.operator import NonlocalOperator
-from nlfilter_torch.operator.options import OperatorOptions
+from nlfilter_torch.operator.options import FilterOptions
 from nlfilter_torch.photo import colorize, recolor
 from nlfilter_torch.photo.picture import sampling, tiles
 from nlfilter_torch.photo.picture.colour import split_luminance
@@ -100,7 +100,7 @@ def coloured(picture: Array, *painted: Array, kind: Any = None, **options: Any) 
 def test_full_passes_recolour_as_in_memory(
     options: dict[str, Any], kept: bool, dtype: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def balanced_well(guide: torch.Tensor, built: OperatorOptions, weights: torch.Tensor | None) -> NonlocalOperator:
+    def balanced_well(guide: torch.Tensor, built: FilterOptions, weights: torch.Tensor | None) -> NonlocalOperator:
         """In float32, to a tolerance that does not hide differences."""
         return operator_from_guide(guide, replace(built, tolerance=1e-6 if dtype == np.float32 else None), weights)
 
