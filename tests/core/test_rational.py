@@ -16,30 +16,30 @@ def test_nodes_cover_the_interval() -> None:
     assert (nodes[1:] / nodes[:-1]).max() < 1.2
 
 
-@pytest.mark.parametrize("degree", range(9))
-def test_polynomials_are_exact(degree: int) -> None:
-    nodes = interval_nodes(6)
-    values = (nodes**degree - 0.3 * nodes).expand(2, -1)
-    best = best_form(values, 6, 1e-3, ROUNDING)
-    assert best is not None
-    assert (best[0].degree, len(best[0].shifts)) == (max(degree, 1), 0)
-    assert best[1] < 1e-13
+def test_polynomials_are_exact() -> None:
+    for degree in range(9):
+        nodes = interval_nodes(6)
+        values = (nodes**degree - 0.3 * nodes).expand(2, -1)
+        best = best_form(values, 6, 1e-3, ROUNDING)
+        assert best is not None
+        assert (best[0].degree, len(best[0].shifts)) == (max(degree, 1), 0)
+        assert best[1] < 1e-13
 
 
 @pytest.mark.parametrize("power", [0.1, 0.3, 0.5, 0.9])
-@pytest.mark.parametrize("tolerance", [1e-2, 1e-3, 1e-4])
-def test_the_error_of_roots_is_that_between_the_nodes(power: float, tolerance: float) -> None:
-    values = interval_nodes(9) ** power
-    best = best_form(values[None], 9, tolerance, ROUNDING)
-    assert best is not None
-    form, error = best
-    assert error <= tolerance
-    assert len(form.shifts) <= 16
-    points = torch.logspace(-9, 0, 4001, dtype=torch.float64)
-    angles = torch.acos(2 * points - 1).unsqueeze(1)
-    terms = [torch.cos(angles * torch.arange(form.degree + 1)), form.shifts / (points.unsqueeze(1) + form.shifts)]
-    result = torch.cat(terms, dim=1) @ form.coefficients(values[None])[0]
-    assert (result - points**power).abs().max() < 1.3 * tolerance
+def test_the_error_of_roots_is_that_between_the_nodes(power: float) -> None:
+    for tolerance in [1e-2, 1e-3, 1e-4]:
+        values = interval_nodes(9) ** power
+        best = best_form(values[None], 9, tolerance, ROUNDING)
+        assert best is not None
+        form, error = best
+        assert error <= tolerance
+        assert len(form.shifts) <= 16
+        points = torch.logspace(-9, 0, 4001, dtype=torch.float64)
+        angles = torch.acos(2 * points - 1).unsqueeze(1)
+        terms = [torch.cos(angles * torch.arange(form.degree + 1)), form.shifts / (points.unsqueeze(1) + form.shifts)]
+        result = torch.cat(terms, dim=1) @ form.coefficients(values[None])[0]
+        assert (result - points**power).abs().max() < 1.3 * tolerance
 
 
 def test_a_logarithm_takes_poles_and_a_step_takes_none() -> None:

@@ -9,6 +9,7 @@ from PIL import Image
 
 from nlfilter_torch import fit_alpha, nonlocal_operator, polynomial_filter
 from tests.images import PHOTOGRAPHS, hard_images
+from tests.pairwise import each_value
 from tests.problems import noise, picture, seeded
 
 ALPHAS = ((2.5, 1.7, 0.6, 1.05), (3.0, 3.0, 4.0, 1.05), (0.2, 0.5, 1.2, 1.0))
@@ -27,8 +28,7 @@ def through_png(image: torch.Tensor) -> torch.Tensor:
     return torch.from_numpy(np.asarray(Image.open(stream)).copy())[None, None] / 255
 
 
-@pytest.mark.parametrize("alpha", ALPHAS)
-@pytest.mark.parametrize("name", PHOTOGRAPHS)
+@pytest.mark.parametrize(("alpha", "name"), each_value(ALPHAS, PHOTOGRAPHS))
 def test_own_output_gives_its_sliders(name: str, alpha: tuple[float, ...]) -> None:
     image = grey(name)
     operator = nonlocal_operator(image, num_landmarks=60)
@@ -48,8 +48,7 @@ def test_own_output_of_another_order(order: int) -> None:
     torch.testing.assert_close(result[0], wanted, atol=1e-4, rtol=0)
 
 
-@pytest.mark.parametrize("alpha", ALPHAS)
-@pytest.mark.parametrize("name", PHOTOGRAPHS)
+@pytest.mark.parametrize(("alpha", "name"), each_value(ALPHAS, PHOTOGRAPHS))
 def test_an_8_bit_png_gives_its_sliders_to_5_per_cent(name: str, alpha: tuple[float, ...]) -> None:
     image = grey(name, 192)
     operator = nonlocal_operator(image, photometric_bandwidth=10 / 255)
@@ -140,8 +139,9 @@ def test_ridge_holds_the_sliders_at_one() -> None:
         assert held < 1e-4
 
 
-@pytest.mark.parametrize("name", ["constant", "8x8", "1x64", "two colours"])
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize(
+    ("name", "dtype"), each_value(["constant", "8x8", "1x64", "two colours"], [torch.float32, torch.float64])
+)
 def test_what_an_image_does_not_decide_stays_at_one(name: str, dtype: torch.dtype) -> None:
     image = torch.from_numpy(hard_images()[name])[None, None].to(dtype)
     operator = nonlocal_operator(image, num_landmarks=10)
@@ -250,8 +250,7 @@ def test_forward_mode_of_fitted_sliders_is_their_slope() -> None:
     torch.testing.assert_close(torch.func.jvp(fitted, (image,), (tangent,))[1], slope, rtol=1e-5, atol=1e-6)
 
 
-@pytest.mark.parametrize("bandwidth", [0.1, 1.0, 100.0])
-@pytest.mark.parametrize("name", ["spike", "checkerboard", "noise"])
+@pytest.mark.parametrize(("bandwidth", "name"), each_value([0.1, 1.0, 100.0], ["spike", "checkerboard", "noise"]))
 def test_sliders_of_nearly_proportional_layers_stay_near_the_true_ones(name: str, bandwidth: float) -> None:
     guide = torch.zeros(1, 1, 24, 30).double()
     if name == "spike":

@@ -1,7 +1,6 @@
 """Diffusion maps and masks: against the dense reference, and properties of every mask."""
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -23,6 +22,7 @@ from nlfilter_torch import (
 )
 from tests import reference
 from tests.images import photograph, two_colours
+from tests.pairwise import each_value
 from tests.problems import build, guides, noise, options, picture
 
 SIDE = 24
@@ -65,8 +65,7 @@ def test_distances_are_those_of_the_dense_map(spectrum, dense, time: float) -> N
         )
 
 
-@pytest.mark.parametrize("time", [0.5, 1.0, 3.0])
-@pytest.mark.parametrize("width", [1.0, 4.0, 40.0])
+@pytest.mark.parametrize(("time", "width"), each_value([0.5, 1.0, 3.0], [1.0, 4.0, 40.0]))
 def test_mask_is_that_of_the_dense_paper(spectrum, dense, time: float, width: float) -> None:
     s, v = dense
     region = regions(3)
@@ -302,12 +301,17 @@ def test_the_scale_of_a_region_does_not_count() -> None:
     torch.testing.assert_close(diffusion_mask(spectrum, region.float() * 3e38).double(), wanted, atol=1e-5, rtol=0)
 
 
-@pytest.mark.parametrize("mask", [torch.ones(50), torch.ones(1, 1, 1, 1), 1.0, torch.ones(7), [1]])
-def test_masks_of_weighted_points_are_checked(mask: Any) -> None:
-    operator = operator_from_features(noise(1, 2, 50), size=(50,), weights=torch.ones(50).double(), num_landmarks=20)
-    image = noise(1, 1, 1, 50, seed=2)
-    with pytest.raises((TypeError, ValueError), match=r"^mask must"):
-        fit_alpha(operator, image, image**2, mask=mask)
+MASKS = [torch.ones(50), torch.ones(1, 1, 1, 1), 1.0, torch.ones(7), [1]]
+
+
+def test_masks_of_weighted_points_are_checked() -> None:
+    for mask in MASKS:
+        operator = operator_from_features(
+            noise(1, 2, 50), size=(50,), weights=torch.ones(50).double(), num_landmarks=20
+        )
+        image = noise(1, 1, 1, 50, seed=2)
+        with pytest.raises((TypeError, ValueError), match=r"^mask must"):
+            fit_alpha(operator, image, image**2, mask=mask)
 
 
 def test_segments_of_small_total_weight_have_their_own_centres() -> None:

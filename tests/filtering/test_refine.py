@@ -14,6 +14,7 @@ from nlfilter_torch import nonlocal_operator, refine
 from nlfilter_torch.filtering.refine import FILTER, build_operator
 from tests import reference
 from tests.images import photograph, two_colours
+from tests.pairwise import each_value
 from tests.problems import noise, picture
 
 SIZE = (12, 13)
@@ -67,8 +68,9 @@ def test_scale_of_logits_does_not_matter() -> None:
     torch.testing.assert_close(refine(30 * logits, image), refine(logits, image), atol=1e-3, rtol=1e-3)
 
 
-@pytest.mark.parametrize("factor", [0.1, 0.3, 3.0, 10.0])
-@pytest.mark.parametrize("name", ["photometric_bandwidth", "spatial_bandwidth", "both"])
+@pytest.mark.parametrize(
+    ("factor", "name"), each_value([0.1, 0.3, 3.0, 10.0], ["photometric_bandwidth", "spatial_bandwidth", "both"])
+)
 def test_bad_bandwidths_do_not_make_it_worse(name: str, factor: float) -> None:
     image, truth, logits = scene()
     recipe = build_operator(image, logits.log_softmax(1), None, FILTER).kernel.recipe

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from nlfilter_torch import Spectrum, nonlocal_operator, operator_from_features, propagate_strokes
 from nlfilter_torch.filtering.scribbles import DAB, NOISE
 from tests.images import two_colours
+from tests.pairwise import each_value
 from tests.problems import build, guides, noise, options, picture, seeded
 
 
@@ -73,8 +74,7 @@ def test_it_is_the_best_linear_estimate(spectrum: Spectrum, strength: float, rea
         np.testing.assert_allclose(result[0, channel].flatten(), expected, atol=2e-5)
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("bandwidth", [0.001, 0.02, 0.05, 0.1])
+@pytest.mark.parametrize(("dtype", "bandwidth"), each_value([torch.float32, torch.float64], [0.001, 0.02, 0.05, 0.1]))
 def test_pixels_that_the_landmarks_miss_do_not_run_away(bandwidth: float, dtype: torch.dtype) -> None:
     """Their affinities of a few millionths would have to be amplified to reach the painted values."""
     image, mask = noise(1, 1, 32, 32, dtype=dtype), spots((8, 8), (20, 20), height=32, width=32).to(dtype)

@@ -15,6 +15,7 @@ from nlfilter_torch import (
 )
 from tests import reference
 from tests.images import photograph
+from tests.pairwise import each_value
 from tests.problems import build, guides, noise, options, picture
 
 
@@ -147,8 +148,7 @@ def test_the_identity_is_the_operator() -> None:
         torch.testing.assert_close(spectral_filter(operator, image, lambda s: s), operator @ image, atol=1e-5, rtol=0)
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("degree", range(1, 8))
+@pytest.mark.parametrize(("dtype", "degree"), each_value([torch.float32, torch.float64], range(1, 8)))
 def test_polynomials_are_the_polynomial_filter(degree: int, dtype: torch.dtype) -> None:
     alpha = (4 * noise(degree + 1, seed=degree) - 1).to(dtype)
     operator, image = OPERATOR.to(dtype), IMAGE.to(dtype)
@@ -166,8 +166,10 @@ def test_an_operator_takes_no_residual() -> None:
         spectral_filter(IMAGE, IMAGE, torch.sqrt)  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float32, torch.float64])
-@pytest.mark.parametrize("made", ["operator", "spectrum"])
+@pytest.mark.parametrize(
+    ("dtype", "made"),
+    each_value([torch.float16, torch.bfloat16, torch.float32, torch.float64], ["operator", "spectrum"]),
+)
 def test_responses_receive_the_dtype_of_the_image(made: str, dtype: torch.dtype) -> None:
     wanted = torch.float64 if dtype == torch.float64 else torch.float32
     layers = torch.nn.Linear(1, 8, dtype=wanted), torch.nn.Tanh(), torch.nn.Linear(8, 1, dtype=wanted)

@@ -23,6 +23,7 @@ from nlfilter_torch import (
 )
 from nlfilter_torch.photo import Look
 from tests.layers import ALPHA, OPTIONS, image
+from tests.pairwise import each_value
 from tests.problems import noise, picture
 
 
@@ -33,8 +34,7 @@ def test_filter_is_the_function(residual: float | None) -> None:
     torch.testing.assert_close(layer(image()), expected, atol=0, rtol=0)
 
 
-@pytest.mark.parametrize("channels", [1, 2, 5])
-@pytest.mark.parametrize("guide_channels", [1, 2, 3])
+@pytest.mark.parametrize(("channels", "guide_channels"), each_value([1, 2, 5], [1, 2, 3]))
 def test_guide_may_be_another_picture(channels: int, guide_channels: int) -> None:
     guide, picture_ = noise(2, guide_channels, 12, 13, seed=1), noise(2, channels, 12, 13)
     result = NonlocalFilter(ALPHA, **OPTIONS)(picture_, guide=guide)
@@ -180,20 +180,20 @@ def test_values_are_assigned_through_the_layer() -> None:
     assert all(before is after for before, after in zip(parameters, layer.parameters(), strict=True))
 
 
-@pytest.mark.parametrize(
-    ("name", "value", "message"),
-    [
-        ("alpha", (1.0, 2.0), r"alpha must keep its shape, \(4,\), got \(2,\); construct a layer"),
-        ("alpha", "bright", "alpha must be numbers or rows of numbers"),
-        ("alpha", [float("nan")] * 4, "alpha must be finite"),
-        ("residual", 1.0, "residual must be a number in the constructor to be changed later, got None there"),
-        ("photometric_bandwidth", -1.0, "photometric_bandwidth must be positive"),
-    ],
-)
-def test_assigned_values_that_do_not_fit_are_refused(name: str, value: object, message: str) -> None:
-    layer = NonlocalFilter(photometric_bandwidth=0.2, learn=("alpha", "photometric_bandwidth"))
-    with pytest.raises((TypeError, ValueError), match=message):
-        setattr(layer, name, value)
+REFUSED = [
+    ("alpha", (1.0, 2.0), r"alpha must keep its shape, \(4,\), got \(2,\); construct a layer"),
+    ("alpha", "bright", "alpha must be numbers or rows of numbers"),
+    ("alpha", [float("nan")] * 4, "alpha must be finite"),
+    ("residual", 1.0, "residual must be a number in the constructor to be changed later, got None there"),
+    ("photometric_bandwidth", -1.0, "photometric_bandwidth must be positive"),
+]
+
+
+def test_assigned_values_that_do_not_fit_are_refused() -> None:
+    for name, value, message in REFUSED:
+        layer = NonlocalFilter(photometric_bandwidth=0.2, learn=("alpha", "photometric_bandwidth"))
+        with pytest.raises((TypeError, ValueError), match=message):
+            setattr(layer, name, value)
 
 
 def test_a_misspelt_option_names_the_class_that_was_called() -> None:

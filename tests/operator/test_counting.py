@@ -18,6 +18,7 @@ from nlfilter_torch import (
     segment_mask,
 )
 from nlfilter_torch.operator.counting import hidden_points
+from tests.pairwise import each_value
 from tests.problems import colour, noise, seeded
 
 SHAPES = ((40, 50), (60, 33), (64, 64))
@@ -44,8 +45,7 @@ def largest_difference(whole: Tensor, part: Tensor) -> float:
     return float((whole[..., : part.shape[-2], : part.shape[-1]] - part).abs().max())
 
 
-@pytest.mark.parametrize("options", OPTIONS)
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize(("options", "dtype"), each_value(OPTIONS, [torch.float32, torch.float64]))
 def test_padding_changes_nothing(options: dict[str, Any], dtype: torch.dtype) -> None:
     pictures = [colour(name).to(dtype) for name in ("coffee", "astronaut", "chelsea")]
     images = [picture[..., :h, :w] for picture, (h, w) in zip(pictures, SHAPES, strict=True)]

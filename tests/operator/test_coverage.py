@@ -13,6 +13,7 @@ from nlfilter_torch import NonlocalOperator, nonlocal_operator, operator_from_fe
 from nlfilter_torch.operator.build import operator_from_points
 from nlfilter_torch.operator.coverage import LARGEST_SHARE, LEAST_POINTS, SAMPLED, sampled_points, share_above
 from nlfilter_torch.operator.options import FilterOptions
+from tests.pairwise import each_value
 from tests.problems import noise, seeded
 
 
@@ -38,8 +39,7 @@ def share_off(operator: NonlocalOperator, features: Tensor, weights: Tensor | No
 
 
 @pytest.mark.filterwarnings("ignore:landmarks must resemble")
-@pytest.mark.parametrize("completion", ["diagonal", "none"])
-@pytest.mark.parametrize("landmarks", [10, 25, 60])
+@pytest.mark.parametrize(("completion", "landmarks"), each_value(["diagonal", "none"], [10, 25, 60]))
 def test_of_few_points_the_share_is_exact(landmarks: int, completion: str) -> None:
     features = clusters(1500, 50, 16, seed=landmarks)
     weights = 0.5 + torch.rand(1500, generator=seeded(1))
@@ -54,8 +54,15 @@ def test_of_few_points_the_share_is_exact(landmarks: int, completion: str) -> No
 
 
 @pytest.mark.filterwarnings("ignore:landmarks must resemble")
-@pytest.mark.parametrize(("dimensions", "landmarks"), [(64, 64), (64, 40), (64, 20), (4, 30), (2, 20)])
-@pytest.mark.parametrize("sampling", ["kmeans", "random"])
+@pytest.mark.parametrize(
+    ("dimensions", "landmarks", "sampling"),
+    [
+        (dimensions, landmarks, sampling)
+        for (dimensions, landmarks), sampling in each_value(
+            [(64, 64), (64, 40), (64, 20), (4, 30), (2, 20)], ["kmeans", "random"]
+        )
+    ],
+)
 def test_of_many_points_the_share_is_that_of_the_dense_filter(dimensions: int, landmarks: int, sampling: str) -> None:
     features = clusters(4096, 60, dimensions, seed=9, apart=8 / dimensions**0.5)
     operator = operator_from_features(features, size=(64, 64), num_landmarks=landmarks, landmarks=sampling)  # type: ignore[arg-type]

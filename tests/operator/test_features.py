@@ -13,6 +13,7 @@ from nlfilter_torch import (
 from nlfilter_torch.operator.features import GuideFeatures, pad_border, patch_window, reduce_channels
 from tests import reference
 from tests.images import photograph
+from tests.pairwise import pairwise
 from tests.problems import picture
 
 SIZES = [(1, 1), (1, 7), (7, 1), (2, 2), (3, 3), (4, 9), (12, 10)]
@@ -22,14 +23,12 @@ def random_guide(channels: int, height: int, width: int, seed: int = 0) -> np.nd
     return np.random.default_rng(seed).random((channels, height, width))
 
 
-@pytest.mark.parametrize("size", [1, 3, 5, 7, 11])
-def test_window_is_the_reference_window(size: int) -> None:
-    np.testing.assert_allclose(patch_window(size), reference.patch_weights(size), rtol=1e-14)
+def test_window_is_the_reference_window() -> None:
+    for size in [1, 3, 5, 7, 11]:
+        np.testing.assert_allclose(patch_window(size), reference.patch_weights(size), rtol=1e-14)
 
 
-@pytest.mark.parametrize("size", SIZES)
-@pytest.mark.parametrize("patch_size", [1, 3, 5, 7])
-@pytest.mark.parametrize("h_x", [None, 2.5, (2.5, 4.0)])
+@pytest.mark.parametrize(("size", "patch_size", "h_x"), pairwise(SIZES, [1, 3, 5, 7], [None, 2.5, (2.5, 4.0)]))
 def test_features_are_the_reference_features(
     size: tuple[int, int], patch_size: int, h_x: float | tuple[float, float] | None
 ) -> None:

@@ -11,18 +11,18 @@ from nlfilter_torch.operator.hidden import MIRRORED, NEAR, REACH, fill_hidden, f
 from tests.problems import noise
 
 
-@pytest.mark.parametrize("margin", [0, 1, 2, 3])
 @pytest.mark.parametrize("shape", [(7, 9), (7, 2), (1, 1), (3, 8)])
-def test_a_rectangle_is_continued_as_an_image_is_padded(shape: tuple[int, int], margin: int) -> None:
-    image = noise(2, 3, *shape)
-    canvas, counts = torch.full((2, 3, 12, 14), torch.nan), torch.zeros(2, 1, 12, 14)
-    canvas = canvas.double()
-    canvas[..., : shape[0], : shape[1]] = image
-    counts[..., : shape[0], : shape[1]] = 1
-    filled = fill_hidden(canvas, counts > 0, margin)
-    assert filled.shape == (2, 3, 12 + 2 * margin, 14 + 2 * margin)
-    expected = pad_border(image, margin)
-    torch.testing.assert_close(filled[..., : expected.shape[2], : expected.shape[3]], expected, atol=1e-14, rtol=0)
+def test_a_rectangle_is_continued_as_an_image_is_padded(shape: tuple[int, int]) -> None:
+    for margin in [0, 1, 2, 3]:
+        image = noise(2, 3, *shape)
+        canvas, counts = torch.full((2, 3, 12, 14), torch.nan), torch.zeros(2, 1, 12, 14)
+        canvas = canvas.double()
+        canvas[..., : shape[0], : shape[1]] = image
+        counts[..., : shape[0], : shape[1]] = 1
+        filled = fill_hidden(canvas, counts > 0, margin)
+        assert filled.shape == (2, 3, 12 + 2 * margin, 14 + 2 * margin)
+        expected = pad_border(image, margin)
+        torch.testing.assert_close(filled[..., : expected.shape[2], : expected.shape[3]], expected, atol=1e-14, rtol=0)
 
 
 def test_replication_and_volumes() -> None:

@@ -19,6 +19,7 @@ from nlfilter_torch.operator.landmarks import (
 )
 from nlfilter_torch.operator.nystrom import inverse_cholesky, nystrom_factor
 from tests.images import hard_images, photograph
+from tests.pairwise import each_value
 from tests.problems import noise
 
 HEIGHT, WIDTH = 20, 30
@@ -111,8 +112,7 @@ def test_a_batch_chooses_what_each_image_chooses(sampling: str) -> None:
     torch.testing.assert_close(together, torch.cat(alone), atol=1e-12, rtol=0)
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("name", list(hard_images()))
+@pytest.mark.parametrize(("dtype", "name"), each_value([torch.float32, torch.float64], list(hard_images())))
 def test_few_distinct_features_leave_the_landmarks_finite_and_usable(name: str, dtype: torch.dtype) -> None:
     image = torch.from_numpy(hard_images()[name]).to(dtype)
     x = image.reshape(1, 1, -1) * 100
@@ -150,8 +150,7 @@ def test_starts_drawn_in_blocks_are_about_as_good_as_those_drawn_singly(
     assert (in_blocks < 1.25 * residual()).all()
 
 
-@pytest.mark.parametrize("marks", [64, 100, 300])
-@pytest.mark.parametrize("spread", [0.05, 0.1, 0.15])
+@pytest.mark.parametrize(("marks", "spread"), each_value([64, 100, 300], [0.05, 0.1, 0.15]))
 def test_no_cluster_is_missed(marks: int, spread: float) -> None:
     generator = seeded(1)
     centres = torch.randn(60, 64, generator=generator)

@@ -12,6 +12,7 @@ from benchmarks import accuracy
 from nlfilter_torch import nonlocal_operator
 from tests import reference
 from tests.images import photograph
+from tests.pairwise import each_value, pairwise
 from tests.problems import SAMPLINGS, build, guides, noise, options, picture
 
 FLOATS = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
@@ -20,8 +21,7 @@ FLOATS = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
 # --- against the dense filter
 
 
-@pytest.mark.parametrize("bandwidth", list(accuracy.LIMITS))
-@pytest.mark.parametrize("name", accuracy.PICTURES)
+@pytest.mark.parametrize(("bandwidth", "name"), each_value(list(accuracy.LIMITS), accuracy.PICTURES))
 def test_filtered_photographs_are_near_the_dense_filter(name: str, bandwidth: int) -> None:
     errors = accuracy.measure(name, bandwidth)
     print(errors)
@@ -30,9 +30,9 @@ def test_filtered_photographs_are_near_the_dense_filter(name: str, bandwidth: in
     assert errors.default <= errors.plain / 2
 
 
-@pytest.mark.parametrize("h_x", [None, 6.0])
-@pytest.mark.parametrize("bandwidth", [5, 10, 20, 40])
-@pytest.mark.parametrize("completion", ["diagonal", "none"])
+@pytest.mark.parametrize(
+    ("h_x", "bandwidth", "completion"), pairwise([None, 6.0], [5, 10, 20, 40], ["diagonal", "none"])
+)
 def test_with_every_pixel_a_landmark_it_is_the_dense_filter(bandwidth: int, completion: str, h_x: float | None) -> None:
     image = photograph("astronaut", 24, 24)
     operator = nonlocal_operator(
@@ -150,9 +150,9 @@ def test_the_order_of_the_channels_does_not_count(landmarks: str) -> None:
     torch.testing.assert_close(other, dense, atol=1e-6, rtol=0)
 
 
-@pytest.mark.parametrize("completion", ["diagonal", "none"])
-@pytest.mark.parametrize("landmarks", SAMPLINGS)
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize(
+    ("completion", "landmarks", "dtype"), pairwise(["diagonal", "none"], SAMPLINGS, [torch.float32, torch.float64])
+)
 def test_a_batch_gives_what_single_calls_give(landmarks: str, completion: str, dtype: torch.dtype) -> None:
     guide = torch.cat([picture(name, 40, 48, dtype) for name in ("astronaut", "camera", "moon")])
     image = noise(3, 2, 40, 48, dtype=dtype)
@@ -171,17 +171,17 @@ def test_a_batch_estimates_what_single_calls_estimate() -> None:
     torch.testing.assert_close(operator.row_sums(), torch.cat([o.row_sums() for o in alone]), atol=1e-9, rtol=0)
 
 
-@pytest.mark.parametrize("dtype", FLOATS)
 @pytest.mark.parametrize("guide_dtype", FLOATS)
-def test_images_keep_their_dtype(dtype: torch.dtype, guide_dtype: torch.dtype) -> None:
-    operator = build(noise(1, 1, 8, 9, dtype=guide_dtype), num_landmarks=20)
-    assert operator.factor.dtype == (torch.float64 if guide_dtype == torch.float64 else torch.float32)
-    image = noise(1, 3, 8, 9, dtype=dtype)
-    filtered = operator @ image
-    assert filtered.dtype == dtype
-    exact = build(noise(1, 1, 8, 9, dtype=guide_dtype).double(), num_landmarks=20) @ image.double()
-    tolerance = 2 * torch.finfo(dtype).eps if dtype.itemsize == 2 else 1e-4
-    torch.testing.assert_close(filtered.double(), exact, atol=tolerance, rtol=0)
+def test_images_keep_their_dtype(guide_dtype: torch.dtype) -> None:
+    for dtype in FLOATS:
+        operator = build(noise(1, 1, 8, 9, dtype=guide_dtype), num_landmarks=20)
+        assert operator.factor.dtype == (torch.float64 if guide_dtype == torch.float64 else torch.float32)
+        image = noise(1, 3, 8, 9, dtype=dtype)
+        filtered = operator @ image
+        assert filtered.dtype == dtype
+        exact = build(noise(1, 1, 8, 9, dtype=guide_dtype).double(), num_landmarks=20) @ image.double()
+        tolerance = 2 * torch.finfo(dtype).eps if dtype.itemsize == 2 else 1e-4
+        torch.testing.assert_close(filtered.double(), exact, atol=tolerance, rtol=0)
 
 
 def test_autocast_changes_nothing() -> None:

@@ -17,6 +17,7 @@ from nlfilter_torch.operator.orientation import (
     source_pixels,
 )
 from tests.images import hard_images, photograph
+from tests.pairwise import each_value
 from tests.problems import inverse, oriented
 
 LEVELS = 0.05 / 255  # difference of images that counts as rounding
@@ -74,8 +75,9 @@ def test_sums_over_tiles_are_those_of_the_image() -> None:
     assert torch.equal(orientation_of(torch.stack(tiles).sum(0), 1).numbers, whole)
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("spatial_bandwidth", [None, 12.0, (5.0, 7.0)])
+@pytest.mark.parametrize(
+    ("dtype", "spatial_bandwidth"), each_value([torch.float32, torch.float64], [None, 12.0, (5.0, 7.0)])
+)
 def test_candidates_of_all_orientations_are_equal_to_the_last_bit(
     dtype: torch.dtype, spatial_bandwidth: float | tuple[float, float] | None
 ) -> None:
@@ -94,8 +96,12 @@ def test_candidates_of_all_orientations_are_equal_to_the_last_bit(
     assert all(torch.equal(points[0], other) for other in points[1:])
 
 
-@pytest.mark.parametrize("options", [{}, {"spatial_bandwidth": 12.0}, {"num_landmarks": 300, "guide_channels": "all"}])
-@pytest.mark.parametrize("number", range(1, ORIENTATIONS))
+@pytest.mark.parametrize(
+    ("options", "number"),
+    each_value(
+        [{}, {"spatial_bandwidth": 12.0}, {"num_landmarks": 300, "guide_channels": "all"}], range(1, ORIENTATIONS)
+    ),
+)
 def test_the_layer_is_equivariant(options: dict[str, object], number: int) -> None:
     colours = torch.cat([picture(), picture("coffee"), picture().flip(2)], dim=1)
     layer = NonlocalFilter(alpha=(3, 1), photometric_bandwidth=20 / 255, **options)  # type: ignore[arg-type]

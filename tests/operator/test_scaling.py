@@ -17,13 +17,15 @@ from nlfilter_torch.operator.sinkhorn import sinkhorn_balance
 from tests.problems import noise
 
 
-@pytest.mark.parametrize("half", [-3.0, -1e-3, 0.0, 1e-3, 3.0])
 @pytest.mark.parametrize("diagonal", [1e-3, 0.1, 1.0])
-def test_the_scaling_is_the_root_for_either_sign(half: float, diagonal: float) -> None:
-    factor, rest = torch.ones(1, 1, 1, dtype=torch.float64), torch.full((1, 1), diagonal, dtype=torch.float64)
-    scaling = scaling_from_moment(factor, rest, torch.full((1, 1, 1), 2 * half, dtype=torch.float64))
-    assert scaling > 0
-    torch.testing.assert_close(scaling * (2 * half + diagonal * scaling), torch.ones_like(scaling), atol=0, rtol=1e-9)
+def test_the_scaling_is_the_root_for_either_sign(diagonal: float) -> None:
+    for half in [-3.0, -1e-3, 0.0, 1e-3, 3.0]:
+        factor, rest = torch.ones(1, 1, 1, dtype=torch.float64), torch.full((1, 1), diagonal, dtype=torch.float64)
+        scaling = scaling_from_moment(factor, rest, torch.full((1, 1, 1), 2 * half, dtype=torch.float64))
+        assert scaling > 0
+        torch.testing.assert_close(
+            scaling * (2 * half + diagonal * scaling), torch.ones_like(scaling), atol=0, rtol=1e-9
+        )
 
 
 @pytest.mark.parametrize("start", [1e-6, 1.0, 1e6])

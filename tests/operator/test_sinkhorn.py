@@ -16,6 +16,7 @@ from nlfilter_torch.operator.scaling import Balancing
 from nlfilter_torch.operator.sinkhorn import Rounds, sinkhorn_balance, sinkhorn_in_graph, sinkhorn_in_rounds
 from tests import reference
 from tests.images import reduced
+from tests.pairwise import each_value, pairwise
 from tests.problems import picture, seeded
 
 
@@ -34,9 +35,15 @@ def row_sums(factor: torch.Tensor, diagonal: torch.Tensor, d: torch.Tensor) -> t
     return d * ((factor.mT @ (factor @ d.unsqueeze(2))).squeeze(2) + diagonal * d)
 
 
-@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 5e-5), (torch.float64, 1e-10)])
-@pytest.mark.parametrize("pixels", [1, 2, 300, 20000, 70000])
-@pytest.mark.parametrize("completed", [False, True])
+@pytest.mark.parametrize(
+    ("dtype", "tolerance", "pixels", "completed"),
+    [
+        (dtype, tolerance, pixels, completed)
+        for (dtype, tolerance), pixels, completed in pairwise(
+            [(torch.float32, 5e-5), (torch.float64, 1e-10)], [1, 2, 300, 20000, 70000], [False, True]
+        )
+    ],
+)
 def test_row_sums_are_one(pixels: int, dtype: torch.dtype, tolerance: float, completed: bool) -> None:
     factor, diagonal = problem(2, 6, pixels, dtype=dtype)
     result = sinkhorn_balance(factor, diagonal, completed=completed)
@@ -221,8 +228,7 @@ def test_the_reproduction_of_a_false_residual(dtype: torch.dtype) -> None:
     assert (sums - 1).abs().max() < min(1e-4, 1.5 * operator.residual.max() + PRECISION[dtype])
 
 
-@pytest.mark.parametrize("dtype", FLOATS)
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize(("dtype", "seed"), each_value(FLOATS, range(4)))
 def test_periodic_images_are_balanced(seed: int, dtype: torch.dtype) -> None:
     image = checkerboard(64, 9, dtype)
     options = {"photometric_bandwidth": 10 / 255, "landmarks": "random", "num_landmarks": 1}

@@ -12,6 +12,7 @@ from nlfilter_torch import (
 )
 from tests import reference
 from tests.images import photograph, two_colours
+from tests.pairwise import each_value
 from tests.problems import build, guides, noise, options, picture
 
 
@@ -82,8 +83,7 @@ def test_spectrum_is_in_order_in_range_and_orthonormal(
     assert (s[~occupied] == 0).all()
 
 
-@pytest.mark.parametrize("name", ["astronaut", "camera", "coffee", "chelsea"])
-@pytest.mark.parametrize("bandwidth", [10, 20, 40])
+@pytest.mark.parametrize(("name", "bandwidth"), each_value(["astronaut", "camera", "coffee", "chelsea"], [10, 20, 40]))
 def test_ritz_values_lie_where_they_must(name: str, bandwidth: int) -> None:
     """Each lies between the eigenvalue of W of the same rank and that of its low-rank part (Courant and Fischer)."""
     operator = build(picture(name, 24, 24), photometric_bandwidth=bandwidth / 255, num_landmarks=60)
@@ -214,8 +214,7 @@ def test_an_empty_batch_has_an_empty_spectrum() -> None:
     assert operator.spectrum().eigenvalues.shape[0] == 0
 
 
-@pytest.mark.parametrize("side", [33, 64, 128])
-@pytest.mark.parametrize("bandwidth", [0.1, 0.3, 1.0])
+@pytest.mark.parametrize(("side", "bandwidth"), each_value([33, 64, 128], [0.1, 0.3, 1.0]))
 def test_eigenvectors_of_a_single_spike_are_orthonormal(side: int, bandwidth: float) -> None:
     image = torch.zeros(1, 1, side, side)
     image[..., side // 2, side // 3] = 1

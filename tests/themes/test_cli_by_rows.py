@@ -23,6 +23,7 @@ from nlfilter_torch.photo.files.tiff import TiffRows
 from nlfilter_torch.photo.picture import pictures, tiles
 from nlfilter_torch.photo.picture.photographs import Photograph, read_photograph, write_photograph
 from tests.files import PROFILE, Array, cat
+from tests.pairwise import each_value
 from tests.ranks import forked
 
 LITTLE = "0.03"  # gigabytes: less than the whole picture needs, more than small blocks of rows need
@@ -72,8 +73,10 @@ def test_of_several_pages_the_first_is_edited(
     assert tifffile.imread(tmp_path / "out.tif").shape == picture.shape
 
 
-@pytest.mark.parametrize("suffix", [".tif", ".png"])
-@pytest.mark.parametrize("options", [(), ("--channels", "all", "--depth", "8"), ("--region", "40,60,20,20:0,1,1,1")])
+@pytest.mark.parametrize(
+    ("suffix", "options"),
+    each_value([".tif", ".png"], [(), ("--channels", "all", "--depth", "8"), ("--region", "40,60,20,20:0,1,1,1")]),
+)
 def test_detail_by_rows_is_detail(photo: Path, tmp_path: Path, suffix: str, options: tuple[str, ...]) -> None:
     source = photo.with_suffix(suffix)
     write_photograph(read_photograph(photo), source)

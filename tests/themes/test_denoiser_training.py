@@ -268,28 +268,28 @@ def test_pictures_of_a_folder_are_reduced_and_some_are_set_aside(tmp_path: Path)
         read_pictures(empty)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["--steps", "0"], "--steps must be at least 1, got 0"),
-        (["--seed", "-1"], "--seed must not be negative, got -1"),
-        (["--rate", "0"], "--rate must be between 0 and 1, got 0"),
-        (["--workers", "-1"], "--workers must not be negative, got -1"),
-        (["--batch", "6", "--parts", "4"], "--batch must be a multiple of --parts, both at least 1, got 6 and 4"),
-        (["--start", "absent"], "--start must be a file of weights, got absent, which is not there"),
-        (["--start", "absent", "--scratch"], "not allowed with argument"),
-        (["--pictures", "absent"], "--pictures must be a folder, got absent"),
-        (["--steps", "many"], "--steps: invalid int value: 'many'"),
-    ],
-)
+REFUSED = [
+    (["--steps", "0"], "--steps must be at least 1, got 0"),
+    (["--seed", "-1"], "--seed must not be negative, got -1"),
+    (["--rate", "0"], "--rate must be between 0 and 1, got 0"),
+    (["--workers", "-1"], "--workers must not be negative, got -1"),
+    (["--batch", "6", "--parts", "4"], "--batch must be a multiple of --parts, both at least 1, got 6 and 4"),
+    (["--start", "absent"], "--start must be a file of weights, got absent, which is not there"),
+    (["--start", "absent", "--scratch"], "not allowed with argument"),
+    (["--pictures", "absent"], "--pictures must be a folder, got absent"),
+    (["--steps", "many"], "--steps: invalid int value: 'many'"),
+]
+
+
 def test_arguments_are_refused_before_anything_is_trained(
-    arguments: list[str], message: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(command, "Training", lambda *_, **__: pytest.fail("trained"))
-    with pytest.raises(SystemExit) as stopped:
-        main(arguments)
-    assert stopped.value.code == 2
-    assert message in capsys.readouterr().err
+    for arguments, message in REFUSED:
+        monkeypatch.setattr(command, "Training", lambda *_, **__: pytest.fail("trained"))
+        with pytest.raises(SystemExit) as stopped:
+            main(arguments)
+        assert stopped.value.code == 2
+        assert message in capsys.readouterr().err
 
 
 def test_a_file_in_place_of_the_folder_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -53,21 +53,21 @@ def test_edits_keep_dtype_and_input(name: str, dtype: torch.dtype) -> None:
     assert torch.equal(converted, before)
 
 
-@pytest.mark.parametrize(
-    ("edit", "others"),
-    [
-        (adjust_tone, ()),
-        (sharpen, ()),
-        (abstract, ()),
-        (denoise, ()),
-        (enhance, (torch.ones(3),)),
-        (region_mask, (SPOT,)),
-    ],
-)
-def test_an_unknown_argument_is_named_with_the_edit(edit: Callable[..., torch.Tensor], others: tuple[object]) -> None:
-    for name in ("contrst", "guide", "source"):
-        with pytest.raises(TypeError, match=rf"^{edit.__name__}\(\) got an unexpected keyword argument '{name}'"):
-            edit(RGB, *others, **{name: 2})
+EDITS_OF_IMAGES = [
+    (adjust_tone, ()),
+    (sharpen, ()),
+    (abstract, ()),
+    (denoise, ()),
+    (enhance, (torch.ones(3),)),
+    (region_mask, (SPOT,)),
+]
+
+
+def test_an_unknown_argument_is_named_with_the_edit() -> None:
+    for edit, others in EDITS_OF_IMAGES:
+        for name in ("contrst", "guide", "source"):
+            with pytest.raises(TypeError, match=rf"^{edit.__name__}\(\) got an unexpected keyword argument '{name}'"):
+                edit(RGB, *others, **{name: 2})
 
 
 def test_lazy_negations_are_images_like_others() -> None:

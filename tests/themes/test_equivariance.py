@@ -25,10 +25,9 @@ from tests.images import photograph
 LEVELS = 0.05 / 255
 # Where the colours on both sides of a border are nearly equal, recolor multiplies rounding errors of its masks by 100.
 RECOLORED_LEVELS = 0.15 / 255
+# All eight orientations are compositions of these two.
 TURNED: dict[str, tuple[Callable[[Tensor], Tensor], Callable[[Tensor], Tensor]]] = {
     "left and right": (lambda x: x.flip(3), lambda x: x.flip(3)),
-    "upside down": (lambda x: x.flip(2), lambda x: x.flip(2)),
-    "transposed": (lambda x: x.mT, lambda x: x.mT),
     "rotated": (lambda x: x.rot90(1, (2, 3)), lambda x: x.rot90(-1, (2, 3))),
 }
 
@@ -98,13 +97,12 @@ EDITS: dict[str, tuple[Callable[..., Tensor], tuple[Tensor, ...]]] = {
 }
 
 
-@pytest.mark.parametrize("turned", TURNED)
 @pytest.mark.parametrize("name", EDITS)
-def test_edits_and_masks_turn_with_the_image(name: str, turned: str) -> None:
-    (edit, others), (turn, back) = EDITS[name], TURNED[turned]
-    image = colours()
+def test_edits_and_masks_turn_with_the_image(name: str) -> None:
+    (edit, others), image = EDITS[name], colours()
+    limit = RECOLORED_LEVELS if name == "recolor" else LEVELS
     with torch.no_grad():
         expected = edit(image, *others)
-        result = back(edit(*(turn(planes) for planes in (image, *others))))
-    limit = RECOLORED_LEVELS if name == "recolor" else LEVELS
-    assert (result - expected).abs().max() < limit
+        for turned, (turn, back) in TURNED.items():
+            result = back(edit(*(turn(planes) for planes in (image, *others))))
+            assert (result - expected).abs().max() < limit, turned

@@ -21,6 +21,7 @@ from nlfilter_torch import (
 from nlfilter_torch.filtering.scribbles import propagate_strokes
 from nlfilter_torch.operator.features import patch_window
 from tests.images import hard_images
+from tests.pairwise import each_value, pairwise
 from tests.plain_autograd import plain_filter
 from tests.problems import noise, picture, seeded
 
@@ -243,9 +244,7 @@ def directions_that_keep_the_rank(guide: Tensor) -> list[Tensor]:
     return [noise(int(level.max()) + 1, seed=seed)[level].view_as(guide) - 0.5 for seed in range(5)]
 
 
-@pytest.mark.parametrize("completion", COMPLETIONS)
-@pytest.mark.parametrize("name", GUIDES)
-@pytest.mark.parametrize("function", [spectral_sum, mask_sum])
+@pytest.mark.parametrize(("completion", "name", "function"), pairwise(COMPLETIONS, GUIDES, [spectral_sum, mask_sum]))
 def test_gradient_in_a_degenerate_guide_is_the_finite_difference(
     function: Callable[[Spectrum, Tensor], Tensor], name: str, completion: str
 ) -> None:
@@ -280,8 +279,7 @@ def test_spectrum_and_products_agree_where_eigenvalues_meet(name: str) -> None:
     torch.testing.assert_close(gradients[1], gradients[0], rtol=1e-5, atol=1e-7)
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("name", hard_images())
+@pytest.mark.parametrize(("dtype", "name"), each_value([torch.float32, torch.float64], hard_images()))
 def test_gradients_are_finite_on_hard_images(name: str, dtype: torch.dtype) -> None:
     guide = torch.from_numpy(hard_images()[name])[None, None].to(dtype).requires_grad_()
     # With half of all seeds, an eigenvalue of two colours is so small in float32 that the slope of its power overflows.

@@ -4,7 +4,7 @@ from itertools import combinations, product
 
 import pytest
 
-from tests.pairwise import pairwise
+from tests.pairwise import each_value, pairwise
 
 AXES = ("abcdef", range(5), [None, (1, 2), [3], "x"], [True, False])
 
@@ -26,3 +26,7 @@ def test_impossible_rows_are_left_out() -> None:
 
 def test_a_single_value_stands_in_every_row() -> None:
     assert pairwise("abc", "x") == [("a", "x"), ("b", "x"), ("c", "x")]
+
+
+def test_each_value_stands_in_a_row() -> None:
+    assert each_value("abc", [1, 2]) == [("a", 1), ("b", 2), ("c", 1)]

@@ -7,6 +7,7 @@ import torch
 
 from nlfilter_torch import detail_layers, nonlocal_operator, polynomial_filter
 from tests.images import PHOTOGRAPHS, hard_images, reduced
+from tests.pairwise import each_value, pairwise
 
 BANDWIDTHS = (1, 3, 10, 30, 100, 1000)  # grey levels
 IMAGES = hard_images()
@@ -38,17 +39,16 @@ def promises(image: torch.Tensor, bandwidth: float, landmarks: str) -> None:
     assert polynomial_filter(operator, image, torch.tensor([3.0, 3.0, 4.0, 1.05]), residual=0.0).isfinite().all()
 
 
-@pytest.mark.parametrize("landmarks", ["kmeans", "uniform"])
-@pytest.mark.parametrize("bandwidth", BANDWIDTHS)
-@pytest.mark.parametrize("name", [*IMAGES, *PHOTOGRAPHS])
+@pytest.mark.parametrize(
+    ("landmarks", "bandwidth", "name"), pairwise(["kmeans", "uniform"], BANDWIDTHS, [*IMAGES, *PHOTOGRAPHS])
+)
 def test_every_image_and_bandwidth(name: str, bandwidth: int, landmarks: str) -> None:
     image = IMAGES[name] if name in IMAGES else reduced(name, 120)
     promises(torch.tensor(image, dtype=torch.float32)[None, None], bandwidth, landmarks)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("bandwidth", [1, 10, 1000])
-@pytest.mark.parametrize("name", PHOTOGRAPHS)
+@pytest.mark.parametrize(("bandwidth", "name"), each_value([1, 10, 1000], PHOTOGRAPHS))
 def test_whole_photographs(name: str, bandwidth: int) -> None:
     promises(torch.tensor(reduced(name, 320), dtype=torch.float32)[None, None], bandwidth, "kmeans")
 

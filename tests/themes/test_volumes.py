@@ -13,6 +13,7 @@ from torch import Tensor
 import nlfilter_torch as nlf
 from nlfilter_torch.operator.features import GuideFeatures, gradients, pad_border, patch_window
 from tests import reference
+from tests.pairwise import each_value, pairwise
 from tests.ranks import run_ranks
 
 SIZE = (4, 5, 6)
@@ -33,9 +34,9 @@ def operator(volume: Tensor) -> nlf.NonlocalOperator:
     return nlf.nonlocal_operator(volume, **OPTIONS)
 
 
-@pytest.mark.parametrize("channels", [1, 2])
-@pytest.mark.parametrize("spatial", [None, 2.5, (2.0, 3.0, 4.0)])
-@pytest.mark.parametrize("patch_size", [1, 3, 5])
+@pytest.mark.parametrize(
+    ("channels", "spatial", "patch_size"), pairwise([1, 2], [None, 2.5, (2.0, 3.0, 4.0)], [1, 3, 5])
+)
 def test_features_are_those_of_the_reference(
     channels: int, spatial: float | tuple[float, ...] | None, patch_size: int
 ) -> None:
@@ -87,8 +88,7 @@ def test_the_bandwidth_is_that_of_the_mean_gradient() -> None:
     torch.testing.assert_close(nlf.estimate_bandwidth(turned), nlf.estimate_bandwidth(noise(1, 1, *SIZE)))
 
 
-@pytest.mark.parametrize("landmarks", ["kmeans", "uniform", "random"])
-@pytest.mark.parametrize("completion", ["diagonal", "none"])
+@pytest.mark.parametrize(("landmarks", "completion"), each_value(["kmeans", "uniform", "random"], ["diagonal", "none"]))
 def test_products_keep_constants_and_means(volume: Tensor, landmarks: Any, completion: Any) -> None:
     options = OPTIONS | {"landmarks": landmarks, "completion": completion, "photometric_bandwidth": 1.0}
     operator = nlf.nonlocal_operator(volume, **options)
@@ -317,8 +317,7 @@ def test_nystrom_blocks_of_pixels_are_those_of_the_reference(completion: Any) ->
     np.testing.assert_allclose(across[:, b], w_ab, atol=tolerance)
 
 
-@pytest.mark.parametrize("landmarks", ["kmeans", "uniform", "random"])
-@pytest.mark.parametrize("weighted", [False, True])
+@pytest.mark.parametrize(("landmarks", "weighted"), each_value(["kmeans", "uniform", "random"], [False, True]))
 def test_the_operator_follows_from_its_nystrom_blocks(volume: Tensor, landmarks: Any, weighted: bool) -> None:
     features = GuideFeatures(patch_window(3, 3), 0.4, None, "all")(volume.expand(2, -1, -1, -1, -1))
     weights = 0.5 + noise(120, seed=9) if weighted else None

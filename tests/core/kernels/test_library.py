@@ -71,9 +71,10 @@ def test_every_operator_is_checked() -> None:
 
 @pytest.mark.filterwarnings("ignore:.*torch.jit.script.* is deprecated:DeprecationWarning")
 @pytest.mark.parametrize("in_c", [True, False], ids=["C", "torch"])
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
 @pytest.mark.parametrize("name", NAMES)
-def test_opcheck(name: str, dtype: torch.dtype, in_c: bool) -> None:
+def test_opcheck(name: str, in_c: bool) -> None:
+    # The kernels in C are for float32, except the solver, which works in float64 alone.
+    dtype = torch.float32 if in_c and name != "solve" else torch.float64
     operator, inputs = getattr(torch.ops.nlfilter, name).default, arguments(dtype)[name]
     with nullcontext() if in_c else definitions_only():
         torch.library.opcheck(operator, inputs)
@@ -83,9 +84,9 @@ def test_opcheck(name: str, dtype: torch.dtype, in_c: bool) -> None:
             )
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_accelerators_have_the_definitions(name: str) -> None:
-    assert torch._C._dispatch_has_computed_kernel_for_dispatch_key(f"nlfilter::{name}", "CUDA")
+def test_accelerators_have_the_definitions() -> None:
+    for name in NAMES:
+        assert torch._C._dispatch_has_computed_kernel_for_dispatch_key(f"nlfilter::{name}", "CUDA")
 
 
 def swept(factor: Tensor, diagonal: Tensor, total: Tensor) -> tuple[Tensor, Tensor]:

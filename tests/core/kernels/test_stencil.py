@@ -29,13 +29,16 @@ def dense(stencil: Tensor) -> Tensor:
     return matrix
 
 
-@pytest.mark.parametrize("size", [(1, 1), (1, 7), (6, 1), (2, 2), (5, 8), (9, 4)])
-def test_a_dense_solve_gives_the_same(size: tuple[int, int]) -> None:
-    stencil, right = problem(*size)
-    result = solve_stencil(stencil, right)
-    for image in range(2):
-        wanted = torch.linalg.solve(dense(stencil[image]), right[image].flatten(1).mT).mT
-        torch.testing.assert_close(result[image].flatten(1), wanted)
+SIZES = [(1, 1), (1, 7), (6, 1), (2, 2), (5, 8), (9, 4)]
+
+
+def test_a_dense_solve_gives_the_same() -> None:
+    for size in SIZES:
+        stencil, right = problem(*size)
+        result = solve_stencil(stencil, right)
+        for image in range(2):
+            wanted = torch.linalg.solve(dense(stencil[image]), right[image].flatten(1).mT).mT
+            torch.testing.assert_close(result[image].flatten(1), wanted)
 
 
 def test_float32_is_as_good_and_stays_so_under_autocast() -> None:

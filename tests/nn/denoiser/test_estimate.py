@@ -22,6 +22,7 @@ from nlfilter_torch.nn.denoiser.statistics import statistics_of
 from nlfilter_torch.photo import denoise
 from nlfilter_torch.photo.edits.noise import profile_of
 from nlfilter_torch.photo.picture.in_memory import InMemory
+from tests.pairwise import each_value, pairwise
 from tests.problems import colour, decibels, noisy, picture
 
 CAT = colour("chelsea", 256, 320).float()
@@ -44,8 +45,7 @@ def _averaged(planes: torch.Tensor) -> torch.Tensor:
     return F.avg_pool2d(F.pad(planes, (1, 1, 1, 1), mode="reflect"), 3, 1)
 
 
-@pytest.mark.parametrize("level", [5, 15, 40])
-@pytest.mark.parametrize("channels", [1, 3])
+@pytest.mark.parametrize(("level", "channels"), each_value([5, 15, 40], [1, 3]))
 def test_white_noise_is_estimated_by_its_own_rule(channels: int, level: int) -> None:
     clean = CAT if channels == 3 else picture("camera", 256, 320, torch.float32)
     image = noisy(clean, level / 255)
@@ -82,9 +82,12 @@ def test_drawn_and_dithered_pictures_stay() -> None:
         assert torch.equal(denoise(image), image)
 
 
-@pytest.mark.parametrize("size", [(1, 1), (2, 30), (3, 3), (16, 16), (40, 200)])
-@pytest.mark.parametrize("channels", [1, 2, 3, 4])
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.bfloat16])
+@pytest.mark.parametrize(
+    ("size", "channels", "dtype"),
+    pairwise(
+        [(1, 1), (2, 30), (3, 3), (16, 16), (40, 200)], [1, 2, 3, 4], [torch.float32, torch.float64, torch.bfloat16]
+    ),
+)
 def test_any_picture(size: tuple[int, int], channels: int, dtype: torch.dtype) -> None:
     image = torch.rand(2, channels, *size, generator=torch.Generator().manual_seed(0)).mul(1.5).to(dtype)
     profile = noise_profile(image)

@@ -8,6 +8,7 @@ from nlfilter_torch.nn.denoiser.noise import Noise
 from nlfilter_torch.photo import denoise
 from nlfilter_torch.photo.edits.noise import noise_of
 from nlfilter_torch.photo.picture.in_memory import InMemory
+from tests.pairwise import each_value
 from tests.problems import colour, decibels, noisy, picture
 
 CAT = colour("chelsea", 96, 128)
@@ -52,8 +53,7 @@ def test_clipped_pixels_do_not_hide_noise() -> None:
     assert float(estimate_noise(noisy(clean, 0.08).clamp(0, 1))) == pytest.approx(0.08, rel=0.1)
 
 
-@pytest.mark.parametrize("level", [15, 30, 50])
-@pytest.mark.parametrize("name", ["astronaut", "coffee"])
+@pytest.mark.parametrize(("level", "name"), each_value([15, 30, 50], ["astronaut", "coffee"]))
 def test_noise_in_8_bits_is_measured_where_clipping_does_not_truncate_it(name: str, level: int) -> None:
     """Both photographs have large dark areas; in 8 bits, 9 to 15 % of the noisy pixels are black or white."""
     result = 255 * estimate_noise(

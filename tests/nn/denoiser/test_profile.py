@@ -7,6 +7,7 @@ import torch
 import torch.nn.functional as F
 
 from nlfilter_torch.nn.denoiser.profile import KNOTS, NoiseProfile, profile_of_difference
+from tests.pairwise import each_value
 
 SCALES = NoiseProfile.SCALES
 
@@ -19,8 +20,7 @@ def grey(light: float, channels: int = 3) -> torch.Tensor:
     return torch.full((1, channels, 256, 256), light)
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("channels", [1, 2, 3])
+@pytest.mark.parametrize(("dtype", "channels"), each_value([torch.float32, torch.float64], [1, 2, 3]))
 def test_white_noise_has_one_level(channels: int, dtype: torch.dtype) -> None:
     clean = grey(0.5, channels).to(dtype)
     profile = profile_of_difference(clean + 0.1 * noise_like(clean), clean)
@@ -80,8 +80,7 @@ def test_scaling_is_per_image() -> None:
     assert profile.scaled(0.0).coarseness.tolist() == [1, 1]
 
 
-@pytest.mark.parametrize("size", [(1, 1), (1, 20), (3, 2), (17, 9)])
-@pytest.mark.parametrize("channels", [1, 3])
+@pytest.mark.parametrize(("size", "channels"), each_value([(1, 1), (1, 20), (3, 2), (17, 9)], [1, 3]))
 def test_small_pictures(size: tuple[int, int], channels: int) -> None:
     clean = torch.full((2, channels, *size), 1.5)
     profile = profile_of_difference(clean + 0.1, clean)

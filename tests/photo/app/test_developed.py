@@ -19,6 +19,7 @@ from nlfilter_torch.photo.picture.developing import balance_of, develop_image
 from nlfilter_torch.photo.picture.photographs import Photograph, read_photograph, write_photograph
 from nlfilter_torch.photo.picture.resizing import resize
 from tests.browser import difference
+from tests.pairwise import each_value
 from tests.problems import cat
 
 ALL = Development(0.4, 0.2, 0.1, 4.0, (0.1, 0.0, 1.0, 0.9))
@@ -168,8 +169,7 @@ def test_undo_redo_and_the_sidecar(session: Session) -> None:
     assert session.recipe.develop.exposure == 1
 
 
-@pytest.mark.parametrize("straighten", [0.0, 3.0])
-@pytest.mark.parametrize("aspect", [None, 16 / 9, 2 / 3])
+@pytest.mark.parametrize(("straighten", "aspect"), each_value([0.0, 3.0], [None, 16 / 9, 2 / 3]))
 def test_a_crop_keeps_its_size_where_it_is_moved(session: Session, straighten: float, aspect: float | None) -> None:
     session.load(session.developing({"straighten": straighten}))
     session.load(session.developing({"crop": (0.2, 0.2, 0.75, 0.8)}, aspect))

@@ -14,6 +14,7 @@ from nlfilter_torch.photo.declared.development import Development
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.declared.strokes import Stroke
+from tests.pairwise import each_value
 from tests.problems import colour
 
 SIZE = (300, 420)  # more than a block that is turned at once
@@ -50,8 +51,13 @@ def by_both(monkeypatch: pytest.MonkeyPatch, source: Path, *arguments: str) -> l
     return pictures
 
 
-@pytest.mark.parametrize("kind", ["plain", "transparent", "nodata", "floats"])
-@pytest.mark.parametrize("arguments", [ALL, ["--crop", "0.2,0.1,0.7,1"], ["--exposure", "-1", "--tint", "0.3"]])
+@pytest.mark.parametrize(
+    ("kind", "arguments"),
+    each_value(
+        ["plain", "transparent", "nodata", "floats"],
+        [ALL, ["--crop", "0.2,0.1,0.7,1"], ["--exposure", "-1", "--tint", "0.3"]],
+    ),
+)
 def test_tiles_give_the_same(kind: str, arguments: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     source = written(tmp_path / "in.tif", kind)
     whole, tiled = by_both(monkeypatch, source, "develop", *arguments)
@@ -106,24 +112,24 @@ def test_the_file_keeps_its_depth_and_its_exif_tells_its_size(tmp_path: Path, ti
         assert dict(after.getexif().get_ifd(34665)) == {40962: 15, 40963: 10}
 
 
-@pytest.mark.parametrize(
-    ("arguments", "sentence"),
-    [
-        (["--crop", "1,2"], "--crop must be the left, top, right and bottom edge as shares from 0 to 1"),
-        (["--crop", "a,b"], 'got "a,b"; correct it'),
-        (["--exposure", "9"], "--exposure"),
-        (
-            ["--aspect", "3/2"],
-            "--aspect must be a width and a height from 0.01 to 100000, such as 3:2, got '3/2'; correct it",
-        ),
-        (["--straighten", "45", "--crop", "0,0,0.1,0.1"], "crop must have its middle within the photograph turned"),
-        (["--workers", "2"], "--workers takes zarr arrays"),
-    ],
-)
-def test_bad_options(arguments: list[str], sentence: str, photo: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["develop", str(photo), str(photo.with_name("out.png")), *arguments]) == 2
-    assert sentence in capsys.readouterr().err
-    assert not photo.with_name("out.png").exists()
+BAD_OPTIONS = [
+    (["--crop", "1,2"], "--crop must be the left, top, right and bottom edge as shares from 0 to 1"),
+    (["--crop", "a,b"], 'got "a,b"; correct it'),
+    (["--exposure", "9"], "--exposure"),
+    (
+        ["--aspect", "3/2"],
+        "--aspect must be a width and a height from 0.01 to 100000, such as 3:2, got '3/2'; correct it",
+    ),
+    (["--straighten", "45", "--crop", "0,0,0.1,0.1"], "crop must have its middle within the photograph turned"),
+    (["--workers", "2"], "--workers takes zarr arrays"),
+]
+
+
+def test_bad_options(photo: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for arguments, sentence in BAD_OPTIONS:
+        assert main(["develop", str(photo), str(photo.with_name("out.png")), *arguments]) == 2
+        assert sentence in capsys.readouterr().err
+        assert not photo.with_name("out.png").exists()
 
 
 def test_notes(tmp_path: Path, tiled: bool, capsys: pytest.CaptureFixture[str]) -> None:

@@ -19,21 +19,21 @@ TECHNICAL = ["--bandwidth", "--spatial-bandwidth", "--patch-size", "--landmarks"
 TECHNICAL += ["--tolerance", "--reach", "--viewing-size", "--residual"]
 
 
-@pytest.mark.parametrize("edit", [*EDITS.values(), MASK], ids=lambda edit: edit.name)
-def test_photographic_options_come_first_in_the_help(edit: Edit, capsys: pytest.CaptureFixture[str]) -> None:
+def test_photographic_options_come_first_in_the_help(capsys: pytest.CaptureFixture[str]) -> None:
     """Settings of the filter, and those of files and memory, are in sections of their own."""
-    assert main([edit.name, "--help"]) == 0
-    shown = capsys.readouterr().out
-    names = (None, "Filter", "Files and memory")
-    starts = [shown.index(f"─ {name or 'Options'} ─") for name in names]
-    assert starts == sorted(starts)
-    sections = {name: shown[a:b] for name, a, b in zip(names, starts, [*starts[1:], len(shown)], strict=True)}
-    for parameter in edit:
-        option = f"--{parameter.name.replace('_', '-')}"
-        assert (option in sections[parameter.panel]) == parameter.is_option
-        assert (parameter.panel == "Filter") == (option in TECHNICAL)
-    assert "--seed" in sections["Filter"]
-    assert all(option in sections["Files and memory"] for option in ("--depth", "--memory", "--full"))
+    for edit in [*EDITS.values(), MASK]:
+        assert main([edit.name, "--help"]) == 0
+        shown = capsys.readouterr().out
+        names = (None, "Filter", "Files and memory")
+        starts = [shown.index(f"─ {name or 'Options'} ─") for name in names]
+        assert starts == sorted(starts)
+        sections = {name: shown[a:b] for name, a, b in zip(names, starts, [*starts[1:], len(shown)], strict=True)}
+        for parameter in edit:
+            option = f"--{parameter.name.replace('_', '-')}"
+            assert (option in sections[parameter.panel]) == parameter.is_option
+            assert (parameter.panel == "Filter") == (option in TECHNICAL)
+        assert "--seed" in sections["Filter"]
+        assert all(option in sections["Files and memory"] for option in ("--depth", "--memory", "--full"))
 
 
 @pytest.mark.parametrize("verb", ["recolor", "colorize", "defocus", "abstract", "denoise", "sharpen", "tone"])
@@ -57,18 +57,19 @@ def test_an_edit_that_changes_nothing_says_so(
     assert "changes nothing" not in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(
-    "arguments", ["tone --contrast 1", "denoise --patch-size 3", "develop", "apply --preset idle.json"]
-)
+WITHOUT_NOTES = ["tone --contrast 1", "denoise --patch-size 3", "develop", "apply --preset idle.json"]
+
+
 def test_what_is_wrong_is_said_without_notes(
-    arguments: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.chdir(tmp_path)
-    Path("idle.json").write_text(Recipe().to_json())
-    verb, *options = arguments.split()
-    assert main([verb, "missing.png", "out.png", *options]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert "missing.png does not exist" in line
+    for arguments in WITHOUT_NOTES:
+        monkeypatch.chdir(tmp_path)
+        Path("idle.json").write_text(Recipe().to_json())
+        verb, *options = arguments.split()
+        assert main([verb, "missing.png", "out.png", *options]) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert "missing.png does not exist" in line
 
 
 @pytest.mark.usefixtures("tiled")
@@ -98,24 +99,22 @@ def test_options_without_effect_are_named(photo: Path, tmp_path: Path, capsys: p
     assert not capsys.readouterr().err
 
 
-@pytest.mark.parametrize(
-    ("verb", "options", "sentence"),
-    [
-        ("recolor", ["--region", "1,2,5,4:red", "--reach", "1"], "Invalid value for '--reach'"),
-        ("defocus", ["--region", "1,2,5,4", "--radius", "0"], "Invalid value for '--radius': "),
-        ("detail", ["--region", "1,2,5,4", "--reach", "1"], "Invalid value for '--reach': "),
-        ("abstract", ["--tones", "1"], "Invalid value for '--tones'"),
-        ("abstract", ["--edge-width", "0"], "Invalid value for '--edge-width': "),
-        ("denoise", ["--noise-level", "-1"], "Invalid value for '--noise-level'"),
-        ("tone", ["--bandwidth", "0"], "--bandwidth must be a positive number of grey levels"),
-        ("denoise", ["--bandwidth", "0"], "Invalid value for '--bandwidth': "),
-    ],
-)
-def test_wrong_options(
-    photo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], verb: str, options: list[str], sentence: str
-) -> None:
-    assert refusal(capsys, verb, photo, tmp_path / "out.png", *options).startswith(sentence)
-    assert [file.name for file in tmp_path.iterdir()] == ["in.png"]
+WRONG_OPTIONS = [
+    ("recolor", ["--region", "1,2,5,4:red", "--reach", "1"], "Invalid value for '--reach'"),
+    ("defocus", ["--region", "1,2,5,4", "--radius", "0"], "Invalid value for '--radius': "),
+    ("detail", ["--region", "1,2,5,4", "--reach", "1"], "Invalid value for '--reach': "),
+    ("abstract", ["--tones", "1"], "Invalid value for '--tones'"),
+    ("abstract", ["--edge-width", "0"], "Invalid value for '--edge-width': "),
+    ("denoise", ["--noise-level", "-1"], "Invalid value for '--noise-level'"),
+    ("tone", ["--bandwidth", "0"], "--bandwidth must be a positive number of grey levels"),
+    ("denoise", ["--bandwidth", "0"], "Invalid value for '--bandwidth': "),
+]
+
+
+def test_wrong_options(photo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for verb, wrong, sentence in WRONG_OPTIONS:
+        assert refusal(capsys, verb, photo, tmp_path / "out.png", *wrong).startswith(sentence)
+        assert [file.name for file in tmp_path.iterdir()] == ["in.png"]
 
 
 def test_options_of_an_edit_with_two_kinds_of_scribbles() -> None:

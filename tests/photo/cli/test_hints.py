@@ -14,64 +14,62 @@ from tests.commands import refusal
 DETAIL = ["--alpha", "--bandwidth", "--region", "--force", "--quality"]
 
 
-@pytest.mark.parametrize(
-    ("arguments", "wanted"),
-    [
-        (
-            ["denoise", "a.png", "b.png", "--sigma", "20"],
-            "No such option: --sigma; here it is --noise-level or --bandwidth",
-        ),
-        (
-            ["detail", "a.png", "b.png", "--sigma", "20"],
-            "No such option: --sigma; here it is --bandwidth or --tolerance",
-        ),
-        (["denoise", "a.png", "b.png", "--luminance", "0"], "No such option: --luminance; here it is --brightness"),
-        (["denoise", "a.png", "b.png", "--color", "0"], "No such option: --color; here it is --colour"),
-        (["defocus", "a.png", "b.png", "--blur", "5"], "No such option: --blur; here it is --radius"),
-        (
-            ["recolor", "a.png", "b.png", "--color", "red"],
-            "No such option: --color; here it is --region X,Y,W,H:COLOUR or --strokes",
-        ),
-        (
-            ["detail", "a.png", "-o", "b.png"],
-            "No such option: -o; the output is the second argument: nlfilter-torch COMMAND IN OUT",
-        ),
-        (["batch", "a", "b", "--jobs", "2"], "No such option: --jobs; here it is --workers"),
-        (["presets", "--jobs", "2"], "No such option: --jobs; nlfilter-torch batch has --workers"),
-        (["sharpen", "a.png", "b.png", "--overwrite"], "No such option: --overwrite; here it is --force"),
-        (["sharpen", "a.png", "b.png", "--strength", "3"], "No such option: --strength; here it is --amount"),
-        (
-            ["detail", "a.png", "b.png", "--rotate", "2"],
-            "No such option: --rotate; nlfilter-torch develop has --exposure, --temperature, --tint, --straighten, "
-            "--crop and --aspect",
-        ),
-        (["develop", "a.png", "b.png", "--ratio", "1:1"], "No such option: --ratio; here it is --aspect"),
-        (
-            ["a.png", "b.png"],
-            "No such command 'a.png'; the command comes first, such as nlfilter-torch detail a.png OUT --preset crisp, "
-            "and nlfilter-torch --help lists all of them",
-        ),
-        (
-            ["blur", "a.png", "b.png"],
-            "No such command 'blur'; here it is nlfilter-torch defocus IN OUT --region X,Y,W,H, and nlfilter-torch "
-            "--help lists all of them",
-        ),
-        (["fancy", "a.png", "b.png"], "No such command 'fancy'; nlfilter-torch --help lists all of them"),
-        (
-            ["detail", "a.png", "b.png", "--alpha", "2", "2", "2", "1"],
-            "Got unexpected extra argument(s) (2 2 1); the numbers of --alpha are separated by commas: --alpha 2,2,2,1",
-        ),
-        (
-            ["detail", "a.png", "b.png", "c.png", "folder"],
-            "Got unexpected extra argument(s) (c.png folder); the command edits one photograph, and nlfilter-torch "
-            "batch IN_DIR OUT_DIR all of a folder",
-        ),
-    ],
-)
-def test_refusals_say_what_was_meant(
-    arguments: list[str], wanted: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert refusal(capsys, *arguments) == wanted
+HINTS = [
+    (
+        ["denoise", "a.png", "b.png", "--sigma", "20"],
+        "No such option: --sigma; here it is --noise-level or --bandwidth",
+    ),
+    (
+        ["detail", "a.png", "b.png", "--sigma", "20"],
+        "No such option: --sigma; here it is --bandwidth or --tolerance",
+    ),
+    (["denoise", "a.png", "b.png", "--luminance", "0"], "No such option: --luminance; here it is --brightness"),
+    (["denoise", "a.png", "b.png", "--color", "0"], "No such option: --color; here it is --colour"),
+    (["defocus", "a.png", "b.png", "--blur", "5"], "No such option: --blur; here it is --radius"),
+    (
+        ["recolor", "a.png", "b.png", "--color", "red"],
+        "No such option: --color; here it is --region X,Y,W,H:COLOUR or --strokes",
+    ),
+    (
+        ["detail", "a.png", "-o", "b.png"],
+        "No such option: -o; the output is the second argument: nlfilter-torch COMMAND IN OUT",
+    ),
+    (["batch", "a", "b", "--jobs", "2"], "No such option: --jobs; here it is --workers"),
+    (["presets", "--jobs", "2"], "No such option: --jobs; nlfilter-torch batch has --workers"),
+    (["sharpen", "a.png", "b.png", "--overwrite"], "No such option: --overwrite; here it is --force"),
+    (["sharpen", "a.png", "b.png", "--strength", "3"], "No such option: --strength; here it is --amount"),
+    (
+        ["detail", "a.png", "b.png", "--rotate", "2"],
+        "No such option: --rotate; nlfilter-torch develop has --exposure, --temperature, --tint, --straighten, "
+        "--crop and --aspect",
+    ),
+    (["develop", "a.png", "b.png", "--ratio", "1:1"], "No such option: --ratio; here it is --aspect"),
+    (
+        ["a.png", "b.png"],
+        "No such command 'a.png'; the command comes first, such as nlfilter-torch detail a.png OUT --preset crisp, "
+        "and nlfilter-torch --help lists all of them",
+    ),
+    (
+        ["blur", "a.png", "b.png"],
+        "No such command 'blur'; here it is nlfilter-torch defocus IN OUT --region X,Y,W,H, and nlfilter-torch "
+        "--help lists all of them",
+    ),
+    (["fancy", "a.png", "b.png"], "No such command 'fancy'; nlfilter-torch --help lists all of them"),
+    (
+        ["detail", "a.png", "b.png", "--alpha", "2", "2", "2", "1"],
+        "Got unexpected extra argument(s) (2 2 1); the numbers of --alpha are separated by commas: --alpha 2,2,2,1",
+    ),
+    (
+        ["detail", "a.png", "b.png", "c.png", "folder"],
+        "Got unexpected extra argument(s) (c.png folder); the command edits one photograph, and nlfilter-torch "
+        "batch IN_DIR OUT_DIR all of a folder",
+    ),
+]
+
+
+def test_refusals_say_what_was_meant(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for arguments, wanted in HINTS:
+        assert refusal(capsys, *arguments) == wanted
 
 
 def test_other_messages_are_left_as_they_are() -> None:

@@ -35,32 +35,40 @@ def test_percentages_are_exact() -> None:
         assert (rectangle.rows, rectangle.columns) == (slice(percent, 100), slice(3 * percent, 300))
 
 
-@pytest.mark.parametrize(
-    ("text", "wanted"),
-    [
-        ("25%,50%,10%,25%", "24,32,9,16"),
-        ("24,50%,9,16", "24,32,9,16"),
-        ("0%,0%,100%,100%", "0,0,96,64"),
-        ("50%,50%", "47,31,2,2"),
-        ("0,0", "0,0,2,2"),
-        ("100%,100%", "94,62,2,2"),
-        ("95,63", "94,62,2,2"),
-    ],
-)
-def test_shares_and_points(text: str, wanted: str) -> None:
-    assert str(Rectangle.parse(text, "--region", (64, 96))) == wanted
+SHARES = [
+    ("25%,50%,10%,25%", "24,32,9,16"),
+    ("24,50%,9,16", "24,32,9,16"),
+    ("0%,0%,100%,100%", "0,0,96,64"),
+    ("50%,50%", "47,31,2,2"),
+    ("0,0", "0,0,2,2"),
+    ("100%,100%", "94,62,2,2"),
+    ("95,63", "94,62,2,2"),
+]
 
 
-@pytest.mark.parametrize("text", ["50%", "1,2,3", "a%,2", "nan%,2,3,4", "50%,50%,60%,10%", "0,0,0%,5", "1.5,2,3,4"])
-def test_wrong_shares(text: str) -> None:
-    with pytest.raises(ValueError, match="--region must"):
-        Rectangle.parse(text, "--region", (64, 96))
+def test_shares_and_points() -> None:
+    for text, wanted in SHARES:
+        assert str(Rectangle.parse(text, "--region", (64, 96))) == wanted
 
 
-@pytest.mark.parametrize("text", ["97,20", "20,65", "-1,20", "101%,50%", "50%,-1%"])
-def test_points_outside(text: str) -> None:
-    with pytest.raises(ValueError, match="--region must be a point in the photograph, which is 96 pixels wide and 64 "):
-        Rectangle.parse(text, "--region", (64, 96))
+WRONG_SHARES = ["50%", "1,2,3", "a%,2", "nan%,2,3,4", "50%,50%,60%,10%", "0,0,0%,5", "1.5,2,3,4"]
+
+
+def test_wrong_shares() -> None:
+    for text in WRONG_SHARES:
+        with pytest.raises(ValueError, match="--region must"):
+            Rectangle.parse(text, "--region", (64, 96))
+
+
+POINTS_OUTSIDE = ["97,20", "20,65", "-1,20", "101%,50%", "50%,-1%"]
+
+
+def test_points_outside() -> None:
+    for text in POINTS_OUTSIDE:
+        with pytest.raises(
+            ValueError, match="--region must be a point in the photograph, which is 96 pixels wide and 64 "
+        ):
+            Rectangle.parse(text, "--region", (64, 96))
 
 
 def test_a_share_does_what_pixels_do(photo: Path, tmp_path: Path) -> None:
@@ -104,45 +112,43 @@ def test_strokes_that_cover_the_photograph_are_refused(
     )
 
 
-@pytest.mark.parametrize(
-    ("verb", "options", "sentence"),
-    [
-        ("recolor", [], "give --strokes FILE or --region X,Y,W,H:COLOUR"),
-        ("colorize", [], "give --strokes FILE or --region X,Y,W,H:COLOUR"),
-        ("defocus", [], "give --region X,Y,W,H or --mask FILE"),
-        (
-            "recolor",
-            ["--region", "1,2,3"],
-            "--region must be four whole numbers X,Y,W,H, such as 40,60,20,20, got '1,2,3'",
-        ),
-        ("recolor", ["--region", "1,2,3,x:red"], "--region must be four whole numbers"),
-        ("recolor", ["--region", "1,2,3,4"], "--region must end in a colour, such as 1,2,3,4:red, got '1,2,3,4'"),
-        ("recolor", ["--region", "1,2,3,4:reddish"], "--region must end in a colour, such as red, #c04020 or rgb("),
-        ("recolor", ["--region", "1,2,3,4:#0000ff80"], "--region must end in an opaque colour, got '#0000ff80'"),
-        ("recolor", ["--region", "1,2,0,4:red"], "--region must be at least 1 pixel wide and high, got 0x4"),
-        (
-            "recolor",
-            ["--region", "88,2,5,4:red"],
-            "--region must lie within the photograph, which is 90 pixels wide and 60",
-        ),
-        ("recolor", ["--region", "-1,2,5,4:red"], "--region must lie within the photograph"),
-        ("recolor", ["--region", "1,2,5,4:red", "--keep", "99,9,9,9"], "--keep must lie within the photograph"),
-        ("recolor", ["--region", "1,2,5,4:red", "--keep", "9,9,9,9:red"], "--keep must be X,Y,W,H only, got"),
-        ("defocus", ["--region", "1,2,5,4:red"], "--region must be X,Y,W,H only, got"),
-        ("detail", ["--region", "1,2,5,4:1,2"], "--region must have as many sliders as --alpha, 4, got 2"),
-        (
-            "detail",
-            ["--remove", "1,2,5,4"],
-            "--remove must come with --region, --add or --mask, got none of them; mark",
-        ),
-        ("detail", ["--region", "1,2,5,4:1,x,1,1"], "--region must be numbers separated by commas"),
-    ],
-)
-def test_wrong_rectangles(
-    photo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], verb: str, options: list[str], sentence: str
-) -> None:
-    assert refusal(capsys, verb, photo, tmp_path / "out.png", *options).startswith(sentence)
-    assert [file.name for file in tmp_path.iterdir()] == ["in.png"]
+WRONG_RECTANGLES = [
+    ("recolor", [], "give --strokes FILE or --region X,Y,W,H:COLOUR"),
+    ("colorize", [], "give --strokes FILE or --region X,Y,W,H:COLOUR"),
+    ("defocus", [], "give --region X,Y,W,H or --mask FILE"),
+    (
+        "recolor",
+        ["--region", "1,2,3"],
+        "--region must be four whole numbers X,Y,W,H, such as 40,60,20,20, got '1,2,3'",
+    ),
+    ("recolor", ["--region", "1,2,3,x:red"], "--region must be four whole numbers"),
+    ("recolor", ["--region", "1,2,3,4"], "--region must end in a colour, such as 1,2,3,4:red, got '1,2,3,4'"),
+    ("recolor", ["--region", "1,2,3,4:reddish"], "--region must end in a colour, such as red, #c04020 or rgb("),
+    ("recolor", ["--region", "1,2,3,4:#0000ff80"], "--region must end in an opaque colour, got '#0000ff80'"),
+    ("recolor", ["--region", "1,2,0,4:red"], "--region must be at least 1 pixel wide and high, got 0x4"),
+    (
+        "recolor",
+        ["--region", "88,2,5,4:red"],
+        "--region must lie within the photograph, which is 90 pixels wide and 60",
+    ),
+    ("recolor", ["--region", "-1,2,5,4:red"], "--region must lie within the photograph"),
+    ("recolor", ["--region", "1,2,5,4:red", "--keep", "99,9,9,9"], "--keep must lie within the photograph"),
+    ("recolor", ["--region", "1,2,5,4:red", "--keep", "9,9,9,9:red"], "--keep must be X,Y,W,H only, got"),
+    ("defocus", ["--region", "1,2,5,4:red"], "--region must be X,Y,W,H only, got"),
+    ("detail", ["--region", "1,2,5,4:1,2"], "--region must have as many sliders as --alpha, 4, got 2"),
+    (
+        "detail",
+        ["--remove", "1,2,5,4"],
+        "--remove must come with --region, --add or --mask, got none of them; mark",
+    ),
+    ("detail", ["--region", "1,2,5,4:1,x,1,1"], "--region must be numbers separated by commas"),
+]
+
+
+def test_wrong_rectangles(photo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for verb, options, sentence in WRONG_RECTANGLES:
+        assert refusal(capsys, verb, photo, tmp_path / "out.png", *options).startswith(sentence)
+        assert [file.name for file in tmp_path.iterdir()] == ["in.png"]
 
 
 def test_wrong_pictures(photo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

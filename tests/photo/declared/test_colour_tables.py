@@ -11,6 +11,7 @@ from nlfilter_torch.photo.declared.colour_tables import cube_of, hald_of, in_ord
 from nlfilter_torch.photo.declared.presets import Recipe, find_recipe
 from nlfilter_torch.photo.edits.applying import apply_step
 from tests.looks import CAT
+from tests.pairwise import each_value
 
 HEAD = "LUT_3D_SIZE 2\n"
 ROWS = "0 0 0\n1 0 0\n0 1 0\n1 1 0\n0 0 1\n1 0 1\n0 1 1\n1 1 1\n"
@@ -29,34 +30,34 @@ def test_comments_titles_and_ranges_from_zero_to_one_are_read() -> None:
     assert step["lattice"] == (0.0,) * 24
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        (ROWS, "it must have a line LUT_3D_SIZE, got none; export"),
-        (HEAD + ROWS + "0 0 0\n", r"it must hold 2\^3 = 8 colours, got 9; export it again"),
-        (HEAD + "0 0 0\n", r"it must hold 2\^3 = 8 colours, got 1; export it again"),
-        ("LUT_1D_SIZE 4\n", "it must be a 3-D table, got a 1-D table; export"),
-        (f"DOMAIN_MAX 4 4 4\n{HEAD}{ROWS}", "DOMAIN_MAX of it must be 1 1 1, got 4 4 4; export"),
-        (f"DOMAIN_MIN -1 0 0\n{HEAD}{ROWS}", "DOMAIN_MIN of it must be 0 0 0, got -1 0 0; export"),
-        (f"LUT_3D_INPUT_RANGE 0 2\n{HEAD}{ROWS}", "LUT_3D_INPUT_RANGE of it must be 0 1, got 0 2; export"),
-        (f"DOMAIN_MIN 0\n{HEAD}{ROWS}", "DOMAIN_MIN of it must hold 3 numbers, got 0; export"),
-        ("LUT_3D_SIZE 200\n", "LUT_3D_SIZE of it must be a whole number from 2 to 65, got 200; export"),
-        ("LUT_3D_SIZE x\n", "LUT_3D_SIZE of it must be a whole number from 2 to 65, got x; export"),
-        (HEAD + ROWS.replace("1 1 1", "1 1"), "line 9 of it must hold 3 numbers, got 1 1; export"),
-        (HEAD + ROWS.replace("1 1 1", "1 nan 1"), "line 9 of it must hold 3 numbers, got 1 nan 1; export"),
-        (HEAD + ROWS.replace("1 1 1", "nan 1 1"), "line 9 of it must hold 3 numbers, got nan 1 1; export"),
-        (HEAD + ROWS.replace("1 1 1", "1_0 1 1"), "line 9 of it must hold 3 numbers, got 1_0 1 1; export"),
-        (HEAD + ROWS.replace(" ", ","), "line 2 of it must hold 3 numbers, got 0,0,0; export"),
-        ("\0\1\n", r"line 1 of it must hold 3 numbers, got \?\?; export"),
-        ("LUT_IN_VIDEO_RANGE\n", "it must be a table of colours, got a line LUT_IN_VIDEO_RANGE; export"),
-        ("hello\n", "it must be a table of colours, got a line hello; export"),
-        ("", "it must have a line LUT_3D_SIZE, got none; export"),
-    ],
-)
-def test_other_tables_are_refused_in_a_sentence(text: str, message: str) -> None:
-    with pytest.raises(ValueError, match=message) as error:
-        step_of_cube(text, "it")
-    assert "\n" not in str(error.value)
+WRONG_TABLES = [
+    (ROWS, "it must have a line LUT_3D_SIZE, got none; export"),
+    (HEAD + ROWS + "0 0 0\n", r"it must hold 2\^3 = 8 colours, got 9; export it again"),
+    (HEAD + "0 0 0\n", r"it must hold 2\^3 = 8 colours, got 1; export it again"),
+    ("LUT_1D_SIZE 4\n", "it must be a 3-D table, got a 1-D table; export"),
+    (f"DOMAIN_MAX 4 4 4\n{HEAD}{ROWS}", "DOMAIN_MAX of it must be 1 1 1, got 4 4 4; export"),
+    (f"DOMAIN_MIN -1 0 0\n{HEAD}{ROWS}", "DOMAIN_MIN of it must be 0 0 0, got -1 0 0; export"),
+    (f"LUT_3D_INPUT_RANGE 0 2\n{HEAD}{ROWS}", "LUT_3D_INPUT_RANGE of it must be 0 1, got 0 2; export"),
+    (f"DOMAIN_MIN 0\n{HEAD}{ROWS}", "DOMAIN_MIN of it must hold 3 numbers, got 0; export"),
+    ("LUT_3D_SIZE 200\n", "LUT_3D_SIZE of it must be a whole number from 2 to 65, got 200; export"),
+    ("LUT_3D_SIZE x\n", "LUT_3D_SIZE of it must be a whole number from 2 to 65, got x; export"),
+    (HEAD + ROWS.replace("1 1 1", "1 1"), "line 9 of it must hold 3 numbers, got 1 1; export"),
+    (HEAD + ROWS.replace("1 1 1", "1 nan 1"), "line 9 of it must hold 3 numbers, got 1 nan 1; export"),
+    (HEAD + ROWS.replace("1 1 1", "nan 1 1"), "line 9 of it must hold 3 numbers, got nan 1 1; export"),
+    (HEAD + ROWS.replace("1 1 1", "1_0 1 1"), "line 9 of it must hold 3 numbers, got 1_0 1 1; export"),
+    (HEAD + ROWS.replace(" ", ","), "line 2 of it must hold 3 numbers, got 0,0,0; export"),
+    ("\0\1\n", r"line 1 of it must hold 3 numbers, got \?\?; export"),
+    ("LUT_IN_VIDEO_RANGE\n", "it must be a table of colours, got a line LUT_IN_VIDEO_RANGE; export"),
+    ("hello\n", "it must be a table of colours, got a line hello; export"),
+    ("", "it must have a line LUT_3D_SIZE, got none; export"),
+]
+
+
+def test_other_tables_are_refused_in_a_sentence() -> None:
+    for text, message in WRONG_TABLES:
+        with pytest.raises(ValueError, match=message) as error:
+            step_of_cube(text, "it")
+        assert "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize("dtype", ["uint8", "uint16", "float32"])
@@ -68,23 +69,24 @@ def test_halds_of_all_depths(dtype: str) -> None:
     torch.testing.assert_close(apply_step(step, CAT), 1 - CAT, atol=1e-5 if levels != 255 else 1e-3, rtol=0)
 
 
+NO_HALDS = [
+    ((64, 65, 3), "must be a Hald, a square picture in colour of 8, 27, 64, .* got 65x64; edit"),
+    ((63, 63, 3), "must be a Hald"),
+    ((64, 64, 1), "must be a Hald"),
+    ((1, 1, 3), "must be a Hald"),
+    ((729, 729, 3), "must be a Hald of level 8 at most, got 9; make a smaller one"),
+]
+
+
+def test_pictures_that_are_no_halds_are_refused() -> None:
+    for shape, message in NO_HALDS:
+        with pytest.raises(ValueError, match=message):
+            step_of_hald(np.zeros(shape, np.uint8), "it")
+
+
 @pytest.mark.parametrize(
-    ("shape", "message"),
-    [
-        ((64, 65, 3), "must be a Hald, a square picture in colour of 8, 27, 64, .* got 65x64; edit"),
-        ((63, 63, 3), "must be a Hald"),
-        ((64, 64, 1), "must be a Hald"),
-        ((1, 1, 3), "must be a Hald"),
-        ((729, 729, 3), "must be a Hald of level 8 at most, got 9; make a smaller one"),
-    ],
+    ("encoding", "ending"), each_value(["utf-8", "utf-8-sig", "utf-16", "latin-1"], ["\n", "\r\n", "\r"])
 )
-def test_pictures_that_are_no_halds_are_refused(shape: tuple[int, int, int], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        step_of_hald(np.zeros(shape, np.uint8), "it")
-
-
-@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "latin-1"])
-@pytest.mark.parametrize("ending", ["\n", "\r\n", "\r"])
 def test_text_of_any_encoding_and_line_ending(encoding: str, ending: str) -> None:
     text = ('TITLE "\u00e9t\u00e9"\n' + HEAD.lower() + ROWS.replace(" ", "\t")).replace("\n", ending)
     assert Recipe.from_file(text.encode(encoding), "it.cube").steps[0]["lattice"] == (0.0,) * 24

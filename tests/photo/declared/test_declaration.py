@@ -26,23 +26,20 @@ EDIT = Edit(
 )
 
 
-@pytest.mark.parametrize(
-    ("parameter", "valid", "invalid"),
-    [
-        (NUMBER, (-5, 0.0, 5.0), (5.1, True, None, "1", float("nan"), [1.0])),
-        (WIDTH, (1, 99), (2, 3.0, 101, None)),
-        (LEVEL, (0.01, 7, "auto", None), (0.0, "all")),
-        (COUNT, (2, 64, None), (1, 2.5, 65)),
-        (CHOICE, ("soft", "none"), ("hard", None, 1)),
-        (SLIDERS, ((1.0, 2.0), [0, 3, -1]), ((1.0,), [1.0, "2"], 1.0, [0.0] * 101, [1e7, 1.0])),
-    ],
-    ids=lambda value: getattr(value, "name", ""),
-)
-def test_values_of_files_are_valid_or_not(
-    parameter: Parameter, valid: tuple[object, ...], invalid: tuple[object, ...]
-) -> None:
-    assert [value for value in valid if not parameter.is_valid(value)] == []
-    assert [value for value in invalid if parameter.is_valid(value)] == []
+VALUES = [
+    (NUMBER, (-5, 0.0, 5.0), (5.1, True, None, "1", float("nan"), [1.0])),
+    (WIDTH, (1, 99), (2, 3.0, 101, None)),
+    (LEVEL, (0.01, 7, "auto", None), (0.0, "all")),
+    (COUNT, (2, 64, None), (1, 2.5, 65)),
+    (CHOICE, ("soft", "none"), ("hard", None, 1)),
+    (SLIDERS, ((1.0, 2.0), [0, 3, -1]), ((1.0,), [1.0, "2"], 1.0, [0.0] * 101, [1e7, 1.0])),
+]
+
+
+def test_values_of_files_are_valid_or_not() -> None:
+    for parameter, valid, invalid in VALUES:
+        assert [value for value in valid if not parameter.is_valid(value)] == []
+        assert [value for value in invalid if parameter.is_valid(value)] == []
 
 
 def test_a_list_of_fixed_length_has_that_length() -> None:
@@ -52,19 +49,18 @@ def test_a_list_of_fixed_length_has_that_length() -> None:
     assert matrix.wanted.startswith("a list of 9 numbers")
 
 
-@pytest.mark.parametrize(
-    ("parameter", "sentence"),
-    [
-        (NUMBER, "a number from -5 to 5"),
-        (WIDTH, "an odd number from 1 to 99"),
-        (LEVEL, 'a positive number of grey levels, from 0.01 to 1000000, or "auto", or null'),
-        (CHOICE, '"soft" or "none"'),
-        (SLIDERS, "a list of 2 to 100 numbers from -1000000 to 1000000"),
-    ],
-    ids=lambda value: getattr(value, "name", ""),
-)
-def test_errors_say_which_values_are_valid(parameter: Parameter, sentence: str) -> None:
-    assert parameter.wanted == sentence
+WANTED = [
+    (NUMBER, "a number from -5 to 5"),
+    (WIDTH, "an odd number from 1 to 99"),
+    (LEVEL, 'a positive number of grey levels, from 0.01 to 1000000, or "auto", or null'),
+    (CHOICE, '"soft" or "none"'),
+    (SLIDERS, "a list of 2 to 100 numbers from -1000000 to 1000000"),
+]
+
+
+def test_errors_say_which_values_are_valid() -> None:
+    for parameter, sentence in WANTED:
+        assert parameter.wanted == sentence
 
 
 def test_idle_values_are_those_that_change_nothing() -> None:

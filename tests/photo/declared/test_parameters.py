@@ -12,7 +12,7 @@ from torch import Tensor
 from benchmarks import parameters
 from nlfilter_torch import photo
 from nlfilter_torch.operator.options import FilterOptions
-from nlfilter_torch.photo.declared.declaration import Edit, Parameter
+from nlfilter_torch.photo.declared.declaration import Edit
 from nlfilter_torch.photo.declared.parameters import EDITS, MASK
 from nlfilter_torch.photo.declared.shared_parameters import FILTER
 from nlfilter_torch.photo.edits.applying import EDIT_OF
@@ -20,8 +20,6 @@ from nlfilter_torch.photo.picture.drawn import Drawn
 from nlfilter_torch.photo.picture.edit import PhotoEdit
 from nlfilter_torch.photo.selections.mask import RegionMask
 from tests.pages import ROOT
-
-EVERY = [(edit, parameter) for edit in EDITS.values() for parameter in edit]
 
 
 def test_the_page_is_up_to_date() -> None:
@@ -40,26 +38,27 @@ def test_another_default_counts_as_a_declaration() -> None:
     assert sorted(name for _, name in parameters.literals(tree)) == ["alpha", "reach", "time"]
 
 
-@pytest.mark.parametrize(("edit", "parameter"), EVERY, ids=lambda value: value.name)
-def test_defaults_are_valid(edit: Edit, parameter: Parameter) -> None:
-    assert parameter.is_valid(parameter.default)
-    assert parameter.idle is ... or parameter.idle == 1.0 or parameter.is_valid(parameter.idle)
-    if parameter.slider is not None and parameter.slider.none is None:
-        assert parameter.low <= parameter.slider.low < parameter.slider.high <= parameter.high
-    for value in (parameter.low, parameter.high) if parameter.domain not in (None, "choice", "count") else ():
-        parameter.check_argument(parameter.argument_of(value, (400, 600)))
+@pytest.mark.parametrize("edit", EDITS.values(), ids=lambda edit: edit.name)
+def test_defaults_are_valid(edit: Edit) -> None:
+    for parameter in edit:
+        assert parameter.is_valid(parameter.default), parameter.name
+        assert parameter.idle is ... or parameter.idle == 1.0 or parameter.is_valid(parameter.idle), parameter.name
+        if parameter.slider is not None and parameter.slider.none is None:
+            assert parameter.low <= parameter.slider.low < parameter.slider.high <= parameter.high, parameter.name
+        for value in (parameter.low, parameter.high) if parameter.domain not in (None, "choice", "count") else ():
+            parameter.check_argument(parameter.argument_of(value, (400, 600)))
 
 
 NAMES = [edit.function or edit.name for edit in (*EDITS.values(), MASK)]
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_docstrings_describe_the_arguments_of_the_function_of_an_image(name: str) -> None:
-    function = getattr(photo, name)
-    described = re.findall(r"^    (\**)(\w+): ", inspect.getdoc(function).split("Args:")[1], flags=re.MULTILINE)
-    assert [argument for _, argument in described] == list(inspect.signature(function).parameters)
-    assert list(function.__annotations__) == [argument for _, argument in described] + ["return"]
-    assert next(iter(inspect.signature(function).parameters.values())).annotation is Tensor
+def test_docstrings_describe_the_arguments_of_the_function_of_an_image() -> None:
+    for name in NAMES:
+        function = getattr(photo, name)
+        described = re.findall(r"^    (\**)(\w+): ", inspect.getdoc(function).split("Args:")[1], flags=re.MULTILINE)
+        assert [argument for _, argument in described] == list(inspect.signature(function).parameters)
+        assert list(function.__annotations__) == [argument for _, argument in described] + ["return"]
+        assert next(iter(inspect.signature(function).parameters.values())).annotation is Tensor
 
 
 @pytest.mark.parametrize("edit", [*EDIT_OF.values(), RegionMask], ids=lambda edit: edit.declared.name)
@@ -90,35 +89,35 @@ def test_every_argument_of_a_function_reaches_its_edit(edit: type[PhotoEdit], mo
     assert {name: reached[name] for name in arguments} == arguments
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_the_image_is_the_first_argument_or_a_keyword(name: str) -> None:
-    function, picture = getattr(photo, name), "grey" if name == "colorize" else "image"
-    parameters = inspect.signature(function).parameters.values()
-    others = {p.name: None for p in parameters if p.default is inspect.Parameter.empty and p.name != picture}
-    with pytest.raises(TypeError, match=rf"{picture} must be a torch.Tensor, got str"):
-        function(**{picture: "photo.png"}, **others)
-    with pytest.raises(TypeError, match=rf"{name}\(\) missing 1 required positional argument: '{picture}'"):
-        function(**others)
-    with pytest.raises(TypeError, match=rf"{name}\(\) got multiple values for argument '{picture}'"):
-        function(None, **{picture: None}, **others)
+def test_the_image_is_the_first_argument_or_a_keyword() -> None:
+    for name in NAMES:
+        function, picture = getattr(photo, name), "grey" if name == "colorize" else "image"
+        parameters = inspect.signature(function).parameters.values()
+        others = {p.name: None for p in parameters if p.default is inspect.Parameter.empty and p.name != picture}
+        with pytest.raises(TypeError, match=rf"{picture} must be a torch.Tensor, got str"):
+            function(**{picture: "photo.png"}, **others)
+        with pytest.raises(TypeError, match=rf"{name}\(\) missing 1 required positional argument: '{picture}'"):
+            function(**others)
+        with pytest.raises(TypeError, match=rf"{name}\(\) got multiple values for argument '{picture}'"):
+            function(None, **{picture: None}, **others)
 
 
-@pytest.mark.parametrize("edit", [*EDITS.values(), MASK], ids=lambda edit: edit.name)
-def test_annotations_say_which_numbers_may_differ_between_images(edit: Edit) -> None:
-    function = inspect.signature(getattr(photo, edit.function or edit.name)).parameters
-    for parameter in edit:
-        if parameter.kind == "number" and parameter.domain is not None:
-            annotation = function[parameter.keyword].annotation
-            assert parameter.per_image == (Tensor in get_args(annotation)), parameter.name
+def test_annotations_say_which_numbers_may_differ_between_images() -> None:
+    for edit in [*EDITS.values(), MASK]:
+        function = inspect.signature(getattr(photo, edit.function or edit.name)).parameters
+        for parameter in edit:
+            if parameter.kind == "number" and parameter.domain is not None:
+                annotation = function[parameter.keyword].annotation
+                assert parameter.per_image == (Tensor in get_args(annotation)), parameter.name
 
 
-@pytest.mark.parametrize("edit", EDITS.values(), ids=lambda edit: edit.name)
-def test_functions_have_the_declared_defaults(edit: Edit) -> None:
-    function = inspect.signature(getattr(photo, edit.function or edit.name)).parameters
-    for parameter in edit:
-        name = parameter.keyword
-        if name in function and parameter.kind != "sliders" and name != "photometric_bandwidth":
-            is_idle = edit.name == "tone" and parameter.idle is not ...
-            wanted = parameter.idle if is_idle else edit.defaults[name]
-            assert function[name].default == wanted
-        assert name in function or name in FILTER or parameter.name == "inside"
+def test_functions_have_the_declared_defaults() -> None:
+    for edit in EDITS.values():
+        function = inspect.signature(getattr(photo, edit.function or edit.name)).parameters
+        for parameter in edit:
+            name = parameter.keyword
+            if name in function and parameter.kind != "sliders" and name != "photometric_bandwidth":
+                is_idle = edit.name == "tone" and parameter.idle is not ...
+                wanted = parameter.idle if is_idle else edit.defaults[name]
+                assert function[name].default == wanted
+            assert name in function or name in FILTER or parameter.name == "inside"

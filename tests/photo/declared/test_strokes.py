@@ -54,22 +54,22 @@ def test_a_stroke_is_the_same_after_a_file() -> None:
     assert Stroke.from_entries(stored, ("in", "out"), "detail") == stroke
 
 
-@pytest.mark.parametrize(
-    ("changed", "sentence"),
-    [
-        ({"points": []}, "points of a stroke in tone must be pairs of numbers"),
-        ({"points": [[0.5, 0.5, 0.5]]}, "points of a stroke in tone must be pairs of numbers"),
-        ({"points": [[0.5, True]]}, "points of a stroke in tone must be pairs of numbers"),
-        ({"radius": 0}, r"radius of a stroke in tone must be in \(0, 1\], got 0"),
-        ({"radius": None}, r"radius of a stroke in tone must be in \(0, 1\], got null"),
-        ({"paint": "colour"}, "paint of a stroke in tone must be one of a colour such as #c04020, keep, got 'colour'"),
-        ({"paint": "#12345"}, "paint of a stroke in tone must be one of"),
-        ({"width": 1}, "strokes of tone must have the entries points, radius and paint"),
-    ],
-)
-def test_bad_strokes_are_refused(changed: dict[str, object], sentence: str) -> None:
-    with pytest.raises(ValueError, match=sentence):
-        Stroke.from_entries({**BLUE.entries(), **changed}, ("colour", "keep"), "tone")
+BAD_STROKES = [
+    ({"points": []}, "points of a stroke in tone must be pairs of numbers"),
+    ({"points": [[0.5, 0.5, 0.5]]}, "points of a stroke in tone must be pairs of numbers"),
+    ({"points": [[0.5, True]]}, "points of a stroke in tone must be pairs of numbers"),
+    ({"radius": 0}, r"radius of a stroke in tone must be in \(0, 1\], got 0"),
+    ({"radius": None}, r"radius of a stroke in tone must be in \(0, 1\], got null"),
+    ({"paint": "colour"}, "paint of a stroke in tone must be one of a colour such as #c04020, keep, got 'colour'"),
+    ({"paint": "#12345"}, "paint of a stroke in tone must be one of"),
+    ({"width": 1}, "strokes of tone must have the entries points, radius and paint"),
+]
+
+
+def test_bad_strokes_are_refused() -> None:
+    for changed, sentence in BAD_STROKES:
+        with pytest.raises(ValueError, match=sentence):
+            Stroke.from_entries({**BLUE.entries(), **changed}, ("colour", "keep"), "tone")
 
 
 def test_thinning_keeps_single_points_and_rounds() -> None:

@@ -6,6 +6,7 @@ import torch.nn.functional as F
 
 from nlfilter_torch.photo import defocus, region_mask
 from nlfilter_torch.photo.edits.defocus import ROWS, convolve
+from tests.pairwise import each_value
 from tests.problems import box, colour
 
 
@@ -65,8 +66,7 @@ def test_flat_images_stay_flat() -> None:
     torch.testing.assert_close(defocus(flat, box(4, 4, size=(24, 30))), flat, atol=1e-5, rtol=0)
 
 
-@pytest.mark.parametrize("height", [7, ROWS, 3 * ROWS + 11])
-@pytest.mark.parametrize("radius", [1, 4, 60])
+@pytest.mark.parametrize(("height", "radius"), each_value([7, ROWS, 3 * ROWS + 11], [1, 4, 60]))
 def test_convolution_in_parts_is_that_of_the_whole(height: int, radius: int) -> None:
     generator = torch.Generator().manual_seed(0)
     planes = torch.rand(2, 1, height, 30, generator=generator, dtype=torch.float64)

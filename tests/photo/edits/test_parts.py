@@ -17,6 +17,7 @@ from nlfilter_torch.photo.edits.applying import fit_step
 from nlfilter_torch.photo.edits.parts import Parts, Rectangle
 from nlfilter_torch.photo.picture.tiles import Passes
 from nlfilter_torch.photo.selections.local_values import ABSOLUTE, RELATIVE
+from tests.pairwise import each_value
 from tests.problems import cat
 from tests.recipes import ALPHA, COLORIZE, DETAIL, IN, INSIDE, RECOLOR, rows_of
 
@@ -57,13 +58,12 @@ def whole(recipe: Recipe, source: NDArray[Any], passes: Passes) -> torch.Tensor:
     return torch.from_numpy(np.concatenate(rows)).permute(2, 0, 1)[None].clamp(0, 1)
 
 
-@pytest.mark.parametrize("name", EDITS)
-@pytest.mark.parametrize("options", [{"statistics": "full"}, {"sample": 4096}])
+@pytest.mark.parametrize(("name", "options"), each_value(EDITS, [{"statistics": "full"}, {"sample": 4096}]))
 def test_a_part_is_that_of_the_whole(
     name: str, options: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if "sample" in options:  # and in blocks, like a large picture
-        monkeypatch.setattr("nlfilter_torch.photo.selections.mask.SOLVED", 2000)
+        monkeypatch.setattr("nlfilter_torch.photo.selections.mask.SOLVED_PIXELS", 2000)
         for kind, links in (("ABSOLUTE", ABSOLUTE), ("RELATIVE", RELATIVE)):
             monkeypatch.setattr(f"nlfilter_torch.photo.edits.colorize.{kind}", replace(links, pixels=2000))
         monkeypatch.setattr("nlfilter_torch.photo.edits.parts.STRIP_PIXELS", 1000)

@@ -12,10 +12,10 @@ from PIL import ExifTags, Image, ImageOps
 from nlfilter_torch.photo.files.exif import read_upright, upright
 from nlfilter_torch.photo.picture.photographs import read_photograph, write_photograph
 from tests.files import exif_block, photograph, same, stored_values, tags
+from tests.pairwise import each_value
 
 
-@pytest.mark.parametrize("orientation", range(1, 9))
-@pytest.mark.parametrize("suffix", [".png", ".tif"])
+@pytest.mark.parametrize(("orientation", "suffix"), each_value(range(1, 9), [".png", ".tif"]))
 def test_exif_orientation_is_applied_and_reset(tmp_path: Path, orientation: int, suffix: str) -> None:
     values = stored_values(3, "uint8")
     image, exif = Image.fromarray(values), exif_block(orientation)
@@ -53,27 +53,27 @@ def odd_exif(kind: str) -> bytes:
     return b"Exif\0\0" + head + orientation + struct.pack("<L", 0) + b"Maker\0" + struct.pack("<LL", 1, 0)
 
 
+ODD = [
+    "text",
+    "beyond the standard",
+    "rational",
+    "table that is text",
+    "table beyond the end",
+    "maker beyond the end",
+]
+
+
 @pytest.mark.parametrize("suffix", [".png", ".jpg", ".webp"])
-@pytest.mark.parametrize(
-    "kind",
-    [
-        "text",
-        "beyond the standard",
-        "rational",
-        "table that is text",
-        "table beyond the end",
-        "maker beyond the end",
-    ],
-)
-def test_fields_of_exif_without_sense_are_ignored(tmp_path: Path, kind: str, suffix: str) -> None:
-    Image.fromarray(stored_values(3, "uint8")).save(tmp_path / f"in{suffix}", exif=odd_exif(kind))
-    opened = read_photograph(tmp_path / f"in{suffix}")
-    assert opened.pixels.shape[-2:] == stored_values(3, "uint8").shape[:2]
-    assert tags(opened.exif)[0][ExifTags.Base.Make] == "Maker"
-    for other in (".png", ".tif", ".jpg"):
-        with pytest.warns(UserWarning, match="damaged") if opened.extras.left_out else contextlib.nullcontext():
-            write_photograph(opened, tmp_path / f"out{other}")
-        assert tags(read_photograph(tmp_path / f"out{other}").exif)[0][ExifTags.Base.Make] == "Maker"
+def test_fields_of_exif_without_sense_are_ignored(tmp_path: Path, suffix: str) -> None:
+    for kind in ODD:
+        Image.fromarray(stored_values(3, "uint8")).save(tmp_path / f"in{suffix}", exif=odd_exif(kind))
+        opened = read_photograph(tmp_path / f"in{suffix}")
+        assert opened.pixels.shape[-2:] == stored_values(3, "uint8").shape[:2]
+        assert tags(opened.exif)[0][ExifTags.Base.Make] == "Maker"
+        for other in (".png", ".tif", ".jpg"):
+            with pytest.warns(UserWarning, match="damaged") if opened.extras.left_out else contextlib.nullcontext():
+                write_photograph(opened, tmp_path / f"out{other}")
+            assert tags(read_photograph(tmp_path / f"out{other}").exif)[0][ExifTags.Base.Make] == "Maker"
 
 
 @pytest.mark.parametrize(
@@ -146,18 +146,18 @@ def subject_block(orientation: int, *, sized: bool) -> bytes:
     return exif.tobytes()
 
 
-@pytest.mark.parametrize("orientation", range(1, 9))
-def test_the_place_of_the_subject_turns_with_the_picture(orientation: int) -> None:
-    stored = np.zeros((30, 40, 1), np.uint8)
-    stored[5, 9] = 255
-    (row,), (column,), _ = upright(stored, orientation).nonzero()
-    turned = read_upright(subject_block(orientation, sized=True))
-    _, details, _ = tags(turned.block)
-    wanted = (4, 2) if orientation < 5 else (2, 4)
-    assert details[SUBJECT_AREA] == (column, row, *wanted)
-    assert turned.left_out == ()
-    unsized = read_upright(subject_block(orientation, sized=False))
-    if orientation == 1:
-        assert tags(unsized.block)[1][SUBJECT_AREA] == (9, 5, 4, 2)
-    else:
-        assert unsized.left_out == ("the place of the subject, as the picture is turned",)
+def test_the_place_of_the_subject_turns_with_the_picture() -> None:
+    for orientation in range(1, 9):
+        stored = np.zeros((30, 40, 1), np.uint8)
+        stored[5, 9] = 255
+        (row,), (column,), _ = upright(stored, orientation).nonzero()
+        turned = read_upright(subject_block(orientation, sized=True))
+        _, details, _ = tags(turned.block)
+        wanted = (4, 2) if orientation < 5 else (2, 4)
+        assert details[SUBJECT_AREA] == (column, row, *wanted)
+        assert turned.left_out == ()
+        unsized = read_upright(subject_block(orientation, sized=False))
+        if orientation == 1:
+            assert tags(unsized.block)[1][SUBJECT_AREA] == (9, 5, 4, 2)
+        else:
+            assert unsized.left_out == ("the place of the subject, as the picture is turned",)

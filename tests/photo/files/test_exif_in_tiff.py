@@ -15,6 +15,7 @@ from nlfilter_torch.photo.files.rows import open_picture, write_picture
 from nlfilter_torch.photo.files.tables import Tables
 from nlfilter_torch.photo.picture.photographs import Photograph, read_photograph, write_photograph
 from tests.files import MAKER_NOTE, PLENTY, camera_block, fields_of, photograph, stored_values
+from tests.pairwise import each_value
 
 
 def upright_fields(order: str) -> dict[tuple[int, int], bytes]:
@@ -25,8 +26,7 @@ def upright_fields(order: str) -> dict[tuple[int, int], bytes]:
     return wanted
 
 
-@pytest.mark.parametrize("order", ["<", ">"])
-@pytest.mark.parametrize("suffix", [".jpg", ".png", ".webp", ".avif", ".tif"])
+@pytest.mark.parametrize(("order", "suffix"), each_value(["<", ">"], [".jpg", ".png", ".webp", ".avif", ".tif"]))
 def test_types_bytes_and_the_maker_note_stay(tmp_path: Path, suffix: str, order: str) -> None:
     picture = np.full((48, 64, 3), 90, np.uint8)
     Image.fromarray(picture).save(tmp_path / "in.jpg", exif=camera_block(order))
@@ -46,8 +46,7 @@ def test_types_bytes_and_the_maker_note_stay(tmp_path: Path, suffix: str, order:
             assert np.abs(np.asarray(thumbnail).astype(int) - 90).max() < 3
 
 
-@pytest.mark.parametrize("order", ["<", ">"])
-@pytest.mark.parametrize("depth", ["uint8", "uint16", "float32"])
+@pytest.mark.parametrize(("order", "depth"), each_value(["<", ">"], ["uint8", "uint16", "float32"]))
 def test_tiff_and_bigtiff_by_rows(tmp_path: Path, order: str, depth: str, monkeypatch: pytest.MonkeyPatch) -> None:
     values = stored_values(3, depth)
     block = exif_tags.read_upright(camera_block(order, thumbnail=False)).block

@@ -12,6 +12,7 @@ from nlfilter_torch.photo.files.jpeg import open_jpeg, write_jpeg
 from nlfilter_torch.photo.files.metadata import Extras, Metadata
 from nlfilter_torch.photo.picture.photographs import read_photograph, write_photograph
 from tests.files import cat
+from tests.pairwise import each_value
 
 GAIN_MAP = b'<x:xmpmeta><rdf:Description hdrgm:Version="1.0" GCamera:MotionPhoto="1" xmp:Rating="4"/></x:xmpmeta>'
 
@@ -48,8 +49,7 @@ def test_the_second_picture_of_an_mpo_is_named(tmp_path: Path) -> None:
         assert image.format == "JPEG"
 
 
-@pytest.mark.parametrize("channels", [1, 3])
-@pytest.mark.parametrize("height", [1, 8, 64, 65, 200, 700])
+@pytest.mark.parametrize(("channels", "height"), each_value([1, 3], [1, 8, 64, 65, 200, 700]))
 def test_strips_are_one_picture(height: int, channels: int) -> None:
     picture = np.tile(cat(channels=channels), (4, 1, 1))[:height]
     stream = io.BytesIO()

@@ -14,6 +14,7 @@ from nlfilter_torch.photo.files.metadata import Metadata
 from nlfilter_torch.photo.files.png import ADAM7, SAMPLES, SIGNATURE, chunks, write_chunk, write_png
 from nlfilter_torch.photo.picture.photographs import read_photograph, write_photograph
 from tests.files import cat
+from tests.pairwise import each_value, pairwise
 
 KINDS = [
     (0, 1),
@@ -57,9 +58,13 @@ def png(width: int, height: int, bits: int, kind: int, interlaced: bool, transpa
     return stream.getvalue()
 
 
-@pytest.mark.parametrize(("kind", "bits"), KINDS)
-@pytest.mark.parametrize("transparent", [False, True])
-@pytest.mark.parametrize("size", [(13, 9), (1, 1), (3, 2)])
+@pytest.mark.parametrize(
+    ("kind", "bits", "transparent", "size"),
+    [
+        (kind, bits, transparent, size)
+        for (kind, bits), transparent, size in pairwise(KINDS, [False, True], [(13, 9), (1, 1), (3, 2)])
+    ],
+)
 def test_interlaced_files(
     tmp_path: Path, kind: int, bits: int, transparent: bool, size: tuple[int, int], capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -117,8 +122,10 @@ def test_long_texts_and_profiles_are_read(tmp_path: Path) -> None:
     np.testing.assert_array_equal(imagecodecs.png_decode((tmp_path / "out.png").read_bytes()), cat())
 
 
-@pytest.mark.parametrize("depth", ["uint8", "uint16"])
-@pytest.mark.parametrize("shape", [(1, 1, 1), (1, 3000, 1), (3000, 1, 3), (2, 70_000, 4), (300, 5000, 4)])
+@pytest.mark.parametrize(
+    ("depth", "shape"),
+    each_value(["uint8", "uint16"], [(1, 1, 1), (1, 3000, 1), (3000, 1, 3), (2, 70_000, 4), (300, 5000, 4)]),
+)
 def test_noise_of_every_shape_is_written(tmp_path: Path, shape: tuple[int, int, int], depth: str) -> None:
     draw = np.random.default_rng(0)
     stream = io.BytesIO()

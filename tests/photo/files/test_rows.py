@@ -16,6 +16,7 @@ from nlfilter_torch.photo.files.metadata import Metadata
 from nlfilter_torch.photo.files.rows import StoredPicture, open_picture, write_picture
 from tests.commands import refused, small_photo
 from tests.files import PLENTY, PROFILE, cat, rows_of
+from tests.pairwise import each_value
 
 
 @pytest.fixture
@@ -48,8 +49,7 @@ def test_tiles_use_little_unless_more_is_given(monkeypatch: pytest.MonkeyPatch) 
         assert job.passes(False, Path()).memory == wanted
 
 
-@pytest.mark.parametrize("suffix", [".tif", ".zarr", ".png"])
-@pytest.mark.parametrize("channels", [1, 2, 3, 4])
+@pytest.mark.parametrize(("suffix", "channels"), each_value([".tif", ".zarr", ".png"], [1, 2, 3, 4]))
 def test_writing_rows_keeps_everything(tmp_path: Path, suffix: str, channels: int) -> None:
     picture = cat(270, 350, 4)[..., [0] if channels == 1 else [0, 3] if channels == 2 else slice(channels)]
     exif = Image.Exif()

@@ -13,6 +13,7 @@ from nlfilter_torch.photo.files.formats import read_channels
 from nlfilter_torch.photo.files.rows import open_picture, upright_copy
 from nlfilter_torch.photo.files.scratch import Scratch
 from tests.files import PLENTY, cat, rows_of
+from tests.pairwise import pairwise
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))
@@ -27,9 +28,7 @@ def test_copies_are_upright(orientation: int) -> None:
         np.testing.assert_array_equal(copy[slice(10, 90)], wanted[10:90])
 
 
-@pytest.mark.parametrize("channels", [1, 3, 4])
-@pytest.mark.parametrize("suffix", [".png", ".jpg"])
-@pytest.mark.parametrize("orientation", [1, 3, 6])
+@pytest.mark.parametrize(("channels", "suffix", "orientation"), pairwise([1, 3, 4], [".png", ".jpg"], [1, 3, 6]))
 def test_large_files(
     tmp_path: Path, channels: int, suffix: str, orientation: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:

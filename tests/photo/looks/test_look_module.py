@@ -5,6 +5,7 @@ import torch
 
 from nlfilter_torch.photo import Look, apply_look, fit_look
 from tests.looks import BENT, CAT, FEW, SEPIA, in_bytes, single_look
+from tests.pairwise import each_value
 
 
 def test_the_layer_learns_what_it_is_told_to() -> None:
@@ -30,8 +31,7 @@ def test_the_layer_takes_what_was_found() -> None:
     assert torch.allclose(Look(look.tensors, learn=())(CAT), look.apply(CAT), atol=1e-5)
 
 
-@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
-@pytest.mark.parametrize("part", ["alpha", "local", "texture"])
+@pytest.mark.parametrize(("dtype", "part"), each_value([torch.float16, torch.bfloat16], ["alpha", "local", "texture"]))
 def test_half_precision_pictures_are_computed_in_float32(part: str, dtype: torch.dtype) -> None:
     exact = CAT.to(dtype).float()
     parts = {

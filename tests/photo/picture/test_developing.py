@@ -15,6 +15,7 @@ from nlfilter_torch.photo.declared.strokes import Stroke
 from nlfilter_torch.photo.edits.applying import apply_recipe
 from nlfilter_torch.photo.picture.developing import develop_image, develop_planes, gains_of, reframed
 from nlfilter_torch.photo.picture.resizing import resize
+from tests.pairwise import each_value
 from tests.problems import colour
 
 
@@ -79,8 +80,7 @@ def test_a_point_is_where_its_stroke_is() -> None:
     assert middle == pytest.approx([share[0] * frame.width, share[1] * frame.height], abs=0.05)
 
 
-@pytest.mark.parametrize("size", [(1, 1), (1, 7), (2, 3), (5, 1)])
-@pytest.mark.parametrize("degrees", [-45.0, 3.0])
+@pytest.mark.parametrize(("size", "degrees"), each_value([(1, 1), (1, 7), (2, 3), (5, 1)], [-45.0, 3.0]))
 def test_tiny_pictures(size: tuple[int, int], degrees: float) -> None:
     edited = develop_image(torch.full((2, 3, *size), 0.4), Development(straighten=degrees, exposure=1.0))
     assert torch.allclose(edited, edited[:1, :1, :1, :1].expand_as(edited), atol=1e-6)

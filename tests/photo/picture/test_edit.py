@@ -31,15 +31,15 @@ def test_an_edit_is_made_of_the_arguments_of_its_step() -> None:
     assert torch.equal(vars(detail)["alpha"], torch.tensor([2.0, 1.0]))
 
 
-@pytest.mark.parametrize("name", EDIT_OF)
-def test_only_recolouring_needs_a_photograph_in_colour(name: str) -> None:
-    edit = edit_of(Step(name), SIZE)
-    edit.check_channels(3)
-    if name == "recolor":
-        with pytest.raises(ValueError, match="recolor needs a colour photograph, got a grey one"):
+def test_only_recolouring_needs_a_photograph_in_colour() -> None:
+    for name in EDIT_OF:
+        edit = edit_of(Step(name), SIZE)
+        edit.check_channels(3)
+        if name == "recolor":
+            with pytest.raises(ValueError, match="recolor needs a colour photograph, got a grey one"):
+                edit.check_channels(1)
+        else:
             edit.check_channels(1)
-    else:
-        edit.check_channels(1)
 
 
 def test_only_colouring_notes_that_a_photograph_is_in_colour() -> None:

@@ -5,6 +5,7 @@ import torch
 
 from nlfilter_torch.photo.picture.limits import Balance
 from tests.brightness import EDITS, changed, drawn, saturated
+from tests.pairwise import each_value
 from tests.problems import colour, luminance
 
 
@@ -80,8 +81,13 @@ def test_saturated_colours_keep_their_chroma_and_muted_ones_their_detail() -> No
         torch.testing.assert_close(together[i : i + 1], alone, atol=1e-12, rtol=0)
 
 
-@pytest.mark.parametrize("restraint", [0.3, 0.7, 1.0])
-@pytest.mark.parametrize(("rest", "change"), [((87, 160), -0.055), ((170, 90), 0.05)])
+@pytest.mark.parametrize(
+    ("restraint", "rest", "change"),
+    [
+        (restraint, rest, change)
+        for restraint, (rest, change) in each_value([0.3, 0.7, 1.0], [((87, 160), -0.055), ((170, 90), 0.05)])
+    ],
+)
 def test_a_restrained_change_causes_no_edge(rest: tuple[int, int], change: float, restraint: float) -> None:
     ends = [9, 8, 7, 6, 5, 4, 3, 2, 1, 0] if change < 0 else [246, 247, 248, 249, 250, 251, 252, 253, 254, 255]
     sky = torch.tensor([[end, *rest] for end in ends]).T.reshape(1, 3, 1, 10) / 255

@@ -10,6 +10,7 @@ from nlfilter_torch.photo.declared.development import Development
 from nlfilter_torch.photo.picture.developing import develop_image
 from nlfilter_torch.photo.picture.tiled_developed import developed_rows
 from nlfilter_torch.photo.picture.tiles import Passes
+from tests.pairwise import each_value
 from tests.recipes import from_rows, rows_of
 from tests.tiles import Rows, cat
 
@@ -17,9 +18,11 @@ ALL = Development(0.3, 0.2, -0.1, 4.0, (0.1, 0.0, 1.0, 0.8))
 
 
 @pytest.mark.parametrize(
-    "development", [Development(), ALL, ALL.geometry, Development(-1.0), Development(crop=ALL.crop)]
+    ("development", "dtype"),
+    each_value(
+        [Development(), ALL, ALL.geometry, Development(-1.0), Development(crop=ALL.crop)], ["float32", "float64"]
+    ),
 )
-@pytest.mark.parametrize("dtype", ["float32", "float64"])
 def test_rows_are_those_of_the_image(development: Development, dtype: str, tmp_path: Path) -> None:
     picture = cat(270, 290).astype(dtype)
     wanted = rows_of(develop_image(from_rows(picture), development))

@@ -18,6 +18,7 @@ from nlfilter_torch.photo.picture.painting import cover, mask_of, paint
 from nlfilter_torch.photo.picture.pictures import Picture
 from nlfilter_torch.photo.picture.tiled_scribbles import read_scribbles
 from tests import problems
+from tests.pairwise import each_value
 from tests.recipes import BLUE, rows_of
 from tests.streams import stream_colorize, stream_detail, stream_recolor
 from tests.tiles import FEW, LEVEL, Rows, Shrinking, cat
@@ -87,14 +88,19 @@ def coloured(picture: Array, *painted: Array, kind: Any = None, **options: Any) 
 
 
 @pytest.mark.usefixtures("small_blocks")
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
 @pytest.mark.parametrize(
-    ("options", "kept"),
+    ("dtype", "options", "kept"),
     [
-        ({}, False),
-        ({"reach": 0.5, "patch_size": 5, "extent": "object"}, True),
-        ({"spatial_bandwidth": 60.0, "photometric_bandwidth": 0.2}, True),
-        ({"landmarks": "uniform", "brightness": 0.8}, False),
+        (dtype, options, kept)
+        for dtype, (options, kept) in each_value(
+            [np.float32, np.float64],
+            [
+                ({}, False),
+                ({"reach": 0.5, "patch_size": 5, "extent": "object"}, True),
+                ({"spatial_bandwidth": 60.0, "photometric_bandwidth": 0.2}, True),
+                ({"landmarks": "uniform", "brightness": 0.8}, False),
+            ],
+        )
     ],
 )
 def test_full_passes_recolour_as_in_memory(
@@ -123,9 +129,11 @@ def test_full_passes_recolour_as_in_memory(
 
 
 @pytest.mark.usefixtures("small_blocks")
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
 @pytest.mark.parametrize(
-    "options", [{}, {"strength": 0.3, "patch_size": 3}, {"patch_size": 1, "spatial_bandwidth": 30.0}]
+    ("dtype", "options"),
+    each_value(
+        [np.float32, np.float64], [{}, {"strength": 0.3, "patch_size": 3}, {"patch_size": 1, "spatial_bandwidth": 30.0}]
+    ),
 )
 def test_full_passes_colourise_as_in_memory(options: dict[str, Any], dtype: Any) -> None:
     picture = grey(cat(83, 121)).astype(dtype)
@@ -257,39 +265,39 @@ def test_painted_pixels_need_memory() -> None:
             edit(picture, strokes, mask, memory=1_000_000)
 
 
+REFUSED = [
+    (lambda s, m: (s[1:], m), {}, "strokes must have the height and width of source, 40x50, got 39x50; resize"),
+    (lambda s, m: (s, m[:, 1:]), {}, "stroke_mask must have the height and width of source, 40x50, got 40x49"),
+    (lambda s, m: (s, 0 * m), {}, "stroke_mask must hold a painted pixel, got none; paint at least one"),
+    (lambda s, m: (np.concatenate([s, 0 * m], axis=2),), {}, "strokes must hold a painted pixel, got none"),
+    (lambda s, m: (s, 2 * m), {}, r"stroke_mask must be in \[0, 1\], got values from 0 to 2; clamp or scale it"),
+    (lambda s, m: (s, -m), {}, r"stroke_mask must be in \[0, 1\], got values from -1 to"),
+    (lambda s, m: (s, np.where(m > 0, np.nan, m)), {}, "stroke_mask holds NaN or infinite pixels"),
+    (lambda s, m: (np.where(m > 0, np.nan, s), m), {}, "strokes holds NaN or infinite pixels"),
+    (
+        lambda s, m: (s,),
+        {},
+        "strokes must have 3 channels with a stroke_mask, or 4 channels without one, got 3 channels without",
+    ),
+    (lambda s, m: (np.concatenate([s, m], axis=2), m), {}, "got 4 channels with a stroke_mask; add or drop it"),
+    (lambda s, m: (s, s), {}, "stroke_mask must have 1 channel, got 3"),
+    (lambda s, m: (Shrinking(s, most=100, read=50), m), {}, "strokes must keep its size while it is read"),
+    (lambda s, m: (s, m), {"statistics": "some"}, "statistics must be one of"),
+    (lambda s, m: (s, m), {"sample": 0}, "sample must be at least 1"),
+    (lambda s, m: (s, m), {"tile_rows": 0}, "tile_rows must be at least 1"),
+    (lambda s, m: (s, m), {"patch_size": 4}, "patch_size must be odd"),
+    (lambda s, m: (s, m), {"num_landmarks": 0}, "num_landmarks must be at least 1"),
+    (lambda s, m: (s, m), {"photometric_bandwidth": 0.0}, "photometric_bandwidth must be positive"),
+    (lambda s, m: (s, m), {"spatial_bandwidth": 0.0}, "spatial_bandwidth must be positive"),
+]
+
+
 @pytest.mark.parametrize("edit", [recoloured, coloured])
-@pytest.mark.parametrize(
-    ("change", "options", "message"),
-    [
-        (lambda s, m: (s[1:], m), {}, "strokes must have the height and width of source, 40x50, got 39x50; resize"),
-        (lambda s, m: (s, m[:, 1:]), {}, "stroke_mask must have the height and width of source, 40x50, got 40x49"),
-        (lambda s, m: (s, 0 * m), {}, "stroke_mask must hold a painted pixel, got none; paint at least one"),
-        (lambda s, m: (np.concatenate([s, 0 * m], axis=2),), {}, "strokes must hold a painted pixel, got none"),
-        (lambda s, m: (s, 2 * m), {}, r"stroke_mask must be in \[0, 1\], got values from 0 to 2; clamp or scale it"),
-        (lambda s, m: (s, -m), {}, r"stroke_mask must be in \[0, 1\], got values from -1 to"),
-        (lambda s, m: (s, np.where(m > 0, np.nan, m)), {}, "stroke_mask holds NaN or infinite pixels"),
-        (lambda s, m: (np.where(m > 0, np.nan, s), m), {}, "strokes holds NaN or infinite pixels"),
-        (
-            lambda s, m: (s,),
-            {},
-            "strokes must have 3 channels with a stroke_mask, or 4 channels without one, got 3 channels without",
-        ),
-        (lambda s, m: (np.concatenate([s, m], axis=2), m), {}, "got 4 channels with a stroke_mask; add or drop it"),
-        (lambda s, m: (s, s), {}, "stroke_mask must have 1 channel, got 3"),
-        (lambda s, m: (Shrinking(s, most=100, read=50), m), {}, "strokes must keep its size while it is read"),
-        (lambda s, m: (s, m), {"statistics": "some"}, "statistics must be one of"),
-        (lambda s, m: (s, m), {"sample": 0}, "sample must be at least 1"),
-        (lambda s, m: (s, m), {"tile_rows": 0}, "tile_rows must be at least 1"),
-        (lambda s, m: (s, m), {"patch_size": 4}, "patch_size must be odd"),
-        (lambda s, m: (s, m), {"num_landmarks": 0}, "num_landmarks must be at least 1"),
-        (lambda s, m: (s, m), {"photometric_bandwidth": 0.0}, "photometric_bandwidth must be positive"),
-        (lambda s, m: (s, m), {"spatial_bandwidth": 0.0}, "spatial_bandwidth must be positive"),
-    ],
-)
-def test_what_cannot_be_used_is_named(edit: Any, change: Any, options: dict[str, Any], message: str) -> None:
-    strokes, mask, _ = paint_rows(40, 50)
-    with pytest.raises(ValueError, match=message):
-        edit(cat(40, 50), *change(strokes, mask), **options)
+def test_what_cannot_be_used_is_named(edit: Any) -> None:
+    for change, options, message in REFUSED:
+        strokes, mask, _ = paint_rows(40, 50)
+        with pytest.raises(ValueError, match=message):
+            edit(cat(40, 50), *change(strokes, mask), **options)
 
 
 def test_what_only_one_of_them_takes_is_named() -> None:

@@ -7,6 +7,7 @@ import torch
 from nlfilter_torch.photo.picture.pictures import Picture
 from nlfilter_torch.photo.picture.tiled import Tiled
 from nlfilter_torch.photo.picture.tiles import Passes
+from tests.pairwise import each_value
 from tests.streams import stream_detail
 from tests.tiles import ALPHA, cat, streamed
 
@@ -30,8 +31,7 @@ def test_memory_gives_the_size_of_tiles() -> None:
         streamed(cat(60, 80), memory=1000)
 
 
-@pytest.mark.parametrize("kind", ["uint8", "uint16", "float32"])
-@pytest.mark.parametrize("channels", [1, 2, 3, 4])
+@pytest.mark.parametrize(("kind", "channels"), each_value(["uint8", "uint16", "float32"], [1, 2, 3, 4]))
 def test_ones_give_the_picture_back_with_its_transparency(kind: str, channels: int) -> None:
     draw = np.random.default_rng(0).random((30, 20, channels))
     picture = (draw if kind == "float32" else draw * np.iinfo(kind).max).astype(kind)

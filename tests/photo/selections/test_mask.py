@@ -17,6 +17,7 @@ from nlfilter_torch.photo.picture.tiled import Tiled
 from nlfilter_torch.photo.picture.tiles import Passes
 from nlfilter_torch.photo.selections import mask as masks
 from nlfilter_torch.photo.selections.mask import RegionMask
+from tests.pairwise import each_value
 from tests.problems import box, colour, noise, seeded
 from tests.streams import settings_of
 
@@ -75,8 +76,9 @@ def test_what_is_scribbled_over_stays() -> None:
     torch.testing.assert_close(mask, region_mask(image, over, box(3, 3, size=SIZE)))
 
 
-@pytest.mark.parametrize("size", [(1, 1), (1, 9), (3, 2), (30, 5)])
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize(
+    ("size", "dtype"), each_value([(1, 1), (1, 9), (3, 2), (30, 5)], [torch.float32, torch.float64])
+)
 def test_small_and_flat_pictures(size: tuple[int, int], dtype: torch.dtype) -> None:
     for image in (torch.full((1, 3, *size), 0.4, dtype=dtype), noise(1, 1, *size, dtype=dtype)):
         scribble = torch.zeros(1, 1, *size, dtype=dtype)

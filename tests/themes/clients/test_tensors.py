@@ -26,6 +26,7 @@ from nlfilter_torch import (
     spectral_filter,
 )
 from tests.layers import ALPHA, EVERYTHING, OPTIONS, image
+from tests.pairwise import each_value
 
 SLIDERS = torch.tensor(ALPHA)
 
@@ -124,8 +125,10 @@ def build_and_filter(picture: Tensor, **options: Any) -> Tensor:
 
 
 @pytest.mark.client('device "meta", `FakeTensorMode`', "yes; edits with scribbles need values")
-@pytest.mark.parametrize("options", [{}, {"landmarks": "uniform"}, {"completion": "none"}])
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.bfloat16])
+@pytest.mark.parametrize(
+    ("options", "dtype"),
+    each_value([{}, {"landmarks": "uniform"}, {"completion": "none"}], [torch.float32, torch.float64, torch.bfloat16]),
+)
 def test_shapes_alone_are_enough(options: dict[str, Any], dtype: torch.dtype) -> None:
     picture = image().to(dtype)
     meta = build_and_filter(picture.to("meta").requires_grad_(), **options)

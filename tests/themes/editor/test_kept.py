@@ -74,11 +74,11 @@ def test_reload_second_tab_and_new_start(browser: Browser, shots: Path) -> None:
         assert len(recipe.current("detail").strokes) == 1
         port = editor.url.rstrip("/").rsplit(":", 1)[1]
         editor.process.send_signal(signal.SIGKILL)
-        editor.process.wait(30)
+        editor.process.wait()
         editor.stop()
         editor = Editor(shots, "--port", port)
         # The page reconnects to the new editor without asking: the edit is stored.
-        expect(undo).to_be_disabled(timeout=60_000)
+        expect(undo).to_be_disabled()
         shown(tab)
         expect(page.locator("path.stroke")).to_have_count(1)
         expect(page.get_by_text("In the region")).to_be_visible()

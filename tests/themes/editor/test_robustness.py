@@ -261,7 +261,7 @@ def test_stopped_in_the_midst_of_saving(browser: Browser, tmp_path: Path) -> Non
         tab.page.get_by_role("button", name="Replace").click()
         wait_for_part(tmp_path, "out.png")
         editor.process.send_signal(signal.SIGKILL)
-        editor.process.wait(30)
+        editor.process.wait()
         assert (tmp_path / "out.png").read_bytes() == b"what was there"
         editor.stop()
         editor = Editor(tmp_path, "large.png", "--port", editor.url.rstrip("/").rsplit(":", 1)[1])
