@@ -26,9 +26,8 @@ from torch import Tensor
 from benchmarks.denoising.cases import Case, psnr
 from benchmarks.denoising.methods import available
 from benchmarks.photographs import pictures
-from nlfilter_torch.nn.denoiser.colours import split_colours
 from nlfilter_torch.nn.denoiser.estimate import noise_profile
-from nlfilter_torch.nn.denoiser.profile import NoiseProfile, profile_of_difference
+from nlfilter_torch.nn.denoiser.profile import NoiseProfile, profile_of_difference, split_colours
 from nlfilter_torch.photo import denoise
 
 LISTED = Path(__file__).with_name("camera_noise.txt")

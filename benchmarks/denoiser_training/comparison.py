@@ -14,7 +14,7 @@ from torch import Tensor
 from benchmarks.denoiser_training.cameras import Camera
 from benchmarks.photographs import pictures
 from nlfilter_torch.core.blocks import reflected
-from nlfilter_torch.nn.denoiser.colours import split_colours
+from nlfilter_torch.nn.denoiser.profile import split_colours
 
 SCALES = (1, 2, 4, 8, 16)  # sides of blocks in pixels
 SIDE = 256  # of simulated photographs

@@ -24,8 +24,8 @@ from torch import Tensor
 
 from benchmarks.denoiser_training.cameras import Camera
 from benchmarks.photographs import photograph
+from nlfilter_torch.nn.denoiser.estimate import statistics_of, window_pixels
 from nlfilter_torch.nn.denoiser.profile import profile_of_difference
-from nlfilter_torch.nn.denoiser.statistics import statistics_of, window_pixels
 
 EXTENSIONS = (".jpg", ".jpeg", ".png", ".webp")
 OWN = ("astronaut", "motorcycle", "rocket", "immunohistochemistry", "hubble_deep_field", "brick", "grass", "gravel")

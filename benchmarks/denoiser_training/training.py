@@ -20,8 +20,7 @@ from torch.utils.data import DataLoader
 from benchmarks.denoiser_training.examples import SHARES, Batches, Examples, Source
 from benchmarks.denoiser_training.graphs import graphed_pivots
 from benchmarks.denoiser_training.pictures import Pictures
-from nlfilter_torch.nn.denoiser.network import PLANES, SLOPE, WIDTH, Layer, NonlocalDenoiser, shapes_of
-from nlfilter_torch.nn.denoiser.weights import read_weights
+from nlfilter_torch.nn.denoiser.network import PLANES, SLOPE, WIDTH, Layer, NonlocalDenoiser, read_weights, shapes_of
 from nlfilter_torch.photo.files.writing import open_beside
 from nlfilter_torch.photo.plotting import save_figure
 

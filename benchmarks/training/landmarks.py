@@ -16,7 +16,7 @@ from benchmarks.photographs import photograph
 from benchmarks.training.figures import Figure
 from benchmarks.training.held_out import held_out
 from nlfilter_torch import NonlocalFilter
-from nlfilter_torch.nn.held import Hold
+from nlfilter_torch.nn.affinity import Hold
 from nlfilter_torch.operator.options import Sampling
 
 LANDMARKS = 100

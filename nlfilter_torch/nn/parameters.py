@@ -17,9 +17,14 @@ class Learnable(nn.Module):
 
     Attributes:
         learnable: maps the names of these options to the names of their parameters.
+        fixed: values of positive options, in use unless they are learned.
     """
 
     learnable: ClassVar[Mapping[str, str]]
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.fixed: dict[str, Any] = {}
 
     def start_positive(self, name: str, value: Any, learn: frozenset[str], *, other: type | None = None) -> None:
         """Initialise a positive option, as a parameter if in ``learn``; values of type ``other`` are not checked."""
@@ -30,7 +35,7 @@ class Learnable(nn.Module):
         self.register_parameter(
             self.learnable[name], nn.Parameter(torch.tensor([math.log(value)])) if name in learn else None
         )
-        setattr(self, f"_{name}", value)
+        self.fixed[name] = value
 
     def shown(self, name: str) -> float | str | None:
         """Format a positive option for ``extra_repr``."""
@@ -73,7 +78,7 @@ def positive_option(name: str, meaning: str) -> Any:
 
     def value(layer: Learnable) -> Any:
         logarithm = getattr(layer, f"log_{name}")
-        return getattr(layer, f"_{name}") if logarithm is None else logarithm.exp().squeeze(0)
+        return layer.fixed[name] if logarithm is None else logarithm.exp().squeeze(0)
 
     def assign(layer: Learnable, value: Any) -> None:
         logarithm = getattr(layer, f"log_{name}")
@@ -82,7 +87,7 @@ def positive_option(name: str, meaning: str) -> Any:
             check_positive(value, name)
             with torch.no_grad():
                 logarithm.fill_(math.log(value))
-        setattr(layer, f"_{name}", value)
+        layer.fixed[name] = value
 
     return property(value, assign, doc=meaning)
 

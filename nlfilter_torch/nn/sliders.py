@@ -18,8 +18,7 @@ from nlfilter_torch.core.checks import (
     described,
 )
 from nlfilter_torch.filtering.filters import filter_regions, polynomial_filter, weigh_layers
-from nlfilter_torch.nn.affinity import AffinityOption, NonlocalAffinity
-from nlfilter_torch.nn.held import Hold
+from nlfilter_torch.nn.affinity import AffinityOption, Hold, NonlocalAffinity
 from nlfilter_torch.nn.parameters import check_learn
 from nlfilter_torch.operator.operator import NonlocalOperator
 from nlfilter_torch.operator.options import AUTO, Completion, FilterOptions, GuideChannels, Landmarks

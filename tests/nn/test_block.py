@@ -29,7 +29,7 @@ def dense(layer: NonlocalBlock, x: Tensor, places: Tensor | None = None) -> Tens
     points = x[0].flatten(1).double()
     embedded = layer.embedding.weight[:, :, 0].double() @ points
     embedded = embedded - embedded.mean(1, keepdim=True)
-    embedded = embedded * layer._temperature / embedded.square().sum(0).mean().sqrt()
+    embedded = embedded * layer.fixed["temperature"] / embedded.square().sum(0).mean().sqrt()
     features = (embedded if places is None else torch.cat([embedded, places])).detach().mT.numpy()
     attention = torch.from_numpy(reference.balanced(reference.affinity(features, features), steps=200))
     attended = nn.functional.conv1d(points[None], layer.value.weight.double(), layer.value.bias.double()) @ attention

@@ -20,9 +20,8 @@ from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.core.torch_internals import outside_transforms, refuse_transforms
 from nlfilter_torch.core.workers import threads_for
 from nlfilter_torch.filtering.filters import detail_layers
-from nlfilter_torch.nn.denoiser.colours import join_colours, split_colours, split_noise
 from nlfilter_torch.nn.denoiser.noise import noise_map
-from nlfilter_torch.nn.denoiser.profile import NoiseProfile
+from nlfilter_torch.nn.denoiser.profile import NoiseProfile, join_colours, split_colours, split_noise
 from nlfilter_torch.nn.denoiser.tiles import in_tiles
 from nlfilter_torch.nn.denoiser.weights import read_weights
 from nlfilter_torch.operator.build import operator_from_points

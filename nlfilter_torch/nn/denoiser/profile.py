@@ -1,5 +1,6 @@
 """The noise of a photograph by scale, plane and brightness, which tells noise of cameras from white noise."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar
@@ -10,7 +11,6 @@ from torch import Tensor
 
 from nlfilter_torch.core.checks import check_image, check_same_size
 from nlfilter_torch.core.precision import full_precision, per_image, squarable, working_dtype
-from nlfilter_torch.nn.denoiser.colours import split_colours
 
 KNOTS = 6  # brightnesses at which levels are known: 0, 0.2, ... 1
 STIFFNESS = 4  # number of blocks that outweigh the assumption that variances at neighbouring knots are the same
@@ -168,3 +168,44 @@ def _levels(planes: tuple[Tensor, Tensor], light: Tensor, scale: int) -> Tensor:
     stiffness = (STIFFEST * squares.sum((1, 2), keepdim=True)).clamp(min=STIFFNESS)
     variances = torch.linalg.solve(squares + stiffness * (slopes.mT @ slopes), sums).mT
     return (variances.clamp(min=0) * (size[0] * size[1])).sqrt()
+
+
+@full_precision
+def split_colours(image: Tensor) -> Tensor:
+    """Split an image (B, 1 or 3, H, W) into luminance and two colour differences (B, 3, H, W).
+
+    The luminance is the mean of the channels. The differences have coefficients of unit norm; for a grey image they are
+    0.
+    """
+    if image.shape[1] == 1:
+        nothing = torch.zeros_like(image)
+        return torch.cat([image, nothing, nothing], dim=1)
+    return torch.einsum("pc,bchw->bphw", _mixture(image), image)
+
+
+@full_precision
+def split_noise(noise: Tensor, channels: int) -> Tensor:
+    """Levels (B, 2, H, W) of luminance and colour differences, from those of white noise (B, 1 or C, H, W)."""
+    if channels == 1:
+        return torch.cat([noise, torch.zeros_like(noise)], dim=1)
+    if noise.shape[1] == 1:
+        return torch.cat([noise / math.sqrt(3), noise], dim=1)
+    variance = noise.to(working_dtype(noise)).square()
+    deviation = torch.cat([variance.sum(1, keepdim=True) / 9, variance.mean(1, keepdim=True)], dim=1)
+    return deviation.clamp(min=1e-30).sqrt().to(noise)
+
+
+@full_precision
+def join_colours(planes: Tensor, channels: int) -> Tensor:
+    """Invert :func:`split_colours`."""
+    if channels == 1:
+        return planes[:, :1]
+    # Coefficients of differences are orthonormal and add up to 0: the inverse is the transpose but for the luminance.
+    inverse = torch.cat([torch.ones_like(_mixture(planes)[:1]), _mixture(planes)[1:]]).mT
+    return torch.einsum("cp,bphw->bchw", inverse, planes)
+
+
+def _mixture(like: Tensor) -> Tensor:
+    """Matrix (3, 3) from red, green and blue to luminance and differences."""
+    rows = [[1 / 3, 1 / 3, 1 / 3], [0.5**0.5, 0.0, -(0.5**0.5)], [6**-0.5, -2 * 6**-0.5, 6**-0.5]]
+    return like.new_tensor(rows)

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from nlfilter_torch.core.inner import Inner
 from nlfilter_torch.core.torch_internals import is_hidden
-from nlfilter_torch.nn.denoiser.statistics import has_few_colours
+from nlfilter_torch.nn.denoiser.estimate import has_few_colours
 from nlfilter_torch.operator.features import pad_border
 from nlfilter_torch.photo.picture.drawn import M
 from nlfilter_torch.photo.picture.source import Source, sampled_places
