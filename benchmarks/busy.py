@@ -2,7 +2,7 @@
 
 Every edit, the operator, the denoiser and steps of training take turns with one thread and with two, alone and beside
 one and two processes that keep a core busy each. Threads wait for each other as in the program
-(``nlfilter_torch.photo.cli.waiting``). With two threads nothing must take more than 1.3 times as long as with one, and
+(``nlfilter_torch.photo.cli.process``). With two threads nothing must take more than 1.3 times as long as with one, and
 alone not more than 1.1 times as long as where threads wait as torch has it, by spinning. Ratios are medians over
 ``--repeats``. ``--spinning`` shows what spinning costs beside busy processes. ``--quick`` runs it on a small picture.
 """
@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Self
 
 from benchmarks.streaming_busy import neighbours
 from benchmarks.training.figures import Figure, table
-from nlfilter_torch.photo.cli.waiting import VARIABLES, sleep_while_waiting
+from nlfilter_torch.photo.cli.process import VARIABLES, sleep_while_waiting
 
 if TYPE_CHECKING:
     import torch

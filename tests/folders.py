@@ -7,8 +7,10 @@ import pytest
 import skimage.data
 from PIL import Image
 
-from nlfilter_torch.photo.cli import folders, main
-from nlfilter_torch.photo.cli.folders import Tally, edit_folder, pictures, prepare
+from nlfilter_torch.photo.cli import main
+from nlfilter_torch.photo.cli.batch import Edit, Tally, edit_folder
+from nlfilter_torch.photo.cli.folders import pictures, prepare
+from nlfilter_torch.photo.cli.workers import Crew
 
 
 def fill(folder: Path, count: int, broken: tuple[int, ...] = (), side: int = 48) -> None:
@@ -28,10 +30,10 @@ def finished(folder: Path) -> dict[str, tuple[int, int]]:
     return {path.name: (path.stat().st_ino, path.stat().st_mtime_ns) for path in folder.glob("[!.]*")}
 
 
-def tally_of(paths: list[Path], target: Path, edit: folders.Edit, workers: int = 1) -> tuple[Tally, list[str]]:
+def tally_of(paths: list[Path], target: Path, edit: Edit, workers: int = 1) -> tuple[Tally, list[str]]:
     tally, told = Tally(), list[str]()
     prepare(paths, target, {})
-    edit_folder(paths, target, edit, workers=workers, threads=1, tell=told.append, begin=lambda name: None, tally=tally)
+    edit_folder(paths, target, edit, Crew(workers), tell=told.append, begin=lambda name: None, tally=tally)
     return tally, told
 
 

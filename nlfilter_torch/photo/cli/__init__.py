@@ -6,7 +6,7 @@ Invalid input of any kind is reported in one sentence on standard error, with ex
 import sys
 from collections.abc import Callable, Iterable
 
-from nlfilter_torch.photo.cli import collector, interrupts, waiting
+from nlfilter_torch.photo.cli import process
 
 Commands = Callable[[], Iterable[Callable[..., None]]]
 
@@ -16,16 +16,16 @@ def main(arguments: list[str] | None = None, others: Commands = tuple) -> int:
 
     ``others`` imports and returns commands besides those of this package.
     """
-    waiting.sleep_while_waiting()
-    collector.collect_seldom()
+    process.sleep_while_waiting()
+    process.collect_seldom()
     try:
-        with interrupts.handled():
+        with process.handled():
             from nlfilter_torch.photo.cli.application import run
 
             return run(arguments, others())
     except KeyboardInterrupt:
-        return interrupts.tell()
-    except interrupts.Ended as ended:
+        return process.tell()
+    except process.Ended as ended:
         return ended.status
     except ModuleNotFoundError as error:
         sys.stderr.write(

@@ -12,18 +12,12 @@ import typer
 from typer.core import TyperCommand
 
 from nlfilter_torch.core.instruction_sets import NAMES, level, load_library
-from nlfilter_torch.photo.cli.apply import apply
-from nlfilter_torch.photo.cli.batch import batch
-from nlfilter_torch.photo.cli.demo import demo
-from nlfilter_torch.photo.cli.develop import develop
+from nlfilter_torch.photo.cli.commands import apply, batch, demo, develop, frames, inspect, presets
 from nlfilter_torch.photo.cli.edits import command
 from nlfilter_torch.photo.cli.fit import fit
-from nlfilter_torch.photo.cli.frames import frames
 from nlfilter_torch.photo.cli.hints import explained
-from nlfilter_torch.photo.cli.inspect import inspect
-from nlfilter_torch.photo.cli.interrupts import INTERRUPTED, tell
 from nlfilter_torch.photo.cli.mask import mask
-from nlfilter_torch.photo.cli.presets import presets
+from nlfilter_torch.photo.cli.process import INTERRUPTED, tell
 from nlfilter_torch.photo.declared.parameters import EDITS
 from nlfilter_torch.version import __version__
 

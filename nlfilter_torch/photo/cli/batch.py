@@ -1,115 +1,87 @@
-"""``nlfilter-torch batch``: the same edit of the details for all photographs of a folder."""
+"""A folder of photographs edited by worker processes: those of joblib on this machine, or those of a cluster.
 
+Needs the ``cli`` extra, and ``cluster`` for a cluster. A file is done when the output folder has a file of
+its name, since a name appears only when its file is complete
+(:func:`~nlfilter_torch.photo.files.writing.open_beside`). An interrupted run continues when it is started again.
+"""
+
+import contextlib
+import io
 import os
-from collections.abc import Callable
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Any
 
 import typer
 
-from nlfilter_torch.photo.cli import options
-from nlfilter_torch.photo.cli.apply import apply
-from nlfilter_torch.photo.cli.edits import (
-    DETAIL_OPTIONS,
-    check_usual,
-    edit_photograph,
-    other_recipe,
-    preset_option,
-    step_of,
-    typed_options,
-    with_options,
-)
-from nlfilter_torch.photo.cli.interrupts import INTERRUPTED
-from nlfilter_torch.photo.declared.looks import LOOKS
+from nlfilter_torch.photo.cli.editing import allowed_memory, check_quality_of, check_workers, is_jpeg
+from nlfilter_torch.photo.cli.edits import edit_photograph
+from nlfilter_torch.photo.cli.folders import left_out, pictures, prepare, subfolders
+from nlfilter_torch.photo.cli.options import NOTE, FileOptions, FolderOptions
+from nlfilter_torch.photo.cli.process import INTERRUPTED
+from nlfilter_torch.photo.cli.progress import steps
+from nlfilter_torch.photo.cli.recipe_job import apply_files
+from nlfilter_torch.photo.cli.workers import Crew, worker_pool
 from nlfilter_torch.photo.declared.parameters import EDITS
-from nlfilter_torch.photo.declared.presets import PRESETS, named_recipe
+from nlfilter_torch.photo.declared.presets import Recipe, named_recipe
+from nlfilter_torch.photo.files.rows import WHOLE, free_memory
+from nlfilter_torch.photo.files.writing import remove_stale
 
-if TYPE_CHECKING:
-    from nlfilter_torch.photo.cli.folders import Tally
-
+DEATHS = 3  # per worker and in a row: after so many deaths the cause is not in the files
 NAMED = 5  # subfolders that are left out and named
+DIED = "the process that worked on it died; use fewer --workers, so that each has more memory, or check the file"
 
-Folder = Annotated[Path, typer.Argument(metavar="IN_DIR", help="The folder that holds the photographs.")]
-Target = Annotated[
-    Path,
-    typer.Argument(
-        metavar="OUT_DIR",
-        help="The folder for the edited ones, under the same names; created if it does not exist. Photographs that "
-        "it already contains are skipped.",
-    ),
-]
-Workers = Annotated[
-    int | None,
-    typer.Option(
-        min=1,
-        metavar="N",
-        help="How many photographs are edited at a time; each takes memory of its own. Default: one per core.",
-    ),
-]
-
-Cluster = Annotated[
-    str | None,
-    typer.Option(
-        metavar="ADDRESS",
-        help=f"The {options.ADDRESS} edit the photographs in place of this machine. {options.ON_CLUSTER}",
-    ),
-]
-
-Preset = Annotated[
-    str | None,
-    preset_option(
-        f"One of {', '.join((*PRESETS, *LOOKS))}, or a file of any edits, such as `nlfilter-torch fit` and the editor "
-        "make. Options on the command line override a detail preset; other presets accept none.",
-        plain=False,
-    ),
-]
+Edit = Callable[[str, str], object]  # edits the file of the first name to that of the second; can be pickled
+FileEdit = Callable[[str, str, FileOptions], object]
+Outcome = list[str] | str  # warnings of a file that was edited, or why it could not be edited
 
 
-@with_options(*DETAIL_OPTIONS)
-def batch(
-    context: typer.Context,
-    folder: Folder,
-    target: Target,
-    seed: options.Seed = 0,
-    preset: Preset = None,
-    workers: Workers = None,
-    cluster: Cluster = None,
-    memory: options.Memory = None,
-    quality: options.QualityOfFolder = None,
-    force: options.Insist = False,
-    **values: Any,
-) -> None:
-    """Edit all photographs of a folder: their details, as `nlfilter-torch detail` does, or by any file of edits.
+@dataclass
+class Tally:
+    """Counts of files.
 
-    A file that cannot be edited is reported and the others are done; the exit status is 1 then. After an interruption
-    the same command does what is left. The workers share --memory; on a cluster, every worker may use that much.
-
-    By a saved edit: `nlfilter-torch batch shots edited --preset look.json`
-
-    On several machines that share the folders: `nlfilter-torch batch shots edited --cluster tcp://host:8786`
+    Attributes:
+        done: edited in this run.
+        skipped: present before.
+        failures: from the name of a file that could not be edited to the reason.
+        left: not begun.
     """
-    step = step_of(EDITS["detail"], values)
-    if not force:
-        check_usual(step, typed_options(context, values))
 
-    from nlfilter_torch.photo.cli.editing import allowed_memory, check_quality_of, check_workers
-    from nlfilter_torch.photo.cli.folders import Tally, edit_folder, left_out, pictures, prepare, subfolders
-    from nlfilter_torch.photo.cli.progress import steps
-    from nlfilter_torch.photo.files.rows import WHOLE, free_memory
+    done: int = 0
+    skipped: int = 0
+    failures: dict[str, str] = field(default_factory=dict)
+    left: int = 0
 
-    check_workers(workers, cluster)
-    if cluster is not None:  # whose workers run in other folders
+
+def batch_of_detail(settings: Mapping[str, Any], folder: Path, target: Path, files: FolderOptions) -> None:
+    """Edit the details of all photographs of a folder, with these values of options."""
+    edit_photographs(partial(edit_photograph, EDITS["detail"], **settings), settings, folder, target, files)
+
+
+def batch_of_recipe(name: str, recipe: Recipe, folder: Path, target: Path, files: FolderOptions) -> None:
+    """Apply the recipe of a preset to all photographs of a folder; ``name`` is that of the preset, or of its file."""
+    absolute = name if named_recipe(name) is not None else str(Path(name).absolute())  # for workers in other folders
+    edit_photographs(partial(apply_files, [absolute], []), {"recipe": recipe.to_json()}, folder, target, files)
+
+
+def edit_photographs(
+    edit: FileEdit, settings: Mapping[str, object], folder: Path, target: Path, files: FolderOptions
+) -> None:
+    """Edit all photographs of a folder, and say how many; raises typer.Exit if not all were edited.
+
+    ``settings`` are recorded in the output folder.
+    """
+    check_workers(files.workers, files.cluster)
+    if files.cluster is not None:  # whose workers run in other folders
         folder, target = folder.absolute(), target.absolute()
-    shared = free_memory() if memory is None else allowed_memory(memory)
-    settings = {**values, "seed": seed}
-    edit: Callable[..., object] = partial(edit_photograph, EDITS["detail"], **settings)
-    if preset is not None and (recipe := other_recipe(context, preset, settings)) is not None:
-        settings, edit = {"recipe": recipe.to_json()}, partial(apply, preset=[_absolute(preset)])
+    shared = free_memory() if files.memory is None else allowed_memory(files.memory)
     paths = pictures(folder)
-    if quality is not None:
-        check_quality_of(paths, quality)
-        settings, edit = {**settings, "quality": quality}, partial(_edit_at_quality, edit, quality)
+    if files.quality is not None:
+        check_quality_of(paths, files.quality)
+        settings = {**settings, "quality": files.quality}
     prepare(paths, target, settings)
     if others := left_out(folder):
         _tell(f"left out {others}; convert them to PNG, JPEG, TIFF, WebP or AVIF if they are photographs")
@@ -119,19 +91,17 @@ def batch(
             f"left out the subfolders {', '.join(names[:NAMED])}{more}; run the command on each that holds photographs"
         )
     tally, interrupted = Tally(), False
-    count = min(workers or _cores(), len(paths))
-    room = memory  # of a worker; None is as much as the command of an edit uses
-    if cluster is None and (memory is not None or shared < count * WHOLE):
+    count = min(files.workers or _cores(), len(paths))
+    room = files.memory  # of a worker; None is as much as the command of an edit uses
+    if files.cluster is None and (files.memory is not None or shared < count * WHOLE):
         room = shared / count / 1e9
     try:
         with steps(len(paths), lines=False) as begin:  # files that fail are told by lines
             edit_folder(
                 paths,
                 target,
-                partial(edit, memory=room),
-                workers=count,
-                threads=max(1, _cores() // count),
-                cluster=cluster,
+                partial(_edited, edit, FileOptions(quality=files.quality, memory=room)),
+                Crew(count, max(1, _cores() // count), files.cluster),
                 tell=_tell,
                 begin=begin,
                 tally=tally,
@@ -146,16 +116,9 @@ def batch(
         raise typer.Exit(1)
 
 
-def _absolute(preset: str) -> str:
-    """A preset's name, or the absolute path of its file, since workers may run in other folders."""
-    return preset if named_recipe(preset) is not None else str(Path(preset).absolute())
-
-
-def _edit_at_quality(edit: Callable[..., object], quality: int, source: str, target: str, **limits: Any) -> None:
-    """Edit a file, with that quality if it is a JPEG."""
-    from nlfilter_torch.photo.cli.editing import is_jpeg
-
-    edit(source, target, **limits, **({"quality": quality} if is_jpeg(target) else {}))
+def _edited(edit: FileEdit, files: FileOptions, source: str, target: str) -> None:
+    """Edit a file, with the quality of these options if it is a JPEG."""
+    edit(source, target, files if is_jpeg(target) else replace(files, quality=None))
 
 
 def _cores() -> int:
@@ -167,7 +130,7 @@ def _tell(sentence: str) -> None:
     typer.echo(f"nlfilter-torch: {sentence}", err=True)
 
 
-def _summarise(tally: "Tally", target: Path) -> None:
+def _summarise(tally: Tally, target: Path) -> None:
     """Counts on the standard output, and the names of what is missing."""
     counts = [f"{tally.done} edited", f"{tally.skipped} there already", f"{len(tally.failures)} failed"]
     if tally.left:
@@ -175,3 +138,76 @@ def _summarise(tally: "Tally", target: Path) -> None:
     typer.echo(f"{', '.join(counts)}, in {target}")
     if tally.failures:
         typer.echo(f"failed: {', '.join(sorted(tally.failures))}")
+
+
+def edit_folder(
+    paths: Sequence[Path],
+    target: Path,
+    edit: Edit,
+    crew: Crew,
+    *,
+    tell: Callable[[str], None],
+    begin: Callable[[str], None],
+    tally: Tally,
+) -> None:
+    """Edit those of ``paths`` that the prepared folder ``target`` does not hold yet; failures do not stop the rest.
+
+    Args:
+        paths: image files, all in one folder.
+        target: folder for the edited files, which keep their names.
+        edit: edits one of them in a worker; its errors and warnings are reported.
+        crew: the workers, which see the folders under the same names.
+        tell: called with a sentence for every failure and warning, as they happen.
+        begin: called with the name of every file that ended.
+        tally: updated as each file ends, so that it is correct after an interrupt too.
+    """
+    names = {path.name for path in paths}
+    remove_stale(target, names)
+    jobs = [path for path in paths if not (target / path.name).exists()]
+    tally.skipped += len(paths) - len(jobs)
+    tally.left += len(jobs)
+    if not jobs:
+        return
+    calls = {path: partial(_edit_file, edit, path, target / path.name) for path in jobs}
+    deaths = 0
+    with (
+        contextlib.ExitStack() as afterwards,
+        worker_pool(replace(crew, number=min(crew.number, len(jobs)))) as pool,
+        contextlib.closing(pool.outcomes(calls)) as ended,
+    ):
+        afterwards.callback(remove_stale, target, names)  # of workers that were ended by an interrupt
+        for path, outcome in ended:
+            begin(path.name)
+            tally.left -= 1
+            deaths = deaths + 1 if outcome is None else 0
+            if isinstance(outcome, list):
+                tally.done += 1
+                for note in outcome:
+                    tell(f"note: {note}" if path.name in note else f"note: {path.name}: {note}")
+                continue
+            reason = DIED if outcome is None else outcome
+            tally.failures[path.name] = reason
+            tell(reason if path.name in reason else f"{path.name}: {reason}")
+            if deaths >= DEATHS * pool.number:
+                tell(f"{deaths} workers died one after the other; no other file is begun")
+                return
+
+
+def _edit_file(edit: Edit, source: Path, target: Path) -> Outcome:
+    """Edit one file in a worker; return its notes and warnings or why it failed."""
+    printed = io.StringIO()
+    with warnings.catch_warnings(record=True) as caught, contextlib.redirect_stderr(printed):
+        warnings.simplefilter("always", UserWarning)
+        try:
+            edit(str(source), str(target))
+        except Exception as error:
+            return _sentence(error)
+    notes = [line.removeprefix(NOTE) for line in printed.getvalue().splitlines() if line.startswith(NOTE)]
+    return notes + [str(warning.message) for warning in caught if issubclass(warning.category, UserWarning)]
+
+
+def _sentence(error: Exception) -> str:
+    """Why a file could not be edited."""
+    if isinstance(error, ValueError | OSError | MemoryError):
+        return " ".join(str(error).split())
+    return " ".join(f"{type(error).__name__}: {error}".split())

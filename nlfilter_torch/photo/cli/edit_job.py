@@ -1,34 +1,37 @@
 """One edit of one photograph, in memory or in tiles, with what the command prints about it."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
+import numpy as np
 import torch
 import typer
+from numpy.typing import NDArray
 from torch import Tensor
 
 from nlfilter_torch.core.workers import single_threaded
 from nlfilter_torch.photo.cli import editing, options
-from nlfilter_torch.photo.cli.changes import ChangeMeter, squared_difference, write_map
-from nlfilter_torch.photo.cli.editing import Job, pixels_of, rows_of
+from nlfilter_torch.photo.cli.editing import MAP_DEPTH, Job, pixels_of, rows_of
 from nlfilter_torch.photo.cli.scribbles import Open, Overlay, ScribbleOptions, at_once, of_edit
 from nlfilter_torch.photo.cli.showing import Scribbled
 from nlfilter_torch.photo.declared.development import AS_IT_IS, Development
-from nlfilter_torch.photo.declared.rows import RowSource
+from nlfilter_torch.photo.declared.rows import WHITE, RowSource, is_hidden
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.edits.applying import edit_of
 from nlfilter_torch.photo.files.rows import StoredPicture, open_picture
 from nlfilter_torch.photo.picture.drawn import Drawn, M
 from nlfilter_torch.photo.picture.edit import PhotoEdit, Rows
 from nlfilter_torch.photo.picture.in_memory import InMemory, edit_image, fit_edit
-from nlfilter_torch.photo.picture.photographs import Photograph
+from nlfilter_torch.photo.picture.photographs import Photograph, write_photograph
 from nlfilter_torch.photo.picture.pictures import Picture, stored_as
 from nlfilter_torch.photo.picture.source import Source, seeded
 from nlfilter_torch.photo.picture.tiled import Tiled
 from nlfilter_torch.photo.picture.tiles import Tiling
+
+ROWS, AROUND = 256, 2  # rows of the photograph that are read at once, and additional rows on both sides
 
 
 @dataclass(frozen=True)
@@ -42,9 +45,8 @@ class EditJob:
         scribbles: options that mark parts of the photograph.
         show: file for the picture of scribbles and mask.
         map: file for the map of what the edit estimates.
-        depth: of the output; None is that of the input.
+        files: how it is read and written.
         seed: of the random numbers.
-        memory: gigabytes that may be used.
         full: whether statistics of tiles are of all pixels.
         notes: what is to be said about the options, once the photograph has been read.
     """
@@ -55,9 +57,8 @@ class EditJob:
     scribbles: ScribbleOptions
     show: Path | None
     map: Path | None
-    depth: options.FileDepth | None
+    files: options.FileOptions
     seed: int
-    memory: float | None
     full: bool
     notes: Sequence[str] = ()
 
@@ -92,14 +93,14 @@ class EditJob:
     def edited(self, photograph: Photograph) -> Tensor:
         """The edited pixels of a photograph in memory, (1, C, H, W)."""
         rows = rows_of(photograph, self.source)
-        with ExitStack() as files:
-            drawn = self._drawn(rows, Opener(files, editing.allowed_memory(self.memory)))
+        with ExitStack() as opened:
+            drawn = self._drawn(rows, Opener(opened, editing.allowed_memory(self.files.memory)))
             self._tell(rows, drawn)
             weights = photograph.weights
             edit = self._measured(InMemory(photograph.pixels, weights=weights), rows)
             pixels = edit_image(edit, photograph.pixels, at_once(self.step.declared, drawn), weights=weights)
         if edit.reports_change:
-            kind = options.DEPTHS[self.depth] if self.depth else photograph.depth  # the files are compared
+            kind = options.DEPTHS[self.files.depth] if self.files.depth else photograph.depth  # the files are compared
             planes = [photograph.pixels] if weights is None else [photograph.pixels, weights]
             before = stored_as(torch.cat(planes, dim=1), photograph.depth)
             after = stored_as(pixels, kind)
@@ -171,3 +172,56 @@ class Opener:
 def as_rows(drawn: Drawn[Overlay]) -> Drawn[RowSource]:
     """Scribbles as a picture in tiles takes them."""
     return Drawn(dict(drawn.masks), drawn.colours, drawn.sliders, drawn.outside)
+
+
+class ChangeMeter:
+    """Measures how much an edit changes the pixels of a photograph, in grey levels (RMS)."""
+
+    def __init__(self) -> None:
+        self._squares, self._count = 0.0, 0
+
+    def add(self, difference: tuple[float, int]) -> None:
+        """Add the difference of some pixels, from :func:`squared_difference`."""
+        self._squares += difference[0]
+        self._count += difference[1]
+
+    def watched(self, tiling: Tiling) -> Tiling:
+        """Edited rows whose differences are added as they are computed."""
+        return replace(tiling, compare=squared_difference, compared=self.add)
+
+    @property
+    def change(self) -> float:
+        """The change of the pixels that were added."""
+        return options.LEVELS * (self._squares / max(self._count, 1)) ** 0.5
+
+
+def write_map(map_of: Callable[[Tensor], Tensor], rows: Rows, path: Path) -> None:
+    """Write what a function computes from a photograph as a picture, at :data:`MAP_DEPTH`.
+
+    The function depends on :data:`AROUND` pixels around each.
+    """
+    parts = []
+    for start in range(0, rows.size[0], ROWS):
+        stop = min(start + ROWS, rows.size[0])
+        first, last = max(start - AROUND, 0), min(stop + AROUND, rows.size[0])
+        planes = map_of(rows.read(slice(first, last)).float())
+        parts.append(planes[..., start - first : stop - first, :])
+    write_photograph(Photograph(torch.cat(parts, dim=2), MAP_DEPTH), path)
+
+
+def squared_difference(before: NDArray[np.generic], after: NDArray[np.generic]) -> tuple[float, int]:
+    """Sum of the squared differences of the colours of stored rows (h, W, S), and the number of values.
+
+    Pixels that are hidden by the transparency before do not count.
+    """
+    colours = 3 if after.shape[2] >= 3 else 1
+    if before.shape[2] in (2, 4):
+        visible = ~is_hidden(before)
+        before, after = before[visible], after[visible]
+    difference = _scaled(after[..., :colours]) - _scaled(before[..., :colours])
+    return float(np.square(difference, dtype=np.float64).sum()), difference.size
+
+
+def _scaled(rows: NDArray[np.generic]) -> NDArray[np.float32]:
+    scaled: NDArray[np.float32] = rows.astype(np.float32) / np.float32(WHITE.get(rows.dtype.name, 1))
+    return scaled

@@ -12,11 +12,10 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.photo.cli import options
-from nlfilter_torch.photo.cli.changes import MAP_DEPTH
 from nlfilter_torch.photo.cli.progress import stages, steps
 from nlfilter_torch.photo.declared.development import Development
 from nlfilter_torch.photo.declared.steps import Step, working_bytes
-from nlfilter_torch.photo.files.formats import TooLarge, check_depth, check_memory, check_type
+from nlfilter_torch.photo.files.formats import Depth, TooLarge, check_depth, check_memory, check_type
 from nlfilter_torch.photo.files.rows import (
     TILED,
     WHOLE,
@@ -40,6 +39,7 @@ from nlfilter_torch.photo.picture.sampling import Report
 from nlfilter_torch.photo.picture.tiles import Passes, Processes, Statistics, Tiling
 from nlfilter_torch.photo.picture.viewing import viewed_size
 
+MAP_DEPTH: Depth = "uint16"
 MOST = 1e6  # gigabytes; upper limit of ``--memory``
 
 
@@ -283,38 +283,15 @@ class FileEdit(Protocol):
         """The edited rows of a photograph that does not fit in memory, which are computed within the block."""
 
 
-def edit_file(
-    edit: FileEdit,
-    source: str,
-    target: str,
-    depth: options.FileDepth | None,
-    *,
-    memory: float | None,
-    workers: int | None = None,
-    cluster: str | None = None,
-    quality: int | None = None,
-    force: bool = False,
-) -> None:
-    """Edit the photograph in a file, and write it to another file, with its metadata.
-
-    Args:
-        edit: the edit.
-        source: the file to read.
-        target: the file to write.
-        depth: of the output; None is that of the input.
-        memory: gigabytes that may be used; None is a fifth of the machine's, but at most 2, or 1 in tiles.
-        workers: number of processes that filter zarr arrays, instead of threads.
-        cluster: address of the cluster whose processes do this.
-        quality: of a JPEG file; None is the default.
-        force: whether the file to write may be the one that is read.
-    """
-    check_not_input(source, target, force=force)
-    check_quality(target, quality)
-    check_processes(source, target, workers, cluster)
-    allowed, kind = allowed_memory(memory), None if depth is None else options.DEPTHS[depth]
+def edit_file(edit: FileEdit, source: str, target: str, files: options.FileOptions) -> None:
+    """Edit the photograph in a file, and write it to another file, with its metadata."""
+    check_not_input(source, target, force=files.force)
+    check_quality(target, files.quality)
+    check_processes(source, target, files.workers, files.cluster)
+    allowed, kind = allowed_memory(files.memory), None if files.depth is None else options.DEPTHS[files.depth]
     with steps(3) as begin:
         begin("Reading")
-        photograph = read_if_it_fits(source, target, edit.bytes_per_pixel, memory)
+        photograph = read_if_it_fits(source, target, edit.bytes_per_pixel, files.memory)
         if photograph is not None:
             size = photograph.size
             edit = edit.at_size(size)
@@ -325,7 +302,7 @@ def edit_file(
             begin("Editing")
             output = output.with_pixels(edit.on_developed(size).edited(photograph))
             begin("Writing")
-            write_photograph(output, target, quality=quality)
+            write_photograph(output, target, quality=files.quality)
             return
     with ExitStack() as stack:
         picture = stack.enter_context(open_picture(Path(source), allowed))
@@ -338,8 +315,10 @@ def edit_file(
         like = part.in_colour() if edit.coloured else part
         check_place(Path(target), stored, like, allowed)
         note_developing(edit, source, size, picture.shape[2])
-        processes = processes_for(workers, cluster, stack)
+        processes = processes_for(files.workers, files.cluster, stack)
         report = stack.enter_context(stages())
-        job = Job(picture, stored, allowed - picture.cached, allowed_memory(memory, TILED), report, stack, processes)
+        job = Job(
+            picture, stored, allowed - picture.cached, allowed_memory(files.memory, TILED), report, stack, processes
+        )
         with edit.tiling(job) as tiling:
-            write_picture(Path(target), tiling, stored, like, quality, tiling.fill)
+            write_picture(Path(target), tiling, stored, like, files.quality, tiling.fill)

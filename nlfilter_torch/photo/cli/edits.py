@@ -1,8 +1,9 @@
 """One command per edit, with options generated from the declaration of its parameters."""
 
 import inspect
-from collections.abc import Callable, Collection, Iterable, Mapping
-from pathlib import Path
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import fields, is_dataclass
+from functools import wraps
 from typing import Annotated, Any, Literal
 
 import typer
@@ -156,34 +157,6 @@ def _declared(parameter: Parameter, panel: str | None = None) -> inspect.Paramet
     return _argument(parameter.name, option(parameter, panel), option_value(parameter, parameter.default))
 
 
-def signature(
-    edit: Edit,
-    *,
-    target: object = options.Target,
-    depth: object = options.OutputDepth,
-    further: Iterable[inspect.Parameter] = (),
-) -> inspect.Signature:
-    """The signature of an edit's command.
-
-    ``target`` and ``depth`` annotate its output and the depth of that; ``further`` options follow these.
-    """
-    return inspect.Signature(
-        [
-            _argument("source", options.Source, inspect.Parameter.empty),
-            _argument("target", target, inspect.Parameter.empty),
-            *(_argument(name, annotation, None) for name, annotation in scribble_options(edit).items()),
-            *(_declared(p) for p in edit if p.is_option),
-            _argument("depth", depth, None),
-            *further,
-            _argument("seed", options.Seed, 0),
-            _argument("memory", options.Memory, None),
-            _argument("full", options.Full, False),
-            _argument("workers", options.Workers, None),
-            _argument("cluster", options.Cluster, None),
-        ]
-    )
-
-
 def with_options(*names: str, more: Iterable[Edit] = ()) -> Callable[[Command], Command]:
     """Replace the ``**values`` of a command by the named options of detail and all options of the edits in ``more``."""
 
@@ -193,8 +166,7 @@ def with_options(*names: str, more: Iterable[Edit] = ()) -> Callable[[Command], 
             for parameter in edit:
                 if parameter.is_option and parameter.name not in added:
                     added[parameter.name] = _declared(parameter, f"Options of {edit.name}")
-        signature = inspect.Signature([*_own_parameters(function), *added.values()])
-        return with_signature(function, signature)
+        return as_command(function, [*_own_parameters(function), *added.values()])
 
     return decorate
 
@@ -204,35 +176,57 @@ def with_declared(edit: Edit) -> Callable[[Command], Command]:
 
     def decorate(function: Command) -> Command:
         source, target, *own = _own_parameters(function)
-        function.__doc__ = edit.help
-        return with_signature(function, inspect.Signature([source, target, *map(_declared, edit), *own]))
+        marks = [_argument(name, annotation, None) for name, annotation in scribble_options(edit).items()]
+        function.__name__, function.__doc__ = edit.name, edit.help
+        return as_command(function, [source, target, *marks, *(_declared(p) for p in edit if p.is_option), *own])
 
     return decorate
 
 
 def _own_parameters(function: Command) -> list[inspect.Parameter]:
-    """The parameters of a command but its ``**values``, to be passed by name."""
-    parameters = inspect.signature(function, eval_str=True).parameters.values()
-    return [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in parameters if p.kind != p.VAR_KEYWORD]
+    """The parameters of a command but its ``**values``, to be passed by name; of a dataclass, those of its fields."""
+    parameters: list[inspect.Parameter] = []
+    for own in inspect.signature(function, eval_str=True).parameters.values():
+        if isinstance(own.annotation, type) and is_dataclass(own.annotation):
+            parameters += inspect.signature(own.annotation, eval_str=True).parameters.values()
+        elif own.kind != own.VAR_KEYWORD:
+            parameters.append(own)
+    return [parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY) for parameter in parameters]
 
 
-def with_signature(function: Command, signature: inspect.Signature) -> Command:
-    """Give a command the signature that typer reads its options from."""
-    setattr(function, "__signature__", signature)  # noqa: B010  # unknown to mypy
-    return function
+def as_command(function: Command, parameters: Sequence[inspect.Parameter]) -> Command:
+    """The command of a function, with these options, of which it takes some as dataclasses."""
+    own = inspect.signature(function, eval_str=True).parameters.values()
+    grouped = {p.name: p.annotation for p in own if isinstance(p.annotation, type) and is_dataclass(p.annotation)}
+
+    @wraps(function)
+    def run(**values: Any) -> None:
+        for name, kind in grouped.items():
+            values[name] = kind(**{field.name: values.pop(field.name) for field in fields(kind)})
+        function(**values)
+
+    run.__annotations__ = {}
+    setattr(run, "__signature__", inspect.Signature(parameters))  # noqa: B010  # which typer reads; unknown to mypy
+    return run
 
 
 def command(edit: Edit) -> Command:
     """Create the command of an edit."""
 
-    def run(source: str, target: str, *, context: typer.Context, **values: Any) -> None:
-        edit_photograph(edit, source, target, typed=typed_options(context, values), **values)
+    @with_declared(edit)
+    def run(
+        source: options.Source,
+        target: options.Target,
+        context: typer.Context,
+        files: options.FileOptions,
+        seed: options.Seed = 0,
+        full: options.Full = False,
+        **values: Any,
+    ) -> None:
+        typed = typed_options(context, values)
+        edit_photograph(edit, source, target, files, typed=typed, seed=seed, full=full, **values)
 
-    run.__name__, run.__doc__, run.__annotations__ = edit.name, edit.help, {}
-    further = _argument("quality", options.Quality, None), _argument("force", options.Force, False)
-    options_of_edit = signature(edit, further=further)
-    context = _argument("context", typer.Context, inspect.Parameter.empty)
-    return with_signature(run, options_of_edit.replace(parameters=[*options_of_edit.parameters.values(), context]))
+    return run
 
 
 def step_of(edit: Edit, options_of_edit: Mapping[str, Value]) -> Step:
@@ -256,30 +250,23 @@ def edit_photograph(
     edit: Edit,
     source: str,
     target: str,
+    files: options.FileOptions,
     *,
     typed: Collection[str] = (),
-    depth: options.FileDepth | None = None,
-    quality: int | None = None,
-    force: bool = False,
     seed: int = 0,
-    memory: float | None = None,
     full: bool = False,
-    workers: int | None = None,
-    cluster: str | None = None,
-    preset: str | None = None,
-    region: list[str] | None = None,
-    strokes: Path | None = None,
-    mask: Path | None = None,
-    show: Path | None = None,
-    map: Path | None = None,
-    **values: Value | list[str],
+    **values: Any,
 ) -> None:
     """Apply an edit to a file.
 
-    ``values`` are those of its parameters and of its further options for scribbles, and ``typed`` holds the names of
-    the options that the user typed.
+    ``values`` are those of its parameters, of its preset, and of its options for scribbles, and ``typed`` holds the
+    names of the options that the user typed.
     """
-    step = step_of(edit, {name: value for name, value in values.items() if not isinstance(value, list)})
+    preset, region = values.pop("preset", None), values.pop("region", None)
+    strokes, mask = values.pop("strokes", None), values.pop("mask", None)
+    show, map = values.pop("show", None), values.pop("map", None)
+    others = {scribble.option: values.pop(scribble.option.removeprefix("--"), None) for scribble in edit.with_options}
+    step = step_of(edit, values)
     look = None if preset is None else preset_step(find_recipe(preset), edit)
     if look is not None:
         if {"region", "mask", *(parameter.name for parameter in edit)}.intersection(typed):
@@ -288,22 +275,17 @@ def edit_photograph(
             )
         step = look
 
-    if not force:
+    if not files.force:
         check_usual(step, typed, [text.partition(":")[2] for text in region or []])
 
-    from nlfilter_torch.photo.cli import editing
     from nlfilter_torch.photo.cli.edit_job import EditJob
+    from nlfilter_torch.photo.cli.editing import check_written, edit_file
     from nlfilter_torch.photo.cli.scribbles import ScribbleOptions
 
-    others = [(s.option, values.get(s.option.removeprefix("--"))) for s in edit.with_options]
-    rectangles = {option: texts for option, texts in others if isinstance(texts, list)}
-    drawn = ScribbleOptions(region, strokes, mask, rectangles)
-    editing.check_written(source, target, show=show, map=map, mask=mask, strokes=strokes, preset=preset)
+    drawn = ScribbleOptions(region, strokes, mask, {name: texts for name, texts in others.items() if texts is not None})
+    check_written(source, target, show=show, map=map, mask=mask, strokes=strokes, preset=preset)
     notes = useless_options(step, typed, marked=drawn.marks_objects(edit))
-    job = EditJob(step, source, target, drawn, show, map, depth, seed, memory, full, notes)
-    editing.edit_file(
-        job, source, target, depth, memory=memory, workers=workers, cluster=cluster, quality=quality, force=force
-    )
+    edit_file(EditJob(step, source, target, drawn, show, map, files, seed, full, notes), source, target, files)
 
 
 def check_usual(step: Step, typed: Collection[str], notes: Iterable[str] = ()) -> None:

@@ -1,27 +1,48 @@
-"""``nlfilter-torch inspect``: pictures and diagnostics of the filter of a photograph."""
+"""Pictures and diagnostics of the filter of a photograph, and of each of its steps on an example."""
 
 import json
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
 
+import skimage.data
+import torch
 import typer
+from matplotlib.figure import Figure
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+from torch import Tensor
 
+from nlfilter_torch.filtering.filters import detail_layers
+from nlfilter_torch.filtering.masks import diffusion_mask
+from nlfilter_torch.filtering.spectral import captured_energy
+from nlfilter_torch.operator.build import nonlocal_operator, operator_from_guide
+from nlfilter_torch.operator.features import reduce_channels
+from nlfilter_torch.operator.operator import NonlocalOperator
+from nlfilter_torch.operator.options import FilterOptions
+from nlfilter_torch.operator.spectrum import Spectrum
 from nlfilter_torch.photo.cli import options
-from nlfilter_torch.photo.cli.edits import step_of, with_options
-from nlfilter_torch.photo.declared.json_values import Value
-from nlfilter_torch.photo.declared.parameters import EDITS
+from nlfilter_torch.photo.cli.editing import viewed_within_memory
+from nlfilter_torch.photo.cli.progress import steps
+from nlfilter_torch.photo.declared.presets import find_recipe
+from nlfilter_torch.photo.declared.steps import Step
+from nlfilter_torch.photo.edits.applying import apply_recipe
+from nlfilter_torch.photo.edits.recolor import recolor
+from nlfilter_torch.photo.files.writing import check_folder, open_beside
+from nlfilter_torch.photo.picture.photographs import read_photograph
+from nlfilter_torch.photo.picture.resizing import resize
+from nlfilter_torch.photo.picture.source import seeded
+from nlfilter_torch.photo.plotting import (
+    plot_eigenvalues,
+    plot_response,
+    save_figure,
+    show_eigenvectors,
+    show_images,
+    show_layers,
+    show_mask,
+)
 
-if TYPE_CHECKING:
-    from torch import Tensor
-
-    from nlfilter_torch.operator.operator import NonlocalOperator
-    from nlfilter_torch.operator.spectrum import Spectrum
-    from nlfilter_torch.photo.declared.steps import Step
-
-Folder = Annotated[
-    Path, typer.Argument(metavar="OUTDIR", help="The folder for the pictures; created if it does not exist.")
-]
 MEASURED = 32  # eigenvectors, of the 300: all of them would take five times as long as the rest
 READ_BYTES = 40  # per pixel, of a photograph that is read and reduced
 # Meaning of each diagnostic, for readers who do not know the paper.
@@ -43,27 +64,8 @@ MEANINGS = {
 }
 
 
-@with_options("alpha", "bandwidth", "spatial_bandwidth", "patch_size", "landmarks", "sampling", "viewing_size")
-def inspect(source: options.Source, folder: Folder, seed: options.Seed = 0, **values: Value) -> None:
-    """Show the filter of a photograph: the patterns it finds, how strong they are, and how sliders change them.
-
-    Writes eigenvectors.png, eigenvalues.png, response.png and diagnostics.json into a folder and prints a table. A
-    photograph larger than the viewing size is reduced to it, as for `detail`.
-
-    Example: `nlfilter-torch inspect in.jpg looks --alpha 3,3,4,1.05`
-    """
-    step = step_of(EDITS["detail"], values)
-
-    import torch
-
-    from nlfilter_torch.operator.features import reduce_channels
-    from nlfilter_torch.photo.cli.editing import viewed_within_memory
-    from nlfilter_torch.photo.cli.progress import steps
-    from nlfilter_torch.photo.files.writing import check_folder, open_beside
-    from nlfilter_torch.photo.picture.photographs import read_photograph
-    from nlfilter_torch.photo.picture.resizing import resize
-    from nlfilter_torch.photo.plotting import plot_eigenvalues, plot_response, save_figure, show_eigenvectors
-
+def write_diagnostics(source: str, folder: Path, step: Step, seed: int) -> None:
+    """Write pictures of the filter of a step for a photograph, with its figures, and print these."""
     check_folder(folder)
     with steps(4) as begin:
         begin("Reading")
@@ -86,20 +88,14 @@ def inspect(source: options.Source, folder: Folder, seed: options.Seed = 0, **va
     print_table(figures, f"The filter of {source}")
 
 
-def build_operator(guide: "Tensor", step: "Step", seed: int = 0) -> "NonlocalOperator":
+def build_operator(guide: Tensor, step: Step, seed: int = 0) -> NonlocalOperator:
     """The operator of a guide (1, 1, H, W), with the filter parameters of a step."""
-    from nlfilter_torch.operator.build import operator_from_guide
-    from nlfilter_torch.operator.options import FilterOptions
-    from nlfilter_torch.photo.picture.source import seeded
-
     parameters = step.filter_options((guide.shape[-2], guide.shape[-1]))
     return operator_from_guide(guide, FilterOptions(**parameters, generator=seeded(seed)))
 
 
-def summarize(operator: "NonlocalOperator", spectrum: "Spectrum", guide: "Tensor") -> dict[str, float]:
+def summarize(operator: NonlocalOperator, spectrum: Spectrum, guide: Tensor) -> dict[str, float]:
     """The diagnostics of an operator of a single image as plain numbers, with the bandwidth in grey levels."""
-    from nlfilter_torch.filtering.spectral import captured_energy
-
     figures = {
         name: value[0] if isinstance(value, list) else value
         for name, value in asdict(operator.diagnostics(MEASURED, spectrum)).items()
@@ -119,10 +115,6 @@ def summarize(operator: "NonlocalOperator", spectrum: "Spectrum", guide: "Tensor
 
 def print_table(figures: dict[str, float], title: str) -> None:
     """Print diagnostics with the meaning of each."""
-    from rich.console import Console
-    from rich.table import Table
-    from rich.text import Text
-
     table = Table(title=Text(title), title_justify="left")
     table.add_column("figure")
     table.add_column("value", justify="right")
@@ -130,3 +122,70 @@ def print_table(figures: dict[str, float], title: str) -> None:
     for name, value in figures.items():
         table.add_row(name.replace("_", " "), f"{value:.4g}", MEANINGS.get(name, ""))
     Console().print(table)
+
+
+ALPHA = (3.0, 3.0, 4.0, 1.05)  # of the response that is drawn
+BLUE = (0.1, 0.3, 0.9)  # of the stroke on the suit
+SELECTION = (slice(300, 320), slice(60, 80))  # rows and columns of a patch of the astronaut's suit
+# Chosen by eye: half the default width keeps the mask on the suit, three times the default time fills its folds.
+SELECTION_WIDTH = 2.0
+SELECTION_TIME = 3.0
+SELECTION_BANDWIDTH = 25 / options.LEVELS
+
+
+def write_examples(folder: Path) -> None:
+    """Write pictures of each step of the filter on an example photograph, and print the figures of its filter."""
+    check_folder(folder)
+    image = torch.from_numpy(skimage.data.astronaut()).permute(2, 0, 1)[None].float() / options.LEVELS
+    with steps(4) as begin:
+        begin("Comparing patches")
+        luminance = reduce_channels(image, "luminance")
+        operator = nonlocal_operator(luminance)
+        spectrum = operator.spectrum()
+
+        begin("Editing")
+        stroke = select(luminance)
+        paint = torch.tensor(BLUE).view(1, 3, 1, 1) * stroke
+        blue = recolor(image, paint, stroke)
+        crisp = apply_recipe(find_recipe("crisp"), image)
+        figures = summarize(operator, spectrum, luminance)
+
+        begin("Selecting a region")
+        by_colour = nonlocal_operator(image, photometric_bandwidth=SELECTION_BANDWIDTH, guide_channels="all")
+        mask = diffusion_mask(by_colour.spectrum(), select(luminance), time=SELECTION_TIME, width=SELECTION_WIDTH)
+
+        begin("Drawing")
+        folder.mkdir(exist_ok=True)
+        paths = save_figures(
+            folder,
+            {
+                "1-before-after": show_images(
+                    {
+                        "Before, with one blue stroke": torch.lerp(image, paint, stroke),
+                        "After: recolor": blue,
+                        "After: detail, preset crisp": crisp,
+                    }
+                ),
+                "2-layers": show_layers(detail_layers(operator, luminance)),
+                "3-eigenvectors": show_eigenvectors(spectrum),
+                "4-sliders": plot_response(torch.tensor(ALPHA), spectrum),
+                "5-selection": show_mask(image, select(luminance), mask),
+            },
+        )
+    print_table(figures, "The filter of the astronaut")
+    typer.echo("Pictures: " + ", ".join(map(str, paths)))
+
+
+def select(luminance: Tensor) -> Tensor:
+    """The mask of a patch of the astronaut's suit."""
+    region = torch.zeros_like(luminance)
+    region[..., SELECTION[0], SELECTION[1]] = 1
+    return region
+
+
+def save_figures(folder: Path, figures: Mapping[str, Figure]) -> list[Path]:
+    """Save figures in a folder, under their names, and return their paths."""
+    paths = [folder / f"{name}.png" for name in figures]
+    for path, figure in zip(paths, figures.values(), strict=True):
+        save_figure(figure, path)
+    return paths

@@ -1,13 +1,12 @@
 """``nlfilter-torch mask``: write a soft mask of an object in a photograph."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from nlfilter_torch.photo.cli import options
-from nlfilter_torch.photo.cli.edits import signature, with_signature
-from nlfilter_torch.photo.declared.json_values import Value
+from nlfilter_torch.photo.cli.edits import with_declared
 from nlfilter_torch.photo.declared.parameters import MASK
 
 Target = Annotated[
@@ -27,30 +26,26 @@ Depth = Annotated[
 ]
 
 
+@with_declared(MASK)
 def mask(
-    source: str,
-    target: str,
-    *,
-    region: list[str] | None = None,
-    background: list[str] | None = None,
-    add: list[str] | None = None,
-    remove: list[str] | None = None,
-    mask: Path | None = None,
-    show: Path | None = None,
-    depth: options.FileDepth | None = None,
-    seed: int = 0,
-    memory: float | None = None,
-    full: bool = False,
-    workers: int | None = None,
-    cluster: str | None = None,
-    **values: Value,
+    source: options.Source,
+    target: Target,
+    depth: Depth = None,
+    seed: options.Seed = 0,
+    memory: options.Memory = None,
+    full: options.Full = False,
+    workers: options.Workers = None,
+    cluster: options.Cluster = None,
+    **values: Any,
 ) -> None:
     """See :data:`MASK`."""
     from nlfilter_torch.photo.cli import editing
     from nlfilter_torch.photo.cli.mask_job import MaskJob
     from nlfilter_torch.photo.cli.scribbles import ScribbleOptions
 
-    scribbles = ScribbleOptions(region, None, mask, {"--background": background, "--add": add, "--remove": remove})
+    region, mask, show = (values.pop(name) for name in ("region", "mask", "show"))
+    rectangles = {scribble.option: values.pop(scribble.option.removeprefix("--")) for scribble in MASK.with_options}
+    scribbles = ScribbleOptions(region, None, mask, rectangles)
     if not scribbles.marks_objects(MASK):
         raise ValueError(MASK.scribbles[0].advice)
     editing.check_apart("OUT", target, photograph=source, mask=mask)
@@ -59,7 +54,3 @@ def mask(
     job.check_depth()
     editing.check_processes(source, target, workers, cluster)
     job.run(workers, cluster)
-
-
-mask.__doc__, mask.__annotations__ = MASK.help, {}
-with_signature(mask, signature(MASK, target=Target, depth=Depth))

@@ -5,6 +5,7 @@ at once.
 """
 
 import math
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -207,6 +208,47 @@ Cluster = Annotated[
         help=f"With zarr arrays as IN and OUT: the {ADDRESS} filter and write their parts. {ON_CLUSTER}",
     ),
 ]
+
+
+@dataclass(frozen=True)
+class FileOptions:
+    """The options of a command that reads one photograph and writes another, in the order of its help."""
+
+    depth: OutputDepth = None
+    quality: Quality = None
+    force: Force = False
+    memory: Memory = None
+    workers: Workers = None
+    cluster: Cluster = None
+
+
+WorkersOfFolder = Annotated[
+    int | None,
+    typer.Option(
+        min=1,
+        metavar="N",
+        help="How many photographs are edited at a time; each takes memory of its own. Default: one per core.",
+    ),
+]
+
+ClusterOfFolder = Annotated[
+    str | None,
+    typer.Option(
+        metavar="ADDRESS",
+        help=f"The {ADDRESS} edit the photographs in place of this machine. {ON_CLUSTER}",
+    ),
+]
+
+
+@dataclass(frozen=True)
+class FolderOptions:
+    """The options of a command that edits the photographs of a folder, in the order of its help."""
+
+    workers: WorkersOfFolder = None
+    cluster: ClusterOfFolder = None
+    memory: Memory = None
+    quality: QualityOfFolder = None
+    force: Insist = False
 
 
 def file(name: str, help: str) -> object:

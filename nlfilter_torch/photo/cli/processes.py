@@ -8,13 +8,13 @@ under the same names; pixels do not pass through the process that fits.
 
 import pickle
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from tempfile import gettempdir
 
-from nlfilter_torch.photo.cli.workers import DEATHS, Workers, is_death, worker_pool
+from nlfilter_torch.photo.cli.workers import Crew, Workers, worker_pool
 from nlfilter_torch.photo.declared.rows import RowSource
 from nlfilter_torch.photo.files.rows import ZarrRows, write_band, zarr_package
 from nlfilter_torch.photo.files.writing import claimed, part_beside
@@ -60,9 +60,13 @@ class ZarrProcesses:
         rows = chunk * max(1, shares)
         done, report = 0, tiling.passes.report
         report(tiling.stage, 0, height)
-        for part, comparisons in self._outcomes(
-            path, [range(k, min(k + rows, height)) for k in range(0, height, rows)]
-        ):
+        parts = [range(start, min(start + rows, height)) for start in range(0, height, rows)]
+        for part, comparisons in self.workers.outcomes({part: partial(compute, path, part) for part in parts}):
+            if comparisons is None:
+                raise ChildProcessError(
+                    f"the processes that worked on the rows from {part.start} on died, one after the other; leave them "
+                    "more memory, by fewer --workers or a smaller --memory"
+                )
             done += len(part)
             report(tiling.stage, done, height)
             tiling.note(comparisons)
@@ -85,29 +89,8 @@ class ZarrProcesses:
                 self.fill(tiling, beside)
                 yield ZarrRows(beside)
 
-    def _outcomes(self, path: Path, parts: list[range]) -> Iterator[tuple[range, list[Comparison]]]:
-        """Yield each range of rows as it is finished, with the comparisons for :meth:`Tiling.note`."""
-        waiting, deaths = dict.fromkeys(parts), 0
-        while waiting:
-            calls = [partial(compute, path, part) for part in waiting]
-            try:
-                with closing(self.workers.run(calls)) as ended:
-                    for part, comparisons in ended:
-                        del waiting[part]
-                        deaths = 0
-                        yield part, comparisons
-            except Exception as error:
-                if not is_death(error):
-                    raise
-                deaths += 1
-                if deaths == DEATHS or type(error).__name__ == "KilledWorker":  # Dask has tried several workers
-                    raise ChildProcessError(
-                        f"the processes that worked on the rows from {next(iter(waiting)).start} on died, one after "
-                        "the other; leave them more memory, by fewer --workers or a smaller --memory"
-                    ) from error
 
-
-def compute(path: Path, rows: range) -> tuple[range, list[Comparison]]:
+def compute(path: Path, rows: range) -> list[Comparison]:
     """Compute a range of rows and write it to the array in a folder, chunk by chunk; runs in a worker."""
     if not (path / JOB).exists():
         raise ValueError(
@@ -121,11 +104,11 @@ def compute(path: Path, rows: range) -> tuple[range, list[Comparison]]:
         values, part_comparisons = tiling.part(start, min(start + array.chunks[0], rows.stop))
         write_band(array, start, values)
         comparisons += part_comparisons
-    return rows, comparisons
+    return comparisons
 
 
 @contextmanager
 def zarr_processes(workers: int | None, cluster: str | None) -> Iterator[ZarrProcesses]:
     """Processes on this machine, or those of a cluster."""
-    with worker_pool(cluster, workers or 1, 1) as pool:
+    with worker_pool(Crew(workers or 1, cluster=cluster)) as pool:
         yield ZarrProcesses(pool, cluster)

@@ -11,8 +11,9 @@ from torch import Tensor
 
 from nlfilter_torch.photo.cli import editing, options
 from nlfilter_torch.photo.cli.editing import Job, pixels_of, rows_of
+from nlfilter_torch.photo.cli.showing import notes_if_idle
 from nlfilter_torch.photo.declared.development import Development
-from nlfilter_torch.photo.declared.presets import Recipe
+from nlfilter_torch.photo.declared.presets import Recipe, find_recipe
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.edits.applying import apply_recipe, edit_of, left_by_crop
 from nlfilter_torch.photo.edits.recipe import edit_regions, edit_tiling
@@ -145,3 +146,36 @@ class RecipeJob:
         of_steps = (note for step in steps for note in edit_of(step, rows.size).notes(rows))
         for note in dict.fromkeys(chain(self.notes, of_steps)):
             options.note(note)
+
+
+def develop_file(recipe: Recipe, aspect: float | None, source: str, target: str, files: options.FileOptions) -> None:
+    """Develop a photograph by a recipe without steps, whose crop is trimmed to width by height, or not for None."""
+    notes = [f"no option changes anything: {target} is written without an edit"] if recipe.develop.is_idle else []
+    editing.edit_file(RecipeJob([recipe], [], source, target, False, notes, aspect=aspect), source, target, files)
+
+
+def apply_files(
+    presets: Sequence[str],
+    masks: Sequence[Path],
+    source: str,
+    target: str,
+    files: options.FileOptions,
+    *,
+    full: bool = False,
+) -> None:
+    """Apply saved edits, by name or file, to a photograph: one to all of it, or one to the region of each mask."""
+    recipes = [find_recipe(name) for name in presets]
+    if len(masks) != len(recipes) and (masks or len(recipes) > 1):
+        raise ValueError(
+            f"--mask must come once for each --preset, got {len(masks)} for {len(recipes)}; "
+            "say where each of them holds, or give one preset alone"
+        )
+    developed = next((name for recipe, name in zip(recipes, presets, strict=True) if not recipe.develop.is_idle), None)
+    if masks and developed is not None:
+        raise ValueError(
+            f"--mask must come with edits that do not develop the photograph, got {developed}; develop it first, by "
+            "nlfilter-torch develop"
+        )
+    editing.check_apart("OUT", target, mask=masks, preset=presets)
+    notes = [note for recipe, name in zip(recipes, presets, strict=True) for note in notes_if_idle(recipe, name)]
+    editing.edit_file(RecipeJob(recipes, masks, source, target, full, notes), source, target, files)

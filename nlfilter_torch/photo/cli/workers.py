@@ -9,7 +9,7 @@ import signal
 import threading
 import time
 import warnings
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from typing import TypeVar
@@ -17,9 +17,9 @@ from typing import TypeVar
 import psutil
 
 CONNECTING = 30  # seconds for a cluster to answer
-DEATHS = 3  # per worker and in a row: after so many deaths the cause is not in the work
 PAUSE = 0.5  # seconds between two looks at the main process
 
+Key = TypeVar("Key")
 Result = TypeVar("Result")
 
 
@@ -29,30 +29,73 @@ class Workers:
 
     number: int
 
-    def run(self, calls: Sequence[Callable[[], Result]]) -> Generator[Result]:
-        """Results of calls in the workers, as they end; calls begin in their order."""
-        from joblib import Parallel, delayed
+    def outcomes(self, calls: Mapping[Key, Callable[[], Result]]) -> Generator[tuple[Key, Result | None]]:
+        """Yield each key with the result of its call, as they end; None if workers die of it.
 
-        parallel = Parallel(return_as="generator_unordered", pre_dispatch=self.number, batch_size=1)
-        yield from parallel([delayed(call)() for call in calls])
+        When a worker dies, joblib ends the others, too. Calls are begun in their order, so that one of the first that
+        have not ended is the cause. Each of these is then made once more while no worker does anything else.
+        """
+        waiting = dict(calls)
+        while waiting:
+            try:
+                with contextlib.closing(_made(waiting, self.number)) as ended:
+                    for key, result in ended:
+                        del waiting[key]
+                        yield key, result
+            except Exception as error:
+                if not _is_death(error):
+                    raise
+                for key in list(waiting)[: self.number]:
+                    yield key, self._alone(key, waiting.pop(key))
+
+    def _alone(self, key: Key, call: Callable[[], Result]) -> Result | None:
+        try:
+            ((_, result),) = _made({key: call}, self.number)
+        except Exception as error:
+            if not _is_death(error):
+                raise
+            return None
+        return result
+
+
+def _made(calls: Mapping[Key, Callable[[], Result]], number: int) -> Generator[tuple[Key, Result]]:
+    """Keys and results of calls in the workers, as they end."""
+    from joblib import Parallel, delayed
+
+    parallel = Parallel(return_as="generator_unordered", pre_dispatch=number, batch_size=1)
+    yield from parallel([delayed(_with_key)(key, call) for key, call in calls.items()])
+
+
+def _with_key(key: Key, call: Callable[[], Result]) -> tuple[Key, Result]:
+    return key, call()
+
+
+@dataclass(frozen=True)
+class Crew:
+    """Which worker processes are wanted.
+
+    Attributes:
+        number: of processes on this machine.
+        threads: of each of these.
+        cluster: address of the scheduler of a Dask cluster, whose workers have one thread each; None is this machine.
+    """
+
+    number: int
+    threads: int = 1
+    cluster: str | None = None
 
 
 @contextlib.contextmanager
-def worker_pool(cluster: str | None, workers: int, threads: int) -> Iterator[Workers]:
+def worker_pool(crew: Crew) -> Iterator[Workers]:
     """Have joblib work in processes of this machine, or in those of a cluster.
-
-    Args:
-        cluster: address of the scheduler of a Dask cluster, whose workers have one thread each; None is this machine.
-        workers: number of processes on this machine.
-        threads: of each of these.
 
     Raises:
         ValueError: if there is no cluster at that address.
     """
-    if cluster is None:
-        yield from _of_this_machine(workers, threads)
+    if crew.cluster is None:
+        yield from _of_this_machine(crew.number, crew.threads)
     else:
-        yield from _of_dask(cluster)
+        yield from _of_dask(crew.cluster)
 
 
 def _of_this_machine(workers: int, threads: int) -> Iterator[Workers]:
@@ -95,7 +138,7 @@ def _of_dask(address: str) -> Iterator[Workers]:
         yield Workers(joblib.effective_n_jobs())
 
 
-def is_death(error: Exception) -> bool:
+def _is_death(error: Exception) -> bool:
     """Whether an error means that a worker died; Dask tries a task on several workers before it says so."""
     return isinstance(error, BrokenProcessPool) or type(error).__name__ == "KilledWorker"
 

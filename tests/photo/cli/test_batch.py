@@ -1,4 +1,4 @@
-"""Photographs of a folder, edited by ``nlfilter-torch batch``."""
+"""Photographs of a folder, edited by ``nlfilter-torch batch``: deaths of workers, errors, and what is left."""
 
 import json
 import os
@@ -13,11 +13,13 @@ import pytest
 import skimage.data
 from PIL import Image
 
-from nlfilter_torch.photo.cli import main
-from nlfilter_torch.photo.cli.folders import RECORD, Edit, Tally, pictures, prepare, subfolders
+from nlfilter_torch.photo.cli import batch, main
+from nlfilter_torch.photo.cli.batch import DEATHS, Edit, Tally, edit_folder
+from nlfilter_torch.photo.cli.folders import RECORD, pictures, prepare
+from nlfilter_torch.photo.cli.workers import Crew
 from nlfilter_torch.photo.declared.presets import PRESETS, Recipe
 from nlfilter_torch.photo.declared.steps import Step
-from tests.folders import fill, finished, refused
+from tests.folders import fill, finished, plain_files, refused, tally_of
 
 OPTIONS = ("--landmarks", "12", "--patch-size", "3", "--bandwidth", "20")
 ROOT = Path(__file__).parents[3]
@@ -86,7 +88,7 @@ def test_files_of_other_types_are_mentioned(
     for name in ("a.HEIC", "b.heic", "notes", "000.png.json", ".hidden.txt", "._000.png"):
         (tmp_path / "in" / name).touch()
     (tmp_path / "in" / "folder.dng").mkdir()
-    monkeypatch.setattr("nlfilter_torch.photo.cli.folders.edit_folder", lambda *_, **__: None)
+    monkeypatch.setattr("nlfilter_torch.photo.cli.batch.edit_folder", lambda *_, **__: None)
     assert main(["batch", str(tmp_path / "in"), str(tmp_path / "out")]) == 0
     assert [path.name for path in pictures(tmp_path / "in")] == ["000.png"]
     assert capsys.readouterr().err == (
@@ -96,13 +98,6 @@ def test_files_of_other_types_are_mentioned(
     )
 
 
-def test_subfolders_are_named_but_for_that_of_the_results(tmp_path: Path) -> None:
-    for name in ("b", "a", ".hidden", "out"):
-        (tmp_path / name).mkdir()
-    (tmp_path / "c.png").touch()
-    assert subfolders(tmp_path, tmp_path / "out") == ["a", "b"]
-
-
 def test_interrupted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     fill(tmp_path / "in", 2)
 
@@ -110,7 +105,7 @@ def test_interrupted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
         tally.done, tally.left = 1, 1
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("nlfilter_torch.photo.cli.folders.edit_folder", interrupt)
+    monkeypatch.setattr("nlfilter_torch.photo.cli.batch.edit_folder", interrupt)
     assert main(["batch", str(tmp_path / "in"), str(tmp_path / "out")]) == 130
     captured = capsys.readouterr()
     told = (
@@ -126,23 +121,24 @@ def test_settings_and_workers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     fill(tmp_path / "in", 9)
     seen = {}
     monkeypatch.setattr(
-        "nlfilter_torch.photo.cli.folders.edit_folder", lambda *args, **kwargs: seen.update(kwargs, args=args)
+        "nlfilter_torch.photo.cli.batch.edit_folder", lambda *args, **kwargs: seen.update(kwargs, args=args)
     )
     monkeypatch.setattr("nlfilter_torch.photo.cli.batch._cores", lambda: 12)
     arguments = ["batch", str(tmp_path / "in"), str(tmp_path / "out"), "--preset", "smooth", "--seed", "5"]
     assert main([*arguments, "--workers", "2", "--memory", "8"]) == 0
-    assert (seen["workers"], seen["threads"]) == (2, 6)
-    settings = seen["args"][2].keywords
-    assert settings.pop("memory") == 4.0  # of two workers
+    assert seen["args"][3] == Crew(2, 6)
+    edit, files = seen["args"][2].args
+    assert files.memory == 4.0  # of two workers
+    settings = edit.keywords
     smooth = PRESETS["smooth"].steps[0]
     assert settings["alpha"] == "0,0,0,1"
     assert (settings["bandwidth"], settings["seed"]) == (f"{smooth['bandwidth']:g}", 5)
     assert json.loads((tmp_path / "out" / RECORD).read_text()) == settings
     assert main(arguments) == 0
-    assert (seen["workers"], seen["threads"]) == (9, 1)
+    assert seen["args"][3] == Crew(9, 1)
 
 
-def edit_here(paths: list[Path], target: Path, edit: Edit, **_: object) -> None:
+def edit_here(paths: list[Path], target: Path, edit: Edit, *_: object, **__: object) -> None:
     """Edit a folder without processes, which take seconds to start."""
     for path in paths:
         edit(str(path), str(target / path.name))
@@ -151,7 +147,7 @@ def edit_here(paths: list[Path], target: Path, edit: Edit, **_: object) -> None:
 def test_the_quality_of_jpeg_files(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("nlfilter_torch.photo.cli.folders.edit_folder", edit_here)
+    monkeypatch.setattr("nlfilter_torch.photo.cli.batch.edit_folder", edit_here)
     source, preset = tmp_path / "in", tmp_path / "look.json"
     fill(source, 1)
     Image.fromarray(skimage.data.chelsea()[:48, :48]).save(source / "001.jpg")
@@ -227,3 +223,72 @@ def test_a_folder_that_cannot_be_written_to(
     assert "No space left on device" in refused(capsys, tmp_path / "in", tmp_path / "out")
     monkeypatch.setattr(os, "access", lambda path, mode: mode != os.W_OK)
     assert "is read-only; choose another" in refused(capsys, tmp_path / "in", tmp_path / "out")
+
+
+@pytest.mark.client("Dask", "edits folders and zarr arrays: `--cluster`")
+@pytest.mark.slow
+def test_a_cluster_of_which_a_worker_is_killed(tmp_path: Path) -> None:
+    """The file of a dead worker is given to another one; broken files are named, and those there are left alone."""
+    distributed = pytest.importorskip("distributed", reason="distributed is not installed")
+    paths = plain_files(tmp_path / "in", 6)
+    prepare(paths, tmp_path / "out", {})
+    (tmp_path / "out" / "5.png").write_text("before")
+    tally, told = Tally(), list[str]()
+    with distributed.LocalCluster(2, threads_per_worker=1, dashboard_address=None) as cluster:
+        edit_folder(
+            paths,
+            tmp_path / "out",
+            die_once_in_a_cluster,
+            Crew(1, cluster=cluster.scheduler_address),
+            tell=told.append,
+            begin=lambda name: None,
+            tally=tally,
+        )
+    assert (tally.done, tally.skipped, tally.left) == (4, 1, 0)
+    assert told == ["2.png: KeyError: 'what'"]
+    assert (tmp_path / "in" / "died").exists()
+    assert (tmp_path / "out" / "5.png").read_text() == "before"
+    assert sorted(finished(tmp_path / "out")) == ["0.png", "1.png", "3.png", "4.png", "5.png"]
+
+
+def die_once_in_a_cluster(source: str, target: str) -> None:
+    """An edit that kills its process over the first file that it is called for, and cannot do another."""
+    mark = Path(source).with_name("died")
+    if Path(source).stem == "1" and not mark.exists():
+        mark.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    if Path(source).stem == "2":
+        raise KeyError("what")
+    Path(target).write_bytes(Path(source).read_bytes())
+
+
+def copy_or_fail(source: str, target: str) -> None:
+    """An edit whose process dies on some files and raises an unexpected error on others."""
+    if Path(source).stem == "1":
+        os.kill(os.getpid(), signal.SIGKILL)
+    if Path(source).stem == "2":
+        raise KeyError("what")
+    Path(target).write_bytes(Path(source).read_bytes())
+
+
+def die(source: str, target: str) -> None:
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+@pytest.mark.slow
+def test_a_worker_that_dies_and_an_error_are_reported(tmp_path: Path) -> None:
+    """The file of a worker that died with it is done."""
+    paths = plain_files(tmp_path / "in", 5)
+    tally, told = tally_of(paths, tmp_path / "out", copy_or_fail, workers=2)
+    assert (tally.done, tally.skipped, tally.left) == (3, 0, 0)
+    assert sorted(told) == [f"1.png: {batch.DIED}", "2.png: KeyError: 'what'"]
+    assert sorted(finished(tmp_path / "out")) == ["0.png", "3.png", "4.png"]
+
+
+@pytest.mark.slow
+def test_workers_that_all_die_end_the_work(tmp_path: Path) -> None:
+    paths = plain_files(tmp_path / "in", 9)
+    tally, told = tally_of(paths, tmp_path / "out", die)
+    assert (tally.done, len(tally.failures)) == (0, DEATHS)
+    assert tally.left == 9 - DEATHS
+    assert told[-1] == f"{DEATHS} workers died one after the other; no other file is begun"

@@ -1,5 +1,6 @@
 """Commands of edits: their options and help, and notes on options without an effect."""
 
+import inspect
 from pathlib import Path
 from typing import get_args
 
@@ -7,7 +8,7 @@ import pytest
 import torch
 
 from nlfilter_torch.photo.cli import main, options
-from nlfilter_torch.photo.cli.edits import option_value, plain_step, preset_step, scribble_options, signature, step_of
+from nlfilter_torch.photo.cli.edits import command, option_value, plain_step, preset_step, scribble_options, step_of
 from nlfilter_torch.photo.declared.declaration import Edit, Scribble
 from nlfilter_torch.photo.declared.parameters import EDITS, MASK
 from nlfilter_torch.photo.declared.presets import Recipe
@@ -128,7 +129,8 @@ def test_options_of_an_edit_with_two_kinds_of_scribbles() -> None:
     colours = Edit("tint", "", (), scribbles=(Scribble("mask", "colour", "Colour", "colours"), keep), map_help="A map.")
     assert list(scribble_options(colours)) == ["strokes", "region", "keep", "show", "map"]
     assert not scribble_options(Edit("plain", "", ()))
-    assert list(signature(edit).parameters)[:6] == ["source", "target", "region", "keep", "mask", "show"]
+    parameters = list(inspect.signature(command(edit)).parameters)
+    assert parameters[:6] == ["source", "target", "region", "keep", "mask", "show"]
 
 
 def test_values_of_options_are_those_of_steps() -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from nlfilter_torch.photo.cli import interrupts, workers
+from nlfilter_torch.photo.cli import process, workers
 from nlfilter_torch.photo.cli.folders import RECORD, pictures
 from nlfilter_torch.photo.files.writing import open_beside
 from tests.folders import fill, plain_files, refused, tally_of
@@ -41,7 +41,7 @@ def wait_for_ever(source: str, target: str) -> None:
 
 def run_for_ever(folder: str, target: str) -> None:
     signal.signal(signal.SIGINT, signal.default_int_handler)  # background jobs of a shell inherit that it is ignored
-    with interrupts.handled():  # as the command does; an interrupt during a callback would be lost
+    with process.handled():  # as the command does
         tally_of(pictures(Path(folder)), Path(target), wait_for_ever)
 
 
@@ -52,19 +52,19 @@ def test_workers_end_with_the_process_that_started_them(number: signal.Signals, 
     plain_files(tmp_path / "in", 2)
     script = "import sys; from tests.photo.cli.test_workers import run_for_ever; run_for_ever(*sys.argv[1:])"
     arguments = [sys.executable, "-c", script, tmp_path / "in", tmp_path / "out"]
-    process = subprocess.Popen(arguments, cwd=ROOT, stderr=subprocess.PIPE, start_new_session=True)
+    started = subprocess.Popen(arguments, cwd=ROOT, stderr=subprocess.PIPE, start_new_session=True)
     until = time.monotonic() + PATIENCE
     while not (tmp_path / "in" / "0.begun").exists():
         assert time.monotonic() < until
         time.sleep(0.01)
-    children = psutil.Process(process.pid).children(recursive=True)
+    children = psutil.Process(started.pid).children(recursive=True)
     assert children
     if number == signal.SIGKILL:
-        process.kill()
+        started.kill()
     else:
-        os.killpg(process.pid, number)
-    _, errors = process.communicate(timeout=PATIENCE)
-    assert process.returncode == -number
+        os.killpg(started.pid, number)
+    _, errors = started.communicate(timeout=PATIENCE)
+    assert started.returncode == -number
     _, alive = psutil.wait_procs(children, timeout=PATIENCE)
     for child in alive:
         child.kill()
