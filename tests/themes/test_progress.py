@@ -43,7 +43,4 @@ def test_saving_in_the_editor_reports_its_progress(session: Session, monkeypatch
         assert stages[-1] == "Writing"
         assert len(set(stages)) > 2 if in_tiles else set(stages) == {"Editing", "Writing"}
     assert float((saved[0] - saved[1]).square().mean().sqrt()) * 255 < 1
-    assert session.stages("large.png") == []  # statistics of all pixels take another time
-    monkeypatch.setattr("nlfilter_torch.photo.app.session.SMALL", 0)
-    assert {"Filtering", "Reducing", "Writing"} <= {stage.name for stage in session.stages("large.png")}
     assert sorted(path.name for path in session.folder.iterdir()) == ["cat.png", "large.png", "small.png"]

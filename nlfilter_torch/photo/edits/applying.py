@@ -1,7 +1,8 @@
 """Applying a step to an image, and caching what later steps of the same kind can reuse."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
+from importlib import import_module
 
 import torch
 from torch import Tensor
@@ -11,15 +12,6 @@ from nlfilter_torch.core.precision import full_precision, working_dtype
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.declared.shared_parameters import FILTER
 from nlfilter_torch.photo.declared.steps import Step
-from nlfilter_torch.photo.edits.abstract import Abstract
-from nlfilter_torch.photo.edits.colorize import Colorize
-from nlfilter_torch.photo.edits.defocus import Defocus
-from nlfilter_torch.photo.edits.denoise import Denoise
-from nlfilter_torch.photo.edits.detail import Detail
-from nlfilter_torch.photo.edits.look import LookEdit
-from nlfilter_torch.photo.edits.recolor import Recolor
-from nlfilter_torch.photo.edits.sharpen import Sharpen
-from nlfilter_torch.photo.edits.tone import Tone
 from nlfilter_torch.photo.picture.developing import develop_image, develop_planes, limits_of
 from nlfilter_torch.photo.picture.drawn import Drawn, M, Painter
 from nlfilter_torch.photo.picture.edit import PhotoEdit
@@ -29,9 +21,38 @@ from nlfilter_torch.photo.picture.source import Fitted, Source, seeded
 from nlfilter_torch.photo.picture.viewing import viewed_size
 from nlfilter_torch.photo.picture.working_range import WorkingRange
 
-#: The edits, and each by its name. A new edit takes a line here.
-EDITS: tuple[type[PhotoEdit], ...] = (Denoise, Detail, Tone, Sharpen, Colorize, Recolor, Defocus, Abstract, LookEdit)
-EDIT_OF: dict[str, type[PhotoEdit]] = {edit.declared.name: edit for edit in EDITS}
+#: The name of each edit, which is that of its module, and of its class. A new edit takes a line here.
+CLASSES = {
+    "denoise": "Denoise",
+    "detail": "Detail",
+    "tone": "Tone",
+    "sharpen": "Sharpen",
+    "colorize": "Colorize",
+    "recolor": "Recolor",
+    "defocus": "Defocus",
+    "abstract": "Abstract",
+    "look": "LookEdit",
+}
+
+
+class Edits(Mapping[str, type[PhotoEdit]]):
+    """The edits by their names, each imported when it is first asked for: a program needs few of them."""
+
+    def __getitem__(self, name: str) -> type[PhotoEdit]:
+        """The class of an edit."""
+        edit: type[PhotoEdit] = getattr(import_module(f"nlfilter_torch.photo.edits.{name}"), CLASSES[name])
+        return edit
+
+    def __iter__(self) -> Iterator[str]:
+        """Their names, in the order of the declaration."""
+        return iter(CLASSES)
+
+    def __len__(self) -> int:
+        """Their number."""
+        return len(CLASSES)
+
+
+EDIT_OF = Edits()
 
 
 def scribbles_of(step: Step, size: tuple[int, int], painter: Painter[M]) -> Drawn[M]:
