@@ -15,6 +15,7 @@ from benchmarks.memory import MIB, forget_peak, resident
 from benchmarks.speed.cases import Case
 from nlfilter_torch import NonlocalFilter
 from nlfilter_torch.operator.nystrom import inverse_cholesky
+from nlfilter_torch.operator.scaling import KernelMatrix
 from nlfilter_torch.operator.sinkhorn import sinkhorn_balance
 
 ALPHA = (3.0, 3.0, 4.0, 1.05)
@@ -62,7 +63,7 @@ def rounding_error(case: Case, image: Tensor) -> dict[str, float]:
         )
         exact_kernel = replace(kernel, landmarks=points, inverse_cholesky=inverse_cholesky(points), features=recipe)
         factor, diagonal = exact_kernel.columns(image.double())
-        scaling = sinkhorn_balance(factor, diagonal).scaling
+        scaling = sinkhorn_balance(KernelMatrix(factor, diagonal)).scaling
         remainder = scaling.square() * diagonal
         exact = replace(operator, factor=factor, diagonal=diagonal, scaling=scaling, remainder=remainder)
         difference = 255 * (result - exact @ image.double())

@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import replace
-from functools import partial
 from typing import Any, Literal, cast
 
 import torch
@@ -56,12 +55,9 @@ from nlfilter_torch.operator.options import (
     SpatialBandwidth,
     bandwidths_of,
 )
-from nlfilter_torch.operator.scaling import Balancing, KernelMatrix, PixelScaling
+from nlfilter_torch.operator.scaling import KernelMatrix, PixelScaling
 from nlfilter_torch.operator.sinkhorn import (
-    TOLERANCE,
     sinkhorn_balance,
-    sinkhorn_in_graph,
-    sinkhorn_in_rounds,
     warn_of_residual,
 )
 from nlfilter_torch.operator.traps import warn_of_scale_of_features, warn_of_units
@@ -440,51 +436,40 @@ def _assemble(
     count = landmark_count(options, points)
     if features.shape[0] == 0:
         return _empty(features, size, count, options.completion, recipe)
-    in_graph, assignment = torch.compiler.is_compiling(), None  # never with a generator, weights or a group
+    assignment = None
     if chosen is None:
         layout = None if recipe is None else recipe.layout
         chosen, assignment = _landmarks(options, features, whole, count, communicator, weights, layout)
     inverse = inverse_cholesky(chosen)
-    alone = not in_graph and communicator.size == 1  # ranks send each other nothing that only diagnostics need
+    alone = (
+        not torch.compiler.is_compiling() and communicator.size == 1
+    )  # ranks send each other nothing that only diagnostics need
     sample = communicator.columns(features.detach(), _places(math.prod(whole), features)) if alone else None
     kernel = Kernel(chosen, inverse, options.completion, features=recipe, assignment=assignment, sample=sample)
     factor, diagonal = whole_kernel = kernel.factor(features)
     if hidden is not None:  # set aside, with row sums of 1
         factor, diagonal = factor * ~hidden.unsqueeze(1), torch.where(hidden, 1.0, diagonal)
     completed, watched = options.completion == "diagonal", not is_hidden(factor)
-
-    if in_graph:  # where nothing may depend on the number of pixels
-        worst, goal, bound = 0.0, tolerance or TOLERANCE[factor.dtype], options.landmarks != "kmeans"
-        factor, diagonal, balancing, before = sinkhorn_in_graph(factor, diagonal, goal, completed, bound)
-    else:
-        balanced = partial(
-            _balanced,
-            tolerance=tolerance,
-            completed=completed,
-            communicator=communicator,
-            weights=weights,
-            watched=watched,
-        )
-        rounds = sinkhorn_in_rounds(
-            factor, diagonal, balanced, completed=completed and watched, communicator=communicator, weights=weights
-        )
-        factor, diagonal, balancing = rounds.factor, rounds.diagonal, rounds.result
-        worst, before = rounds.residual, rounds.before
-    scaling, residual = balancing.scaling, balancing.residual
+    matrix = KernelMatrix(factor, diagonal, weights, communicator)
+    bound = options.landmarks != "kmeans"
+    balancing = sinkhorn_balance(matrix, tolerance=tolerance, completed=completed, bound=bound)
+    matrix, scaling, residual, before = balancing.matrix, balancing.scaling, balancing.residual, balancing.before
+    factor, diagonal = matrix.factor, matrix.diagonal
+    worst = float(residual.max()) if watched else 0.0
     remainder = scaling * (scaling * diagonal)  # in this order: without completion d^2 may overflow
     gram = shifted_gram(factor, root_weighted(scaling, weights), remainder, communicator)
     allowed = slack(factor.dtype, worst)
     if watched and is_bounded(options.landmarks, points, count) and exceeds(gram, balancing.moment, allowed):
-        limit = limiter(gram, KernelMatrix(factor, diagonal, weights, communicator).moment(scaling), allowed)
+        limit = limiter(gram, matrix.moment(scaling), allowed)
         factor, kernel = limit.to(factor) @ factor, replace(kernel, limiter=limit.to(factor))
         before = tuple(torch.linalg.solve(limit.detach(), total) for total in before)  # preserves u . total
-        residual = _residual(KernelMatrix(factor.detach(), diagonal.detach(), weights, communicator), scaling.detach())
+        matrix = replace(matrix, factor=factor)
+        residual = _residual(matrix, scaling)
         warn_of_residual(residual, tolerance, factor.dtype, completed=completed)
     if hidden is not None:
         columns, own = whole_kernel
         columns = columns if kernel.limiter is None else kernel.limiter @ columns
-        balanced_kernel = KernelMatrix(factor, diagonal, weights, communicator)
-        factor, diagonal, scaling = extended(balanced_kernel, scaling, columns, own, hidden, completed=completed)
+        factor, diagonal, scaling = extended(matrix, scaling, columns, own, hidden, completed=completed)
         remainder = scaling * (scaling * diagonal)
     return NonlocalOperator(
         factor=factor,
@@ -530,27 +515,11 @@ def _least(weights: Tensor | None, communicator: Communicator) -> Tensor | None:
     return -communicator.max(-torch.where(weights > 0, weights, torch.inf).amin(1, keepdim=True))
 
 
+@torch.no_grad()
 def _residual(matrix: KernelMatrix, scaling: Tensor) -> Tensor:
     """Largest deviation of a row sum of W from 1, (B,)."""
     sums = matrix.row_sums(scaling, matrix.moment(scaling))
     return matrix.communicator.max((sums - 1).abs().amax(1))
-
-
-def _balanced(
-    factor: Tensor,
-    diagonal: Tensor,
-    *,
-    tolerance: float | None,
-    completed: bool,
-    communicator: Communicator,
-    weights: Tensor | None,
-    watched: bool,
-) -> tuple[Balancing, float]:
-    """Balance a kernel; also return its residual, 0 unless ``watched``."""
-    balancing = sinkhorn_balance(
-        factor, diagonal, tolerance=tolerance, completed=completed, communicator=communicator, weights=weights
-    )
-    return balancing, float(balancing.residual.max()) if watched else 0.0
 
 
 def _empty(

@@ -14,15 +14,15 @@ Three methods solve the equation; the result does not depend on which:
   balances the kernels of the paper's method (``completion="none"``), whose affinities may be negative and whose
   scalings are large.
 - Newton's method on M unknowns (:mod:`~nlfilter_torch.operator.scaling`) balances kernels with a completed diagonal.
+  Chebyshev iteration takes twice as many sweeps there, but needs no Cholesky factor, so that ONNX has all of it.
 
 On CPUs a damped Newton method continues where these do not converge. The gradient is implicit, by the same equation,
 and therefore the same for all methods.
 """
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from functools import partial
-from typing import Any, ClassVar, Generic, TypeVar
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -38,18 +38,16 @@ from nlfilter_torch.operator.eigenvalue_bound import ALWAYS, exceeds, shifted_gr
 from nlfilter_torch.operator.scaling import (
     Balancing,
     KernelMatrix,
-    Solution,
     conjugate_gradients,
     damped,
     isolated,
-    newton,
+    sampled_newton,
 )
-
-Result = TypeVar("Result", bound=Balancing)
 
 TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-12}
 # Larger residuals cause a warning, unless the tolerance allows them.
 ALARM = {torch.float32: 1e-4, torch.float64: 1e-9}
+MOST_ROUNDS = 8  # of removing isolated pixels; one or two are usual
 # Chebyshev semi-iteration:
 MAX_SWEEPS = 40
 ACCELERATOR_SWEEPS = 12  # reading the residual would stall the queue of an accelerator
@@ -60,33 +58,61 @@ LARGEST_SCALING = 1e30  # for pixels that no scaling balances because their appr
 
 
 def sinkhorn_balance(
-    factor: Tensor,
-    diagonal: Tensor,
+    matrix: KernelMatrix,
     *,
     tolerance: float | None = None,
     completed: bool = False,
-    communicator: Communicator = ALONE,
-    weights: Tensor | None = None,
+    bound: bool = False,
 ) -> Balancing:
     """Scale ``K = factor^T factor + diag(diagonal)`` to unit row sums, by one vector for rows and columns.
 
     Args:
-        factor: (B, M, N).
-        diagonal: (B, N), non-negative.
+        matrix: K.
         tolerance: residual at which to stop; None means 1e-5 in float32 and 1e-12 in float64. On CPUs, a final
             residual above both this and 1e-4 (1e-9 in float64) causes a warning.
         completed: whether K has a unit diagonal and, up to approximation errors, no negative entries; a faster method
-            then applies.
-        communicator: ranks that the rows of the image are distributed over.
-        weights: number of identical pixels that each point represents, (B, N), a constant; None means one each.
+            then applies. On CPUs, isolated pixels are removed, and balancing is repeated until there are none.
+        bound: whether a compiled program warns of eigenvalues above 1 of large factors, too.
     """
+    factor, diagonal, weights, communicator = matrix.factor, matrix.diagonal, matrix.weights, matrix.communicator
     tolerance = tolerance or TOLERANCE[factor.dtype]
-    with torch.no_grad():
-        solution = solve(KernelMatrix(factor, diagonal, weights, communicator), tolerance, completed)
-    warn_of_residual(solution.residual, tolerance, factor.dtype, completed=completed)
-    known = solution.scaling, solution.moment, solution.inverse
+    if torch.compiler.is_compiling():  # where nothing may depend on the number of pixels; never with weights or a group
+        scaling, moments, residual, inverse, removed = sinkhorn(
+            factor.detach(), diagonal.detach(), tolerance, completed, bound
+        )
+        factor, diagonal = without(factor, removed), torch.where(removed, 1.0, diagonal)
+        *before, moment = moments.unbind()
+        found = Balancing(matrix, scaling, moment, residual, 0, inverse, tuple(before))
+    else:
+        with torch.no_grad():
+            constant = replace(matrix, factor=factor.detach(), diagonal=diagonal.detach())
+            found, alone = balanced_in_rounds(constant, tolerance, completed)
+        if alone is not None:
+            factor, diagonal = factor * ~alone.unsqueeze(1), torch.where(alone, 1.0, diagonal)
+    known = found.scaling, found.moment, found.inverse
     scaling = _ImplicitScaling.apply(factor, diagonal, *known, completed, communicator, weights)  # type: ignore[no-untyped-call]
-    return Balancing(scaling, solution.moment, solution.residual, solution.steps)
+    return replace(found, matrix=replace(matrix, factor=factor, diagonal=diagonal), scaling=scaling)
+
+
+def balanced_in_rounds(matrix: KernelMatrix, tolerance: float, completed: bool) -> tuple[Balancing, Tensor | None]:
+    """Balance a kernel without a gradient; also return its isolated pixels (B, N), or None if there are none.
+
+    On CPUs, if the kernel is completed, the isolated pixels are removed, and this is repeated until there are none.
+    """
+    watched, removed, before = not is_hidden(matrix.factor), None, list[Tensor]()
+    while True:
+        found = solve(matrix, tolerance, completed)
+        warn_of_residual(found.residual, tolerance, matrix.factor.dtype, completed=completed)
+        if not (completed and watched) or len(before) == MOST_ROUNDS:
+            break
+        alone = isolated(found.scaling, matrix.diagonal, float(found.residual.max()), matrix.weights)
+        if not bool(matrix.communicator.max(alone.any().to(matrix.factor))):
+            break
+        before.append(found.moment)
+        removed = alone if removed is None else removed | alone
+        factor, diagonal = matrix.factor * ~alone.unsqueeze(1), torch.where(alone, 1.0, matrix.diagonal)
+        matrix = replace(matrix, factor=factor, diagonal=diagonal)
+    return replace(found, before=tuple(before)), removed
 
 
 def warn_of_residual(residual: Tensor, tolerance: float | None, dtype: torch.dtype, *, completed: bool) -> None:
@@ -139,91 +165,29 @@ class _ImplicitScaling(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         factor, diagonal, scaling, moment, inverse, weights = ctx.saved_tensors
-        matrix = KernelMatrix(factor, diagonal, weights, ctx.communicator)
-        solution = Balancing(scaling, moment, scaling, 0)  # the residual is not used
-        gradients = implicit_gradients(matrix, solution, inverse, grad, ctx.completed)
-        return *gradients, None, None, None, None, None, None
+        dtype = factor.dtype
+        if not ctx.completed:  # without completion d may reach 1e25, and its square overflows float32
+            factor, diagonal, scaling, grad = (tensor.double() for tensor in (factor, diagonal, scaling, grad))
+        share = 1 / (1 + scaling * (scaling * diagonal))  # 1 / (1 + r)
+        weight = scaling.square() * share
+        matrix = KernelMatrix(factor, diagonal, None, ctx.communicator)
+        solution = conjugate_gradients(matrix, weighted(weight, weights), matrix.moment(weight * grad), inverse)
+        affinity = weighted(matrix.affinities(solution), weights)
+        a = scaling * scaling * share * (grad - affinity)
+        totals = torch.cat([moment, solution], dim=2).to(dtype)  # (B, M, 2)
+        grad_factor = outer_product(totals, torch.stack([-a, -weighted(scaling, weights)], dim=1).to(dtype))
+        return grad_factor, (-a * scaling).to(dtype), None, None, None, None, None, None
 
 
-def solve(matrix: KernelMatrix, tolerance: float, completed: bool) -> Solution:
+def solve(matrix: KernelMatrix, tolerance: float, completed: bool) -> Balancing:
     """Balance a kernel by the method that suits it, and continue with the damped method if that does not converge."""
     # A program that is traced through has neither Cholesky factors nor the search for a place in a sorted list.
     quick = completed and not torch.compiler.is_compiling()
-    solution = newton(matrix, tolerance) if quick else _chebyshev(matrix, tolerance)
+    solution = sampled_newton(matrix, tolerance) if quick else _chebyshev(matrix, tolerance)
     goal = attainable(matrix.factor, tolerance, matrix.communicator)
     if not is_hidden(matrix.factor) and not bool((solution.residual <= goal).all()):
         solution = damped(matrix, solution, goal)
     return solution
-
-
-def implicit_gradients(
-    matrix: KernelMatrix, balancing: Balancing, inverse: Tensor, grad: Tensor, completed: bool
-) -> tuple[Tensor, Tensor]:
-    """Gradients with respect to factor and diagonal from that with respect to the scaling.
-
-    See :class:`_ImplicitScaling`.
-    """
-    factor, diagonal, weights, communicator = matrix.factor, matrix.diagonal, matrix.weights, matrix.communicator
-    scaling, total, dtype = balancing.scaling, balancing.moment, factor.dtype
-    if not completed:  # without completion d may reach 1e25, and its square overflows float32
-        factor, diagonal, scaling, grad = (tensor.double() for tensor in (factor, diagonal, scaling, grad))
-    share = 1 / (1 + scaling * (scaling * diagonal))  # 1 / (1 + r)
-    weight = scaling.square() * share
-    matrix = KernelMatrix(factor, diagonal, None, communicator)
-    right = matrix.moment(weight * grad)
-    solution = conjugate_gradients(factor, weighted(weight, weights), right, inverse, communicator)
-    affinity = weighted(matrix.affinities(solution), weights)
-    a = scaling * scaling * share * (grad - affinity)
-    totals = torch.cat([total, solution], dim=2).to(dtype)  # (B, M, 2)
-    grad_factor = outer_product(totals, torch.stack([-a, -weighted(scaling, weights)], dim=1).to(dtype))
-    return grad_factor, (-a * scaling).to(dtype)
-
-
-@dataclass(frozen=True)
-class Rounds(Generic[Result]):
-    """A balancing without isolated pixels, and the rounds that led to it.
-
-    Attributes:
-        factor: (B, M, N), zero at the removed pixels.
-        diagonal: (B, N), 1 at the removed pixels.
-        result: the balancing.
-        residual: largest deviation of a row sum from 1; 0 if values are hidden.
-        before: moments of the earlier rounds, in which isolated pixels were found.
-        removed: the isolated pixels, (B, N) bool; None if there are none.
-    """
-
-    MOST: ClassVar[int] = 8  # maximum number of rounds; one or two are usual
-
-    factor: Tensor
-    diagonal: Tensor
-    result: Result
-    residual: float
-    before: tuple[Tensor, ...]
-    removed: Tensor | None
-
-
-def sinkhorn_in_rounds(
-    factor: Tensor,
-    diagonal: Tensor,
-    balanced: Callable[[Tensor, Tensor], tuple[Result, float]],
-    *,
-    completed: bool,
-    communicator: Communicator = ALONE,
-    weights: Tensor | None = None,
-) -> Rounds[Result]:
-    """Balance a kernel. If it is ``completed``, remove isolated pixels and repeat until there are none."""
-    result, worst = balanced(factor, diagonal)
-    before: list[Tensor] = []
-    removed: Tensor | None = None
-    while completed and len(before) < Rounds.MOST:
-        alone = isolated(result.scaling.detach(), diagonal.detach(), worst, weights)
-        if not bool(communicator.max(alone.any().to(factor))):
-            break
-        before.append(result.moment)
-        removed = alone if removed is None else removed | alone
-        factor, diagonal = factor * ~alone.unsqueeze(1), torch.where(alone, 1.0, diagonal)
-        result, worst = balanced(factor, diagonal)
-    return Rounds(factor, diagonal, result, worst, tuple(before), removed)
 
 
 def chebyshev_weights(low: float, high: float) -> Iterator[tuple[float, float]]:
@@ -237,7 +201,7 @@ def chebyshev_weights(low: float, high: float) -> Iterator[tuple[float, float]]:
         yield rho * previous, 2 * rho / radius
 
 
-def _chebyshev(matrix: KernelMatrix, tolerance: float) -> Solution:
+def _chebyshev(matrix: KernelMatrix, tolerance: float) -> Balancing:
     """Balance any kernel by Chebyshev semi-iteration; on CPUs until the residual reaches ``tolerance`` or stalls."""
     factor, diagonal, weights, communicator = matrix.factor, matrix.diagonal, matrix.weights, matrix.communicator
     sums = matrix.affinities(matrix.moment(torch.ones_like(diagonal))) + diagonal
@@ -267,21 +231,14 @@ def _chebyshev(matrix: KernelMatrix, tolerance: float) -> Solution:
             break
         scaling, total = following, next_total
     identity = torch.eye(factor.shape[1], dtype=torch.float64, device=factor.device).expand(len(factor), -1, -1)
-    return Solution(scaling, total, residual.nan_to_num(nan=torch.inf), sweeps, identity)
-
-
-def _solve_and_warn(factor: Tensor, diagonal: Tensor, *, tolerance: float, completed: bool) -> tuple[Solution, float]:
-    """Balance a kernel without a gradient; return the solution and its residual, 0 on accelerators."""
-    solution = solve(KernelMatrix(factor, diagonal), tolerance, completed)
-    warn_of_residual(solution.residual, tolerance, factor.dtype, completed=completed)
-    return solution, 0.0 if is_hidden(factor) else float(solution.residual.max())
+    return Balancing(matrix, scaling, total, residual.nan_to_num(nan=torch.inf), sweeps, identity)
 
 
 def _fake_sinkhorn(
     factor: Tensor, diagonal: Tensor, tolerance: float, completed: bool, bound: bool
 ) -> tuple[Tensor, ...]:
     batch, landmarks, _ = factor.shape
-    moments = factor.new_empty(Rounds.MOST + 1, batch, landmarks, 1, dtype=torch.float64)
+    moments = factor.new_empty(MOST_ROUNDS + 1, batch, landmarks, 1, dtype=torch.float64)
     inverse = factor.new_empty(batch, landmarks, landmarks, dtype=torch.float64)
     removed = torch.empty_like(diagonal, dtype=torch.bool)
     return torch.empty_like(diagonal), moments, factor.new_empty(batch), inverse, removed
@@ -298,20 +255,17 @@ def sinkhorn(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Balance a kernel: return d (B, N), moments, residual (B,), inverse Jacobian and a mask of the removed pixels.
 
-    The moments are those of the rounds, padded with copies of the last to ``Rounds.MOST + 1``. Warn if eigenvalues
+    The moments are those of the rounds, padded with copies of the last to ``MOST_ROUNDS + 1``. Warn if eigenvalues
     exceed 1, of large factors only with ``bound``.
     """
-    balanced = partial(_solve_and_warn, tolerance=tolerance, completed=completed)
-    watched = not is_hidden(factor)
-    rounds = sinkhorn_in_rounds(factor, diagonal, balanced, completed=completed and watched)
-    result, factor, diagonal = rounds.result, rounds.factor, rounds.diagonal
-    if watched and (bound or factor.shape[1] * factor.shape[2] <= ALWAYS):
-        remainder = result.scaling * (result.scaling * diagonal)
-        gram = shifted_gram(factor, result.scaling, remainder, ALONE)
-        if exceeds(gram, result.moment, slack(factor.dtype, rounds.residual)):
+    result, removed = balanced_in_rounds(KernelMatrix(factor, diagonal), tolerance, completed)
+    if not is_hidden(factor) and (bound or factor.shape[1] * factor.shape[2] <= ALWAYS):
+        remainder = result.scaling * (result.scaling * result.matrix.diagonal)
+        gram = shifted_gram(result.matrix.factor, result.scaling, remainder, ALONE)
+        if exceeds(gram, result.moment, slack(factor.dtype, float(result.residual.max()))):
             warn("eigenvalues exceed 1, which compiled programs do not correct; use landmarks='kmeans'")
-    moments = [*rounds.before, *[result.moment] * (Rounds.MOST + 1 - len(rounds.before))]
-    removed = torch.zeros_like(diagonal, dtype=torch.bool) if rounds.removed is None else rounds.removed
+    moments = [*result.before, *[result.moment] * (MOST_ROUNDS + 1 - len(result.before))]
+    removed = torch.zeros_like(diagonal, dtype=torch.bool) if removed is None else removed
     return result.scaling, torch.stack(moments), result.residual, result.inverse.contiguous(), removed
 
 
@@ -326,16 +280,3 @@ def without(factor: Tensor, removed: Tensor) -> Tensor:
     An operator of its own, since inductor would write the product once for every operator that takes it.
     """
     return factor * ~removed.unsqueeze(1)
-
-
-def sinkhorn_in_graph(
-    factor: Tensor, diagonal: Tensor, tolerance: float, completed: bool, bound: bool
-) -> tuple[Tensor, Tensor, Balancing, tuple[Tensor, ...]]:
-    """Factor and diagonal without isolated pixels, their balancing, and the moments of the rounds before it."""
-    scaling, moments, residual, inverse, removed = sinkhorn(
-        factor.detach(), diagonal.detach(), tolerance, completed, bound
-    )
-    factor, diagonal = without(factor, removed), torch.where(removed, 1.0, diagonal)
-    known = scaling, moments[-1], inverse
-    scaling = _ImplicitScaling.apply(factor, diagonal, *known, completed, ALONE, None)  # type: ignore[no-untyped-call]
-    return factor, diagonal, Balancing(scaling, moments[-1], residual, 0), moments[:-1].unbind()

@@ -13,7 +13,7 @@ from nlfilter_torch import (
     nonlocal_operator,
     polynomial_filter,
 )
-from nlfilter_torch.operator.sinkhorn import sinkhorn_in_graph
+from nlfilter_torch.operator.sinkhorn import sinkhorn
 from tests.problems import noise, picture, seeded
 from tests.streams import stream_detail
 
@@ -148,4 +148,4 @@ def test_eigenvalues_above_one_in_a_graph_are_warned_of() -> None:
     operator = nonlocal_operator(guide, spatial_bandwidth=3.0, num_landmarks=50, landmarks="random")
     unlimited = replace(operator.kernel, limiter=None).factor(operator.kernel.recipe(guide))
     with pytest.warns(UserWarning, match="eigenvalues exceed 1, which compiled programs do not correct"):
-        sinkhorn_in_graph(*unlimited, 1e-5, True, True)
+        sinkhorn(*unlimited, 1e-5, True, True)

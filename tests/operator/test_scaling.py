@@ -4,16 +4,15 @@ import pytest
 import torch
 from torch import Tensor
 
-from nlfilter_torch.core.communicator import ALONE
 from nlfilter_torch.operator.scaling import (
     LARGEST,
+    Balancing,
     KernelMatrix,
-    Solution,
     conjugate_gradients,
     damped,
     scaling_from_moment,
 )
-from nlfilter_torch.operator.sinkhorn import sinkhorn_balance
+from nlfilter_torch.operator.sinkhorn import solve
 from tests.problems import noise
 
 
@@ -36,8 +35,9 @@ def test_the_damped_method_converges_from_any_start(start: float) -> None:
     assert (factor.mT @ factor).min() < -0.05
     scaling = torch.full((2, 60), start, dtype=torch.float64)
     infinite = torch.full((2,), torch.inf, dtype=torch.float64)
-    begun = Solution(scaling, factor @ scaling.unsqueeze(2), infinite, 0, torch.eye(5).double().expand(2, -1, -1))
-    result = damped(KernelMatrix(factor, diagonal), begun, 1e-12)
+    matrix, identity = KernelMatrix(factor, diagonal), torch.eye(5).double().expand(2, -1, -1)
+    begun = Balancing(matrix, scaling, factor @ scaling.unsqueeze(2), infinite, 0, identity)
+    result = damped(matrix, begun, 1e-12)
     sums = result.scaling * ((factor.mT @ result.moment).squeeze(2) + diagonal * result.scaling)
     torch.testing.assert_close(sums, torch.ones_like(sums), atol=1e-11, rtol=0)
     assert result.residual.max() < 1e-11
@@ -47,7 +47,7 @@ def test_damped_steps_take_over_where_sweeps_do_not_converge() -> None:
     """The scaling d of a pixel exceeds the bound of the sweeps."""
     factor = torch.tensor([[[1.0, -0.9, -0.9, 0.4]]], dtype=torch.float64)
     diagonal = 1 - factor.square().sum(1) + 1e-3
-    result = sinkhorn_balance(factor, diagonal, completed=True)
+    result = solve(KernelMatrix(factor, diagonal), 1e-12, True)
     assert result.scaling.max() > LARGEST
     sums = result.scaling * ((factor.mT @ result.moment).squeeze(2) + diagonal * result.scaling)
     torch.testing.assert_close(sums, torch.ones_like(sums), atol=1e-11, rtol=0)
@@ -58,10 +58,9 @@ def test_damped_steps_balance_weighted_points() -> None:
     factor = factor / factor.norm(dim=1, keepdim=True).clamp(min=1.0)
     diagonal, weights = (1 - factor.square().sum(1)).clamp(min=0.01), noise(1, 30, seed=5) * 9 + 0.5
     scaling = torch.full((1, 30), 1e4, dtype=torch.float64)
-    start = Solution(
-        scaling, factor @ scaling.unsqueeze(2), torch.full((1,), torch.inf).double(), 0, torch.eye(4).double()
-    )
-    result = damped(KernelMatrix(factor, diagonal, weights), start, 1e-12)
+    matrix, infinite = KernelMatrix(factor, diagonal, weights), torch.full((1,), torch.inf).double()
+    start = Balancing(matrix, scaling, factor @ scaling.unsqueeze(2), infinite, 0, torch.eye(4).double())
+    result = damped(matrix, start, 1e-12)
     sums = result.scaling * ((factor.mT @ result.moment).squeeze(2) + diagonal * result.scaling)
     torch.testing.assert_close(sums, torch.ones_like(sums), atol=1e-11, rtol=0)
     total = factor @ (weights * result.scaling).unsqueeze(2)
@@ -81,7 +80,7 @@ def system(steepness: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
 def test_conjugate_gradients_solve_systems_with_the_spectrum_of_balancing() -> None:
     factor, weight, right, expected = system(0.3)
     identity = torch.eye(30, dtype=torch.float64).expand(1, -1, -1)
-    solution = conjugate_gradients(factor, weight, right, identity, ALONE)
+    solution = conjugate_gradients(KernelMatrix(factor, weight), weight, right, identity)
     torch.testing.assert_close(solution, expected, atol=1e-12, rtol=0)
 
 
@@ -89,5 +88,5 @@ def test_conjugate_gradients_that_run_out_of_steps_say_so() -> None:
     factor, weight, right, expected = system(12.0)
     identity = torch.eye(30, dtype=torch.float64).expand(1, -1, -1)
     with pytest.warns(UserWarning, match="balancing left a linear system unsolved"):
-        solution = conjugate_gradients(factor, weight, right, identity, ALONE)
+        solution = conjugate_gradients(KernelMatrix(factor, weight), weight, right, identity)
     assert float((solution - expected).norm() / expected.norm()) > 0.01

@@ -12,8 +12,8 @@ from nlfilter_torch import (
     estimate_bandwidth,
     nonlocal_operator,
 )
-from nlfilter_torch.operator.scaling import Balancing
-from nlfilter_torch.operator.sinkhorn import Rounds, sinkhorn_balance, sinkhorn_in_graph, sinkhorn_in_rounds
+from nlfilter_torch.operator.scaling import KernelMatrix
+from nlfilter_torch.operator.sinkhorn import sinkhorn_balance
 from tests import reference
 from tests.images import reduced
 from tests.pairwise import each_value, pairwise
@@ -46,7 +46,7 @@ def row_sums(factor: torch.Tensor, diagonal: torch.Tensor, d: torch.Tensor) -> t
 )
 def test_row_sums_are_one(pixels: int, dtype: torch.dtype, tolerance: float, completed: bool) -> None:
     factor, diagonal = problem(2, 6, pixels, dtype=dtype)
-    result = sinkhorn_balance(factor, diagonal, completed=completed)
+    result = sinkhorn_balance(KernelMatrix(factor, diagonal), completed=completed)
     assert (result.scaling > 0).all()
     assert (row_sums(factor, diagonal, result.scaling) - 1).abs().max() <= tolerance
 
@@ -55,26 +55,26 @@ def test_row_sums_are_one(pixels: int, dtype: torch.dtype, tolerance: float, com
 def test_scaling_is_the_reference_scaling(completed: bool) -> None:
     factor, diagonal = problem(1, 5, 80)
     kernel = (factor.mT @ factor + torch.diag_embed(diagonal))[0].numpy()
-    d = sinkhorn_balance(factor, diagonal, completed=completed).scaling[0].numpy()
+    d = sinkhorn_balance(KernelMatrix(factor, diagonal), completed=completed).scaling[0].numpy()
     np.testing.assert_allclose(d[:, None] * kernel * d, reference.balanced(kernel), atol=1e-11)
 
 
 @given(scale=st.floats(1e-2, 1e2))
 def test_a_kernel_times_c_is_scaled_by_its_root(scale: float) -> None:
     factor, diagonal = problem(1, 5, 80)
-    d = sinkhorn_balance(factor, diagonal).scaling
-    scaled = sinkhorn_balance(factor * scale**0.5, diagonal * scale).scaling
+    d = sinkhorn_balance(KernelMatrix(factor, diagonal)).scaling
+    scaled = sinkhorn_balance(KernelMatrix(factor * scale**0.5, diagonal * scale)).scaling
     torch.testing.assert_close(scaled, d / scale**0.5, rtol=1e-9, atol=0)
 
 
 @pytest.mark.parametrize(("completed", "pixels"), [(False, 500), (True, 500), (True, 20000)])
 def test_the_residual_is_that_of_the_scaling(completed: bool, pixels: int) -> None:
     factor, diagonal = problem(3, 6, pixels)
-    result = sinkhorn_balance(factor, diagonal, tolerance=1e-3, completed=completed)
+    result = sinkhorn_balance(KernelMatrix(factor, diagonal), tolerance=1e-3, completed=completed)
     measured = (row_sums(factor, diagonal, result.scaling) - 1).abs().amax(1)
     torch.testing.assert_close(result.residual, measured, atol=1e-12, rtol=0)
     assert result.residual.max() <= 1e-3
-    assert 1 <= result.steps <= sinkhorn_balance(factor, diagonal, completed=completed).steps
+    assert 1 <= result.steps <= sinkhorn_balance(KernelMatrix(factor, diagonal), completed=completed).steps
 
 
 def test_one_slow_step_is_not_the_end() -> None:
@@ -86,15 +86,16 @@ def test_one_slow_step_is_not_the_end() -> None:
 
 @pytest.mark.parametrize("completed", [False, True])
 def test_identity_is_balanced_already(completed: bool) -> None:
-    result = sinkhorn_balance(torch.zeros(1, 3, 50), torch.ones(1, 50), completed=completed)
+    result = sinkhorn_balance(KernelMatrix(torch.zeros(1, 3, 50), torch.ones(1, 50)), completed=completed)
     torch.testing.assert_close(result.scaling, torch.ones(1, 50))
 
 
 @pytest.mark.parametrize(("completed", "pixels"), [(False, 500), (True, 500), (True, 20000)])
 def test_a_batch_is_its_images(completed: bool, pixels: int) -> None:
     factor, diagonal = problem(3, 6, pixels)
-    together = sinkhorn_balance(factor, diagonal, completed=completed).scaling
-    alone = [sinkhorn_balance(factor[i : i + 1], diagonal[i : i + 1], completed=completed).scaling for i in range(3)]
+    together = sinkhorn_balance(KernelMatrix(factor, diagonal), completed=completed).scaling
+    images = [KernelMatrix(factor[i : i + 1], diagonal[i : i + 1]) for i in range(3)]
+    alone = [sinkhorn_balance(image, completed=completed).scaling for image in images]
     torch.testing.assert_close(together, torch.cat(alone), rtol=1e-10, atol=0)
 
 
@@ -104,7 +105,7 @@ def test_the_estimated_jacobian_leaves_the_gradient_exact() -> None:
     gradients = []
     for (factor, diagonal), completed in zip(problems, (False, True), strict=True):
         weights = torch.randn(2, 4000, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-        loss = (sinkhorn_balance(factor, diagonal, completed=completed).scaling * weights).sum()
+        loss = (sinkhorn_balance(KernelMatrix(factor, diagonal), completed=completed).scaling * weights).sum()
         gradients.append(torch.autograd.grad(loss, (factor, diagonal)))
     for result, expected in zip(*gradients, strict=True):
         torch.testing.assert_close(result, expected, atol=1e-10, rtol=1e-8)
@@ -123,7 +124,7 @@ def test_row_sums_that_stay_off_are_told() -> None:
     with pytest.warns(
         UserWarning, match=r"balancing left row sums that differ from 1 by up to .*completion='diagonal'"
     ):
-        result = sinkhorn_balance(factor, torch.zeros(1, 4))
+        result = sinkhorn_balance(KernelMatrix(factor, torch.zeros(1, 4)))
     assert result.scaling.isfinite().all()
     assert (result.scaling > 0).all()
 
@@ -133,7 +134,8 @@ def test_implicit_gradient_is_the_unrolled_one(completed: bool) -> None:
     factor, diagonal = (t.requires_grad_() for t in problem(2, 4, 40))
     weights = torch.randn(2, 40, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     implicit = torch.autograd.grad(
-        (sinkhorn_balance(factor, diagonal, completed=completed).scaling * weights).sum(), (factor, diagonal)
+        (sinkhorn_balance(KernelMatrix(factor, diagonal), completed=completed).scaling * weights).sum(),
+        (factor, diagonal),
     )
 
     d = torch.ones(2, 40, dtype=torch.float64)
@@ -151,23 +153,18 @@ def lonely() -> tuple[Tensor, Tensor]:
 
 
 @pytest.mark.filterwarnings("ignore:eigenvalues exceed 1")
+@pytest.mark.filterwarnings("ignore:.*autograd.function.Function.* should not be instantiated:DeprecationWarning")
 @pytest.mark.parametrize("completed", [True, False])
 def test_balancing_in_a_graph_is_that_without_one(completed: bool) -> None:
     actual = []
-    for in_graph in (False, True):
+    for balance in (sinkhorn_balance, torch.compile(sinkhorn_balance, backend="aot_eager", fullgraph=True)):
         factor, diagonal = (tensor.clone().requires_grad_() for tensor in lonely())
-        if in_graph:
-            kept, rest, result, before = sinkhorn_in_graph(factor, diagonal, 1e-5, completed, False)
-            rounds = Rounds.MOST - sum(torch.equal(total, result.moment) for total in before)
-        else:
-
-            def balanced(factor: Tensor, diagonal: Tensor) -> tuple[Balancing, float]:
-                return sinkhorn_balance(factor, diagonal, completed=completed), 1e-5
-
-            whole = sinkhorn_in_rounds(factor, diagonal, balanced, completed=completed)
-            kept, rest, result, rounds = whole.factor, whole.diagonal, whole.result, len(whole.before)
+        result = balance(KernelMatrix(factor, diagonal), tolerance=1e-5, completed=completed)
+        kept, rest = result.matrix.factor, result.matrix.diagonal
+        repeated = sum(torch.equal(total, result.moment) for total in result.before)
         gradients = torch.autograd.grad((result.scaling * kept[:, 0] + rest).square().sum(), [factor, diagonal])
-        actual.append((kept, rest, result.scaling, result.moment, result.residual, *gradients, torch.tensor(rounds)))
+        rounds = torch.tensor(len(result.before) - repeated)
+        actual.append((kept, rest, result.scaling, result.moment, result.residual, *gradients, rounds))
     assert int(actual[0][-1]) == completed  # the lonely pixel is removed in one round
     for ours, theirs in zip(*actual, strict=True):
         torch.testing.assert_close(ours, theirs, atol=1e-6, rtol=1e-5)
@@ -245,7 +242,7 @@ def test_a_ramp_of_unlike_pixels_is_balanced(dtype: torch.dtype) -> None:
 def test_a_warning_names_a_remedy_that_is_not_in_force() -> None:
     factor = torch.tensor([[[1.0, 1.0, -1.0, 1e-3]]])
     with pytest.warns(UserWarning, match="row sums that differ from 1 by up to .*num_landmarks$") as caught:
-        sinkhorn_balance(factor, torch.zeros(1, 4), completed=True)
+        sinkhorn_balance(KernelMatrix(factor, torch.zeros(1, 4)), completed=True)
     assert "completion" not in str(caught[0].message)
 
 

@@ -51,21 +51,6 @@ def sum_grams(factor: Tensor, scaling: Tensor, remainder: Tensor | None, count: 
     return total.sum(0, keepdim=True) if parts > 1 else total
 
 
-def _fake_gram(factor: Tensor, weights: Tensor) -> Tensor:
-    batch, landmarks, _ = factor.shape
-    return factor.new_empty(batch, landmarks, landmarks)
-
-
-def _compiled_gram(factor: Tensor, weights: Tensor) -> Tensor:
-    return _compiled_grams(factor, weights.sqrt(), None, 1)[:, 0].to(factor.dtype)
-
-
-@register("gram(Tensor factor, Tensor weights) -> Tensor", kernel(_compiled_gram), _fake_gram)
-def gram(factor: Tensor, weights: Tensor) -> Tensor:
-    """``factor diag(weights) factor^T``, (B, M, M) in the precision of the factor, for weights (B, N) >= 0."""
-    return (factor * weights.unsqueeze(1)) @ factor.mT
-
-
 def compute_grams(
     factor: Tensor, scaling: Tensor, remainder: Tensor | None, count: int, *, exact: bool = False
 ) -> Tensor:

@@ -216,8 +216,8 @@ def learn_filter(pictures: Sequence[Picture], guide: Guide) -> LearntFilter:
     built = operator_from_points(points, (points.shape[2],), options, weights[0])
     pixels = (built.factor, built.diagonal, colours, weights)
     cuts = zip(*(part.split(CHUNK, dim=-1) for part in pixels), strict=True)
-    blocks = [Block(factor, diagonal, image, weight) for factor, diagonal, image, weight in cuts]
-    empty = Block(built.factor[..., :0], built.diagonal[..., :0], colours[..., :0], weights[..., :0])
+    blocks = [Block(factor, diagonal, weight, image=image) for factor, diagonal, image, weight in cuts]
+    empty = Block(built.factor[..., :0], built.diagonal[..., :0], weights[..., :0], image=colours[..., :0])
     kernel = replace(built.kernel, features=recipe)
     return LearntFilter(Pilot(kernel, empty, built.balancing.moment, 0), built.balancing, blocks)
 

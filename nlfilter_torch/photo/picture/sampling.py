@@ -39,11 +39,12 @@ from nlfilter_torch.operator.orientation import (
     source_pixels,
     stretched_sums,
 )
-from nlfilter_torch.operator.sinkhorn import sinkhorn_balance
+from nlfilter_torch.operator.scaling import Result
+from nlfilter_torch.operator.sinkhorn import solve, warn_of_residual
 from nlfilter_torch.photo.picture.counted import CountedPixels
 from nlfilter_torch.photo.picture.pictures import Picture, Tile
 from nlfilter_torch.photo.picture.source import Guide
-from nlfilter_torch.photo.picture.statistics import Block, Result
+from nlfilter_torch.photo.picture.statistics import Block
 
 PILOT = 1 << 15  # pixels of the first sample: their factor, 13 MB at m = 100, is balanced in memory
 PILOT_TOLERANCE = 1e-3  # tolerance of its balancing, which is an initial guess
@@ -191,7 +192,8 @@ class PassOverPicture:
             columns = self.kernel.columns(guide.pixels, origin=guide.origin, halo=guide.halo)
             self.cache.keep(first, columns)
         weights, ones = self.picture.weights(tile), torch.ones_like(columns[1])
-        return Block(*columns, image, ones if weights is None else weights.to(ones).view_as(ones), tile.start)
+        weights = ones if weights is None else weights.to(ones).view_as(ones)
+        return Block(*columns, weights, image=image, start_row=tile.start)
 
 
 @dataclass(frozen=True)
@@ -291,10 +293,11 @@ def take_pilot(picture: GuidePicture, report: Report, workers: int = 1) -> Pilot
         points = condense(sample.subset, count, generator, sample.canonical)
         kernel = Kernel(points, inverse_cholesky(points), options.completion, features=sample.recipe)
         columns = kernel.factor(sample.features)
-        balancing = sinkhorn_balance(
-            *columns, tolerance=PILOT_TOLERANCE, completed=options.completion == "diagonal", weights=sample.weights
-        )
-        return Pilot(kernel, Block(*columns, sample.image, sample.weights), balancing.moment, sample.seed)
+        block = Block(*columns, sample.weights, image=sample.image)
+        completed = options.completion == "diagonal"
+        balancing = solve(block, PILOT_TOLERANCE, completed)
+        warn_of_residual(balancing.residual, PILOT_TOLERANCE, picture.dtype, completed=completed)
+        return Pilot(kernel, block, balancing.moment, sample.seed)
 
 
 @dataclass(frozen=True, eq=False)
@@ -531,7 +534,7 @@ class Draws:
         chosen, counts = draw(likely, np.random.default_rng([self.seed, block.start_row]))
         weights = (counts / likely[chosen]).to(block.weights)[None] * block.weights[:, chosen]
         factor, diagonal, image = (planes[..., chosen] for planes in (block.factor, block.diagonal, block.image))
-        return Block(factor, diagonal, image, weights)
+        return Block(factor, diagonal, weights, image=image)
 
 
 def draw(rates: Tensor, generator: np.random.Generator) -> tuple[Tensor, Tensor]:

@@ -12,10 +12,9 @@ initial guess, and a sample estimates how f changes from there: ``x = f(guess) +
 The error is the error of the sample times that of the guess.
 """
 
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from functools import partial
-from typing import Protocol, TypeVar
 
 import torch
 from torch import Tensor
@@ -26,7 +25,7 @@ from nlfilter_torch.core.warning import warn
 from nlfilter_torch.operator.columns import Columns
 from nlfilter_torch.operator.eigenvalue_bound import exceeds, limiter, shift, slack
 from nlfilter_torch.operator.pixel_matrix import capacitance_inverse, shifted_gram, shifted_remainder
-from nlfilter_torch.operator.scaling import LARGEST, PixelScaling, scaling_from_moment
+from nlfilter_torch.operator.scaling import LARGEST, KernelMatrix, Pass, PixelScaling, newton
 
 CONVERGED = {
     torch.float32: 1e-5,
@@ -36,82 +35,42 @@ MAX_PASSES = 12
 ALARM = 1e-3
 
 
-Result = TypeVar("Result")
-
-
-@dataclass(frozen=True)
-class Block:
+@dataclass(frozen=True, eq=False)
+class Block(KernelMatrix):
     """A block of pixels in a pass.
 
     Attributes:
-        factor: their columns of the factor, (1, M, n).
-        diagonal: their diagonal, (1, n).
-        image: their colours, (1, C, n).
         weights: number of pixels that each represents, (1, n).
+        image: their colours, (1, C, n).
         start_row: row of the first pixel in the picture.
     """
 
-    factor: Tensor
-    diagonal: Tensor
-    image: Tensor
     weights: Tensor
+    image: Tensor = field(kw_only=True)
     start_row: int = 0
 
     @staticmethod
     def concatenate(parts: list["Block"]) -> "Block":
         """Several blocks as one."""
-        factors, diagonals, images, weights = zip(
-            *((part.factor, part.diagonal, part.image, part.weights) for part in parts), strict=True
+        factors, diagonals, weights, images = zip(
+            *((part.factor, part.diagonal, part.weights, part.image) for part in parts), strict=True
         )
-        return Block(torch.cat(factors, 2), torch.cat(diagonals, 1), torch.cat(images, 2), torch.cat(weights, 1))
+        return Block(torch.cat(factors, 2), torch.cat(diagonals, 1), torch.cat(weights, 1), image=torch.cat(images, 2))
 
 
-class Pass(Protocol):
-    """A pass over the blocks of a picture or of a sample."""
-
-    def __call__(self, function: Callable[[Block], Result]) -> Iterable[Result]:
-        """Apply a function to each block, and yield the results in order."""
-
-
-@dataclass(frozen=True)
-class NewtonTerms:
-    """Terms of a step of Newton's method at the moment ``total``, with scalings of at most ``largest``."""
-
-    total: Tensor
-    largest: float
-
-    def __call__(self, block: Block) -> tuple[Tensor, Tensor, torch.dtype]:
-        """The sums, the Jacobian and the dtype of a block."""
-        scaling = scaling_from_moment(block.factor, block.diagonal, self.total.to(block.factor))
-        scaling = scaling.clamp(max=self.largest)
-        remainder = scaling * (scaling * block.diagonal)
-        weights = scaling * (block.weights / (1 + remainder)).sqrt()
-        sums = moment(block.factor, (block.weights * scaling).unsqueeze(1))
-        return sums, sum_grams(block.factor, weights, remainder, 1)[:, 0], block.factor.dtype
-
-
-def balance_by_passes(blocks: Pass, total: Tensor, *, completed: bool, correction: Tensor | float = 0.0) -> Tensor:
+def balance_by_passes(
+    blocks: Pass[Block], total: Tensor, dtype: torch.dtype, *, completed: bool, bias: Tensor | float = 0.0
+) -> Tensor:
     """Solve for the moment t (1, M, 1) of the pixels in ``blocks``, from an initial guess ``total``.
 
-    ``correction`` is added to the sum over the blocks. ``completed`` means that the kernel has a unit diagonal and no
-    negative entry, so that no scaling can be large. Scalings are then clamped, since they would start large for pixels
-    that the guess does not represent, and Newton's method would only halve them in every pass.
+    ``bias`` is added to the sum over the blocks. ``completed`` means that the kernel has a unit diagonal and no
+    negative entry, so that no scaling can be large.
     """
-    largest = LARGEST if completed else float("inf")
-    identity = torch.eye(total.shape[1], dtype=total.dtype, device=total.device)
-    change, tolerance = float("inf"), 0.0
-    for _ in range(MAX_PASSES):
-        sums, jacobian = torch.zeros_like(total), identity.expand(total.shape[0], -1, -1)
-        for part, slope, dtype in blocks(NewtonTerms(total, largest)):
-            sums, jacobian, tolerance = sums + part, jacobian + slope, CONVERGED[dtype]
-        step = torch.cholesky_solve(sums + correction - total, torch.linalg.cholesky_ex(jacobian).L)
-        total = total + step
-        change = float(step.norm() / total.norm())
-        if change <= tolerance:
-            return total
+    most = LARGEST if completed else float("inf")
+    total, _, change = newton(blocks, total, steps=MAX_PASSES, most=most, bias=bias, tolerance=CONVERGED[dtype])
     if change > ALARM:
         warn(
-            f"balancing still changed by {change:.1e} after {MAX_PASSES} passes; "
+            f"balancing still changed by {float(change):.1e} after {MAX_PASSES} passes; "
             "raise photometric_bandwidth or num_landmarks, or use completion='diagonal'"
         )
     return total
@@ -121,7 +80,7 @@ def balance_by_passes(blocks: Pass, total: Tensor, *, completed: bool, correctio
 class GramByPasses:
     """Computes ``F (x I - R)^-k F^T`` in a pass over the pixels for each x and k."""
 
-    blocks: Pass
+    blocks: Pass[Block]
     pixel_scaling: PixelScaling
 
     def __call__(self, at: Tensor, power: int) -> Tensor:
@@ -134,7 +93,7 @@ class GramByPasses:
         return sum_grams(block.factor, (scaling * weights.sqrt()).to(block.factor), None, 1)[:, 0]
 
 
-def limiter_by_passes(blocks: Pass, pixel_scaling: PixelScaling, dtype: torch.dtype) -> Tensor | None:
+def limiter_by_passes(blocks: Pass[Block], pixel_scaling: PixelScaling, dtype: torch.dtype) -> Tensor | None:
     """Compute the ``X^(1/2)`` (1, M, M) to multiply the factor by, or None if no eigenvalue exceeds 1."""
     gram, allowed = GramByPasses(blocks, pixel_scaling), slack(dtype, CONVERGED[dtype])
     return limiter(gram, pixel_scaling.moment, allowed) if exceeds(gram, pixel_scaling.moment, allowed) else None
@@ -268,7 +227,7 @@ class ShiftedTerms:
         return ShiftedSums(torch.stack(grams, dim=1), moments.unflatten(2, (len(shifts), -1)).transpose(1, 2))
 
 
-def sum_up_shifted(blocks: Pass, terms: ShiftedTerms) -> ShiftedSums:
+def sum_up_shifted(blocks: Pass[Block], terms: ShiftedTerms) -> ShiftedSums:
     """Compute the sums for shifted systems, in one pass over blocks of pixels."""
     grams, moments = torch.zeros(()), torch.zeros(())
     for sums in blocks(terms):
@@ -276,7 +235,7 @@ def sum_up_shifted(blocks: Pass, terms: ShiftedTerms) -> ShiftedSums:
     return ShiftedSums(grams, moments)
 
 
-def sum_up(blocks: Pass, values: Callable[[Block], tuple[Tensor, Columns]], order: int) -> Sums:
+def sum_up(blocks: Pass[Block], values: Callable[[Block], tuple[Tensor, Columns]], order: int) -> Sums:
     """Compute the sums for the first ``order`` powers of W, in one pass over blocks of pixels.
 
     ``values`` computes the planes y (1, C, n) to filter in a block, and its columns.

@@ -17,7 +17,7 @@ from nlfilter_torch.operator.columns import Columns
 from nlfilter_torch.operator.features import reduce_channels
 from nlfilter_torch.operator.operator import Kernel
 from nlfilter_torch.operator.pixel_matrix import shifted_remainder, sums_exactly
-from nlfilter_torch.operator.scaling import PixelScaling
+from nlfilter_torch.operator.scaling import Pass, PixelScaling, Result
 from nlfilter_torch.operator.spectrum import RitzPairs
 from nlfilter_torch.photo.picture import sampling
 from nlfilter_torch.photo.picture.pictures import Tile
@@ -38,8 +38,6 @@ from nlfilter_torch.photo.picture.statistics import (
     CONVERGED,
     Block,
     Guess,
-    Pass,
-    Result,
     ShiftedSums,
     ShiftedTerms,
     Sums,
@@ -271,10 +269,12 @@ class TiledOperator:
         total, completed, difference = self.pilot.moment, self.pilot.completed, None
         if self.sample_size is not None:
             self._sample, difference = self._draw_sample(self.sample_size, planes, order)
-            total = balance_by_passes(self.over("Balancing"), total, completed=completed, correction=difference.moment)
+            total = balance_by_passes(
+                self.over("Balancing"), total, self.guide.dtype, completed=completed, bias=difference.moment
+            )
         if self.full_passes:
             self._sample = difference = None
-            total = balance_by_passes(self.over("Balancing"), total, completed=completed)
+            total = balance_by_passes(self.over("Balancing"), total, self.guide.dtype, completed=completed)
         self._pixel_scaling = PixelScaling(total, completed, CONVERGED[self.guide.dtype])
         limiter = (
             limiter_by_passes(self.over("Bounding"), self._pixel_scaling, self.guide.dtype) if self.bounded else None
@@ -348,7 +348,7 @@ class TiledOperator:
         """Columns of pixels with a given factor and diagonal."""
         return Columns(factor, *self.pixel_scaling(factor, diagonal))
 
-    def over(self, stage: str) -> Pass:
+    def over(self, stage: str) -> Pass[Block]:
         """A pass over the sample, or over all pixels if there is none."""
         if self._sample is None:
             return self._over_picture(stage)
@@ -373,7 +373,7 @@ class TiledOperator:
             known = self._sums[planes] = self._summed_up(planes, order, self._over_picture("Summing up"))
         return known
 
-    def _summed_up(self, planes: Planes, order: int, blocks: Pass) -> Sums:
+    def _summed_up(self, planes: Planes, order: int, blocks: Pass[Block]) -> Sums:
         return sum_up(blocks, partial(self._planes_and_columns, planes), order)
 
     def _planes_and_columns(self, planes: Planes, block: Block) -> tuple[Tensor, Columns]:
@@ -431,7 +431,7 @@ class TiledOperator:
         self.prepare()
         return self._shifted(planes, shifts, self._over_picture("Summing up"))
 
-    def _shifted(self, planes: Planes, shifts: Tensor, blocks: Pass) -> ShiftedSums:
+    def _shifted(self, planes: Planes, shifts: Tensor, blocks: Pass[Block]) -> ShiftedSums:
         exact = sums_exactly(self.guide.dtype, self.guide.pixels)
         return sum_up_shifted(blocks, ShiftedTerms(partial(self._planes_and_columns, planes), shifts, exact))
 

@@ -3,7 +3,6 @@
 import pytest
 import torch
 
-from nlfilter_torch.core.kernels import definitions_only, grams
 from nlfilter_torch.core.kernels.grams import sum_grams
 from tests.native import LEVELS, by_torch, random
 from tests.pairwise import pairwise
@@ -31,11 +30,3 @@ def test_grams(level: int, pixels: int, marks: int, count: int) -> None:
         assert (result[:, j] - exact).abs().max() <= size
         assert (plain[:, j] - exact).abs().max() <= 10 * size
     assert torch.equal(result, result.mT)
-
-
-def test_a_gram_matrix_of_weighted_columns() -> None:
-    factor, weights = random(2, 6, 400), random(2, 400, seed=1).exp()
-    exact = (factor.double() * weights.double().unsqueeze(1)) @ factor.double().mT
-    torch.testing.assert_close(grams.gram(factor, weights), exact.float(), rtol=1e-4, atol=1e-3)
-    with definitions_only():
-        torch.testing.assert_close(grams.gram(factor, weights), exact.float(), rtol=1e-4, atol=1e-3)

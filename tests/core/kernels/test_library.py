@@ -18,7 +18,7 @@ from nlfilter_torch.core.kernels.grams import sum_grams
 from nlfilter_torch.core.kernels.tall_skinny import moment, spread
 from nlfilter_torch.operator import build  # noqa: F401, registers two
 from nlfilter_torch.operator.nystrom import inverse_cholesky, nystrom_factor
-from nlfilter_torch.operator.scaling import KernelMatrix, _sweep
+from nlfilter_torch.operator.scaling import KernelMatrix
 from tests import reference
 from tests.native import by_torch, needs_kernels, random
 
@@ -46,7 +46,6 @@ def arguments(dtype: torch.dtype) -> dict[str, tuple[Any, ...]]:
         "sweep": (factor, weights, vector, 2.0, weights),
         "weigh": (factor, weights, vector),
         "grams": (factor, weights, weights, 2),
-        "gram": (factor, weights),
         "pivots": (features, torch.linspace(0.1, 0.9, TRIALS * LANDMARKS, dtype=dtype).view(-1, TRIALS), 1e-4),
         "lloyd": (features, landmarks, 3, 1e-6),
         "invert": (factor @ factor.mT + torch.eye(LANDMARKS, dtype=dtype),),
@@ -90,7 +89,7 @@ def test_accelerators_have_the_definitions() -> None:
 
 
 def swept(factor: Tensor, diagonal: Tensor, total: Tensor) -> tuple[Tensor, Tensor]:
-    return _sweep(KernelMatrix(factor, diagonal), total)
+    return KernelMatrix(factor, diagonal).sweep(total)
 
 
 @pytest.fixture(params=[False, True], ids=["threads of torch", "threads of its own"])

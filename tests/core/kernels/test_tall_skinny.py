@@ -8,10 +8,9 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.core.blocks import SWEPT
-from nlfilter_torch.core.communicator import ALONE
 from nlfilter_torch.core.kernels import definitions_only, tall_skinny
-from nlfilter_torch.core.kernels.tall_skinny import gather, moment, spread
-from nlfilter_torch.operator.scaling import KernelMatrix, _sweep, weighted_moment
+from nlfilter_torch.core.kernels.tall_skinny import gather, moment, spread, weigh
+from nlfilter_torch.operator.scaling import KernelMatrix
 from tests.native import LEVELS, by_torch, random
 from tests.pairwise import pairwise
 
@@ -52,7 +51,7 @@ def test_derivatives_of_any_order(count: int, threads: Callable[[int], None]):
 
 
 def swept(factor: Tensor, diagonal: Tensor, total: Tensor) -> tuple[Tensor, Tensor]:
-    return _sweep(KernelMatrix(factor, diagonal), total)
+    return KernelMatrix(factor, diagonal).sweep(total)
 
 
 def fits(_: int, pixels: int, marks: int) -> bool:
@@ -102,11 +101,11 @@ def test_products_with_few_rows(level: int, pixels: int, rows: int, marks: int) 
     indirect=["level"],
 )
 def test_weighted_moments(level: int, pixels: int, marks: int) -> None:
-    arguments = random(2, marks, pixels), random(2, pixels, seed=1).exp(), ALONE, random(2, marks, 1).double()
-    factor, weights, total = (t.double() for t in arguments if isinstance(t, Tensor))
-    exact = factor @ (weights.unsqueeze(2) * (factor.mT @ total.float().double()))
-    result = weighted_moment(*arguments)
-    plain = by_torch(weighted_moment, *arguments)
+    arguments = random(2, marks, pixels), random(2, pixels, seed=1).exp(), random(2, marks)
+    factor, weights, total = (t.double() for t in arguments)
+    exact = (factor @ (weights.unsqueeze(2) * (factor.mT @ total.unsqueeze(2)))).squeeze(2)
+    result = weigh(*arguments)
+    plain = by_torch(weigh, *arguments)
     error, usual = (result - exact).abs().max(), (plain - exact).abs().max()
     assert error <= 2 * usual + 1e-6 * exact.abs().max(), (error, usual)
 

@@ -25,7 +25,7 @@ def test_balancing_that_does_not_settle_warns(monkeypatch: pytest.MonkeyPatch) -
     picture = GuidePicture(Picture(cat(30, 40)), Guide(FilterOptions(num_landmarks=20)))
     pilot = sampling.take_pilot(picture, silent)
     with pytest.warns(UserWarning, match="balancing still changed by .* after 1 passes"):
-        balance_by_passes(lambda of: [of(pilot.sample)], 9 * pilot.moment, completed=True)
+        balance_by_passes(pilot.sample.whole, 9 * pilot.moment, torch.float32, completed=True)
 
 
 def test_sums_over_weighted_blocks_solve_shifted_systems() -> None:
@@ -36,7 +36,7 @@ def test_sums_over_weighted_blocks_solve_shifted_systems() -> None:
     matrix = PixelMatrix(*parts, operator.communicator, weights)
     wanted = matrix.solve(planes, shifts, matrix.capacitances(shifts))
     cuts = [slice(0, 30), slice(30, 70)]
-    blocks = [Block(parts[0][:, :, cut], parts[2][:, cut], planes[:, :, cut], weights[:, cut]) for cut in cuts]
+    blocks = [Block(parts[0][:, :, cut], parts[2][:, cut], weights[:, cut], image=planes[:, :, cut]) for cut in cuts]
     columns = {id(block): Columns(*(part[..., cut] for part in parts)) for block, cut in zip(blocks, cuts, strict=True)}
     terms = ShiftedTerms(lambda block: (block.image, columns[id(block)]), shifts, False)
     inner = sum_up_shifted(lambda function: map(function, blocks), terms).inner()
