@@ -29,7 +29,6 @@ from nlfilter_torch import (
 from nlfilter_torch.core.rational import interval_nodes, rational_form
 from nlfilter_torch.filtering.lanczos import Lanczos, gains_of
 from nlfilter_torch.filtering.rational_product import rational_product
-from nlfilter_torch.operator.pixel_matrix import PixelMatrix
 
 LEVELS = 255
 Response = Callable[[Tensor], Tensor]
@@ -182,8 +181,7 @@ def _cost(operator: NonlocalOperator, planes: Tensor, text: str, limit: float | 
 
 def compared(operator: NonlocalOperator, image: Tensor, decades: int) -> Iterator[Figure]:
     """The power 0.1 by the three methods, against a rational function of 32 poles."""
-    parts = operator.factor, operator.scaling, operator.remainder
-    matrix, planes = PixelMatrix(*parts, operator.communicator), image.flatten(2)
+    matrix, planes = operator.matrix, image.flatten(2)
     values = tenth_power(interval_nodes(decades))[None]
 
     def rational(degree: int, poles: int) -> Tensor:

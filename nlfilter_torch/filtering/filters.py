@@ -18,11 +18,10 @@ from nlfilter_torch.core.checks import (
     check_unit_range,
     check_values,
 )
-from nlfilter_torch.core.kernels.tall_skinny import spread
 from nlfilter_torch.core.layouts import in_format_of, shaped_as
 from nlfilter_torch.core.precision import full_precision, per_image
-from nlfilter_torch.operator.columns import Columns
 from nlfilter_torch.operator.operator import NonlocalOperator
+from nlfilter_torch.operator.pixel_matrix import Columns
 
 
 def detail_layers(operator: NonlocalOperator, image: Tensor, *, order: int = 3) -> Tensor:
@@ -72,12 +71,7 @@ def layers_of_columns(columns: Columns, coefficients: Tensor, image: Tensor) -> 
 
     ``coefficients`` are the moments of ``y, W y, ..., W^(k-1) y`` over all pixels, (1, k, M, C).
     """
-    rows = coefficients.to(columns.factor).transpose(2, 3)  # (1, k, C, M), for one read of the columns
-    affinities = spread(rows.flatten(1, 2), columns.factor, columns.scaling).unflatten(1, rows.shape[1:3])
-    smoothed, remainder = [image], columns.remainder.unsqueeze(1)
-    for affinity in affinities.unbind(1):  # one for each power of W
-        smoothed.append(torch.addcmul(affinity, remainder, smoothed[-1]))
-    return layers_between(torch.stack(smoothed, dim=1))
+    return layers_between(torch.stack(columns.powers_of(image, columns.spread_each(coefficients)), dim=1))
 
 
 def weigh_layers(layers: Tensor, alpha: Tensor) -> Tensor:

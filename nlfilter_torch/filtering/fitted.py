@@ -26,8 +26,8 @@ from nlfilter_torch.core.containers import Target, loadable, moved
 from nlfilter_torch.core.kernels.tall_skinny import moment, spread
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.filtering.filters import layers_of_columns, residual_change, weigh_layers
-from nlfilter_torch.operator.columns import Columns
 from nlfilter_torch.operator.operator import Kernel, NonlocalOperator
+from nlfilter_torch.operator.pixel_matrix import Columns
 from nlfilter_torch.operator.scaling import PixelScaling
 
 

@@ -150,9 +150,8 @@ def ritz_space(matrix: PixelMatrix, planes: Tensor, response: Response, toleranc
 def krylov_product(matrix: PixelMatrix, planes: Tensor, response: Response, space: RitzSpace) -> Tensor:
     """``f(W) y`` in a Krylov space of the planes, (B, C, N); differentiable once in y, f and W."""
     gains = matrix.communicator.copy_to_group(gains_of(response, space.values))
-    parts = matrix.factor, matrix.scaling, matrix.remainder
     result: Tensor = _KrylovProduct.apply(  # type: ignore[no-untyped-call]
-        *parts, planes, gains, space, response, matrix.communicator, matrix.weights
+        *matrix.parts, planes, gains, space, response
     )
     return result
 
@@ -164,14 +163,14 @@ class _KrylovProduct(torch.autograd.Function):
         factor: Tensor,
         scaling: Tensor,
         remainder: Tensor,
+        weights: Tensor | None,
+        communicator: Communicator,
         planes: Tensor,
         gains: Tensor,
         space: RitzSpace,
         response: Response,
-        communicator: Communicator,
-        weights: Tensor | None,
     ) -> Tensor:
-        ctx.save_for_backward(factor, scaling, remainder, planes, gains, weights)
+        ctx.save_for_backward(factor, scaling, remainder, weights, planes, gains)
         ctx.space, ctx.response, ctx.communicator = space, response, communicator
         return space.combine(gains).to(planes)
 
@@ -179,12 +178,12 @@ class _KrylovProduct(torch.autograd.Function):
     @for_each_gradient
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-        factor, scaling, remainder, planes, gains, weights = ctx.saved_tensors
-        matrix, space = PixelMatrix(factor, scaling, remainder, ctx.communicator, weights), ctx.space
+        factor, scaling, remainder, weights, planes, gains = ctx.saved_tensors
+        matrix, space = PixelMatrix(factor, scaling, remainder, weights, ctx.communicator), ctx.space
         inner = (space.basis @ grad.unsqueeze(3)).squeeze(3).double()  # (B, C, k)
         grad_gains = (space.vectors.mT @ inner.unsqueeze(3)).squeeze(3) * space.start
-        if not any(ctx.needs_input_grad[:4]):
-            return None, None, None, None, grad_gains, None, None, None, None
+        if not any(ctx.needs_input_grad[:6]):
+            return *[None] * 6, grad_gains, None, None
         # W is symmetric in the sum over points with their weights, in which the gradient is grad / weights.
         pulled = (
             grad
@@ -200,7 +199,7 @@ class _KrylovProduct(torch.autograd.Function):
             answers = gains_of(ctx.response, adjoint.values)
         grad_planes = weighted(adjoint.combine(answers).to(planes), weights)
         if not any(ctx.needs_input_grad[:3]):
-            return None, None, None, grad_planes, grad_gains, None, None, None, None
+            return *[None] * 5, grad_planes, grad_gains, None, None
         differences = divided_differences(
             ctx.response, (adjoint.values, answers), (space.values, gains), meeting=MEETING[answers.dtype]
         )
@@ -208,4 +207,4 @@ class _KrylovProduct(torch.autograd.Function):
         core = adjoint.vectors @ inner @ space.vectors.mT
         left = weighted((core.mT.to(planes) @ adjoint.basis).flatten(1, 2), weights)
         grads = matrix.gradient(left, space.basis.flatten(1, 2))
-        return *grads, grad_planes, grad_gains, None, None, None, None
+        return *grads, None, None, grad_planes, grad_gains, None, None

@@ -97,8 +97,7 @@ def apply_function(
     planes = fold_batch(trainable(image).to(operator.factor), operator.factor.shape[0])
     if planes.numel() == 0:
         return FunctionProduct(image.clone(), 0, 0, 0.0)
-    parts = operator.factor, operator.scaling, operator.remainder
-    matrix = PixelMatrix(*parts, operator.communicator, operator.weights)
+    matrix = operator.matrix
     decades, seen = _decades(matrix)
     nodes = interval_nodes(decades).to(planes.device).expand(len(planes), -1)
     values = response(nodes)

@@ -29,14 +29,7 @@ def rational_product(matrix: PixelMatrix, planes: Tensor, form: RationalForm, co
     if not matrix.needs_gradient:
         return _product(matrix, planes, shifts, matrix.capacitances(shifts), coefficients.to(planes))
     result: Tensor = _RationalProduct.apply(  # type: ignore[no-untyped-call]
-        matrix.factor,
-        matrix.scaling,
-        matrix.remainder,
-        planes,
-        coefficients.to(planes),
-        shifts,
-        matrix.communicator,
-        matrix.weights,
+        *matrix.parts, planes, coefficients.to(planes), shifts
     )
     return result
 
@@ -88,23 +81,23 @@ class _RationalProduct(torch.autograd.Function):
         factor: Tensor,
         scaling: Tensor,
         remainder: Tensor,
+        weights: Tensor | None,
+        communicator: Communicator,
         planes: Tensor,
         coefficients: Tensor,
         shifts: Tensor,
-        communicator: Communicator,
-        weights: Tensor | None,
     ) -> Tensor:
-        matrix = PixelMatrix(factor, scaling, remainder, communicator, weights)
+        matrix = PixelMatrix(factor, scaling, remainder, weights, communicator)
         inverses, ctx.communicator = matrix.capacitances(shifts), communicator
-        ctx.save_for_backward(factor, scaling, remainder, planes, coefficients, shifts, inverses, weights)
+        ctx.save_for_backward(factor, scaling, remainder, weights, planes, coefficients, shifts, inverses)
         return _product(matrix, planes, shifts, inverses, coefficients)
 
     @staticmethod
     @for_each_gradient
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-        factor, scaling, remainder, planes, coefficients, shifts, inverses, weights = ctx.saved_tensors
-        matrix = PixelMatrix(factor, scaling, remainder, ctx.communicator, weights)
+        factor, scaling, remainder, weights, planes, coefficients, shifts, inverses = ctx.saved_tensors
+        matrix = PixelMatrix(factor, scaling, remainder, weights, ctx.communicator)
         degree = coefficients.shape[1] - len(shifts) - 1
         parts = coefficients[:, :, None, None]
         terms, adjoints = _chebyshev(matrix, planes, degree), _adjoints(matrix.transpose, grad, parts, degree)
@@ -124,7 +117,7 @@ class _RationalProduct(torch.autograd.Function):
         grads: tuple[Tensor | None, ...] = (None, None, None)
         if left:
             grads = matrix.gradient(torch.cat(left, dim=1), torch.cat(right, dim=1))
-        return (*grads, grad_planes, torch.stack(grad_coefficients, dim=1), None, None, None)
+        return (*grads, None, None, grad_planes, torch.stack(grad_coefficients, dim=1), None)
 
 
 def _adjoints(matrix: PixelMatrix, grad: Tensor, coefficients: Tensor, degree: int) -> list[Tensor]:

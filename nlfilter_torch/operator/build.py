@@ -7,7 +7,6 @@ from typing import Any, Literal, cast
 import torch
 from torch import Tensor
 
-from nlfilter_torch.core.blocks import root_weighted
 from nlfilter_torch.core.checks import (
     check_counted,
     check_features,
@@ -33,7 +32,7 @@ from nlfilter_torch.operator.coverage import (
     sampled_points,
     share_above,
 )
-from nlfilter_torch.operator.eigenvalue_bound import exceeds, is_bounded, limiter, shifted_gram, slack
+from nlfilter_torch.operator.eigenvalue_bound import exceeds, is_bounded, limiter, slack
 from nlfilter_torch.operator.features import (
     GuideFeatures,
     bandwidth_of_rows,
@@ -55,6 +54,7 @@ from nlfilter_torch.operator.options import (
     SpatialBandwidth,
     bandwidths_of,
 )
+from nlfilter_torch.operator.pixel_matrix import PixelMatrix
 from nlfilter_torch.operator.scaling import KernelMatrix, PixelScaling
 from nlfilter_torch.operator.sinkhorn import (
     sinkhorn_balance,
@@ -457,7 +457,7 @@ def _assemble(
     factor, diagonal = matrix.factor, matrix.diagonal
     worst = float(residual.max()) if watched else 0.0
     remainder = scaling * (scaling * diagonal)  # in this order: without completion d^2 may overflow
-    gram = shifted_gram(factor, root_weighted(scaling, weights), remainder, communicator)
+    gram = PixelMatrix(factor, scaling, remainder, weights, communicator).gram_below
     allowed = slack(factor.dtype, worst)
     if watched and is_bounded(options.landmarks, points, count) and exceeds(gram, balancing.moment, allowed):
         limit = limiter(gram, matrix.moment(scaling), allowed)

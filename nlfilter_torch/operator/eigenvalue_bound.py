@@ -9,13 +9,10 @@ differs from W only in the directions whose eigenvalues of S exceed 1.
 """
 
 from collections.abc import Callable
-from functools import partial
 
 import torch
 from torch import Tensor
 
-from nlfilter_torch.core.communicator import Communicator
-from nlfilter_torch.core.kernels.grams import compute_grams
 from nlfilter_torch.core.matrix_function import SymmetricMatrix
 from nlfilter_torch.operator.options import Landmarks
 
@@ -24,7 +21,7 @@ SLACK = {torch.float32: 3e-5, torch.float64: 1e-9}
 MAX_STEPS = 12
 ALWAYS = 1 << 22  # elements of a factor; up to this size the bound takes a few milliseconds
 
-# Maps (x, k), x of shape (B,), to ``F (x I - R)^-k F^T``, (B, M, M) in float64.
+# ``F (x I - R)^-k F^T``, (B, M, M) in float64, for x of shape (B,) and k; see :meth:`PixelMatrix.gram_below`.
 ShiftedGram = Callable[[Tensor, int], Tensor]
 
 
@@ -36,23 +33,6 @@ def is_bounded(landmarks: Landmarks, pixels: int, num_landmarks: int) -> bool:
     Landmarks that are held or passed may lie anywhere.
     """
     return not isinstance(landmarks, str) or landmarks != "kmeans" or pixels * num_landmarks <= ALWAYS
-
-
-def shifted_gram(factor: Tensor, scaling: Tensor, remainder: Tensor, communicator: Communicator) -> ShiftedGram:
-    """Function that computes S for factor (B, M, N), d (B, N) and r (B, N) in memory; differentiable."""
-    return partial(_shifted_gram, factor, scaling, remainder, communicator)
-
-
-def _shifted_gram(
-    factor: Tensor, scaling: Tensor, remainder: Tensor, communicator: Communicator, at: Tensor, power: int
-) -> Tensor:
-    weights = shift(at, remainder).pow(-power / 2)
-    return communicator.sum(compute_grams(factor, (scaling * weights).to(factor), None, 1)[:, 0])
-
-
-def shift(at: Tensor, remainder: Tensor) -> Tensor:
-    """``x - r``, (B, N) in float64, clamped to at least 1e-9."""
-    return (at.unsqueeze(1) - remainder.double()).clamp(min=1e-9)
 
 
 def slack(dtype: torch.dtype, residual: float) -> float:

@@ -7,7 +7,7 @@ from typing import Self
 import torch
 from torch import Tensor
 
-from nlfilter_torch.core.blocks import fold_batch, root_weighted, unfold_batch, weighted
+from nlfilter_torch.core.blocks import fold_batch, unfold_batch, weighted
 from nlfilter_torch.core.checks import (
     check_count,
     check_features,
@@ -22,13 +22,12 @@ from nlfilter_torch.core.layouts import in_format_of
 from nlfilter_torch.core.precision import full_precision, trainable, uncompiled
 from nlfilter_torch.core.torch_internals import outside_transforms, refuse_transforms
 from nlfilter_torch.operator.assignment import Assignment
-from nlfilter_torch.operator.columns import Columns
 from nlfilter_torch.operator.coverage import SAMPLED, SampledRows, sampled_points
-from nlfilter_torch.operator.eigenvalue_bound import largest_eigenvalue, shifted_gram
+from nlfilter_torch.operator.eigenvalue_bound import largest_eigenvalue
 from nlfilter_torch.operator.features import GuideFeatures
 from nlfilter_torch.operator.nystrom import nystrom_factor
 from nlfilter_torch.operator.options import Completion
-from nlfilter_torch.operator.pixel_matrix import PixelMatrix
+from nlfilter_torch.operator.pixel_matrix import Columns, PixelMatrix
 from nlfilter_torch.operator.scaling import KernelMatrix, PixelScaling
 from nlfilter_torch.operator.spectrum import Spectrum, compute_spectrum
 
@@ -200,6 +199,11 @@ class NonlocalOperator(Batch):
         return self.kernel.assignment
 
     @property
+    def matrix(self) -> PixelMatrix:
+        """W of the points in a row: products with planes (B, C, N)."""
+        return PixelMatrix(self.factor, self.scaling, self.remainder, self.weights, self.communicator)
+
+    @property
     def shape(self) -> torch.Size:
         """Shape (B, N, N) of the matrices W; :attr:`size` is that of the images."""
         images, _, pixels = self.factor.shape
@@ -326,8 +330,7 @@ class NonlocalOperator(Batch):
         folded = fold_batch(trainable(image).to(self.factor), self.factor.shape[0])
         if folded.numel() == 0:  # an empty batch
             return image[:0].to(self.factor).unsqueeze(1).expand(-1, order, *image.shape[1:])
-        matrix = PixelMatrix(self.factor, self.scaling, self.remainder, self.communicator, self.weights)
-        return unfold_batch(matrix.powers(folded, order), image.shape[0], image.shape[2:])
+        return unfold_batch(self.matrix.powers(folded, order), image.shape[0], image.shape[2:])
 
     @property
     def diagonal_share(self) -> Tensor:
@@ -397,12 +400,11 @@ class NonlocalOperator(Batch):
         inner = self.communicator.sum(products)
         lengths = self.communicator.sum(images[0].double().square().flatten(1).sum(1))
         highest, lowest = (self.communicator.max((sign * self.remainder).amax(1)) for sign in (1, -1))
-        gram = shifted_gram(self.factor, root_weighted(self.scaling, self.weights), self.remainder, self.communicator)
         return Certificate(
             symmetry=((inner[:, 0] - inner[:, 1]).abs() / lengths.prod().sqrt()).tolist(),
             row_sums=self.communicator.max((self.row_sums() - 1).abs().flatten(1).amax(1)).tolist(),
             smallest_eigenvalue=(-lowest).tolist(),
-            largest_eigenvalue=largest_eigenvalue(gram, highest, self.factor.dtype).tolist(),
+            largest_eigenvalue=largest_eigenvalue(self.matrix.gram_below, highest, self.factor.dtype).tolist(),
         )
 
     @full_precision

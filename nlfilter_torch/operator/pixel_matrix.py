@@ -3,6 +3,10 @@
 With ``W = D U^T U D Omega + R`` (scaling D, weights Omega of the points, diagonal part R), the identity of Woodbury
 gives ``(W + t I)^-1 y = (R + t)^-1 (y - D U^T C^-1 U D Omega (R + t)^-1 y)`` with the M x M matrix
 ``C = I + U D^2 Omega (R + t)^-1 U^T``: one Gram matrix and two reads of the factor, without iteration.
+
+Products, powers and solutions all have one form: sums over the points, a small matrix, and a spread of the result. The
+sums of :class:`Columns` are those over a block, such as a tile, and are added up; those of :class:`PixelMatrix` are
+over all points.
 """
 
 from dataclasses import dataclass, replace
@@ -12,36 +16,114 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.core.blocks import root_weighted, weighted
-from nlfilter_torch.core.communicator import Communicator
-from nlfilter_torch.core.kernels.grams import compute_grams
+from nlfilter_torch.core.communicator import ALONE, Communicator
+from nlfilter_torch.core.kernels.grams import compute_grams, sum_grams
 from nlfilter_torch.core.kernels.tall_skinny import moment, spread
 from nlfilter_torch.core.low_rank import outer_product
 from nlfilter_torch.core.precision import once_differentiable
 from nlfilter_torch.core.torch_internals import for_each_gradient, in_transform, is_hidden
 
 SMALL = 1 << 17  # pixels up to which Gram matrices are summed in float64 throughout
+LEAST_APART = 1e-9  # of the smallest difference from r
 ROWS = 8  # images in one product; the kernels in C are fastest for at most so many
 
 
 @dataclass(frozen=True, eq=False)
-class PixelMatrix:
-    """W, or its transpose, for planes (B, C, N).
+class Columns:
+    """The columns of some points: ``W_ij = d_i u_i . u_j d_j w_j``, plus r_i where i = j.
+
+    A block of the sums over points that products with W and functions of it consist of; F is factor diag(d).
 
     Attributes:
-        factor: U, (B, M, N).
-        scaling: d, (B, N).
-        remainder: r, (B, N).
-        communicator: ranks that the points are distributed over.
-        weights: number of pixels that each point represents, (B, N), or None.
-        transposed: whether it is the transpose of W, which differs if there are weights.
+        factor: u, (B, M, n).
+        scaling: d, (B, n).
+        remainder: r, (B, n).
+        weights: w, the number of pixels that each point represents, (B, n); None means one each.
     """
 
     factor: Tensor
     scaling: Tensor
     remainder: Tensor
-    communicator: Communicator
     weights: Tensor | None = None
+
+    @property
+    def mass(self) -> Tensor:
+        """Coefficients (B, n) of sums over points, d w."""
+        return weighted(self.scaling, self.weights)
+
+    def sums(self, planes: Tensor) -> Tensor:
+        """``F diag(w) y`` over the points for planes y (B, C, n): (B, M, C) in float64."""
+        return moment(self.factor, self.mass.unsqueeze(1) * planes)
+
+    def spread(self, sums: Tensor) -> Tensor:
+        """``F^T c``, (B, C, n), from sums c over all points, (B, M, C)."""
+        return spread(sums.mT.to(self.factor), self.factor, self.scaling)
+
+    def powers_of(self, planes: Tensor, smooth: Tensor) -> list[Tensor]:
+        """``y, W y, ..., W^k y`` for planes y (B, C, n).
+
+        ``smooth`` (B, k, C, n) is ``F^T`` times the sums of all but the last over all points.
+        """
+        powers = [planes]
+        for part in smooth.unbind(1):
+            powers.append(torch.addcmul(part, self.remainder.unsqueeze(1), powers[-1]))
+        return powers
+
+    def spread_each(self, sums: Tensor) -> Tensor:
+        """:meth:`spread` of sums (B, k, M, C) in one read of the factor, (B, k, C, n)."""
+        return self.spread(sums.transpose(1, 2).flatten(2)).unflatten(1, (sums.shape[1], sums.shape[3]))
+
+    def grams(self, count: int) -> Tensor:
+        """``F diag(w r^j) F^T`` over the points for j = 0 to count - 1, (B, J, M, M) in float64."""
+        return sum_grams(self.factor, root_weighted(self.scaling, self.weights), self.remainder, count)
+
+    def gram_below(self, at: Tensor, power: int) -> Tensor:
+        """``F diag(w) (x I - R)^-k F^T`` over the points for x (B,) above every r, and k: (B, M, M) in float64."""
+        apart = (at.unsqueeze(1) - self.remainder.double()).clamp(min=LEAST_APART)
+        scaling = root_weighted(self.scaling, self.weights) * apart.pow(-power / 2)
+        return compute_grams(self.factor, scaling.to(self.factor), None, 1)[:, 0]
+
+    def shifted_grams(self, shifts: Tensor, *, exact: bool) -> Tensor:
+        """``F diag(w) (R + t_j)^-1 F^T`` over the points for shifts t (J,), (B, J, M, M) in float64."""
+        scaling = root_weighted(self.scaling, self.weights)
+        roots = ((self.remainder + shift).rsqrt() for shift in shifts.to(self.remainder).unbind())
+        grams = [compute_grams(self.factor, scaling * root, None, 1, exact=exact)[:, 0] for root in roots]
+        return torch.stack(grams, dim=1)
+
+    def lowered(self, shifts: Tensor) -> Tensor:
+        """``t_j / (r + t_j)`` for shifts t, (B, J, 1, n)."""
+        shifts = shifts.to(self.remainder).view(1, -1, 1, 1)
+        return shifts / (self.remainder[:, None, None] + shifts)
+
+    def shifted_sums(self, planes: Tensor, shifts: Tensor) -> Tensor:
+        """``F diag(w) (R + t_j)^-1 y`` over the points for planes y (B, C, n), (B, J, M, C) in float64."""
+        sums = self.sums((self.lowered(shifts) * planes.unsqueeze(1)).flatten(1, 2)).unflatten(2, (len(shifts), -1))
+        return sums.transpose(1, 2) / shifts.double().view(1, -1, 1, 1)
+
+    def shifted_solutions(self, planes: Tensor, shifts: Tensor, inner: Tensor) -> Tensor:
+        """``t_j (W + t_j I)^-1 y``, (B, J, C, n), for planes y (B, C, n).
+
+        ``inner`` (B, J, M, C) are the :meth:`shifted_sums` of all points, times the inverses of C.
+        """
+        return self.lowered(shifts) * (planes.unsqueeze(1) - self.spread_each(inner))
+
+
+@dataclass(frozen=True, eq=False)
+class PixelMatrix(Columns):
+    """W, or its transpose, for planes (B, C, N): the columns of all points, or of those of this rank.
+
+    Attributes:
+        communicator: ranks that the points are distributed over.
+        transposed: whether it is the transpose of W, which differs if there are weights.
+    """
+
+    communicator: Communicator = ALONE
     transposed: bool = False
+
+    @property
+    def parts(self) -> tuple[Tensor, Tensor, Tensor, Tensor | None, Communicator]:
+        """What W is made of."""
+        return self.factor, self.scaling, self.remainder, self.weights, self.communicator
 
     @property
     def transpose(self) -> "PixelMatrix":
@@ -53,24 +135,26 @@ class PixelMatrix:
         """Whether W is to be differentiated."""
         return torch.is_grad_enabled() and any(t.requires_grad for t in (self.factor, self.scaling, self.remainder))
 
-    def _sums(self, planes: Tensor) -> Tensor:
-        """Sums over points on the right of the product, (B, M, C) in float64."""
-        scaling = self.scaling.unsqueeze(1)
-        mass = scaling if self.transposed else weighted(scaling, self.weights)
-        return self.communicator.sum(moment(self.factor, mass * planes))
+    @property
+    def mass(self) -> Tensor:
+        """Coefficients (B, N) of sums on the right of the product."""
+        return self.scaling if self.transposed else super().mass
 
-    def _spread(self, sums: Tensor) -> Tensor:
+    def sums(self, planes: Tensor) -> Tensor:
+        """Sums over all points on the right of the product, (B, M, C) in float64."""
+        return self.communicator.sum(super().sums(planes))
+
+    def spread(self, sums: Tensor) -> Tensor:
         """Planes (B, C, N) on the left of the product, from sums (B, M, C)."""
-        scaling = weighted(self.scaling, self.weights) if self.transposed else self.scaling
-        return spread(sums.mT.to(self.factor), self.factor, scaling)
+        return weighted(super().spread(sums), self.weights) if self.transposed else super().spread(sums)
+
+    def gram_below(self, at: Tensor, power: int) -> Tensor:
+        """:meth:`Columns.gram_below` over all points."""
+        return self.communicator.sum(super().gram_below(at, power))
 
     def product(self, planes: Tensor) -> Tensor:
         """``W y`` for planes y, (B, C, N)."""
-        return self._product(planes, self._sums(planes))
-
-    def _product(self, planes: Tensor, sums: Tensor) -> Tensor:
-        """:meth:`product`, from the sums of the planes."""
-        return torch.addcmul(self._spread(sums), self.remainder.unsqueeze(1), planes)
+        return torch.addcmul(self.spread(self.sums(planes)), self.remainder.unsqueeze(1), planes)
 
     def powers(self, planes: Tensor, order: int) -> Tensor:
         """``W y, W^2 y, ..., W^k y``, (B, k, C, N), for planes y, (B, C, N); of W itself, not of its transpose.
@@ -79,33 +163,25 @@ class PixelMatrix:
         also in forward mode.
         """
         if self.needs_gradient and not in_transform():  # which needs ordinary operations
-            parts = self.factor, self.scaling, self.remainder
-            result: Tensor = _Powers.apply(*parts, self.communicator, self.weights, planes, order)  # type: ignore[no-untyped-call]
+            result: Tensor = _Powers.apply(*self.parts, planes, order)  # type: ignore[no-untyped-call]
             return result
-        return torch.stack(self.powers_and_sums(planes, order)[0][1:], dim=1)
+        return torch.stack(self.powers_in_order(planes, order)[1:], dim=1)
 
-    def powers_and_sums(self, planes: Tensor, order: int) -> tuple[list[Tensor], list[Tensor]]:
-        """The k + 1 planes ``y, ..., W^k y``, and the sums (B, M, C) of all but the last, as ordinary operations."""
-        images, sums = [planes], []
+    def powers_in_order(self, planes: Tensor, order: int) -> list[Tensor]:
+        """The k + 1 planes ``y, ..., W^k y``, as ordinary operations."""
+        images = [planes]
         for _ in range(order):
-            sums.append(self._sums(images[-1]).to(self.factor))
-            images.append(self._product(images[-1], sums[-1]))
-        return images, sums
+            images.append(self.product(images[-1]))
+        return images
 
+    @torch.no_grad()
     def capacitances(self, shifts: Tensor) -> Tensor:
         """Inverses of C for positive shifts (J,), (B, J, M, M) in float64; without a gradient."""
-        batch, landmarks, _ = self.factor.shape
+        batch, landmarks, pixels = self.factor.shape
         if len(shifts) == 0:
             return self.factor.new_empty(batch, 0, landmarks, landmarks, dtype=torch.float64)
-        with torch.no_grad():
-            return torch.stack([self._capacitance(shift) for shift in shifts.to(self.remainder).unbind()], dim=1)
-
-    def _capacitance(self, shift: Tensor) -> Tensor:
-        """Inverse of C for one shift, (B, M, M)."""
-        factor, scaling = self.factor.detach(), root_weighted(self.scaling.detach(), self.weights)
-        exact = sums_exactly(factor.dtype, factor.shape[2])
-        gram = self.communicator.sum(shifted_gram(factor, scaling, self.remainder.detach(), shift, exact=exact))
-        return capacitance_inverse(gram)
+        grams = self.shifted_grams(shifts, exact=sums_exactly(self.factor.dtype, pixels))
+        return torch.stack([capacitance_inverse(self.communicator.sum(gram)) for gram in grams.unbind(1)], dim=1)
 
     def solve(self, planes: Tensor, shifts: Tensor, capacitances: Tensor) -> Tensor:
         """``t_j (W + t_j I)^-1 y`` for all shifts, (B, J, C, N), for planes y (B, C, N).
@@ -115,18 +191,12 @@ class PixelMatrix:
             shifts: t, (J,).
             capacitances: those of the shifts, (B, J, M, M).
         """
-        step = max(1, ROWS // planes.shape[1])
-        parts = zip(shifts.to(self.remainder).split(step), capacitances.split(step, dim=1), strict=True)
-        return torch.cat([self._solve(planes, part, inverses) for part, inverses in parts], dim=1)
-
-    def _solve(self, planes: Tensor, shifts: Tensor, inverses: Tensor) -> Tensor:
-        """:meth:`solve` for a few shifts, with one read of the factor in each direction."""
-        count, channels = len(shifts), planes.shape[1]
-        lowered = shifted_remainder(self.remainder, shifts)
-        sums = self._sums((lowered * planes.unsqueeze(1)).flatten(1, 2))  # (B, M, J C)
-        sums = inverses @ sums.unflatten(2, (count, channels)).transpose(1, 2) / shifts.double().view(1, -1, 1, 1)
-        smooth = self._spread(sums.transpose(1, 2).flatten(2)).unflatten(1, (count, channels))
-        return lowered * (planes.unsqueeze(1) - smooth)
+        step = max(1, ROWS // planes.shape[1])  # a few shifts with one read of the factor in each direction
+        parts = zip(shifts.split(step), capacitances.split(step, dim=1), strict=True)
+        solutions = [
+            self.shifted_solutions(planes, part, inverses @ self.shifted_sums(planes, part)) for part, inverses in parts
+        ]
+        return torch.cat(solutions, dim=1)
 
     def gradient(self, left: Tensor, right: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Gradient of ``sum_k left_k^T W right_k`` for planes (B, K, N): those of factor, scaling and remainder.
@@ -146,52 +216,35 @@ class _Powers(torch.autograd.Function):
     """Powers of W with a single matrix product as gradient of the factor; autograd would form 2k full matrices.
 
     With ``P_i = W P_(i-1)`` and, backwards, ``A_(i-1) = G_(i-1) + W^T A_i``, the loss changes by ``sum_i A_i^T dW
-    P_(i-1)``. Weights multiply the columns of W.
+    P_(i-1)``.
     """
 
     @staticmethod
     def forward(ctx: Any, *arguments: Any) -> Tensor:
-        *parts, planes, order = arguments
-        images, moments = PixelMatrix(*parts).powers_and_sums(planes, order)
-        factor, scaling, remainder, ctx.communicator, weights = parts
-        ctx.save_for_backward(factor, scaling, remainder, weights, *images, *moments)
+        factor, scaling, remainder, weights, ctx.communicator, planes, order = arguments
+        matrix = PixelMatrix(factor, scaling, remainder, weights, ctx.communicator)
+        images = matrix.powers_in_order(planes, order)
+        ctx.save_for_backward(factor, scaling, remainder, weights, *images[:-1])
         return torch.stack(images[1:], dim=1)
 
     @staticmethod
     @for_each_gradient
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-        factor, scaling, remainder, weights, *rest = ctx.saved_tensors
-        order = len(rest) // 2
-        images, moments = rest[: order + 1], rest[order + 1 :]
-        d, r = scaling.unsqueeze(1), remainder.unsqueeze(1)
-        grad_scaling, grad_remainder = torch.zeros_like(scaling), torch.zeros_like(remainder)
-        left, right = [], []  # columns (B, M, C) and rows (B, C, N) whose product is the gradient of the factor
+        factor, scaling, remainder, weights, *images = ctx.saved_tensors
+        matrix = PixelMatrix(factor, scaling, remainder, weights, ctx.communicator)
+        adjoints: list[Tensor] = []
         adjoint = torch.zeros_like(images[0])
-        for i in range(order, 0, -1):
-            adjoint = adjoint + grad[:, i - 1]
-            before = images[i - 1]
-            total = ctx.communicator.sum(moment(factor, d * adjoint)).to(factor)
-            affinity = spread(total.mT, factor)  # the image of the adjoint, before scaling
-            summed = weighted(before, weights)
-            # The scaling multiplies the factor on both sides; each side contributes a product with the other.
-            grad_scaling += (adjoint * spread(moments[i - 1].mT, factor) + summed * affinity).sum(1)
-            grad_remainder += (adjoint * before).sum(1)
-            left += [moments[i - 1], total]
-            right += [d * adjoint, d * summed]
-            adjoint = weighted(d * affinity, weights) + r * adjoint
-        grad_factor = outer_product(torch.cat(left, dim=2), torch.cat(right, dim=1))
-        return grad_factor, grad_scaling, grad_remainder, None, None, adjoint, None
+        for gradient in grad.flip(1).unbind(1):
+            adjoints.append(adjoint + gradient)
+            adjoint = matrix.transpose.product(adjoints[-1])
+        gradients = matrix.gradient(torch.cat(adjoints, dim=1), torch.cat(images[::-1], dim=1))
+        return *gradients, None, None, adjoint, None
 
 
 def sums_exactly(dtype: torch.dtype, pixels: int) -> bool:
     """Whether Gram matrices of so many pixels are summed in float64."""
     return dtype == torch.float32 and pixels <= SMALL
-
-
-def shifted_gram(factor: Tensor, scaling: Tensor, remainder: Tensor, shift: Tensor, *, exact: bool) -> Tensor:
-    """``U D^2 (R + t)^-1 U^T`` for a shift t, (B, M, M) in float64."""
-    return compute_grams(factor, scaling * (remainder + shift).rsqrt(), None, 1, exact=exact)[:, 0]
 
 
 def capacitance_inverse(gram: Tensor) -> Tensor:
@@ -204,8 +257,3 @@ def capacitance_inverse(gram: Tensor) -> Tensor:
     # Rounding may leave a Gram matrix with negative eigenvalues, if the shift is far below the largest eigenvalue.
     values, vectors = torch.linalg.eigh((gram + gram.mT) / 2)
     return (vectors / (1 + values.clamp(min=0.0)).unsqueeze(-2)) @ vectors.mT
-
-
-def shifted_remainder(remainder: Tensor, shifts: Tensor) -> Tensor:
-    """``t_j / (r + t_j)`` for shifts t, (B, J, 1, N)."""
-    return shifts.view(1, -1, 1, 1) / (remainder[:, None, None] + shifts.view(1, -1, 1, 1))

@@ -28,13 +28,14 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.core.blocks import SWEPT, pixel_blocks, weighted
-from nlfilter_torch.core.communicator import ALONE, Communicator
+from nlfilter_torch.core.communicator import Communicator
 from nlfilter_torch.core.kernels.tall_skinny import gather, spread
 from nlfilter_torch.core.low_rank import outer_product
 from nlfilter_torch.core.precision import once_differentiable
 from nlfilter_torch.core.torch_internals import for_each_gradient, is_hidden, register
 from nlfilter_torch.core.warning import warn
-from nlfilter_torch.operator.eigenvalue_bound import ALWAYS, exceeds, shifted_gram, slack
+from nlfilter_torch.operator.eigenvalue_bound import ALWAYS, exceeds, slack
+from nlfilter_torch.operator.pixel_matrix import PixelMatrix
 from nlfilter_torch.operator.scaling import (
     Balancing,
     KernelMatrix,
@@ -261,8 +262,8 @@ def sinkhorn(
     result, removed = balanced_in_rounds(KernelMatrix(factor, diagonal), tolerance, completed)
     if not is_hidden(factor) and (bound or factor.shape[1] * factor.shape[2] <= ALWAYS):
         remainder = result.scaling * (result.scaling * result.matrix.diagonal)
-        gram = shifted_gram(result.matrix.factor, result.scaling, remainder, ALONE)
-        if exceeds(gram, result.moment, slack(factor.dtype, float(result.residual.max()))):
+        balanced = PixelMatrix(result.matrix.factor, result.scaling, remainder)
+        if exceeds(balanced.gram_below, result.moment, slack(factor.dtype, float(result.residual.max()))):
             warn("eigenvalues exceed 1, which compiled programs do not correct; use landmarks='kmeans'")
     moments = [*result.before, *[result.moment] * (MOST_ROUNDS + 1 - len(result.before))]
     removed = torch.zeros_like(diagonal, dtype=torch.bool) if removed is None else removed

@@ -23,7 +23,7 @@ from nlfilter_torch.core.kernels.tall_skinny import moment, spread
 from nlfilter_torch.core.matrix_function import SymmetricMatrix
 from nlfilter_torch.core.precision import full_precision, trainable
 from nlfilter_torch.core.torch_internals import is_hidden
-from nlfilter_torch.operator.columns import Columns
+from nlfilter_torch.operator.pixel_matrix import Columns
 
 # Eigenvalues of G below this, relative to the largest, are rounding errors.
 CUT = {torch.float32: 1e-5, torch.float64: 1e-9}

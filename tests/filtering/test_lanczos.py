@@ -12,7 +12,7 @@ from tests.problems import noise, picture
 def matrix(batch: int = 1) -> PixelMatrix:
     guide = torch.cat([picture(name, 20, 24) for name in ("camera", "coffee")])[:batch]
     operator = nonlocal_operator(guide, num_landmarks=30, photometric_bandwidth=0.1)
-    return PixelMatrix(operator.factor, operator.scaling, operator.remainder, operator.communicator)
+    return operator.matrix
 
 
 def dense_of(matrix: PixelMatrix) -> torch.Tensor:
@@ -23,7 +23,7 @@ def dense_of(matrix: PixelMatrix) -> torch.Tensor:
 def test_the_basis_is_orthonormal_and_w_is_tridiagonal_in_it() -> None:
     for weights in (None, noise(1, 30, seed=3) + 0.3):
         operator = operator_from_features(noise(1, 2, 30), size=(30,), num_landmarks=8, weights=weights)
-        w = PixelMatrix(operator.factor, operator.scaling, operator.remainder, operator.communicator, operator.weights)
+        w = operator.matrix
         iteration = Lanczos(w, noise(1, 2, 30, seed=1))
         iteration.extend(4)
         iteration.extend(3)
@@ -72,7 +72,7 @@ def test_gradients(weighted: bool) -> None:
     def product(features: torch.Tensor, planes: torch.Tensor, step: torch.Tensor) -> torch.Tensor:
         operator = operator_from_features(features, size=(20,), num_landmarks=6, weights=weights, landmarks="uniform")
         parts = operator.factor, operator.scaling, operator.remainder
-        w = PixelMatrix(*parts, operator.communicator, weights)
+        w = PixelMatrix(*parts, weights)
 
         def response(values: torch.Tensor) -> torch.Tensor:
             return (values - step).relu() + step * values

@@ -18,7 +18,7 @@ def product(guide: Tensor, planes: Tensor, coefficients: Tensor, degree: int, po
     operator = nonlocal_operator(guide, num_landmarks=7, photometric_bandwidth=0.4, landmarks="uniform")
     parts = operator.factor, operator.scaling, operator.remainder
     form = rational_form(6, degree, poles, 1.0, 0.15)
-    return rational_product(PixelMatrix(*parts, operator.communicator), planes, form, coefficients)
+    return rational_product(PixelMatrix(*parts), planes, form, coefficients)
 
 
 @pytest.mark.parametrize(("degree", "poles"), FORMS)
@@ -51,6 +51,6 @@ def test_second_derivatives_for_a_fixed_operator() -> None:
 def test_poles_are_weighed_after_their_systems_are_solved() -> None:
     operator = nonlocal_operator(GUIDE, num_landmarks=7, photometric_bandwidth=0.4, landmarks="uniform")
     planes, weights, form = noise(2, 3, 30, seed=1), noise(2, 5, seed=2), rational_form(6, 0, 4, 1.0, 0.15)
-    matrix = PixelMatrix(operator.factor, operator.scaling, operator.remainder, operator.communicator)
+    matrix = operator.matrix
     result = weigh_poles(planes, pole_terms(matrix, planes, form), weights)
     torch.testing.assert_close(result, rational_product(matrix, planes, form, weights))

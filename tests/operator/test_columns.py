@@ -7,7 +7,7 @@ from nlfilter_torch import (
     nonlocal_operator,
     operator_from_features,
 )
-from nlfilter_torch.operator.columns import Columns
+from nlfilter_torch.operator.pixel_matrix import Columns
 from tests.problems import noise, picture, seeded
 
 

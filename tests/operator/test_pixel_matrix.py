@@ -23,7 +23,7 @@ def built(weighted: bool, batch: int = 2) -> NonlocalOperator:
 
 def matrix_of(operator: NonlocalOperator) -> PixelMatrix:
     parts = operator.factor, operator.scaling, operator.remainder
-    return PixelMatrix(*parts, operator.communicator, operator.weights)
+    return PixelMatrix(*parts, operator.weights, operator.communicator)
 
 
 @pytest.mark.parametrize("weighted", [False, True])
@@ -57,7 +57,7 @@ def test_a_gram_matrix_with_rounding_errors_is_solved() -> None:
     factor = noise(1, 4, 300).float()
     factor[:, 1] = factor[:, 0]
     scaling, remainder = torch.full((1, 300), 0.05), torch.zeros(1, 300)
-    matrix = PixelMatrix(factor, scaling, remainder, built(False).communicator)
+    matrix = PixelMatrix(factor, scaling, remainder)
     inverses = matrix.capacitances(torch.tensor([1e-12]))
     assert inverses.isfinite().all()
     assert matrix.solve(noise(1, 1, 300).float(), torch.tensor([1e-12]), inverses).abs().max() < 2
@@ -67,7 +67,7 @@ def test_a_gram_matrix_with_rounding_errors_is_solved() -> None:
 def test_the_gradient_is_that_of_autograd(weighted: bool) -> None:
     operator, (left, right) = built(weighted), noise(2, 2, 3, 30, seed=2)
     parts = [t.detach().clone().requires_grad_() for t in (operator.factor, operator.scaling, operator.remainder)]
-    matrix = PixelMatrix(*parts, operator.communicator, operator.weights)
+    matrix = PixelMatrix(*parts, operator.weights, operator.communicator)
     assert matrix.needs_gradient
     (left * matrix.product(right)).sum().backward()
     with torch.no_grad():

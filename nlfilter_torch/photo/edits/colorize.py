@@ -28,9 +28,9 @@ from nlfilter_torch.core.checks import check_count, check_patch_size, check_posi
 from nlfilter_torch.core.precision import per_image, squarable
 from nlfilter_torch.filtering.masks import segment
 from nlfilter_torch.filtering.scribbles import fit_strokes
-from nlfilter_torch.operator.columns import Columns
 from nlfilter_torch.operator.features import reduce_channels
 from nlfilter_torch.operator.options import FilterOptions
+from nlfilter_torch.operator.pixel_matrix import Columns
 from nlfilter_torch.operator.spectrum import Spectrum
 from nlfilter_torch.photo.declared.declaration import Edit
 from nlfilter_torch.photo.declared.parameters import COLORIZE

@@ -29,7 +29,7 @@ from nlfilter_torch.photo.picture.drawn import Drawn
 from nlfilter_torch.photo.picture.pictures import Picture
 from nlfilter_torch.photo.picture.sampling import CHUNK, ColumnCache, GuidePicture, Pilot
 from nlfilter_torch.photo.picture.source import Fitted, Guide, Planes, Source, seeded
-from nlfilter_torch.photo.picture.statistics import Block, ShiftedSums, Sums
+from nlfilter_torch.photo.picture.statistics import Block, Sums
 from nlfilter_torch.photo.picture.tiled import Tiled
 from nlfilter_torch.photo.picture.tiled_operator import TiledOperator, first_plane
 from nlfilter_torch.photo.picture.tiles import Passes
@@ -79,7 +79,7 @@ class FrameOperator(TiledOperator):
 
     def _pairs_of_references(self) -> RitzPairs:
         sums = self._sums_of_references(first_plane, 1)
-        return RitzPairs.of_sums(sums.grams[:, :2], sums.dtype)
+        return RitzPairs.of_sums(sums.grams[:, :2], self.guide.dtype)
 
     def sums(self, planes: Planes, order: int) -> Sums:
         """The sums over the references for the first ``order`` powers of W."""
@@ -88,11 +88,11 @@ class FrameOperator(TiledOperator):
     def _sums_of_references(self, planes: Planes, order: int) -> Sums:
         return self._summed_up(planes, order, self.over("Summing up"))
 
-    def shifted_sums(self, planes: Planes, shifts: Tensor) -> ShiftedSums:
+    def shifted_inner(self, planes: Planes, shifts: Tensor) -> Tensor:
         """The sums over the references for shifted systems."""
         return self.frame.cached_result(partial(self._shifted_of_references, planes, shifts))
 
-    def _shifted_of_references(self, planes: Planes, shifts: Tensor) -> ShiftedSums:
+    def _shifted_of_references(self, planes: Planes, shifts: Tensor) -> Tensor:
         return self._shifted(planes, shifts, self.over("Summing up"))
 
     def mean(self, planes: Planes) -> Tensor:

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from nlfilter_torch.core.kernels.tall_skinny import spread
 from nlfilter_torch.filtering.filters import residual_change, weigh_layers
-from nlfilter_torch.operator.columns import Columns
+from nlfilter_torch.operator.pixel_matrix import Columns
 from nlfilter_torch.operator.spectrum import Response
 from nlfilter_torch.photo.picture.source import Operator, Pixels, Planes
 

@@ -16,10 +16,9 @@ from nlfilter_torch.filtering.filters import detail_layers
 from nlfilter_torch.filtering.rational_product import pole_terms, rational_product, weigh_poles
 from nlfilter_torch.filtering.scribbles import check_painted
 from nlfilter_torch.operator.build import operator_from_guide
-from nlfilter_torch.operator.columns import Columns
 from nlfilter_torch.operator.hidden import fill_nearby
 from nlfilter_torch.operator.operator import NonlocalOperator
-from nlfilter_torch.operator.pixel_matrix import PixelMatrix
+from nlfilter_torch.operator.pixel_matrix import Columns
 from nlfilter_torch.operator.spectrum import RitzPairs, Spectrum
 from nlfilter_torch.photo.declared.declaration import Arguments
 from nlfilter_torch.photo.picture.drawn import Drawn, M
@@ -255,7 +254,7 @@ class InMemoryOperator:
 
     def of_columns(self, function: Callable[[Columns], Tensor]) -> Planes:
         """Apply a function to the columns of all pixels."""
-        planes = function(Columns(self.operator.factor, self.operator.scaling, self.operator.remainder))
+        planes = function(self.operator.matrix)
         return part_of(planes.unflatten(2, self.source.size))
 
     def layers(self, planes: Planes, order: int) -> Planes:
@@ -272,9 +271,7 @@ class InMemoryOperator:
     def rational(self, planes: Planes, form: RationalForm, weights: Tensor) -> Planes:
         """Compute :func:`rational_product`; with a cache, other weights take little time."""
         values, operator = planes(self.source).flatten(2), self.operator
-        matrix = PixelMatrix(
-            operator.factor, operator.scaling, operator.remainder, operator.communicator, operator.weights
-        )
+        matrix = operator.matrix
         if matrix.needs_gradient:
             result = rational_product(matrix, values, form, weights)
         else:

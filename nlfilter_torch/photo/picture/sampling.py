@@ -16,7 +16,6 @@ from torch import Tensor
 from nlfilter_torch.core.blocks import stratified
 from nlfilter_torch.core.workers import in_order, single_threaded
 from nlfilter_torch.operator.assignment import Layout
-from nlfilter_torch.operator.columns import Columns
 from nlfilter_torch.operator.features import (
     GuideFeatures,
     bandwidth_of_gradient,
@@ -39,6 +38,7 @@ from nlfilter_torch.operator.orientation import (
     source_pixels,
     stretched_sums,
 )
+from nlfilter_torch.operator.pixel_matrix import Columns
 from nlfilter_torch.operator.scaling import Result
 from nlfilter_torch.operator.sinkhorn import solve, warn_of_residual
 from nlfilter_torch.photo.picture.counted import CountedPixels

@@ -19,7 +19,7 @@ from nlfilter_torch.core.checks import FAR_OUTSIDE
 from nlfilter_torch.core.inner import Inner
 from nlfilter_torch.core.rational import RationalForm
 from nlfilter_torch.core.torch_internals import is_unreadable
-from nlfilter_torch.operator.columns import Columns
+from nlfilter_torch.operator.pixel_matrix import Columns
 from nlfilter_torch.operator.spectrum import RitzPairs
 from nlfilter_torch.photo.picture.drawn import M
 from nlfilter_torch.photo.picture.pixels import Fitted, Pixels, Planes

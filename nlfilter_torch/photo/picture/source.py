@@ -17,9 +17,9 @@ from nlfilter_torch.core.blocks import symmetric_places
 from nlfilter_torch.core.inner import Inner
 from nlfilter_torch.core.kernels.grams import compute_grams
 from nlfilter_torch.core.rational import RationalForm
-from nlfilter_torch.operator.columns import Columns
 from nlfilter_torch.operator.features import blur, blur_margin, reduce_channels
 from nlfilter_torch.operator.options import FilterOptions
+from nlfilter_torch.operator.pixel_matrix import Columns
 from nlfilter_torch.operator.spectrum import RitzPairs
 from nlfilter_torch.photo.picture.drawn import M
 from nlfilter_torch.photo.picture.pixels import Fitted as Fitted

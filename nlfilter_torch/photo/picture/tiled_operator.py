@@ -7,17 +7,16 @@ from functools import cached_property, partial
 import torch
 from torch import Tensor
 
-from nlfilter_torch.core.kernels.tall_skinny import spread
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.core.rational import RationalForm
 from nlfilter_torch.core.workers import in_order
 from nlfilter_torch.filtering.filters import layers_of_columns
 from nlfilter_torch.filtering.rational_product import weigh_poles
-from nlfilter_torch.operator.columns import Columns
+from nlfilter_torch.operator.eigenvalue_bound import exceeds, limiter, slack
 from nlfilter_torch.operator.features import reduce_channels
 from nlfilter_torch.operator.operator import Kernel
-from nlfilter_torch.operator.pixel_matrix import shifted_remainder, sums_exactly
-from nlfilter_torch.operator.scaling import Pass, PixelScaling, Result
+from nlfilter_torch.operator.pixel_matrix import Columns, capacitance_inverse, sums_exactly
+from nlfilter_torch.operator.scaling import Pass, PixelScaling, summed
 from nlfilter_torch.operator.spectrum import RitzPairs
 from nlfilter_torch.photo.picture import sampling
 from nlfilter_torch.photo.picture.pictures import Tile
@@ -34,19 +33,7 @@ from nlfilter_torch.photo.picture.sampling import (
     visit,
 )
 from nlfilter_torch.photo.picture.source import SAMPLE, Blocks, Pixels, Planes, sampled_pairs, sampled_places
-from nlfilter_torch.photo.picture.statistics import (
-    CONVERGED,
-    Block,
-    Guess,
-    ShiftedSums,
-    ShiftedTerms,
-    Sums,
-    Totals,
-    balance_by_passes,
-    limiter_by_passes,
-    sum_up,
-    sum_up_shifted,
-)
+from nlfilter_torch.photo.picture.statistics import CONVERGED, Block, Guess, Sums, balance_by_passes, sums_of_powers
 
 SAMPLE_BLOCKS = 8  # blocks that a sample is split into, to be shared among workers
 
@@ -183,42 +170,11 @@ class RationalPlanes:
 
     def __call__(self, pixels: Pixels) -> Tensor:
         """The planes (1, C, h, W) at the pixels."""
-        image, columns = self.planes(pixels), with_columns(pixels).columns(self.operator)
-        planes, inner = image.flatten(2), self.inner.to(columns.factor)
-        rows = inner.transpose(2, 3).flatten(1, 2)  # (1, J C, M)
-        smooth = spread(rows, columns.factor, columns.scaling).unflatten(1, (len(self.shifts), -1))
-        lowered = shifted_remainder(columns.remainder, self.shifts.to(planes))
-        result = weigh_poles(planes, lowered * (planes.unsqueeze(1) - smooth), self.weights)
-        return result.unflatten(2, image.shape[-2:])
-
-
-@dataclass(frozen=True)
-class PassOverBlocks:
-    """A pass over blocks in memory."""
-
-    blocks: list[Block]
-    workers: int
-
-    def __call__(self, function: Callable[[Block], Result]) -> Iterator[Result]:
-        """Apply a function to each block, and yield the results in order."""
-        return in_order(function, self.blocks, self.workers)
-
-
-@dataclass(frozen=True)
-class SampleDraw:
-    """Draws the sample of a block, and computes the sums over all its pixels at a guess."""
-
-    guess: Guess
-    draws: Draws
-
-    def __call__(self, block: Block) -> tuple[Block, Totals]:
-        """The drawn pixels, and the sums."""
-        columns, totals = self.guess.totals(block)
-        return self.draws(block, columns), totals
-
-    def totals(self, block: Block) -> Totals:
-        """The sums alone."""
-        return self.guess.totals(block)[1]
+        image = self.planes(pixels)
+        solutions = (
+            with_columns(pixels).columns(self.operator).shifted_solutions(image.flatten(2), self.shifts, self.inner)
+        )
+        return weigh_poles(image.flatten(2), solutions, self.weights).unflatten(2, image.shape[-2:])
 
 
 @dataclass(eq=False)
@@ -266,52 +222,53 @@ class TiledOperator:
         """
         if self._pixel_scaling is not None:
             return
-        total, completed, difference = self.pilot.moment, self.pilot.completed, None
+        total, dtype = self.pilot.moment, self.guide.dtype
+        balanced = partial(balance_by_passes, dtype=dtype, completed=self.pilot.completed)
+        biases: tuple[Tensor, ...] | None = None
         if self.sample_size is not None:
-            self._sample, difference = self._draw_sample(self.sample_size, planes, order)
-            total = balance_by_passes(
-                self.over("Balancing"), total, self.guide.dtype, completed=completed, bias=difference.moment
-            )
+            self._sample, biases = self._draw_sample(self.sample_size, planes, order)
+            total = balanced(self.over("Balancing"), total, bias=biases[0])
         if self.full_passes:
-            self._sample = difference = None
-            total = balance_by_passes(self.over("Balancing"), total, self.guide.dtype, completed=completed)
-        self._pixel_scaling = PixelScaling(total, completed, CONVERGED[self.guide.dtype])
-        limiter = (
-            limiter_by_passes(self.over("Bounding"), self._pixel_scaling, self.guide.dtype) if self.bounded else None
-        )
-        if limiter is not None:
-            self.kernel = replace(self.kernel, limiter=limiter.to(self.kernel.landmarks))
+            self._sample = biases = None
+            total = balanced(self.over("Balancing"), total)
+        self._pixel_scaling = PixelScaling(total, self.pilot.completed, CONVERGED[dtype])
+        limit = self._limiter(total) if self.bounded else None
+        if limit is not None:
+            self.kernel = replace(self.kernel, limiter=limit.to(self.kernel.landmarks))
             self.cache.blocks.clear()
-        if self._sample is None or difference is None:
+        if self._sample is None or biases is None:
             return
-        if limiter is not None:
-            self._sample = [replace(block, factor=limiter.to(block.factor) @ block.factor) for block in self._sample]
-            difference = Totals(
-                difference.moment, limiter @ difference.coefficients, limiter @ difference.grams.to(limiter) @ limiter
-            )
-        self._grams = difference.grams
+        _, moments, grams = biases
+        if limit is not None:
+            self._sample = [replace(block, factor=limit.to(block.factor) @ block.factor) for block in self._sample]
+            moments, grams = limit @ moments, limit @ grams.to(limit) @ limit
+        self._grams = grams
         sample = self._summed_up(planes, order, self.over("Summing up"))
-        self._sums[planes] = replace(sample, correction=difference.coefficients)
+        self._sums[planes] = replace(sample, moments=sample.moments + moments)
 
-    def _draw_sample(self, count: int, planes: Planes, order: int) -> tuple[list[Block], Totals]:
+    def _limiter(self, total: Tensor) -> Tensor | None:
+        """The ``X^(1/2)`` (1, M, M) to multiply the factor by, or None if no eigenvalue exceeds 1."""
+        blocks, allowed = self.over("Bounding"), slack(self.guide.dtype, CONVERGED[self.guide.dtype])
+        gram = partial(self._gram_below, blocks)
+        return limiter(gram, total, allowed) if exceeds(gram, total, allowed) else None
+
+    def _gram_below(self, blocks: Pass[Block], at: Tensor, power: int) -> Tensor:
+        """:meth:`Columns.gram_below` of all pixels, in a pass over them."""
+        return summed(blocks(lambda block: (self.block_columns(block).gram_below(at, power),)))[0]
+
+    def _draw_sample(self, count: int, planes: Planes, order: int) -> tuple[list[Block], tuple[Tensor, ...]]:
         """Draw about ``count`` pixels; also return the sums over all pixels minus theirs, both at the pilot's guess."""
         pilot, values = self.pilot, partial(_planes_of_block, planes)
         guess = Guess(pilot.moment, torch.empty(1, 0, pilot.moment.shape[1], 1), values, self.guide.guide.spectral)
         columns = guess.columns(pilot.sample)
-        known = sum_up(
-            PassOverBlocks([pilot.sample], self.workers), lambda block: (values(block, columns), columns), order
-        )
+        known = Sums(*sums_of_powers(columns, values(pilot.sample, columns), order))
         guess = replace(guess, coefficients=known.coefficients()[:, :-1])
-        draw, drawn, total = SampleDraw(guess, Draws(pilot, columns, count, self.guide.pixels)), [], None
-        for block, totals in self._over_picture("Sampling")(draw):
-            drawn.append(block)
-            total = totals if total is None else total.plus(totals)
-        assert total is not None  # for mypy; a picture has a pixel
+        draws = Draws(pilot, columns, count, self.guide.pixels)
+        drawn, totals = zip(*self._over_picture("Sampling")(partial(_draw_and_sum, guess, draws)), strict=True)
         step = -(-len(drawn) // SAMPLE_BLOCKS)
         sample = [Block.concatenate(drawn[first : first + step]) for first in range(0, len(drawn), step)]
-        for totals in PassOverBlocks(sample, self.workers)(draw.totals):
-            total = total.plus(totals, sign=-1)
-        return sample, total
+        own = summed(totals for _, totals in in_order(guess.totals, sample, self.workers))
+        return sample, tuple(map(torch.sub, summed(totals), own))
 
     def _over_picture(self, stage: str) -> PassOverPicture:
         """A pass over every pixel."""
@@ -353,11 +310,11 @@ class TiledOperator:
         if self._sample is None:
             return self._over_picture(stage)
         self.report(stage, 0, 1)
-        return PassOverBlocks(self._sample, self.workers)
+        return partial(in_order, items=self._sample, workers=self.workers)
 
     def pixels(self, block: Block) -> BlockPixels:
         """The pixels of a block, with their columns."""
-        return BlockPixels(block.image.unsqueeze(2), self.scaled(block.factor, block.diagonal))
+        return BlockPixels(block.image.unsqueeze(2), self.block_columns(block))
 
     @torch.no_grad()
     @full_precision
@@ -373,13 +330,16 @@ class TiledOperator:
             known = self._sums[planes] = self._summed_up(planes, order, self._over_picture("Summing up"))
         return known
 
-    def _summed_up(self, planes: Planes, order: int, blocks: Pass[Block]) -> Sums:
-        return sum_up(blocks, partial(self._planes_and_columns, planes), order)
+    def block_columns(self, block: Block) -> Columns:
+        """The columns of a block, with its weights."""
+        return replace(self.scaled(block.factor, block.diagonal), weights=block.weights)
 
-    def _planes_and_columns(self, planes: Planes, block: Block) -> tuple[Tensor, Columns]:
-        """Planes (1, C, n) of the pixels of a block, and their columns."""
+    def _summed_up(self, planes: Planes, order: int, blocks: Pass[Block]) -> Sums:
+        return Sums(*summed(blocks(partial(self._sums_of_block, planes, order))))
+
+    def _sums_of_block(self, planes: Planes, order: int, block: Block) -> tuple[Tensor, Tensor]:
         pixels = self.pixels(block)
-        return planes(pixels).flatten(2), pixels.known_columns
+        return sums_of_powers(pixels.known_columns, planes(pixels).flatten(2), order)
 
     @cached_property
     def pairs(self) -> RitzPairs:
@@ -390,7 +350,7 @@ class TiledOperator:
             blocks = map(self._weighted_columns, places.split(sampling.CHUNK))
             return sampled_pairs(blocks, count, self.guide.dtype)
         sums = next(iter(self._sums.values()), None) or self.sums(first_plane, 1)
-        return RitzPairs.of_sums(sums.grams[:, :2] + self._grams, sums.dtype)
+        return RitzPairs.of_sums(sums.grams[:, :2] + self._grams, self.guide.dtype)
 
     def _weighted_columns(self, places: Tensor) -> Columns:
         """Columns of single pixels, whose scaling is multiplied by the roots of their weights."""
@@ -422,27 +382,31 @@ class TiledOperator:
 
     def rational(self, planes: Planes, form: RationalForm, weights: Tensor) -> Planes:
         """A rational function of W, from the sums for shifted systems."""
-        return RationalPlanes(self, planes, form.shifts, weights, self.shifted_sums(planes, form.shifts).inner())
+        return RationalPlanes(self, planes, form.shifts, weights, self.shifted_inner(planes, form.shifts))
 
     @torch.no_grad()
     @full_precision
-    def shifted_sums(self, planes: Planes, shifts: Tensor) -> ShiftedSums:
-        """Sums over all pixels for shifted systems: a sample, drawn for balancing, lacks rare pixels."""
+    def shifted_inner(self, planes: Planes, shifts: Tensor) -> Tensor:
+        """The ``inner`` of shifted systems, from all pixels: a sample, drawn for balancing, lacks rare pixels."""
         self.prepare()
         return self._shifted(planes, shifts, self._over_picture("Summing up"))
 
-    def _shifted(self, planes: Planes, shifts: Tensor, blocks: Pass[Block]) -> ShiftedSums:
-        exact = sums_exactly(self.guide.dtype, self.guide.pixels)
-        return sum_up_shifted(blocks, ShiftedTerms(partial(self._planes_and_columns, planes), shifts, exact))
+    def _shifted(self, planes: Planes, shifts: Tensor, blocks: Pass[Block]) -> Tensor:
+        """Coefficients of the factor in the solutions of shifted systems, (1, J, M, C)."""
+        grams, sums = summed(blocks(partial(self._shifted_of_block, planes, shifts)))
+        return capacitance_inverse(grams) @ sums
+
+    def _shifted_of_block(self, planes: Planes, shifts: Tensor, block: Block) -> tuple[Tensor, Tensor]:
+        pixels, exact = self.pixels(block), sums_exactly(self.guide.dtype, self.guide.pixels)
+        columns, values = pixels.known_columns, planes(pixels).flatten(2)
+        return columns.shifted_grams(shifts, exact=exact), columns.shifted_sums(values, shifts)
 
     @torch.no_grad()
     @full_precision
     def mean(self, planes: Planes) -> Tensor:
         """Means over the sample, or over all pixels if there is none."""
-        total, weight = torch.zeros(()), torch.zeros((), dtype=torch.float64)
         self.prepare()
-        for values, weights in self.over("Averaging")(partial(self._weighted_sums, planes)):
-            total, weight = total + values, weight + weights
+        total, weight = summed(self.over("Averaging")(partial(self._weighted_sums, planes)))
         return (total / weight).to(self.guide.dtype)
 
     def _weighted_sums(self, planes: Planes, block: Block) -> tuple[Tensor, Tensor]:
@@ -464,3 +428,9 @@ class TiledOperator:
 def _planes_of_block(planes: Planes, block: Block, columns: Columns) -> Tensor:
     """Planes (1, C, n) of the pixels of a block with the given columns."""
     return planes(BlockPixels(block.image.unsqueeze(2), columns)).flatten(2)
+
+
+def _draw_and_sum(guess: Guess, draws: Draws, block: Block) -> tuple[Block, tuple[Tensor, ...]]:
+    """The pixels that are drawn from a block, and its sums at a guess."""
+    columns, totals = guess.totals(block)
+    return draws(block, columns), totals

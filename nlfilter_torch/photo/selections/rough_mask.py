@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.filtering.scribbles import fit_strokes
-from nlfilter_torch.operator.columns import Columns
 from nlfilter_torch.operator.features import blur, blur_margin, pad_border
 from nlfilter_torch.operator.options import FilterOptions
+from nlfilter_torch.operator.pixel_matrix import Columns
 from nlfilter_torch.photo.picture.colour import LIGHTNESS, hundredths_of_lab
 from nlfilter_torch.photo.picture.resizing import block_means, enlarged
 from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles, scribbled_blocks

@@ -2,8 +2,8 @@
 
 import torch
 
-from nlfilter_torch.operator.columns import Columns
 from nlfilter_torch.operator.options import FilterOptions
+from nlfilter_torch.operator.pixel_matrix import Columns
 from nlfilter_torch.photo.picture.in_memory import InMemory
 from nlfilter_torch.photo.picture.source import (
     Guide,
