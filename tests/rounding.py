@@ -4,6 +4,10 @@ import torch
 
 from nlfilter_torch.nn.denoiser.network import AFTER, BEFORE, PASSES, WIDTH
 
+#: How many times larger one rounding error may be than another of the same sums in another order, as both are random:
+#: the largest of a few pixels is a third of that of many, and both the kernels and their definitions have few at times.
+SPREAD = 4
+
 
 def rounding(terms: int, size: float = 1.0, dtype: torch.dtype = torch.float32) -> float:
     """Return the largest difference to expect between two sums of so many terms that are added in different orders.

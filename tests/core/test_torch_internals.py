@@ -83,7 +83,7 @@ def test_no_other_module_uses_private_parts_of_torch() -> None:
 FIRST_CALLS = """
 import contextlib
 import torch
-from nlfilter_torch import denoise, enhance
+from nlfilter_torch.photo import denoise, enhance
 image = torch.linspace(0.1, 0.9, 3 * 48 * 48, dtype=torch.float64).view(1, 3, 48, 48)
 calls = [
     lambda image: denoise(image, noise_level=0.1),

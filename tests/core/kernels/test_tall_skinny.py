@@ -13,6 +13,7 @@ from nlfilter_torch.core.kernels.tall_skinny import gather, moment, spread, weig
 from nlfilter_torch.operator.scaling import KernelMatrix
 from tests.native import LEVELS, by_torch, random
 from tests.pairwise import pairwise
+from tests.rounding import SPREAD
 
 
 def doubles(*shape: int) -> Tensor:
@@ -74,7 +75,7 @@ def test_sweep(level: int, pixels: int, marks: int) -> None:
     plain = by_torch(swept, factor, diagonal, total)
     torch.testing.assert_close(result[0], exact[0].float(), rtol=1e-5, atol=0)
     error, usual = (result[1] - exact[1]).abs().max(), (plain[1] - exact[1]).abs().max()
-    assert error <= 2 * usual + 1e-5 * exact[1].abs().max(), (error, usual)
+    assert error <= SPREAD * usual + 1e-5 * exact[1].abs().max(), (error, usual)
 
 
 @pytest.mark.parametrize(
@@ -107,7 +108,7 @@ def test_weighted_moments(level: int, pixels: int, marks: int) -> None:
     result = weigh(*arguments)
     plain = by_torch(weigh, *arguments)
     error, usual = (result - exact).abs().max(), (plain - exact).abs().max()
-    assert error <= 2 * usual + 1e-6 * exact.abs().max(), (error, usual)
+    assert error <= SPREAD * usual + 1e-6 * exact.abs().max(), (error, usual)
 
 
 def test_weights_count_pixels() -> None:
