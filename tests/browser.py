@@ -219,8 +219,13 @@ class Tab:
         if release:
             self.page.mouse.up()
 
+    def wait_for_brush(self) -> None:
+        """Wait until the page draws with a pointer, which the editor tells it after a tab with a brush is chosen."""
+        self.page.wait_for_function("!document.documentElement.classList.contains('brushless')")
+
     def paint(self, *points: tuple[float, float], release: bool = True) -> None:
         """Draw a line through points given as fractions of the picture's size."""
+        self.wait_for_brush()
         box = self.place()
         at = [(box["x"] + x * box["width"], box["y"] + y * box["height"]) for x, y in points]
         self.page.mouse.move(*at[0])
@@ -254,6 +259,7 @@ class Fingers:
 
 def by_finger(tab: Tab, *points: tuple[float, float]) -> None:
     """Draw a line with a finger through points given as fractions of the picture's size."""
+    tab.wait_for_brush()
     fingers, box = Fingers(tab), tab.place()
     kind = "Start"
     for x, y in points:
