@@ -17,7 +17,7 @@ import argparse
 import base64
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -34,9 +34,9 @@ from nlfilter_torch.photo.app.brush import RADIUS
 from nlfilter_torch.photo.declared.parameters import EDITS, MASK
 from nlfilter_torch.photo.declared.presets import Recipe, find_recipe
 from nlfilter_torch.photo.declared.steps import Step
-from nlfilter_torch.photo.declared.strokes import Stroke
+from nlfilter_torch.photo.declared.strokes import Mark
 from nlfilter_torch.photo.edits.applying import apply_recipe
-from nlfilter_torch.photo.picture.painting import colour_of, mask_of
+from nlfilter_torch.photo.picture.painting import colour_of, cover
 from nlfilter_torch.photo.picture.photographs import Photograph, write_photograph
 from nlfilter_torch.photo.picture.resizing import resize
 
@@ -46,7 +46,7 @@ CELLS = 8  # of a digest, across and down
 SIDE = 600  # short side of photographs, at most
 GREY = 0.6  # behind an object that is cut out
 TILE, ACROSS = (200, 300), 5  # of the contact sheet
-PAINTS = {"in": "#ffd91a", "out": "#e02020", "keep": "#20d0e0"}
+PAINTS = {"in": "#ffd91a", "out": "#e02020"}
 AIM = 0.85  # share of the results to keep
 KINDS = {"recolor": "recolouring", "mask": "masks and defocus", "defocus": "masks and defocus"}
 
@@ -72,7 +72,7 @@ class Job:
     what: str
     edit: str
     recipe: Recipe
-    strokes: tuple[Stroke, ...]
+    strokes: tuple[Mark, ...]
     noise: float
     keeper: bool | None
     why: str
@@ -82,8 +82,7 @@ class Job:
         """The job of an entry of the file."""
         edit, what = entry["edit"], entry["what"]
         drawn = [{"radius": RADIUS} | stroke for stroke in entry.get("strokes", ())]
-        words = MASK.words if edit == "mask" else EDITS[edit].words if edit in EDITS else ()
-        strokes = tuple(Stroke.from_entries(stroke, words, what) for stroke in drawn)
+        strokes = tuple(EDITS.get(edit, MASK).mark_of(stroke, what) for stroke in drawn)
         recipe = find_recipe(entry["preset"]) if edit == "preset" else Recipe()
         if edit in EDITS:
             entries = entry.get("parameters", {}) | ({"strokes": drawn} if drawn else {})
@@ -124,6 +123,12 @@ class Job:
             colour = colour_of(PAINTS.get(stroke.paint, stroke.paint)).view(1, 3, 1, 1)
             image = scribbled(image, colour.expand_as(image), mask)
         return image
+
+
+def mask_of(strokes: Iterable[Mark], size: tuple[int, int]) -> Tensor:
+    """The mask (1, 1, H, W) of the pixels that strokes cover."""
+    planes = [cover(stroke, size).float() for stroke in strokes]
+    return torch.stack([torch.zeros(size), *planes]).amax(0)[None, None]
 
 
 def jobs(file: Path = STORED) -> list[Job]:

@@ -30,14 +30,14 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from benchmarks.edited_photographs import edited_photographs
-from benchmarks.keepers import Job, jobs
+from benchmarks.keepers import Job, jobs, mask_of
 from benchmarks.mask_peers import PEERS
 from benchmarks.photographs import reduced_to
 from nlfilter_torch.photo import region_mask
 from nlfilter_torch.photo.edits.applying import edit_of, scribbles_of
 from nlfilter_torch.photo.picture.drawn import Drawn
 from nlfilter_torch.photo.picture.in_memory import edit_image
-from nlfilter_torch.photo.picture.painting import TensorPainter, mask_of
+from nlfilter_torch.photo.picture.painting import TensorPainter
 from nlfilter_torch.photo.picture.photographs import Photograph, write_photograph
 from nlfilter_torch.photo.picture.resizing import resize
 from nlfilter_torch.photo.selections.mask import ObjectEdit
@@ -135,7 +135,7 @@ def selected(job: Job, image: Tensor) -> Tensor:
 def _strokes(job: Job, size: tuple[int, int]) -> tuple[Tensor, Tensor | None]:
     """Masks (1, 1, H, W) of the strokes on the object and, if there are any, on its background."""
     sides = [
-        [stroke for stroke in job.strokes if (stroke.paint in ("out", "keep")) == opposed] for opposed in (False, True)
+        [stroke for stroke in job.strokes if (stroke.role == "background") == opposed] for opposed in (False, True)
     ]
     inside, background = (mask_of(strokes, size) for strokes in sides)
     return inside, background * (1 - inside) if sides[1] else None

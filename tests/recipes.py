@@ -15,7 +15,7 @@ from nlfilter_torch.photo.picture.tiles import Passes
 
 LINE = ((0.25, 0.25), (0.5, 0.3))
 IN, OUT = Stroke(LINE, 0.06, "in"), Stroke(((0.8, 0.8),), 0.1, "out")
-BLUE, KEEP = Stroke(LINE, 0.06, "#2040e0"), Stroke(((0.8, 0.8),), 0.1, "keep")
+BLUE, KEEP = Stroke(LINE, 0.06, "#2040e0"), Stroke(((0.8, 0.8),), 0.1, "out")
 ALPHA, INSIDE = (0.5, 1.0, 1.0, 1.0), (3.0, 3.0, 2.0, 1.0)
 DETAIL = Step("detail", (IN, OUT), alpha=ALPHA, inside=INSIDE, reach=0.5, landmarks=40)
 RECOLOR = Step("recolor", (BLUE, KEEP), reach=0.5, tolerance=20.0)

@@ -156,7 +156,7 @@ def stroke(paint: str, points: list[list[float]], radius: float = 0.05) -> Entri
 
 def steps() -> list[Entries]:
     """A step of every edit, those that take strokes with strokes."""
-    blue, red, keep = stroke("#2050c0", LEFT), stroke("#c04020", RIGHT), stroke("keep", [[0.5, 0.1]])
+    blue, red, keep = stroke("#2050c0", LEFT), stroke("#c04020", RIGHT), stroke("out", [[0.5, 0.1]])
     inside, outside = stroke("in", LEFT), stroke("out", RIGHT, 0.1)
     return [
         {"edit": "denoise", "strength": 0.7, "noise_level": 4.0},

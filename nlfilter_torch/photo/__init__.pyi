@@ -3,6 +3,7 @@ from .declared.presets import PRESETS as PRESETS
 from .declared.presets import Recipe as Recipe
 from .declared.presets import find_recipe as find_recipe
 from .declared.steps import Step as Step
+from .declared.strokes import Region as Region
 from .declared.strokes import Stroke as Stroke
 from .edits.abstract import abstract as abstract
 from .edits.applying import apply_recipe as apply_recipe

@@ -65,7 +65,7 @@ def test_score_does_not_count_a_band_around_the_outline():
 def test_masks_of_every_kind_of_job_and_of_peers_select_the_object():
     image, wanted = scene(), Outline(job("mask"), (SQUARE,))
     recoloured = job(
-        "recolor", strokes=[STROKE | {"paint": "#0040c0"}, STROKE | {"paint": "keep", "points": [[0.1, 0.5]]}]
+        "recolor", strokes=[STROKE | {"paint": "#0040c0"}, STROKE | {"paint": "out", "points": [[0.1, 0.5]]}]
     )
     masks = [selected(each, image) for each in (job("mask"), job("defocus"), recoloured)]
     masks += [by_peer("GrabCut", wanted, image)]

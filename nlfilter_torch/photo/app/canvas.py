@@ -12,7 +12,7 @@ from nlfilter_torch.photo.app.brush import BRUSHES, Brush
 from nlfilter_torch.photo.app.crop_tool import CropTool
 from nlfilter_torch.photo.declared.parameters import DETAIL, EDITS
 from nlfilter_torch.photo.declared.steps import Step
-from nlfilter_torch.photo.declared.strokes import Stroke
+from nlfilter_torch.photo.declared.strokes import Mark, Stroke
 
 Draw = Callable[[str, Callable[[], None]], None]  # adds a stroke to a step
 
@@ -268,14 +268,14 @@ class Canvas:
         """Show the strokes of the step and the one being drawn, unless strokes are hidden."""
         if self._session is None:
             return
-        strokes: tuple[Stroke, ...] = ()
+        strokes: tuple[Mark, ...] = ()
         if self._show_strokes.value:
             strokes = self._session.step_in_view(self._step).strokes if self._step in BRUSHES else ()
             if self._line:
                 height, width = self._preview_size
                 points = tuple((x / width, y / height) for x, y in self._line)
                 strokes += (Stroke(points, self._brush.radius[self._step], self._brush.paint(self._step)),)
-        self._photo.set_content(drawing.strokes_svg(strokes, self._preview_size))
+        self._photo.set_content(drawing.strokes_svg(strokes, self._preview_size, keeps=drawing.keeps(self._step)))
         is_hatched = bool(strokes and self.pictures.get("ignored"))
         if is_hatched:
             self._show("ignored", self._ignored)

@@ -9,7 +9,7 @@ from nlfilter_torch.photo.app.preview import Preview
 from nlfilter_torch.photo.declared.development import AS_IT_IS, Development, Frame
 from nlfilter_torch.photo.declared.presets import DEVELOPING_BYTES
 from nlfilter_torch.photo.declared.steps import Step
-from nlfilter_torch.photo.declared.strokes import Stroke
+from nlfilter_torch.photo.declared.strokes import Mark
 from nlfilter_torch.photo.edits.applying import left_by_crop
 from nlfilter_torch.photo.edits.parts import Parts, Rectangle
 from nlfilter_torch.photo.files.formats import check_memory
@@ -50,7 +50,7 @@ class Developed:
     before: Tensor
     preview: Preview
     parts: Parts
-    _counted: dict[tuple[Stroke, ...], bool] = field(default_factory=dict)  # whether strokes reach pixels that count
+    _counted: dict[tuple[Mark, ...], bool] = field(default_factory=dict)  # whether strokes reach pixels that count
 
     @staticmethod
     def of(photograph: Photograph, name: str, pixels: int) -> "Developed":

@@ -10,9 +10,8 @@ from PIL import Image
 from torch import Tensor
 
 from nlfilter_torch.filtering.filters import polynomial_response
-from nlfilter_torch.photo.declared.declaration import ScribbleRole
 from nlfilter_torch.photo.declared.parameters import EDITS
-from nlfilter_torch.photo.declared.strokes import Stroke
+from nlfilter_torch.photo.declared.strokes import Mark, Region, ScribbleRole, Stroke
 from nlfilter_torch.photo.picture.colour import hundredths_of_lab
 
 QUALITY = 95
@@ -28,10 +27,8 @@ ROLES: dict[ScribbleRole, str] = {
     "added": "#38bdf8",
     "removed": "#a855f7",
 }
-#: Colours of strokes with a meaning, by its word; grey is what stays as it is.
-WORDS = {scribble.word: ROLES[scribble.role] for edit in EDITS.values() for scribble in edit.scribbles} | {
-    "keep": "#9ca3af"
-}
+KEPT = "#9ca3af"  # colour of strokes on what keeps its colour
+OUTLINE = 2  # width in pixels of a preview of the border of a region
 WHITE_TINT, BLACK_TINT = (255, 60, 60, 255), (60, 120, 255, 255)  # where a picture is clipped
 BINS = 64  # of a histogram
 
@@ -132,19 +129,29 @@ def _encode(image: Image.Image, kind: str, **options: object) -> bytes:
     return stream.getvalue()
 
 
-def strokes_svg(strokes: Iterable[Stroke], size: tuple[int, int]) -> str:
-    """Strokes as SVG in pixels of a preview of ``size`` (height, width).
+def keeps(edit: str) -> bool:
+    """Whether what is marked as the background of an edit keeps its colour, while objects take others."""
+    return any(scribble.kind == "colours" for scribble in EDITS[edit].scribbles) if edit in EDITS else False
+
+
+def strokes_svg(marks: Iterable[Mark], size: tuple[int, int], *, keeps: bool = False) -> str:
+    """Strokes, and the borders of regions, as SVG in pixels of a preview of ``size`` (height, width).
+
+    With ``keeps``, marks on the background are grey, and others have their own colours.
 
     >>> strokes_svg([Stroke(((0.5, 0.5), (1.0, 0.5)), 0.1, "#ff0000")], (100, 200))
     '<path d="M100.0 50.0L200.0 50.0" stroke="#ff0000" stroke-width="20.0" class="stroke" />'
     """
     height, width = size
     paths = []
-    for stroke in strokes:
-        points = stroke.points if len(stroke.points) > 1 else stroke.points * 2  # a dot is a line of no length
+    for mark in marks:
+        points, end, thickness = mark.outline if isinstance(mark, Region) else mark.points, "Z", float(OUTLINE)
+        if isinstance(mark, Stroke):
+            points = points if len(points) > 1 else points * 2  # a dot is a line of no length
+            end, thickness = "", 2 * mark.radius * min(size)
         line = "L".join(f"{x * width:.1f} {y * height:.1f}" for x, y in points)
-        colour, thickness = stroke.colour or WORDS[stroke.paint], 2 * stroke.radius * min(size)
-        paths.append(f'<path d="M{line}" stroke="{colour}" stroke-width="{thickness:.1f}" class="stroke" />')
+        colour = mark.colour or (KEPT if keeps and mark.role == "background" else ROLES[mark.role])
+        paths.append(f'<path d="M{line}{end}" stroke="{colour}" stroke-width="{thickness:.1f}" class="stroke" />')
     return "".join(paths)
 
 

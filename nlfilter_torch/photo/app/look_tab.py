@@ -9,7 +9,7 @@ from nlfilter_torch.photo.app import drawing
 from nlfilter_torch.photo.app.controls import show_pressed
 from nlfilter_torch.photo.app.tabs import EditTab, Link
 from nlfilter_torch.photo.declared.json_values import Value
-from nlfilter_torch.photo.declared.looks import LOOKS
+from nlfilter_torch.photo.declared.presets import LOOKS
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.edits.applying import apply_step
 from nlfilter_torch.photo.picture.resizing import resize

@@ -5,6 +5,7 @@ from torch import Tensor
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.edits.applying import edit_of, scribbles_of
 from nlfilter_torch.photo.picture.drawn import Drawn
+from nlfilter_torch.photo.picture.edit import MARKS, PhotoEdit
 from nlfilter_torch.photo.picture.in_memory import InMemory, edit_image
 from nlfilter_torch.photo.picture.painting import TensorPainter
 from nlfilter_torch.photo.selections.stray import stray_parts
@@ -42,17 +43,23 @@ def _selected(step: Step, image: Tensor, stride: float) -> Tensor | None:
     selection = edit.selection() if step.marks_object() else None
     if selection is None:
         return None
-    marks = edit.marks(scribbles_of(step, size, TensorPainter())).masks
-    # The last plane of what has colours is its mask.
-    return edit_image(selection, image.clamp(0, 1), Drawn({name: mask[:, -1:] for name, mask in marks.items()}))
+    return edit_image(selection, image.clamp(0, 1), Drawn(_masks(step, edit, size)))
 
 
 def _ignored(step: Step, image: Tensor) -> Tensor | None:
     size = (image.shape[-2], image.shape[-1])
-    if not step.painted_as("object") or edit_of(step, size).selection() is None:
+    edit = edit_of(step, size)
+    if not step.painted_as("object") or edit.selection() is None:
         return None
-    drawn = scribbles_of(step, size, TensorPainter()).masks
-    names = [scribble.argument for scribble in step.declared.with_role("object", "background")]
-    parts = [stray_parts(InMemory(image.clamp(0, 1)), drawn[name].ceil()) for name in names if name in drawn]
+    masks = _masks(step, edit, size)
+    names = [name for name in ("scribbles", "background") if name in masks]
+    parts = [stray_parts(InMemory(image.clamp(0, 1)), masks[name].amax(1, keepdim=True).ceil()) for name in names]
     stray: Tensor = sum(parts[1:], parts[0])
     return stray.clamp(max=1) if bool(stray.any()) else None
+
+
+def _masks(step: Step, edit: PhotoEdit, size: tuple[int, int]) -> dict[str, Tensor]:
+    """The masks of the scribbles of a step, under the names that the edit of its selection takes."""
+    marks = edit.marks(scribbles_of(step, size, TensorPainter())).masks
+    coloured = {MARKS[scribble.role] for scribble in step.declared.scribbles if scribble.kind == "colours"}
+    return {name: mask[:, -1:] if name in coloured else mask for name, mask in marks.items()}

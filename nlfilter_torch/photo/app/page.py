@@ -34,6 +34,7 @@ from nlfilter_torch.photo.declared.development import Development
 from nlfilter_torch.photo.declared.json_values import Value
 from nlfilter_torch.photo.declared.parameters import DETAIL, EDITS
 from nlfilter_torch.photo.declared.presets import Recipe
+from nlfilter_torch.photo.declared.strokes import sliders_of
 from nlfilter_torch.photo.picture.sampling import Report
 
 Save = Callable[[str, Report], Path]  # name and progress
@@ -445,7 +446,10 @@ class Editor:
     async def _respond(self) -> None:
         """Show the response of the sliders for the layers."""
         detail = self.session.recipe.current(DETAIL.name)
-        curves = [(OUTSIDE, detail["alpha"]), *([(INSIDE, detail.sliders_inside)] if detail.has_region() else [])]
+        curves = [
+            (OUTSIDE, detail["alpha"]),
+            *((INSIDE, row) for row in sliders_of(detail.strokes, detail.sliders_inside)),
+        ]
         eigenvalues = await self._tasks.run("Working", partial(self.session.eigenvalues, detail))
         self._panel.draw_response(drawing.response_svg(eigenvalues, curves))
 

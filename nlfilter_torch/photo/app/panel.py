@@ -9,10 +9,10 @@ from nlfilter_torch.photo.app.develop_tab import DevelopTab
 from nlfilter_torch.photo.app.look_tab import LookTab
 from nlfilter_torch.photo.app.step_list import StepList
 from nlfilter_torch.photo.app.tabs import EditTab, Link
-from nlfilter_torch.photo.declared.declaration import ScribbleRole
 from nlfilter_torch.photo.declared.development import DEVELOP
 from nlfilter_torch.photo.declared.parameters import DETAIL, EDITS
 from nlfilter_torch.photo.declared.shared_parameters import LOOK
+from nlfilter_torch.photo.declared.strokes import ScribbleRole
 
 #: The kind of tab of each edit, in the order of the tabs.
 TABS: dict[str, type[EditTab]] = dict.fromkeys((DEVELOP.name, DETAIL.name, *EDITS), EditTab) | {

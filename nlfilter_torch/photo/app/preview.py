@@ -11,7 +11,7 @@ after its own are applied as they were fitted to the picture before.
 
 import math
 from bisect import bisect_right
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -29,9 +29,11 @@ from nlfilter_torch.photo.declared.parameters import DETAIL, MASK
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.declared.shared_parameters import VIEWING_SIZE
 from nlfilter_torch.photo.declared.steps import Step
+from nlfilter_torch.photo.declared.strokes import sliders_of
 from nlfilter_torch.photo.edits.applying import PreparedStep, edit_of, filter_key, over, scribbles_of
 from nlfilter_torch.photo.picture.changes import (
     activity,
+    blend_changes,
     change_in_parts,
     change_of_mean,
     limit_by_activity,
@@ -123,23 +125,24 @@ class WeighedLayers:
         activity: the activity, by which changes are limited.
         threshold: the threshold of the activity.
         sliders: the sliders outside the region.
-        sliders_inside: those in the region.
-        mask: the region, or None for no region.
+        regions: those of each region.
+        masks: of the regions, (1, K, h, w), or None for no region.
     """
 
     layers: Planes
     activity: Planes
     threshold: float
     sliders: tuple[float, ...]
-    sliders_inside: tuple[float, ...]
-    mask: Planes | None
+    regions: Sequence[tuple[float, ...]]
+    masks: Planes | None
 
     def __call__(self, pixels: Pixels) -> Tensor:
         """The change at some pixels of the picture."""
         layers = self.layers(pixels)
         change = _change_by(layers, self.sliders)
-        if self.mask is not None:
-            change = torch.lerp(change, _change_by(layers, self.sliders_inside), self.mask(pixels))
+        if self.masks is not None:
+            changes = [_change_by(layers, sliders) for sliders in self.regions]
+            change = blend_changes(torch.cat([*changes, change], dim=1), self.masks(pixels))
         return limit_by_activity(change, self.activity(pixels), self.threshold)
 
 
@@ -211,7 +214,7 @@ class Preview:
         self._working = range_of(InMemory(photograph.float()))
         self._source = InMemory(self.pixels, {})  # with the filter of the masks
         self._compared_by: Key = ()  # the settings of that filter
-        self._mask: tuple[Key, Tensor] | None = None
+        self._masks: tuple[Key, Tensor] | None = None
         self._active: tuple[tuple[int, int], Tensor] | None = None
         self._filter: tuple[Key, Callable[[Step], Tensor]] | None = None
         self._pictures: list[StepPicture] = []
@@ -263,12 +266,15 @@ class Preview:
         scale = self._viewed(detail)[0] / size[0]
         return DETAIL["spatial_bandwidth"].distance(detail.arguments(size, scale)["spatial_bandwidth"], size)
 
-    def mask(self, detail: Step) -> Tensor | None:
-        """The mask (1, 1, h, w) of the region, or None without strokes; only the first one is slow."""
+    def masks(self, detail: Step) -> Tensor | None:
+        """The masks (1, K, h, w) of the regions, or None without strokes; only the first ones are slow."""
         if not detail.has_region():
             return None
-        key = (detail.strokes, detail["reach"], detail["extent"], detail["tolerance"], detail["landmarks"])
-        if self._mask is None or self._mask[0] != key:
+        regions = sliders_of(detail.strokes, detail.sliders_inside)
+        marks = detail.painted_as("object", "added")
+        numbers = tuple(regions.index(mark.meaning.sliders or detail.sliders_inside) for mark in marks)
+        key = (detail.strokes, numbers, detail["reach"], detail["extent"], detail["tolerance"], detail["landmarks"])
+        if self._masks is None or self._masks[0] != key:
             fewer = min(detail["landmarks"], MASK.defaults["num_landmarks"])
             if (detail["tolerance"], fewer) != self._compared_by:
                 self._source, self._compared_by = InMemory(self.pixels, {}), (detail["tolerance"], fewer)
@@ -277,8 +283,8 @@ class Preview:
             if selection is None:
                 return None
             fitted = fit_edit(selection, self._source, edit.marks(drawn), working=self._working)
-            self._mask = (key, self._source.all(fitted))
-        return self._mask[1]
+            self._masks = (key, self._source.all(fitted))
+        return self._masks[1]
 
     def before(self, step: Step) -> Tensor:
         """The picture before a step, as it was last rendered, or the reduced photograph."""
@@ -339,17 +345,17 @@ class Preview:
 
     def _blend(self, detail: Step) -> Fitted:
         """A step that weighs layers."""
-        mask = self.mask(detail)
+        masks, regions = self.masks(detail), sliders_of(detail.strokes, detail.sliders_inside)
         change = WeighedLayers(
             part_of(self.layers(detail).layers),
             part_of(self._activity(detail)),
             detail["threshold"] / 255,
             detail["alpha"],
-            detail.sliders_inside,
-            None if mask is None else part_of(mask),
+            regions,
+            None if masks is None else part_of(masks),
         )
-        rows = [detail["alpha"], detail.sliders_inside]
-        brighter = detail["alpha"][-1] - 1 if mask is None else change_of_mean(torch.tensor(rows) - 1)
+        rows = torch.tensor([detail["alpha"], *regions])
+        brighter = detail["alpha"][-1] - 1 if masks is None else change_of_mean(rows - 1)
         return within_limits(self._source, Fitted(change), detail["limits"], brighter)
 
     def _filter_of(self, step: Step, image: Tensor, before: Key, *, keep: bool) -> Callable[[Step], Tensor]:

@@ -19,7 +19,7 @@ from nlfilter_torch.photo.declared.json_values import Value
 from nlfilter_torch.photo.declared.parameters import EDITS
 from nlfilter_torch.photo.declared.presets import Recipe, on_frame
 from nlfilter_torch.photo.declared.steps import Step
-from nlfilter_torch.photo.declared.strokes import Stroke, thin
+from nlfilter_torch.photo.declared.strokes import Mark, thin
 from nlfilter_torch.photo.edits.applying import apply_recipe
 from nlfilter_torch.photo.edits.parts import Parts, Rectangle
 from nlfilter_torch.photo.edits.recipe import edit_rows
@@ -224,7 +224,7 @@ class Session:
         """Whether the preview has fewer pixels than the photograph; raises ValueError if none is open."""
         return self.preview.stride > 1
 
-    def set(self, edit: str, *, strokes: tuple[Stroke, ...] | None = None, **values: Value) -> None:
+    def set(self, edit: str, *, strokes: tuple[Mark, ...] | None = None, **values: Value) -> None:
         """Change the chosen step with that edit, or add such a step, and let it be seen.
 
         :meth:`commit` completes the change.
@@ -309,10 +309,9 @@ class Session:
         height, width = self.preview.size
         shares = thin(((x / width, y / height) for x, y in points), SPACING * radius)
         entries = {"points": [list(point) for point in shares], "radius": round(radius, 4), "paint": paint}
-        words = EDITS[step].words
-        if not words:
+        if not EDITS[step].scribbles:
             raise ValueError(f"{step} takes no strokes: it holds for the whole photograph")
-        stroke = self.developed.frame.stroke_outward(Stroke.from_entries(entries, words, step))
+        stroke = self.developed.frame.mark_outward(EDITS[step].mark_of(entries, step))
         current = self.recipe.current(step)
         painted = current.changed(strokes=(*current.strokes, stroke)).switched_on()
         if painted.has_region() and not current.has_region():  # it begins with the sliders of the rest
@@ -354,7 +353,8 @@ class Session:
         step, preview = self.developed.counted(self.step_in_view(edit)), self.preview
         with self._drawing:
             if step.declared.regional is not None:
-                return preview.mask(step)
+                masks = preview.masks(step)
+                return None if masks is None else masks.amax(1, keepdim=True)
             return self._overlays.selected(step, preview.before(step), preview.stride)
 
     def ignored(self, edit: str) -> Tensor | None:

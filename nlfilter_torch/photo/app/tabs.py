@@ -10,10 +10,10 @@ from nlfilter_torch.photo.app import controls
 from nlfilter_torch.photo.app.brush import BRUSHES, COLOURS, RADIUS, Brush
 from nlfilter_torch.photo.app.controls import Change, Choice, Control, Slider, SteadySlider
 from nlfilter_torch.photo.app.step_list import Replace
-from nlfilter_torch.photo.declared.declaration import ScribbleRole
 from nlfilter_torch.photo.declared.json_values import Value
 from nlfilter_torch.photo.declared.parameters import EDITS
 from nlfilter_torch.photo.declared.presets import Recipe
+from nlfilter_torch.photo.declared.strokes import ScribbleRole
 
 BY_HAND = "Brush (B) and Eraser (E) paint on the mask itself; S is the first tool again."
 

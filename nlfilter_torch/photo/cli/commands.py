@@ -19,9 +19,8 @@ from nlfilter_torch.photo.cli.edits import (
 )
 from nlfilter_torch.photo.declared.development import DEVELOP, Development
 from nlfilter_torch.photo.declared.json_values import Value
-from nlfilter_torch.photo.declared.looks import CHARACTERS, LOOKS
 from nlfilter_torch.photo.declared.parameters import EDITS
-from nlfilter_torch.photo.declared.presets import PRESETS, PURPOSES, Recipe, find_recipe
+from nlfilter_torch.photo.declared.presets import CHARACTERS, LOOKS, PRESETS, PURPOSES, Recipe, find_recipe
 
 #: Edits without scribbles.
 EDITS_WITHOUT_STROKES = tuple(edit for edit in EDITS.values() if not edit.requires_strokes)

@@ -15,14 +15,14 @@ from torch import Tensor
 from nlfilter_torch.core.workers import single_threaded
 from nlfilter_torch.photo.cli import editing, options
 from nlfilter_torch.photo.cli.editing import MAP_DEPTH, Job, pixels_of, rows_of
-from nlfilter_torch.photo.cli.scribbles import Open, Overlay, ScribbleOptions, at_once, of_edit
+from nlfilter_torch.photo.cli.scribbles import MarkedPhotograph, Opener, ScribbleOptions
 from nlfilter_torch.photo.cli.showing import Scribbled
 from nlfilter_torch.photo.declared.development import AS_IT_IS, Development
-from nlfilter_torch.photo.declared.rows import WHITE, RowSource, is_hidden
+from nlfilter_torch.photo.declared.rows import WHITE, is_hidden
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.edits.applying import edit_of
 from nlfilter_torch.photo.files.rows import StoredPicture, open_picture
-from nlfilter_torch.photo.picture.drawn import Drawn, M
+from nlfilter_torch.photo.picture.drawn import M
 from nlfilter_torch.photo.picture.edit import PhotoEdit, Rows
 from nlfilter_torch.photo.picture.in_memory import InMemory, edit_image, fit_edit
 from nlfilter_torch.photo.picture.photographs import Photograph, write_photograph
@@ -94,11 +94,11 @@ class EditJob:
         """The edited pixels of a photograph in memory, (1, C, H, W)."""
         rows = rows_of(photograph, self.source)
         with ExitStack() as opened:
-            drawn = self._drawn(rows, Opener(opened, editing.allowed_memory(self.files.memory)))
-            self._tell(rows, drawn)
+            marked = self._marked(rows, PictureOpener(opened, editing.allowed_memory(self.files.memory)))
+            self._tell(rows, marked)
             weights = photograph.weights
             edit = self._measured(InMemory(photograph.pixels, weights=weights), rows)
-            pixels = edit_image(edit, photograph.pixels, at_once(self.step.declared, drawn), weights=weights)
+            pixels = edit_image(edit, photograph.pixels, marked.tensors(), weights=weights)
         if edit.reports_change:
             kind = options.DEPTHS[self.files.depth] if self.files.depth else photograph.depth  # the files are compared
             planes = [photograph.pixels] if weights is None else [photograph.pixels, weights]
@@ -115,11 +115,11 @@ class EditJob:
         passes = job.passes(self.full, Path(self.target).parent)
         tiled = Tiled(Picture(job.picture.marked, self.source), passes, self.scribbles.called)
         rows = Rows(self.source, job.size, tiled.channels, partial(pixels_of, tiled.picture))
-        drawn = self._drawn(rows, job.open)
-        self._tell(rows, drawn)
+        marked = self._marked(rows, job.open)
+        self._tell(rows, marked)
         edit = self._measured(tiled, rows)
         with single_threaded(tiled.passes.workers(1)):
-            fitted = fit_edit(edit, tiled, as_rows(drawn))
+            fitted = fit_edit(edit, tiled, marked.rows())
         with tiled.tiling(fitted) as whole:
             meter, tiling = ChangeMeter(), replace(whole, nodata=job.picture.nodata)
             yield meter.watched(tiling) if edit.reports_change else tiling
@@ -130,15 +130,14 @@ class EditJob:
         """The edit with the settings for a picture (H, W), sampled at every so many pixels of the photograph."""
         return edit_of(self.step, size, stride=stride, generator=seeded(self.seed))
 
-    def _drawn(self, rows: Rows, read: Open) -> Drawn[Overlay]:
-        """The scribbles, from the options."""
+    def _marked(self, rows: Rows, opener: Opener) -> MarkedPhotograph:
+        """The marks, from the options."""
         edit = self.step.declared
-        alpha = None if edit.regional is None else self.step["alpha"]
-        return of_edit(edit, alpha, rows.size, self.scribbles, read)
+        return self.scribbles.on(edit, rows.size, opener, () if edit.regional is None else self.step["alpha"])
 
-    def _tell(self, rows: Rows, drawn: Drawn[Overlay]) -> None:
-        """Print what scribbles cover and what the edit leaves out, and write the picture of ``--show``."""
-        edit, scribbled = self._edit_at(rows.size), Scribbled(self.step.declared, rows, drawn)
+    def _tell(self, rows: Rows, marked: MarkedPhotograph) -> None:
+        """Print what marks cover and what the edit leaves out, and write the picture of ``--show``."""
+        edit, scribbled = self._edit_at(rows.size), Scribbled(marked, rows)
         edit.check_channels(rows.channels)
         if self.show is not None:
             scribbled.check()
@@ -158,7 +157,7 @@ class EditJob:
 
 
 @dataclass(frozen=True)
-class Opener:
+class PictureOpener:
     """Opens pictures of scribbles, which are closed with ``files``."""
 
     files: ExitStack
@@ -167,11 +166,6 @@ class Opener:
     def __call__(self, path: Path) -> StoredPicture:
         """Open a picture."""
         return self.files.enter_context(open_picture(path, self.memory))
-
-
-def as_rows(drawn: Drawn[Overlay]) -> Drawn[RowSource]:
-    """Scribbles as a picture in tiles takes them."""
-    return Drawn(dict(drawn.masks), drawn.colours, drawn.sliders, drawn.outside)
 
 
 class ChangeMeter:

@@ -11,9 +11,8 @@ import typer
 from nlfilter_torch.photo.cli import options
 from nlfilter_torch.photo.declared.declaration import FILTER_PANEL, UNITS, Edit, Kind, Parameter, ScribbleKind
 from nlfilter_torch.photo.declared.json_values import Value
-from nlfilter_torch.photo.declared.looks import LOOKS
 from nlfilter_torch.photo.declared.parameters import DETAIL, EDITS
-from nlfilter_torch.photo.declared.presets import PRESETS, Recipe, find_recipe
+from nlfilter_torch.photo.declared.presets import LOOKS, PRESETS, Recipe, find_recipe
 from nlfilter_torch.photo.declared.steps import Step
 
 Command = Callable[..., None]  # typer reads its signature
@@ -106,13 +105,14 @@ def scribble_options(edit: Edit) -> dict[str, object]:
     kinds = [scribble.kind for scribble in edit.scribbles if scribble.role == "object"]
     annotations: dict[str, object] = {"preset": PresetName} if edit.presets else {}
     for kind in kinds:
-        annotations |= {"strokes": options.StrokesFile} if kind == "colours" else {}
-        annotations["region"] = REGIONS[kind]
+        annotations |= {"strokes": options.StrokesFile, "region": REGIONS[kind]}
     for scribble in edit.with_options:
         name = scribble.option.removeprefix("--")
         annotations[name] = options.rectangles(scribble.option, METAVARS[scribble.kind], scribble.option_help)
-    if any(kind != "colours" for kind in kinds):
+    if kinds:
         annotations["mask"] = options.MaskFile
+    if "colours" in kinds:
+        annotations["colour"] = options.Colour
     if edit.scribbles:
         annotations["show"] = options.Show
     if edit.map_help:
@@ -264,6 +264,8 @@ def edit_photograph(
     """
     preset, region = values.pop("preset", None), values.pop("region", None)
     strokes, mask = values.pop("strokes", None), values.pop("mask", None)
+    # Of the options for scribbles only "colour" may also be the name of a parameter.
+    colour = values.pop("colour", None) if "colour" in scribble_options(edit) else None
     show, map = values.pop("show", None), values.pop("map", None)
     others = {scribble.option: values.pop(scribble.option.removeprefix("--"), None) for scribble in edit.with_options}
     step = step_of(edit, values)
@@ -276,13 +278,14 @@ def edit_photograph(
         step = look
 
     if not files.force:
-        check_usual(step, typed, [text.partition(":")[2] for text in region or []])
+        check_usual(step, typed, [options.split_region(text)[2] or "" for text in region or []])
 
     from nlfilter_torch.photo.cli.edit_job import EditJob
     from nlfilter_torch.photo.cli.editing import check_written, edit_file
     from nlfilter_torch.photo.cli.scribbles import ScribbleOptions
 
-    drawn = ScribbleOptions(region, strokes, mask, {name: texts for name, texts in others.items() if texts is not None})
+    rectangles = {name: texts for name, texts in others.items() if texts is not None}
+    drawn = ScribbleOptions(region, strokes, mask, rectangles, colour)
     check_written(source, target, show=show, map=map, mask=mask, strokes=strokes, preset=preset)
     notes = useless_options(step, typed, marked=drawn.marks_objects(edit))
     edit_file(EditJob(step, source, target, drawn, show, map, files, seed, full, notes), source, target, files)

@@ -43,13 +43,13 @@ def mask(
     from nlfilter_torch.photo.cli.mask_job import MaskJob
     from nlfilter_torch.photo.cli.scribbles import ScribbleOptions
 
-    region, mask, show = (values.pop(name) for name in ("region", "mask", "show"))
+    strokes, region, mask, show = (values.pop(name) for name in ("strokes", "region", "mask", "show"))
     rectangles = {scribble.option: values.pop(scribble.option.removeprefix("--")) for scribble in MASK.with_options}
-    scribbles = ScribbleOptions(region, None, mask, rectangles)
+    scribbles = ScribbleOptions(region, strokes, mask, rectangles)
     if not scribbles.marks_objects(MASK):
         raise ValueError(MASK.scribbles[0].advice)
-    editing.check_apart("OUT", target, photograph=source, mask=mask)
-    editing.check_apart("--show", show, photograph=source, output=target, mask=mask)
+    editing.check_apart("OUT", target, photograph=source, mask=mask, strokes=strokes)
+    editing.check_apart("--show", show, photograph=source, output=target, mask=mask, strokes=strokes)
     job = MaskJob(values, source, Path(target), scribbles, show, seed, memory, full, depth)
     job.check_depth()
     editing.check_processes(source, target, workers, cluster)

@@ -8,10 +8,10 @@ from pathlib import Path
 
 from nlfilter_torch.core.workers import single_threaded
 from nlfilter_torch.photo.cli import editing, options
-from nlfilter_torch.photo.cli.edit_job import Opener, as_rows
+from nlfilter_torch.photo.cli.edit_job import PictureOpener
 from nlfilter_torch.photo.cli.editing import pixels_of, rows_of
 from nlfilter_torch.photo.cli.progress import stages, steps
-from nlfilter_torch.photo.cli.scribbles import Open, Overlay, ScribbleOptions, at_once, of_edit
+from nlfilter_torch.photo.cli.scribbles import MarkedPhotograph, Opener, ScribbleOptions
 from nlfilter_torch.photo.cli.showing import Scribbled, tell_selected
 from nlfilter_torch.photo.declared.json_values import Value
 from nlfilter_torch.photo.declared.parameters import MASK
@@ -113,9 +113,10 @@ class MaskJob:
         """The mask of a photograph in memory."""
         rows = rows_of(photograph, self.source)
         with ExitStack() as files:
-            drawn = self._drawn(rows, Opener(files, allowed))
+            marked = self._marked(rows, PictureOpener(files, allowed))
+            drawn = marked.tensors()
         image = InMemory(photograph.pixels, weights=photograph.weights)
-        return mask.with_pixels(image.all(self._fitted(image, at_once(MASK, drawn))))
+        return mask.with_pixels(image.all(self._fitted(image, drawn)))
 
     def _check_rows(self, picture: StoredPicture, allowed: int) -> StoredPicture:
         """Check whether the mask can be written, and return the picture that it is written like."""
@@ -133,9 +134,9 @@ class MaskJob:
         """Compute the mask in tiles and write it."""
         tiled = Tiled(Picture(job.picture.marked, self.source), job.passes(self.full, self.target.parent), "--region")
         rows = Rows(self.source, job.size, tiled.channels, partial(pixels_of, tiled.picture))
-        drawn = self._drawn(rows, job.open)
+        marked = self._marked(rows, job.open)
         with single_threaded(tiled.passes.workers(1)):
-            fitted = self._fitted(tiled, as_rows(drawn))
+            fitted = self._fitted(tiled, marked.rows())
         if self.floats:
             write_pfm(self.target, tiled.all(fitted)[0, 0].float().numpy())
             return
@@ -148,19 +149,19 @@ class MaskJob:
         arguments = {p.keyword: p.argument_of(self.values[p.name], size, stride) for p in MASK}
         return RegionMask.of(arguments | {"generator": seeded(self.seed)})
 
-    def _drawn(self, rows: Rows, read: Open) -> Drawn[Overlay]:
-        """The scribbles; prints the colours that they cover, and writes the picture of ``--show``."""
-        drawn = of_edit(MASK, None, rows.size, self.scribbles, read)
-        scribbled = Scribbled(MASK, rows, drawn)
+    def _marked(self, rows: Rows, opener: Opener) -> MarkedPhotograph:
+        """The marks; prints the colours that they cover, and writes the picture of ``--show``."""
+        marked = self.scribbles.on(MASK, rows.size, opener)
+        scribbled = Scribbled(marked, rows)
         scribbled.tell_colours()
         if self.show is not None:
             scribbled.show(self.show, self._edit_at)
-        return drawn
+        return marked
 
     def _fitted(self, source: Source[M], drawn: Drawn[M]) -> Fitted:
         """Fit the mask, and print how much is selected."""
         working, edit = range_of(source), self._edit_at(source.size)
         seen = source if working is None else Seen(source, working)
         regions = edit.select(seen, drawn)
-        tell_selected(regions.selected(seen), self.scribbles.rectangles["--background"])
+        tell_selected(regions.selected(seen), opposed="background" in drawn.masks)
         return Fitted(regions.masks) if working is None else of_picture(Fitted(regions.masks), working)

@@ -13,6 +13,7 @@ import typer
 
 from nlfilter_torch.photo.declared.declaration import FILTER_PANEL, GAINS, MAX_SLIDERS, UNITS, Parameter
 from nlfilter_torch.photo.declared.development import Crop, check_value
+from nlfilter_torch.photo.declared.strokes import Shape
 
 if TYPE_CHECKING:
     from nlfilter_torch.photo.files.formats import Depth
@@ -73,6 +74,17 @@ def parse_sliders(text: str, option: str) -> tuple[float, ...]:
             f"{option} must be numbers from {GAINS[0]:.0f} to {GAINS[1]:.0f}, such as 3,3,4,1.05, got {text!r}"
         )
     return tuple(numbers)
+
+
+def split_region(text: str) -> tuple[Shape, str, str | None]:
+    """Split the text of a region into its shape, its numbers, and the note after its colon.
+
+    >>> split_region("1,2,3,4"), split_region("ellipse:1,2,3,4:red")
+    (('rectangle', '1,2,3,4', None), ('ellipse', '1,2,3,4', 'red'))
+    """
+    rest = text.removeprefix("ellipse:")
+    numbers, colon, note = rest.partition(":")
+    return "rectangle" if rest == text else "ellipse", numbers, note if colon else None
 
 
 def parse_crop(text: str) -> Crop:
@@ -263,26 +275,32 @@ def rectangles(name: str, metavar: str, help: str) -> object:
 
 StrokesFile = file(
     "--strokes",
-    "Scribbles on the photograph: a PNG, TIFF or WebP picture of its size, transparent where nothing is drawn.",
+    "Scribbles on the photograph: a PNG, TIFF or WebP picture of its size, transparent where nothing is drawn, or an "
+    "edit file (.json), whose strokes are taken, whatever edit they were drawn for.",
 )
+Colour = Annotated[
+    str | None,
+    typer.Option("--colour", metavar="COLOUR", help="Colour of --mask, and of regions and strokes that say none."),
+]
+_SHAPES = "`ellipse:X,Y,W,H` is the ellipse in a rectangle, and X,Y,X,Y,X,Y and so on are the corners of a polygon. "
 ColourRegions = rectangles(
     "--region",
     "X,Y,W,H:COLOUR",
     "A rectangle of colour, instead of scribbles or on top of them: column and row of its upper left corner, width and "
     "height, in pixels or in % of the photograph, and a colour such as red or #c04020; X,Y alone is a small square "
-    "around that point. May be repeated; later rectangles cover earlier ones.",
+    f"around that point. {_SHAPES}May be repeated; later ones cover earlier ones.",
 )
 Regions = rectangles(
     "--region",
     "X,Y,W,H",
     "A rectangle: column and row of its upper left corner, width and height, in pixels or in % of the photograph; X,Y "
-    "alone is a small square around that point. May be repeated.",
+    f"alone is a small square around that point. {_SHAPES}May be repeated.",
 )
 SliderRegions = rectangles(
     "--region",
     "X,Y,W,H[:SLIDERS]",
     "Edit only what resembles a rectangle: column and row of its upper left corner, its width and height, and its own "
-    "sliders if they differ from --alpha, such as 60,300,20,20:3,3,4,1. May be repeated.",
+    f"sliders if they differ from --alpha, such as 60,300,20,20:3,3,4,1. {_SHAPES}May be repeated.",
 )
 MaskFile = file(
     "--mask",

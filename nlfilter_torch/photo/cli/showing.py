@@ -6,6 +6,8 @@ Also other notes on what an edit does to a photograph.
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
+from itertools import groupby
 from operator import itemgetter
 from pathlib import Path
 
@@ -15,14 +17,16 @@ import typer
 from torch import Tensor
 
 from nlfilter_torch.photo.cli.options import note
-from nlfilter_torch.photo.cli.scribbles import Overlay, overlays
-from nlfilter_torch.photo.declared.declaration import Edit
+from nlfilter_torch.photo.cli.scribbles import MarkedPhotograph
 from nlfilter_torch.photo.declared.presets import Recipe
+from nlfilter_torch.photo.declared.rows import RowSource
 from nlfilter_torch.photo.picture.colour import hundredths_of_lab
 from nlfilter_torch.photo.picture.drawn import Drawn
 from nlfilter_torch.photo.picture.edit import MARKS, PhotoEdit, Rows
 from nlfilter_torch.photo.picture.in_memory import InMemory, edit_image
+from nlfilter_torch.photo.picture.painting import cover
 from nlfilter_torch.photo.picture.photographs import Photograph, write_photograph
+from nlfilter_torch.photo.picture.tiled_scribbles import plane_rows
 from nlfilter_torch.photo.selections.scribbled_colours import frame_places
 from nlfilter_torch.photo.selections.stray import stray_parts
 
@@ -38,33 +42,33 @@ OUTSIDE_BRIGHTNESS = 0.4  # brightness outside the mask, where the picture is sh
 
 @dataclass(frozen=True)
 class Scribbled:
-    """A photograph with scribbles of an edit.
+    """A photograph with marks of an edit.
 
     Attributes:
-        edit: the edit.
+        marked: the marks.
         rows: the photograph.
-        drawn: the scribbles.
     """
 
-    edit: Edit
+    marked: MarkedPhotograph
     rows: Rows
-    drawn: Drawn[Overlay]
 
     def check(self) -> None:
-        """Raise ValueError if there are no scribbles to show."""
-        if not list(overlays(self.edit, self.drawn)):
+        """Raise ValueError if there are no marks to show."""
+        if not self.marked.marks:
             raise ValueError("--show needs scribbles; give --region X,Y,W,H, or omit --show")
 
     def tell_colours(self) -> None:
-        """Print the colour under each rectangle, and a note on standard error if some cover very different colours."""
-        for scribble, option, overlay in overlays(self.edit, self.drawn):
-            if scribble.role in ("added", "removed"):  # these may cover anything
-                continue
+        """Print the colour under each region, and a note on standard error if some cover very different colours."""
+        height, width = self.rows.size
+        for option, regions in groupby(self.marked.drawn_regions(), key=itemgetter(0)):
             shares = dict[str, float]()
-            for rectangle, _, _ in overlay.rectangles:
-                pixels = self.rows.read(rectangle.rows)[..., rectangle.columns].float().clamp(0, 1).flatten(2)
-                place = f"{option} {rectangle}"
-                shares[place] = tell_colour(place, pixels)
+            for _, region in regions:
+                heights = [y * height for _, y in region.outline]
+                rows = slice(max(0, math.floor(min(heights))), min(height, math.ceil(max(heights)) + 1))
+                pixels = self.rows.read(rows)[..., cover(region, (height, width), rows)].float().clamp(0, 1)
+                place = f"{option} {region.text((height, width))}"
+                if pixels.shape[2]:
+                    shares[place] = tell_colour(place, pixels)
             note_mixed(shares, option)
 
     def show(self, target: Path, edit_at: Callable[[tuple[int, int], float], PhotoEdit]) -> None:
@@ -91,10 +95,16 @@ class Scribbled:
     def _marks(self, stride: int) -> tuple[dict[str, Tensor], Tensor | None]:
         """The scribbles at a reduced size, under the names that the edit of their mask takes, and their colours."""
         marks, colours = dict[str, Tensor](), None
-        for scribble, _, overlay in overlays(self.edit, self.drawn):
-            planes = _planes(overlay, self.rows.size, stride)
-            if scribble.kind == "colours":
-                colours = planes[:, :3] if scribble.role == "object" else colours
+        drawn = self.marked.rows()
+        for scribble in self.marked.edit.scribbles:
+            coloured, is_object = scribble.kind == "colours", scribble.role == "object"
+            source = drawn.colours if coloured and is_object else drawn.masks.get(scribble.argument)
+            if source is None:
+                continue
+            # Even marks of less than a reduced pixel remain visible.
+            planes = _reduced(partial(_planes, source), self.rows.size, stride, F.max_pool2d)
+            if coloured:
+                colours = planes[:, :3] if is_object else colours
                 planes = planes[:, 3:]
             marks[MARKS[scribble.role]] = planes.amax(1, keepdim=True)
         if "scribbles" in marks:
@@ -158,11 +168,14 @@ def hatched(shown: Tensor, places: Tensor) -> Tensor:
     return torch.where((places > 0) & lines, torch.zeros_like(shown), shown)
 
 
-def tell_selected(mask: Tensor, background: list[str] | None) -> None:
-    """Print the share of a picture that a mask (1, 1, H, W) selects, and a note if its borders belong to it too."""
+def tell_selected(mask: Tensor, *, opposed: bool) -> None:
+    """Print the share of a picture that a mask (1, 1, H, W) selects, and a note if its borders belong to it too.
+
+    There is no note if it is ``opposed`` by scribbles on the background.
+    """
     typer.echo(f"selected: {100 * float(mask.mean()):.0f} % of the picture")
     borders = mask.flatten(2)[..., frame_places((mask.shape[-2], mask.shape[-1]))]
-    if float(borders.mean()) > BORDER_SHARE and not background:
+    if float(borders.mean()) > BORDER_SHARE and not opposed:
         note("nearly all of the picture's borders are selected; mark what is not part of the object with --background")
 
 
@@ -179,9 +192,9 @@ def unlike(pixels: Tensor, middle: Tensor) -> float:
     return float((lab.norm(dim=1) > LARGE_DISTANCE).float().mean())
 
 
-def _planes(overlay: Overlay, size: tuple[int, int], stride: int) -> Tensor:
-    """Reduce scribbles; even those of less than a reduced pixel remain visible."""
-    return _reduced(overlay.planes, size, stride, F.max_pool2d)
+def _planes(source: RowSource, rows: slice) -> Tensor:
+    """Some rows of masks or colours, as planes (1, K, h, W)."""
+    return torch.from_numpy(plane_rows(source, rows)).permute(2, 0, 1)[None]
 
 
 def _reduced(read: Read, size: tuple[int, int], stride: int, pool: Callable[..., Tensor]) -> Tensor:

@@ -1,4 +1,4 @@
-"""Colour tables of other programs, as steps of a look: ``.cube`` files, and pictures of all colours (Hald).
+"""Colour tables of other programs, as lattices of a look: ``.cube`` files, and pictures of all colours (Hald).
 
 A ``.cube`` file, as Adobe defined it, lists colours in lines, a Hald in rows of pixels; of both, red changes from one
 colour to the next. Imports neither torch nor, before it is needed, NumPy.
@@ -8,7 +8,6 @@ import math
 from typing import TYPE_CHECKING
 
 from nlfilter_torch.photo.declared.declaration import MAX_NODES
-from nlfilter_torch.photo.declared.steps import Step
 
 if TYPE_CHECKING:
     import numpy as np
@@ -16,14 +15,15 @@ if TYPE_CHECKING:
 
     Values = NDArray[np.uint8] | NDArray[np.uint16] | NDArray[np.floating]
 
+Lattice = tuple[float, ...]  # changes of colours, as the parameter of ``look`` has them
 EXPORT = "export a 3-D table of colours from 0 to 1"
-MOST_LEVELS = math.isqrt(MAX_NODES)
+MOST_HALD_LEVEL = math.isqrt(MAX_NODES)
 CUBE_NODES, HALD_LEVEL = 33, 8  # of the tables that are written
-WHITE = 65535
+WHITE_16 = 65535
 
 
-def step_of_cube(text: str, name: str) -> Step:
-    """The look of a table in a ``.cube`` file.
+def lattice_of_cube(text: str, name: str) -> Lattice:
+    """The lattice of a table in a ``.cube`` file.
 
     Raises:
         ValueError: if it is not a 3-D table of colours from 0 to 1. ``name`` is the file's name in the message.
@@ -43,11 +43,11 @@ def step_of_cube(text: str, name: str) -> Step:
         raise ValueError(f"{name} must hold {size}^3 = {size**3} colours, got {len(rows)}; export it again")
     import numpy as np
 
-    return step_of_table(np.array(rows))
+    return lattice_of(np.array(rows))
 
 
-def step_of_hald(picture: "Values", name: str) -> Step:
-    """The look of a picture (H, W, C) of all colours, in 8 or 16 bits or in floats.
+def lattice_of_hald(picture: "Values", name: str) -> Lattice:
+    """The lattice of a picture (H, W, C) of all colours, in 8 or 16 bits or in floats.
 
     Raises:
         ValueError: if it is none: its sides are the cube of a whole number.
@@ -61,23 +61,23 @@ def step_of_hald(picture: "Values", name: str) -> Step:
             f"{name} must be a Hald, a square picture in colour of 8, 27, 64, ... 512 pixels, got {width}x{height}; "
             "edit one that ImageMagick makes: convert hald:8 hald.png"
         )
-    if level > MOST_LEVELS:
-        raise ValueError(f"{name} must be a Hald of level {MOST_LEVELS} at most, got {level}; make a smaller one")
-    white = {"uint8": 255, "uint16": WHITE}.get(picture.dtype.name, 1)
-    return step_of_table(np.asarray(picture[..., :3], dtype=np.float64).reshape(-1, 3) / white)
+    if level > MOST_HALD_LEVEL:
+        raise ValueError(f"{name} must be a Hald of level {MOST_HALD_LEVEL} at most, got {level}; make a smaller one")
+    white = {"uint8": 255, "uint16": WHITE_16}.get(picture.dtype.name, 1)
+    return lattice_of(np.asarray(picture[..., :3], dtype=np.float64).reshape(-1, 3) / white)
 
 
-def step_of_table(colours: "NDArray[np.floating]") -> Step:
-    """The look of a table (n^3, 3) of colours, in the order of files."""
+def lattice_of(colours: "NDArray[np.floating]") -> Lattice:
+    """The lattice of a table (n^3, 3) of colours, in the order of files."""
     import numpy as np
 
     size = round(len(colours) ** (1 / 3))
     table = colours.reshape(size, size, size, 3).transpose(3, 2, 1, 0)
     changes = table - np.stack(np.meshgrid(*[np.arange(size) / (size - 1)] * 3, indexing="ij"))
-    return Step("look", lattice=tuple(np.round(changes, 6).ravel().tolist()))
+    return tuple(np.round(changes, 6).ravel().tolist())
 
 
-def in_order(table: "NDArray[np.floating]") -> "NDArray[np.floating]":
+def table_rows(table: "NDArray[np.floating]") -> "NDArray[np.floating]":
     """Colours (n^3, 3) in the order of files, of a table (3, n, n, n) by red, green and blue."""
     return table.transpose(3, 2, 1, 0).reshape(-1, 3)
 
@@ -85,7 +85,7 @@ def in_order(table: "NDArray[np.floating]") -> "NDArray[np.floating]":
 def cube_of(table: "NDArray[np.floating]", title: str) -> str:
     """A ``.cube`` file of a table (3, n, n, n) by red, green and blue."""
     head = f'TITLE "{title}"\nLUT_3D_SIZE {len(table[0])}\nDOMAIN_MIN 0 0 0\nDOMAIN_MAX 1 1 1\n'
-    return head + "".join(f"{red:.6f} {green:.6f} {blue:.6f}\n" for red, green, blue in in_order(table).tolist())
+    return head + "".join(f"{red:.6f} {green:.6f} {blue:.6f}\n" for red, green, blue in table_rows(table).tolist())
 
 
 def hald_of(table: "NDArray[np.floating]") -> "NDArray[np.uint16]":
@@ -93,7 +93,7 @@ def hald_of(table: "NDArray[np.floating]") -> "NDArray[np.uint16]":
     import numpy as np
 
     side = math.isqrt(len(table[0])) ** 3
-    levels = np.clip(np.rint(in_order(table) * WHITE), 0, WHITE)
+    levels = np.clip(np.rint(table_rows(table) * WHITE_16), 0, WHITE_16)
     return levels.reshape(side, side, 3).astype(np.uint16)
 
 

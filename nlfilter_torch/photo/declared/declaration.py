@@ -3,6 +3,7 @@
 Does not import torch, so that the command line prints help and lists without delay.
 """
 
+import reprlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -10,6 +11,7 @@ from types import EllipsisType
 from typing import TYPE_CHECKING, Any, Literal, TypeGuard, cast
 
 from nlfilter_torch.photo.declared.json_values import Value, is_within
+from nlfilter_torch.photo.declared.strokes import WORDS, Mark, ScribbleRole, is_layer, mark_of, meaning_of
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -277,7 +279,6 @@ def nodes_of(count: int) -> int | None:
 
 
 ScribbleKind = Literal["colours", "mask", "sliders"]
-ScribbleRole = Literal["object", "background", "added", "removed"]
 
 
 @dataclass(frozen=True)
@@ -289,7 +290,6 @@ class Scribble:
 
     Attributes:
         argument: name of the mask among the arguments of the edit's function.
-        word: meaning of a stroke in files; ``colour`` in it stands for any colour.
         label: text of the brush in the editor.
         kind: ``"colours"`` are scribbles whose colours count, ``"mask"`` is a single mask, and ``"sliders"`` are masks
             of several regions that have sliders of their own.
@@ -304,7 +304,6 @@ class Scribble:
     """
 
     argument: str
-    word: str
     label: str
     kind: ScribbleKind = "mask"
     role: ScribbleRole = "object"
@@ -312,6 +311,17 @@ class Scribble:
     option: str = ""
     option_help: str = ""
     advice: str = ""
+
+    @property
+    def word(self) -> str:
+        """The paint of marks with its role, in which ``colour`` stands for any colour.
+
+        >>> Scribble("keep", "Keep", role="background").word, Scribble("added", "Brush", "colours", "added").word
+        ('out', 'add colour')
+        """
+        if self.kind != "colours":
+            return WORDS[self.role]
+        return "colour" if self.role == "object" else f"{WORDS[self.role]} colour"
 
 
 @dataclass(frozen=True)
@@ -383,7 +393,7 @@ class Edit:
 
     @property
     def words(self) -> tuple[str, ...]:
-        """The meanings that strokes can have."""
+        """The paints that marks can have."""
         return tuple(scribble.word for scribble in self.scribbles)
 
     @property
@@ -400,7 +410,39 @@ class Edit:
         """The scribbles that have one of these roles."""
         return tuple(scribble for scribble in self.scribbles if scribble.role in roles)
 
+    def mark_of(self, value: object, place: str) -> Mark:
+        """Create a mark from a JSON value, see :func:`~nlfilter_torch.photo.declared.strokes.mark_of`.
+
+        Raises:
+            ValueError: if it is none that the edit takes; ``place`` says in the message where it was found.
+        """
+        mark = mark_of(value, place)
+        self.check_mark(mark, f"a stroke in {place}")
+        return mark
+
+    def check_mark(self, mark: Mark, place: str) -> None:
+        """Raise ValueError unless the edit takes marks with such a meaning: their role, with a colour if it needs one.
+
+        A colour or sliders that were meant for another edit mean nothing to an edit that has no use for them.
+        """
+        meaning = meaning_of(mark.paint) if isinstance(mark.paint, str) else None
+        kinds = set() if meaning is None else {scribble.kind for scribble in self.with_role(meaning.role)}
+        coloured = is_layer(mark) or (meaning is not None and meaning.colour is not None)
+        sliders = None if meaning is None else meaning.sliders
+        if "mask" in kinds or ("colours" in kinds and coloured):
+            return
+        if "sliders" in kinds and (sliders is None or self["alpha"].is_valid(sliders)):
+            return
+        wanted = ", ".join(map(_described, self.words))
+        raise ValueError(f"paint of {place} must be one of {wanted}, got {reprlib.repr(mark.paint)}; correct it")
+
     @property
     def regional(self) -> Scribble | None:
         """The scribbles on regions that have sliders of their own, if the edit takes such."""
         return next((scribble for scribble in self.scribbles if scribble.kind == "sliders"), None)
+
+
+def _described(word: str) -> str:
+    """A meaning of marks, for errors."""
+    before, colour, _ = word.partition("colour")
+    return f"{before}{'with ' if before else ''}a colour such as {before}#c04020" if colour else word

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 from nlfilter_torch.photo.declared.declaration import Edit, Parameter, Slider
 from nlfilter_torch.photo.declared.json_values import is_within, shown
-from nlfilter_torch.photo.declared.strokes import Point, Stroke
+from nlfilter_torch.photo.declared.strokes import Mark, Point
 
 Crop = tuple[float, float, float, float]
 WHOLE: Crop = (0.0, 0.0, 1.0, 1.0)
@@ -309,15 +309,13 @@ class Frame:
         column, row = turned(column, row, -self.angle)
         return column / width + 0.5, row / height + 0.5
 
-    def stroke_inward(self, stroke: Stroke) -> Stroke:
-        """A stroke in coordinates of the original, in those of the developed picture."""
-        points = tuple(self.inward(*point) for point in stroke.points)
-        return replace(stroke, points=points, radius=stroke.radius * self.scale)
+    def mark_inward(self, mark: Mark) -> Mark:
+        """A mark in coordinates of the original, in those of the developed picture."""
+        return mark.mapped(self.inward, self.scale)
 
-    def stroke_outward(self, stroke: Stroke) -> Stroke:
-        """A stroke in coordinates of the developed picture, in those of the original."""
-        points = tuple(self.outward(*point) for point in stroke.points)
-        return replace(stroke, points=points, radius=stroke.radius / self.scale)
+    def mark_outward(self, mark: Mark) -> Mark:
+        """A mark in coordinates of the developed picture, in those of the original."""
+        return mark.mapped(self.outward, 1 / self.scale)
 
 
 def turned(x: float, y: float, angle: float) -> tuple[float, float]:

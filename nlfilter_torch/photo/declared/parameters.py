@@ -34,9 +34,15 @@ from nlfilter_torch.photo.declared.shared_parameters import (
 
 CRISP = (2.2, 2.2, 2.2, 1.0)
 BACKGROUND_HELP = "A rectangle of the background, where too much is selected. May be repeated."
+PAINT = Scribble(
+    "stroke_mask",
+    "Paint",
+    "colours",
+    needed=True,
+    advice="give --strokes FILE or --region X,Y,W,H:COLOUR, such as --region 40,60,20,20:red",
+)
 ADD = Scribble(
     "added",
-    "add",
     "Brush",
     role="added",
     option="--add",
@@ -44,7 +50,6 @@ ADD = Scribble(
 )
 REMOVE = Scribble(
     "removed",
-    "remove",
     "Eraser",
     role="removed",
     option="--remove",
@@ -125,8 +130,8 @@ DETAIL = Edit(
     function="enhance",
     hint="Paint on an area to give it its own sliders; everything that resembles it is selected too.",
     scribbles=(
-        Scribble("regions", "in", "Edit this", "sliders"),
-        Scribble("negative", "out", "Not this", role="background"),
+        Scribble("regions", "Edit this", "sliders"),
+        Scribble("negative", "Not this", role="background", option="--background", option_help=BACKGROUND_HELP),
         replace(ADD, kind="sliders"),
         REMOVE,
     ),
@@ -302,16 +307,15 @@ RECOLOR = Edit(
     ),
     hint="Choose a colour and paint some of it on an object; similar areas take it too.",
     scribbles=(
-        Scribble("stroke_mask", "colour", "Paint", "colours", needed=True),
+        PAINT,
         Scribble(
-            "keep",
             "keep",
             "Keep as it is",
             role="background",
             option="--keep",
             option_help="A rectangle; everything that resembles it stays unchanged. May be repeated.",
         ),
-        replace(ADD, word="add colour", kind="colours"),
+        replace(ADD, kind="colours"),
         REMOVE,
     ),
 )
@@ -348,7 +352,7 @@ COLORIZE = Edit(
         *filter_parameters(bandwidth=40.0, share=0.7, patch_size=1)[:4],
     ),
     hint="For grey photographs: paint some colours, and they spread over similar areas nearby.",
-    scribbles=(Scribble("stroke_mask", "colour", "Paint", "colours", needed=True),),
+    scribbles=(PAINT,),
     coloured=True,
 )
 
@@ -387,14 +391,11 @@ DEFOCUS = Edit(
     scribbles=(
         Scribble(
             "focus_region",
-            "in",
             "Keep sharp",
             needed=True,
             advice="give --region X,Y,W,H or --mask FILE to mark what stays sharp, such as --region 190,60,60,60",
         ),
-        Scribble(
-            "background", "out", "Blur this", role="background", option="--background", option_help=BACKGROUND_HELP
-        ),
+        Scribble("background", "Blur this", role="background", option="--background", option_help=BACKGROUND_HELP),
         ADD,
         REMOVE,
     ),
@@ -422,14 +423,11 @@ MASK = Edit(
     scribbles=(
         Scribble(
             "scribbles",
-            "in",
             "Select this",
             needed=True,
             advice="give --region X,Y,W,H or --mask FILE to mark part of the object, such as --region 190,60,60,60",
         ),
-        Scribble(
-            "background", "out", "Not this", role="background", option="--background", option_help=BACKGROUND_HELP
-        ),
+        Scribble("background", "Not this", role="background", option="--background", option_help=BACKGROUND_HELP),
         ADD,
         REMOVE,
     ),

@@ -18,27 +18,26 @@ and strokes stay in place when the crop changes. Does not import torch.
 """
 
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from nlfilter_torch.core.warning import warn
-from nlfilter_torch.photo.declared.colour_tables import step_of_cube, step_of_hald
+from nlfilter_torch.photo.declared.colour_tables import lattice_of_cube, lattice_of_hald
 from nlfilter_torch.photo.declared.development import AS_IT_IS, Development, Frame
 from nlfilter_torch.photo.declared.json_values import Value, parse_json, shown
-from nlfilter_torch.photo.declared.looks import LOOKS
 from nlfilter_torch.photo.declared.parameters import EDITS
 from nlfilter_torch.photo.declared.steps import VERSION, Step, acting_steps, json_of
-from nlfilter_torch.photo.declared.strokes import reaches
+from nlfilter_torch.photo.declared.strokes import Region
 
 if TYPE_CHECKING:
     from nlfilter_torch.photo.declared.colour_tables import Values
 
 ORDER = tuple(EDITS)  # order in which the editor adds steps
-JPEG = b"\xff\xd8\xff"
-PICTURES = (b"\x89PNG", b"II*\0", b"MM\0*", JPEG)  # how files of pictures start
+JPEG_START = b"\xff\xd8\xff"
+PICTURE_STARTS = (b"\x89PNG", b"II*\0", b"MM\0*", JPEG_START)  # how files of pictures start
 OTHER_PICTURES = (b"BM", b"RIFF", b"GIF8", b"P6", b"\0\0\0")  # of kinds that are not read here
-MARKS = ((b"\xff\xfe", "utf-16"), (b"\xfe\xff", "utf-16"), (b"", "utf-8-sig"))  # how files of text start
+TEXT_STARTS = ((b"\xff\xfe", "utf-16"), (b"\xfe\xff", "utf-16"), (b"", "utf-8-sig"))  # how files of text start
 DEVELOPING_BYTES = 48  # per pixel: three copies in colour with transparency; 41 were measured
 REMEDY = "save one in the editor"
 
@@ -202,7 +201,7 @@ class Recipe:
         entries = parse_json(text, name, remedy)
         if not isinstance(entries, dict) or "steps" not in entries:
             raise ValueError(f"{name} is not a preset: it must hold a list of steps; {remedy}")
-        steps = tuple(_read_steps(entries, name))
+        steps = tuple(map(partial(_beside, Path(name).parent), _read_steps(entries, name)))
         return Recipe(steps, Development.from_entries(entries.get("develop", {}), name))
 
     @staticmethod
@@ -214,11 +213,11 @@ class Recipe:
             ValueError: if it is neither. ``name`` is the file's name in the message.
         """
         if name.lower().endswith(".cube"):
-            encoding = next(encoding for mark, encoding in MARKS if content.startswith(mark))
-            return Recipe((step_of_cube(content.decode(encoding, "replace"), name),))
-        if content.startswith(PICTURES):
-            step = step_of_hald(_decoded(content, name), name)
-            if content.startswith(JPEG):
+            encoding = next(encoding for mark, encoding in TEXT_STARTS if content.startswith(mark))
+            return Recipe((Step("look", lattice=lattice_of_cube(content.decode(encoding, "replace"), name)),))
+        if content.startswith(PICTURE_STARTS):
+            step = Step("look", lattice=lattice_of_hald(_decoded(content, name), name))
+            if content.startswith(JPEG_START):
                 warn(f"{name} is a Hald in a JPEG file, whose compression shifts the colours; save it as PNG")
             return Recipe((step,))
         if content.startswith(OTHER_PICTURES):
@@ -237,9 +236,21 @@ def on_frame(step: Step, frame: Frame, seen: tuple[int, int] | None = None) -> S
     if frame.is_whole or not step.strokes:
         return step
     objects = step.painted_as("object", "added")
-    misses = bool(objects) and not any(reaches(stroke, frame.original) for stroke in objects)
-    strokes = map(frame.stroke_inward, step.strokes)
-    return step.changed(strokes=tuple(stroke for stroke in strokes if misses or reaches(stroke, seen or frame.size)))
+    misses = bool(objects) and not any(mark.reaches(frame.original) for mark in objects)
+    strokes = map(frame.mark_inward, step.strokes)
+    return step.changed(strokes=tuple(stroke for stroke in strokes if misses or stroke.reaches(seen or frame.size)))
+
+
+def _beside(folder: Path, step: Step) -> Step:
+    """A step whose pictures of marks lie in a folder, unless their paths are absolute."""
+    if not any(isinstance(mark, Region) and mark.file for mark in step.strokes):
+        return step
+    return step.changed(
+        strokes=tuple(
+            replace(mark, file=str(folder.absolute() / mark.file)) if isinstance(mark, Region) and mark.file else mark
+            for mark in step.strokes
+        )
+    )
 
 
 def _decoded(content: bytes, name: str) -> "Values":
@@ -309,6 +320,35 @@ PURPOSES: dict[str, str] = {
     "soft skin": "removes pores and grain, keeps eyes and outlines",
     "calm": "less contrast within objects, as in haze",
     "smooth": "removes texture, keeps edges; a start for a drawing",
+}
+
+
+_GREY = (0.32, 0.52, 0.16)  # red, green and blue in a grey photograph; more red than luminance has keeps skin light
+_SOFT_CONTRAST = (0.0, 0.215, 0.5, 0.785, 1.0)
+
+
+def _look(red: tuple[float, ...], green: tuple[float, ...], blue: tuple[float, ...], factor: float = 1.0) -> Step:
+    """A look of three curves and a factor of saturation."""
+    return Step("look", red=red, green=green, blue=blue, saturation=(factor,) * 5)
+
+
+#: The named looks, which are presets too: steps of ``look`` with tone curves and colours only, chosen by eye. The
+#: editor shows them.
+LOOKS: dict[str, Step] = {
+    "vivid": _look(_SOFT_CONTRAST, _SOFT_CONTRAST, _SOFT_CONTRAST, 1.2),
+    "warm": _look((0.0, 0.27, 0.54, 0.78, 1.0), (0.0, 0.25, 0.505, 0.755, 1.0), (0.0, 0.23, 0.46, 0.7, 0.96), 1.05),
+    "cool": _look((0.0, 0.23, 0.465, 0.715, 0.97), (0.0, 0.245, 0.5, 0.75, 1.0), (0.015, 0.275, 0.54, 0.785, 1.0)),
+    "faded": _look((0.08, 0.29, 0.51, 0.73, 0.95), (0.07, 0.28, 0.5, 0.72, 0.94), (0.09, 0.29, 0.5, 0.7, 0.9), 0.75),
+    "mono": Step("look", matrix=_GREY * 3),  # curves, which act on each channel, would tint it
+}
+
+#: Short descriptions of the :data:`LOOKS`.
+CHARACTERS: dict[str, str] = {
+    "vivid": "more contrast and colour",
+    "warm": "lighter, towards red and yellow",
+    "cool": "slightly darker, towards blue",
+    "faded": "lifted shadows, dimmed highlights, pale colours",
+    "mono": "black and white, with light skin",
 }
 
 

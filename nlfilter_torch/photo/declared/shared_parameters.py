@@ -17,7 +17,6 @@ from nlfilter_torch.photo.declared.declaration import (
     Unit,
 )
 from nlfilter_torch.photo.declared.json_values import Value
-from nlfilter_torch.photo.declared.shading import LANDMARKS, LEVELS, NEAR
 
 
 class Presentation(TypedDict, total=False):
@@ -154,8 +153,14 @@ def filter_parameters(
     )
 
 
+# Options of a filter whose detail layers exclude shading, for edits of brightness.
+SHADING_LEVELS = 20.0  # photometric bandwidth, in grey levels
+SHADING_DISTANCE = 1 / 12  # spatial bandwidth, as a fraction of the short side; excludes shading from the detail layers
+SHADING_LANDMARKS = 300
 #: Filter parameters of the edits of brightness that separate shading from detail.
-WITHOUT_SHADING = filter_parameters(bandwidth=LEVELS, share=NEAR, landmarks=LANDMARKS, auto=True, far=True)
+WITHOUT_SHADING = filter_parameters(
+    bandwidth=SHADING_LEVELS, share=SHADING_DISTANCE, landmarks=SHADING_LANDMARKS, auto=True, far=True
+)
 #: For all edits of brightness.
 LIMITS = choice(
     "limits",

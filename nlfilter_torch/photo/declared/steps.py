@@ -8,15 +8,13 @@ import copy
 import json
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from nlfilter_torch.photo.declared.declaration import Arguments, Edit, ScribbleRole
+from nlfilter_torch.photo.declared.declaration import Arguments, Edit
 from nlfilter_torch.photo.declared.json_values import Value, is_within, plain, shown
 from nlfilter_torch.photo.declared.parameters import EDITS
 from nlfilter_torch.photo.declared.shared_parameters import FILTER
-
-if TYPE_CHECKING:
-    from nlfilter_torch.photo.declared.strokes import Stroke
+from nlfilter_torch.photo.declared.strokes import Mark, ScribbleRole, sliders_of
 
 VERSION = 1  # of files of steps
 NONE = (1.0, 1.0, 1.0, 1.0)  # sliders that change nothing
@@ -29,7 +27,7 @@ class Step:
 
     Attributes:
         edit: name of the edit, one of :data:`~nlfilter_torch.photo.declared.parameters.EDITS`.
-        strokes: strokes painted for it.
+        strokes: strokes and regions marked for it.
         values: names and values of the parameters that differ from their defaults, in the order of declaration.
         on: whether it is applied.
         opacity: how much of its result is shown over the picture before it: 1 is all, 0 none.
@@ -42,12 +40,12 @@ class Step:
     """
 
     edit: str
-    strokes: tuple["Stroke", ...]
+    strokes: tuple[Mark, ...]
     values: tuple[tuple[str, Value], ...]
     on: bool = True
     opacity: float = 1.0
 
-    def __init__(self, edit: str, strokes: tuple["Stroke", ...] = (), **values: Value) -> None:
+    def __init__(self, edit: str, strokes: tuple[Mark, ...] = (), **values: Value) -> None:
         """Create a step; omitted parameters have their defaults."""
         declared = EDITS[edit]
         unknown = values.keys() - {parameter.name for parameter in declared}
@@ -73,7 +71,7 @@ class Step:
         """Return the value of a parameter."""
         return dict(self.values).get(name, EDITS[self.edit][name].default)
 
-    def changed(self, *, strokes: tuple["Stroke", ...] | None = None, **values: Value) -> "Step":
+    def changed(self, *, strokes: tuple[Mark, ...] | None = None, **values: Value) -> "Step":
         """Return a copy with other strokes or parameters."""
         step = Step(self.edit, self.strokes if strokes is None else strokes, **{**dict(self.values), **values})
         return step.mixed(on=self.on, opacity=self.opacity)
@@ -95,13 +93,9 @@ class Step:
         """Declaration of the edit."""
         return EDITS[self.edit]
 
-    def painted(self, *words: str) -> tuple["Stroke", ...]:
-        """Return the strokes that have the meaning of one of these words, in which ``colour`` is any colour."""
-        return tuple(stroke for stroke in self.strokes if any(map(stroke.means, words)))
-
-    def painted_as(self, *roles: ScribbleRole) -> tuple["Stroke", ...]:
-        """Return the strokes of scribbles that have one of these roles."""
-        return self.painted(*(scribble.word for scribble in self.declared.with_role(*roles)))
+    def painted_as(self, *roles: ScribbleRole) -> tuple[Mark, ...]:
+        """Return the marks that have one of these roles."""
+        return tuple(mark for mark in self.strokes if mark.role in roles)
 
     def marks_object(self) -> bool:
         """Whether a stroke marks an object, or adds to its mask."""
@@ -132,9 +126,8 @@ class Step:
         if self.declared.parts and not any(self[name] for name in self.declared.parts):
             return False
         acting = [p for p in self.declared if p.idle is not ...]
-        return any(not p.is_idle(self[p.name]) for p in acting) or (
-            self.has_region() and any(slider != 1 for slider in self.sliders_inside)
-        )
+        regions = sliders_of(self.strokes, self.sliders_inside) if self.has_region() else ()
+        return any(not p.is_idle(self[p.name]) for p in acting) or any(set(sliders) != {1} for sliders in regions)
 
     def bytes_per_pixel(self, *, masked: bool = False) -> int:
         """Memory in bytes needed per pixel of an image; ``masked`` if a region is given by other means than strokes."""
@@ -193,7 +186,7 @@ class Step:
         """
         declared, values = EDITS[edit], dict[str, Value]()
         parameters = {parameter.name: parameter for parameter in declared}
-        strokes: tuple[Stroke, ...] = ()
+        strokes: tuple[Mark, ...] = ()
         on, opacity = _read_mixing(entries, place)
         for entry, value in entries.items():
             if entry in MIXING:
@@ -211,6 +204,9 @@ class Step:
         step = Step(edit, strokes, **values)
         if declared.regional is not None and len(step.sliders_inside) != len(step["alpha"]):
             raise ValueError(f"inside of {place} must have as many numbers as alpha; add or drop some")
+        notes = [mark.meaning.sliders for mark in strokes if mark.meaning.sliders is not None]
+        if declared.regional is not None and any(len(sliders) != len(step["alpha"]) for sliders in notes):
+            raise ValueError(f"sliders in paint of {place} must be as many numbers as alpha; add or drop some")
         return step.mixed(on=on, opacity=opacity)
 
 
@@ -251,9 +247,7 @@ def _read_mixing(entries: dict[str, object], place: str) -> tuple[bool, float]:
     return on, float(opacity)
 
 
-def _read_strokes(value: object, declared: Edit, place: str) -> tuple["Stroke", ...]:
-    from nlfilter_torch.photo.declared.strokes import Stroke
-
+def _read_strokes(value: object, declared: Edit, place: str) -> tuple[Mark, ...]:
     if not isinstance(value, list):
         raise ValueError(f"strokes of {place} must be a list, got {shown(value)}; correct them")
-    return tuple(Stroke.from_entries(stroke, declared.words, place) for stroke in value)
+    return tuple(declared.mark_of(stroke, place) for stroke in value)

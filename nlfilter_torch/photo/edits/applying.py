@@ -1,6 +1,7 @@
 """Applying a step to an image, and caching what later steps of the same kind can reuse."""
 
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from functools import partial
 from importlib import import_module
 
@@ -13,7 +14,7 @@ from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.declared.shared_parameters import FILTER
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.picture.developing import develop_image, develop_planes, limits_of
-from nlfilter_torch.photo.picture.drawn import Drawn, M, Painter
+from nlfilter_torch.photo.picture.drawn import Drawn, M, Painter, drawn_by
 from nlfilter_torch.photo.picture.edit import PhotoEdit
 from nlfilter_torch.photo.picture.in_memory import InMemory, fit_edit
 from nlfilter_torch.photo.picture.painting import TensorPainter
@@ -59,33 +60,14 @@ def scribbles_of(step: Step, size: tuple[int, int], painter: Painter[M]) -> Draw
     """Rasterise the strokes of a step over a picture (H, W).
 
     Raises:
-        ValueError: if no pixel is under the strokes that mark the objects.
+        ValueError: if no pixel is under the strokes that mark the objects, or the edit does not take one of them.
     """
     if not step.is_drawn():
         return Drawn()
-    _check_covered(step, step.marks_object())
-    masks: dict[str, M] = {}
-    colours: M | None = None
-    on_object, on_mask = step.painted_as("object"), step.painted_as("added", "removed")
-    for scribble in step.declared.scribbles:
-        strokes = step.painted(scribble.word)
-        if not strokes:
-            continue
-        if scribble.role in ("added", "removed"):
-            masks[scribble.argument] = painter.on_mask(on_mask, scribble.word, size)
-        elif scribble.kind == "colours":
-            colours, mask = painter.colours(strokes, size)
-            _check_covered(step, painter.covers(colours if mask is None else mask))
-            masks |= {} if mask is None else {scribble.argument: mask}
-        elif scribble.role == "object":
-            masks[scribble.argument] = painter.mask(strokes, size)
-            _check_covered(step, painter.covers(masks[scribble.argument]))
-        else:
-            mask = painter.mask(strokes, size, above=on_object)
-            masks |= {scribble.argument: mask} if painter.covers(mask) else {}
     if step.declared.regional is None:
-        return Drawn(masks, colours)
-    return Drawn(masks, colours, torch.tensor(step.sliders_inside)[None], torch.tensor(step["alpha"]))
+        return drawn_by(step.declared, step.strokes, size, painter)
+    drawn = drawn_by(step.declared, step.strokes, size, painter, step.sliders_inside)
+    return replace(drawn, outside=torch.tensor(step["alpha"]))
 
 
 def left_by_crop(step: Step, source: Source[M], painter: Painter[M]) -> Step:
@@ -96,14 +78,9 @@ def left_by_crop(step: Step, source: Source[M], painter: Painter[M]) -> Step:
     objects = step.painted_as("object", "added")
     if not objects:
         return step
-    mask = painter.mask(objects, source.size)
+    mask = painter.planes([tuple((mark, True) for mark in objects)], source.size)
     is_seen = not painter.covers(mask) or len(source.scribbles(mask, None, "strokes", needed=False).places) > 0
     return step if is_seen else step.changed(strokes=())
-
-
-def _check_covered(step: Step, covered: bool) -> None:
-    if not covered:
-        raise ValueError(f"strokes of {step.edit} must cover a pixel of the photograph, got none that do; move them")
 
 
 def edit_of(

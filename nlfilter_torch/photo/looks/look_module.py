@@ -25,7 +25,7 @@ from nlfilter_torch.operator.options import (
     Sampling,
     SpatialBandwidth,
 )
-from nlfilter_torch.photo.declared.shading import LANDMARKS, LEVELS, NEAR
+from nlfilter_torch.photo.declared.shared_parameters import SHADING_DISTANCE, SHADING_LANDMARKS, SHADING_LEVELS
 from nlfilter_torch.photo.looks.histogram import KINDS_OF_LEVELS, STRENGTHS
 from nlfilter_torch.photo.looks.look_filter import BLURS, LOOK_PARTS, LookPart, acts, check_part, filter_look
 
@@ -81,9 +81,9 @@ class Look(nn.Module):
         learn: LookPart | Collection[LookPart] = LOOK_PARTS,
         knots: int = 17,
         patch_size: int = FilterOptions.patch_size,
-        photometric_bandwidth: float | Tensor | Literal["auto"] = LEVELS / 255,
+        photometric_bandwidth: float | Tensor | Literal["auto"] = SHADING_LEVELS / 255,
         spatial_bandwidth: SpatialBandwidth | Literal["auto"] | None = AUTO,
-        num_landmarks: int = LANDMARKS,
+        num_landmarks: int = SHADING_LANDMARKS,
         landmarks: Sampling = SAMPLING,
         completion: Completion = FilterOptions.completion,
         guide_channels: GuideChannels = FilterOptions.guide_channels,
@@ -168,4 +168,4 @@ class Look(nn.Module):
         """Options of the filter for an image (B, 3, H, W)."""
         if not isinstance(self.options.spatial_bandwidth, str):
             return self.options
-        return replace(self.options, spatial_bandwidth=NEAR * min(image.shape[-2:]))
+        return replace(self.options, spatial_bandwidth=SHADING_DISTANCE * min(image.shape[-2:]))

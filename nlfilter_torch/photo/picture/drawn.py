@@ -1,17 +1,21 @@
-"""Scribbles of an edit, in the form that a source takes, and what rasterises strokes to that form."""
+"""The scribbles of an edit as a source takes them, and the one way from marks on a picture to these."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Generic, Protocol, TypeVar
 
+import torch
 from torch import Tensor
 
-from nlfilter_torch.photo.declared.strokes import Stroke
+from nlfilter_torch.photo.declared.declaration import Edit
+from nlfilter_torch.photo.declared.strokes import Mark, ScribbleRole, sliders_of
+from nlfilter_torch.photo.picture.pixels import M as M
 
-M = TypeVar("M")  # masks and colours of pixels as a source takes them: tensors in memory, rows in tiles
-M_co = TypeVar("M_co", covariant=True)  # likewise, of values that are only read
+M_co = TypeVar("M_co", covariant=True)  # as M, of values that are only read
 
 Size = tuple[int, int]  # (H, W)
+#: What is shown of marks in a plane, from the lowest to the topmost: marks, and whether they paint or erase.
+Plane = tuple[tuple[Mark, bool], ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,19 +42,62 @@ class Drawn(Generic[M_co]):
 
 
 class Painter(Protocol[M]):
-    """Rasterises strokes to masks and colours as a source takes them."""
+    """Rasterises marks to masks and colours as a source takes them."""
 
-    def mask(self, strokes: Sequence[Stroke], size: Size, *, above: Sequence[Stroke] = ()) -> M:
-        """The mask of strokes on a picture (H, W), which is 0 where the strokes ``above`` cover them."""
+    def planes(self, shown: Sequence[Plane], size: Size, *, soft: bool = False, coloured: bool = False) -> M:
+        """See :func:`~nlfilter_torch.photo.picture.painting.rasterised`."""
 
-    def colours(self, strokes: Sequence[Stroke], size: Size) -> tuple[M, M | None]:
-        """Colours of strokes and their mask, which is None if it is the fourth channel of the colours."""
+    def covers(self, planes: M) -> bool:
+        """Whether masks or colours cover a pixel of the picture."""
 
-    def on_mask(self, strokes: Sequence[Stroke], word: str, size: Size) -> M:
-        """What strokes of a meaning set on a mask of a picture (H, W), with RGB before it if the meaning has a colour.
 
-        Later strokes of any meaning cover earlier ones.
-        """
+def drawn_by(
+    edit: Edit, marks: Sequence[Mark], size: Size, painter: Painter[M], inside: tuple[float, ...] = ()
+) -> Drawn[M]:
+    """What marks on a picture (H, W) are for an edit.
 
-    def covers(self, marks: M) -> bool:
-        """Whether a mask or colours cover a pixel of the picture."""
+    Marks on objects cover those on the background, of which nothing may be left. Of what is added to masks and removed
+    from them, the later covers the earlier. ``inside`` are the sliders of regions whose marks say none, if the edit
+    takes such.
+
+    Raises:
+        ValueError: if the edit does not take a mark, or those of objects are needed and cover no pixel.
+    """
+    for mark in marks:
+        edit.check_mark(mark, f"strokes of {edit.name}")
+    _check_covered(edit, not edit.requires_strokes or any(mark.role in ("object", "added") for mark in marks))
+    masks: dict[str, M] = {}
+    colours: M | None = None
+    sliders = sliders_of(marks, inside) if inside else ()
+    for scribble in edit.scribbles:
+        role, coloured = scribble.role, scribble.kind == "colours"
+        own = [mark for mark in marks if mark.role == role]
+        if not own:
+            continue
+        groups = [own]
+        if scribble.kind == "sliders":
+            groups = [[mark for mark in own if (mark.meaning.sliders or inside) == row] for row in sliders]
+        shown = [_plane(group, role, marks) for group in groups]
+        planes = painter.planes(shown, size, soft=role in ("added", "removed"), coloured=coloured)
+        if role == "object":
+            _check_covered(edit, painter.covers(planes))
+        if role == "object" and coloured:
+            colours = planes
+        elif role != "background" or painter.covers(planes):
+            masks[scribble.argument] = planes
+    return Drawn(masks, colours, torch.tensor(sliders) if sliders else None)
+
+
+def _check_covered(edit: Edit, covered: bool) -> None:
+    if not covered:
+        raise ValueError(f"strokes of {edit.name} must cover a pixel of the photograph, got none that do; move them")
+
+
+def _plane(group: Sequence[Mark], role: ScribbleRole, marks: Sequence[Mark]) -> Plane:
+    """What is shown of a group of marks with a role, among all marks of an edit."""
+    if role == "object":
+        return tuple((mark, True) for mark in group)
+    if role == "background":
+        return (*((mark, True) for mark in group), *((mark, False) for mark in marks if mark.role == "object"))
+    others = ("removed",) if role == "added" else ("added",)
+    return tuple((mark, mark.role == role) for mark in marks if mark in group or mark.role in others)

@@ -9,7 +9,8 @@ from typing import ClassVar, Self
 from torch import Tensor
 
 from nlfilter_torch.operator.options import FilterOptions
-from nlfilter_torch.photo.declared.declaration import Arguments, Edit, ScribbleRole
+from nlfilter_torch.photo.declared.declaration import Arguments, Edit
+from nlfilter_torch.photo.declared.strokes import ScribbleRole
 from nlfilter_torch.photo.picture.drawn import Drawn, M
 from nlfilter_torch.photo.picture.pixels import Fitted
 from nlfilter_torch.photo.picture.source import Source
@@ -119,6 +120,11 @@ class PhotoEdit(ABC):
         return None
 
     def marks(self, drawn: Drawn[M]) -> Drawn[M]:
-        """The scribbles under the names that :meth:`selection` takes."""
-        scribbles = [scribble for scribble in self.declared.scribbles if scribble.argument in drawn.masks]
-        return Drawn({MARKS[scribble.role]: drawn.masks[scribble.argument] for scribble in scribbles})
+        """The scribbles under the names that :meth:`selection` takes; the last plane of colours is their mask."""
+        masks = dict[str, M]()
+        for scribble in self.declared.scribbles:
+            coloured = drawn.colours if scribble.kind == "colours" and scribble.role == "object" else None
+            mask = drawn.masks.get(scribble.argument, coloured)
+            if mask is not None:
+                masks[MARKS[scribble.role]] = mask
+        return Drawn(masks)

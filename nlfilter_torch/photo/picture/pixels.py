@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 import torch
 from torch import Tensor
@@ -11,6 +11,7 @@ from nlfilter_torch.core.blocks import block_length
 from nlfilter_torch.core.inner import Inner
 
 STRIP = 1 << 18  # pixels that a core computes at a time; with fewer, cores wait for each other if other programs run
+M = TypeVar("M")  # masks and colours of pixels as a source takes them: tensors in memory, rows in tiles
 
 
 class Pixels(Protocol):

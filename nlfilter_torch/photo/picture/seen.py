@@ -21,8 +21,7 @@ from nlfilter_torch.core.rational import RationalForm
 from nlfilter_torch.core.torch_internals import is_unreadable
 from nlfilter_torch.operator.pixel_matrix import Columns
 from nlfilter_torch.operator.spectrum import RitzPairs
-from nlfilter_torch.photo.picture.drawn import M
-from nlfilter_torch.photo.picture.pixels import Fitted, Pixels, Planes
+from nlfilter_torch.photo.picture.pixels import Fitted, M, Pixels, Planes
 from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles
 from nlfilter_torch.photo.picture.source import Blocks, Guide, Kept, Operator, Reduced, Source, sampled_places, seeded
 from nlfilter_torch.photo.picture.working_range import WorkingRange

@@ -21,8 +21,8 @@ from nlfilter_torch.operator.features import blur, blur_margin, reduce_channels
 from nlfilter_torch.operator.options import FilterOptions
 from nlfilter_torch.operator.pixel_matrix import Columns
 from nlfilter_torch.operator.spectrum import RitzPairs
-from nlfilter_torch.photo.picture.drawn import M
 from nlfilter_torch.photo.picture.pixels import Fitted as Fitted
+from nlfilter_torch.photo.picture.pixels import M
 from nlfilter_torch.photo.picture.pixels import Pixels as Pixels
 from nlfilter_torch.photo.picture.pixels import Planes as Planes
 from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from nlfilter_torch.photo.declared.rows import RowSource
-from nlfilter_torch.photo.declared.strokes import Stroke
-from nlfilter_torch.photo.picture.painting import mask_of, paint, painted_on_mask
+from nlfilter_torch.photo.picture.drawn import Plane, Size
+from nlfilter_torch.photo.picture.painting import Open, opened_picture, rasterised
 from nlfilter_torch.photo.picture.pictures import LazyRows, Picture, stored_as, transparency
 from nlfilter_torch.photo.picture.pixels import Pixels, corner
 from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles
@@ -21,42 +21,31 @@ ReadRows = Callable[[int, int], Tensor]  # (start, stop) to these rows
 
 
 class RowPainter:
-    """Rasterises strokes as they are read: to rows, of which only a few are in memory at once."""
+    """Rasterises marks as they are read: to rows (H, W, K), of which only a few are in memory at once."""
 
-    def mask(self, strokes: Sequence[Stroke], size: tuple[int, int], *, above: Sequence[Stroke] = ()) -> RowSource:
-        """The mask of strokes over a picture (H, W): rows (H, W, 1), see :func:`mask_of`."""
-        return LazyRows((*size, 1), partial(_mask_rows, strokes, size, above))
+    def __init__(self, opened: Open = opened_picture) -> None:
+        self._opened = opened
 
-    def colours(self, strokes: Sequence[Stroke], size: tuple[int, int]) -> tuple[RowSource, None]:
-        """Strokes over a picture (H, W): rows (H, W, 4) in RGB with their mask, and None."""
-        return LazyRows((*size, 4), partial(_colour_rows, strokes, size)), None
+    def planes(self, shown: Sequence[Plane], size: Size, *, soft: bool = False, coloured: bool = False) -> RowSource:
+        """Return :func:`rasterised` marks."""
+        read = partial(_rasterised_rows, tuple(shown), size, soft=soft, coloured=coloured, opened=self._opened)
+        return LazyRows((*size, 3 * coloured + len(shown)), read)
 
-    def on_mask(self, strokes: Sequence[Stroke], word: str, size: tuple[int, int]) -> RowSource:
-        """What strokes of a meaning set on a mask: rows (H, W, 1 or 4), see :func:`painted_on_mask`."""
-        samples = 4 if "colour" in word else 1
-        return LazyRows((*size, samples), partial(_on_mask_rows, strokes, word, size))
-
-    def covers(self, marks: RowSource) -> bool:
-        """Whether a mask or colours cover a pixel."""
-        return LazyRows(tuple(marks.shape), partial(_rows_of, marks), marks.dtype).any()
+    def covers(self, planes: RowSource) -> bool:
+        """Whether masks or colours cover a pixel."""
+        return LazyRows(tuple(planes.shape), partial(plane_rows, planes), planes.dtype).any()
 
 
-def _rows_of(marks: RowSource, rows: slice) -> NDArray[np.generic]:
-    return np.asarray(marks[rows])
-
-
-def _mask_rows(
-    strokes: Sequence[Stroke], size: tuple[int, int], above: Sequence[Stroke], rows: slice
+def _rasterised_rows(
+    shown: Sequence[Plane], size: Size, rows: slice, *, soft: bool, coloured: bool, opened: Open
 ) -> NDArray[np.generic]:
-    return stored_as(mask_of(strokes, size, rows, above=above), "float32")
+    planes = rasterised(shown, size, rows, soft=soft, coloured=coloured, opened=opened)
+    return stored_as(planes, "float32")
 
 
-def _on_mask_rows(strokes: Sequence[Stroke], word: str, size: tuple[int, int], rows: slice) -> NDArray[np.generic]:
-    return stored_as(painted_on_mask(strokes, word, size, rows), "float32")
-
-
-def _colour_rows(strokes: Sequence[Stroke], size: tuple[int, int], rows: slice) -> NDArray[np.generic]:
-    return stored_as(torch.cat(paint(strokes, size, rows), dim=1), "float32")
+def plane_rows(planes: RowSource, rows: slice) -> NDArray[np.generic]:
+    """Some rows (h, W, K) of planes."""
+    return np.asarray(planes[rows])
 
 
 def region_rows(masks: RowSource, region: int) -> LazyRows:

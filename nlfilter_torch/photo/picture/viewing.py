@@ -24,9 +24,8 @@ from torch import Tensor
 
 from nlfilter_torch.core.torch_internals import cached_constants
 from nlfilter_torch.operator.features import pad_border
-from nlfilter_torch.photo.picture.drawn import M
 from nlfilter_torch.photo.picture.limits import Balance, Limits, balance_of, balanced, clamped, limit, move_luminance
-from nlfilter_torch.photo.picture.pixels import Fitted, Pixels, Planes, corner
+from nlfilter_torch.photo.picture.pixels import Fitted, M, Pixels, Planes, corner
 from nlfilter_torch.photo.picture.resizing import interpolation, resized, rows_of
 from nlfilter_torch.photo.picture.source import Source
 

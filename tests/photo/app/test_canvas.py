@@ -10,7 +10,6 @@ from nicegui import Client
 from nlfilter_torch.photo.app import drawing
 from nlfilter_torch.photo.app.brush import Brush
 from nlfilter_torch.photo.app.canvas import Canvas
-from nlfilter_torch.photo.app.overlays import Overlays
 from nlfilter_torch.photo.app.session import Session
 from nlfilter_torch.photo.picture.photographs import Photograph, write_photograph
 from tests.problems import cat
@@ -183,13 +182,6 @@ def test_parts_of_strokes_that_do_not_count_are_hatched(opened: Page, tmp_path: 
     assert ignored.nonzero()[:, 3].min() >= 44  # the green begins at 48
     canvas._show_strokes.set_value(False)
     assert not canvas._ignored.visible
-    overlays, step = Overlays(), session.recipe.current("detail")
-    first = overlays.ignored(step, session.preview.pixels)
-    assert first is not None
-    assert overlays.ignored(step.mixed(on=False, opacity=0.3), session.preview.pixels) is first
-    mask = overlays.selected(step, session.preview.pixels)
-    assert overlays.selected(step.mixed(opacity=0.3), session.preview.pixels) is mask
-    assert overlays.ignored(step, torch.full_like(session.preview.pixels, 0.5)) is None
 
 
 def test_what_is_clipped(opened: Page, session: Session) -> None:

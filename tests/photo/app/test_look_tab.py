@@ -9,8 +9,7 @@ from nicegui import Client, ui
 from PIL import Image
 
 from nlfilter_torch.photo.app.look_tab import SIDE, LookTab, entries_of, thumbnails
-from nlfilter_torch.photo.declared.looks import LOOKS
-from nlfilter_torch.photo.declared.presets import Recipe
+from nlfilter_torch.photo.declared.presets import LOOKS, Recipe
 from nlfilter_torch.photo.edits.applying import apply_step
 from tests.photo.app.page_controls import Controls
 from tests.problems import cat

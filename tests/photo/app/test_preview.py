@@ -17,11 +17,11 @@ from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.declared.strokes import Stroke
 from nlfilter_torch.photo.edits.applying import PreparedStep, apply_recipe, apply_step
-from nlfilter_torch.photo.picture.painting import mask_of
 from nlfilter_torch.photo.picture.resizing import resize
 from nlfilter_torch.photo.picture.source import seeded
 from nlfilter_torch.photo.picture.viewing import viewed_size
 from tests.problems import cat, difference
+from tests.strokes import mask_of
 
 FEW = {"landmarks": 60}
 
@@ -79,7 +79,7 @@ HERE, THERE = ((0.2, 0.2), (0.3, 0.2)), ((0.7, 0.6), (0.8, 0.7))
 PAIRS = {
     "recolor": (
         Step("recolor", (Stroke(HERE, 0.04, "#2040e0"),)),
-        Step("recolor", (Stroke(HERE, 0.04, "#20e040"), Stroke(THERE, 0.04, "keep")), reach=0.5),
+        Step("recolor", (Stroke(HERE, 0.04, "#20e040"), Stroke(THERE, 0.04, "out")), reach=0.5),
     ),
     "colorize": (
         Step("colorize", (Stroke(HERE, 0.04, "#2040e0"),)),
@@ -350,12 +350,12 @@ def test_masks_are_those_of_the_library_and_need_no_other_filter(monkeypatch: py
     preview, size = Preview(image), (image.shape[-2], image.shape[-1])
     inner, outer = mask_of((first,), size), mask_of((second,), size)
     wanted = [region_mask(image, inner, generator=seeded()), region_mask(image, inner, outer, generator=seeded())]
-    assert torch.equal(preview.mask(Step("detail", (first,))), wanted[0])
+    assert torch.equal(preview.masks(Step("detail", (first,))), wanted[0])
     monkeypatch.setattr("nlfilter_torch.photo.picture.in_memory.operator_from_guide", None)
-    assert torch.equal(preview.mask(Step("detail", (first, second), landmarks=400)), wanted[1])
-    assert not torch.equal(preview.mask(Step("detail", (first, second), reach=0.9)), wanted[1])
+    assert torch.equal(preview.masks(Step("detail", (first, second), landmarks=400)), wanted[1])
+    assert not torch.equal(preview.masks(Step("detail", (first, second), reach=0.9)), wanted[1])
     with pytest.raises(TypeError):
-        preview.mask(Step("detail", (first, second), tolerance=20.0))
+        preview.masks(Step("detail", (first, second), tolerance=20.0))
 
 
 def test_areas_are_means() -> None:

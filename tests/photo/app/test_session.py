@@ -1,5 +1,6 @@
 """A session of the editor without its page: steps, strokes and history."""
 
+import json
 from pathlib import Path
 
 import imagecodecs
@@ -9,6 +10,7 @@ import skimage.data
 import torch
 from PIL import Image
 
+from nlfilter_torch.photo.app.drawing import strokes_svg
 from nlfilter_torch.photo.app.page import PRESET_KINDS
 from nlfilter_torch.photo.app.session import Session
 from nlfilter_torch.photo.declared.colour_tables import cube_of, hald_of
@@ -69,7 +71,7 @@ def test_strokes(session: Session) -> None:
     (stroke,) = session.recipe.current("detail").strokes
     assert stroke.points[0] == (round(20 / 150, 4), 0.2)
     assert stroke.paint == "in"
-    mask = session.preview.mask(session.recipe.current("detail"))
+    mask = session.preview.masks(session.recipe.current("detail"))
     assert mask is not None
     assert mask[0, 0, 20, 30] > 0.9
     session.add_stroke("recolor", LINE, 0.03, "#2040e0")
@@ -80,13 +82,45 @@ def test_strokes(session: Session) -> None:
         session.add_stroke("defocus", LINE, 0.03, "red")
 
 
+def test_regions_of_files_are_those_of_the_preview(session: Session, tmp_path: Path) -> None:
+    """A file with regions, and with strokes that were drawn for other edits, is shown as it is applied."""
+    mask = np.zeros((100, 150), np.uint8)
+    mask[60:80, 100:130] = 255
+    Image.fromarray(mask).save(tmp_path / "mask.png")
+    strokes = [
+        {"paint": "#2040e0", "rectangle": [0.1, 0.1, 0.2, 0.2]},
+        {"paint": "in 3,1,1,1", "ellipse": [0.4, 0.4, 0.2, 0.2]},
+        {"paint": "in", "mask": "mask.png"},
+        {"paint": "out", "polygon": [[0.7, 0.1], [0.9, 0.1], [0.9, 0.3]]},
+    ]
+    steps = [
+        {"edit": "detail", "alpha": [1, 1, 1, 1], "inside": [2, 2, 1, 1], "strokes": strokes},
+        {"edit": "defocus", "strokes": strokes},
+        {"edit": "recolor", "strokes": strokes[:1] + strokes[3:]},
+    ]
+    content = json.dumps({"version": 1, "steps": steps}).encode()
+    session.load_preset(content, str(tmp_path / "edit.json"))
+    for edit in ("detail", "defocus", "recolor"):
+        selected = session.mask(edit)
+        assert selected is not None
+        assert selected[0, 0, 20, 30] > 0.9
+    masks = session.preview.masks(session.recipe.current("detail"))
+    assert masks is not None
+    assert masks[0, 0, 70, 115] > 0.9
+    assert masks[0, 1, 50, 75] > 0.9  # of other sliders
+    assert strokes_svg(session.step_in_view("defocus").strokes, (100, 150)).count("Z") == 4  # borders of regions
+    shown = session.render()
+    assert shown.isfinite().all()
+    assert difference(shown, session.preview.pixels) > 0
+
+
 def test_strokes_under_others_count_as_absent(session: Session) -> None:
     session.add_stroke("detail", LINE, 0.06, "in")
     session.set("detail", inside=(3.0, 3.0, 2.0, 1.0))
     session.commit()
-    without, alone = session.render(), session.preview.mask(session.recipe.current("detail"))
+    without, alone = session.render(), session.preview.masks(session.recipe.current("detail"))
     session.add_stroke("detail", LINE, 0.03, "out")
-    mask = session.preview.mask(session.recipe.current("detail"))
+    mask = session.preview.masks(session.recipe.current("detail"))
     assert mask is not None
     assert alone is not None
     assert torch.equal(mask, alone)

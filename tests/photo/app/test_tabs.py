@@ -37,8 +37,8 @@ def test_the_settings_of_the_brush(shown: Controls) -> None:
     EditTab("colorize", shown.link)  # whose field shows the same colour
     words, others, _ = shown.of(ui.toggle)
     assert (words.value, others.value) == ("colour", "in")
-    words.set_value("keep")
-    assert shown.brush.paint("recolor") == "keep"
+    words.set_value("out")
+    assert shown.brush.paint("recolor") == "out"
     words.set_value("add colour")
     assert shown.brush.paint("recolor") == f"add {COLOURS[0]}"
     assert shown.brush.paint("defocus") == "in"

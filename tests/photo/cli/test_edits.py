@@ -120,17 +120,17 @@ def test_wrong_options(photo: Path, tmp_path: Path, capsys: pytest.CaptureFixtur
 
 def test_options_of_an_edit_with_two_kinds_of_scribbles() -> None:
     """An edit that declares its scribbles has the options for them, which nothing else names."""
-    keep = Scribble("keep", "keep", "Keep", role="background", option="--keep", option_help="Pixels to keep.")
-    edit = Edit("desaturate", "", (), scribbles=(Scribble("scribbles", "in", "Object", needed=True), keep))
+    keep = Scribble("keep", "Keep", role="background", option="--keep", option_help="Pixels to keep.")
+    edit = Edit("desaturate", "", (), scribbles=(Scribble("scribbles", "Object", needed=True), keep))
     annotations = scribble_options(edit)
-    assert list(annotations) == ["region", "keep", "mask", "show"]
+    assert list(annotations) == ["strokes", "region", "keep", "mask", "show"]
     assert annotations["region"] is options.Regions
     assert get_args(annotations["keep"])[1].help == "Pixels to keep."
-    colours = Edit("tint", "", (), scribbles=(Scribble("mask", "colour", "Colour", "colours"), keep), map_help="A map.")
-    assert list(scribble_options(colours)) == ["strokes", "region", "keep", "show", "map"]
+    colours = Edit("tint", "", (), scribbles=(Scribble("mask", "Colour", "colours"), keep), map_help="A map.")
+    assert list(scribble_options(colours)) == ["strokes", "region", "keep", "mask", "colour", "show", "map"]
     assert not scribble_options(Edit("plain", "", ()))
     parameters = list(inspect.signature(command(edit)).parameters)
-    assert parameters[:6] == ["source", "target", "region", "keep", "mask", "show"]
+    assert parameters[:7] == ["source", "target", "strokes", "region", "keep", "mask", "show"]
 
 
 def test_values_of_options_are_those_of_steps() -> None:

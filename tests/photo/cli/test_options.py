@@ -105,11 +105,11 @@ WRONG_PRESETS = [
     (step_file("abstract", f'"tones": {LONG}'), "must be a whole number from 2 to 65536, or null"),
     (step_file("abstract", '"tones": 4.0'), "must be a whole number from 2 to 65536, or null"),
     (
-        step_file("recolor", f'"strokes": [{{"points": [[{LONG}, 0]], "radius": 0.1, "paint": "keep"}}]'),
+        step_file("recolor", f'"strokes": [{{"points": [[{LONG}, 0]], "radius": 0.1, "paint": "out"}}]'),
         "must be pairs of numbers",
     ),
     (
-        step_file("recolor", f'"strokes": [{{"points": [[0, 0]], "radius": {LONG}, "paint": "keep"}}]'),
+        step_file("recolor", f'"strokes": [{{"points": [[0, 0]], "radius": {LONG}, "paint": "out"}}]'),
         "must be in (0, 1]",
     ),
 ]

@@ -8,11 +8,16 @@ import torch
 from PIL import Image
 
 from nlfilter_torch.photo.cli import main
-from nlfilter_torch.photo.cli.scribbles import Rectangle, ScribbleOptions, at_once, of_edit, overlays, selection
+from nlfilter_torch.photo.cli.scribbles import MarkedPhotograph, ScribbleOptions, parse_region
 from nlfilter_torch.photo.declared.declaration import Edit, Scribble
-from nlfilter_torch.photo.declared.parameters import EDITS
+from nlfilter_torch.photo.declared.parameters import EDITS, MASK
+from nlfilter_torch.photo.declared.presets import Recipe
+from nlfilter_torch.photo.declared.steps import Step
+from nlfilter_torch.photo.declared.strokes import Region
 from nlfilter_torch.photo.files.rows import StoredPicture, open_picture
+from nlfilter_torch.photo.picture.painting import cover
 from nlfilter_torch.photo.picture.photographs import Photograph, write_photograph
+from nlfilter_torch.photo.picture.tiled_scribbles import plane_rows
 from tests.commands import refusal
 from tests.problems import box, colour
 
@@ -24,15 +29,45 @@ def rgb(path: Path) -> np.ndarray:
         return np.asarray(opened.convert("RGB")).astype(int)
 
 
+def placed(text: str, size: tuple[int, int], option: str = "--region") -> str:
+    """The region of a text, in pixels."""
+    return parse_region(text, option, size, "in")[0].text(size)
+
+
+def marked(edit: Edit, options: ScribbleOptions, alpha: tuple[float, ...] = ()) -> MarkedPhotograph:
+    """A photograph of :data:`SIZE` with options that name no picture."""
+    return options.on(edit, SIZE, unread, alpha)
+
+
 def test_rectangles() -> None:
-    assert Rectangle.parse("0,0,64,48", "--region", (48, 64)) == Rectangle(slice(0, 48), slice(0, 64), None)
-    assert Rectangle.parse("63,47,1,1:", "--region", (48, 64)).note == ""
+    region, note = parse_region("0,0,64,48", "--region", (48, 64), "in")
+    assert cover(region, (48, 64)).all()
+    assert note is None
+    assert parse_region("63,47,1,1:", "--region", (48, 64), "in")[1] == ""
+
+
+def test_ellipses_and_polygons() -> None:
+    ellipse, note = parse_region("ellipse:10%,20,40,30:red", "--region", (64, 96), "in")
+    assert (ellipse.text((64, 96)), note) == ("ellipse:9,20,40,30", "red")
+    inside = cover(ellipse, (64, 96))
+    assert inside[20:50, 9:49].sum() == inside.sum()
+    assert abs(int(inside.sum()) - torch.pi * 20 * 15) < 10
+    triangle, _ = parse_region("10,10,50,10,10,50%", "--region", (64, 96), "in")
+    assert triangle.text((64, 96)) == "10,10,50,10,10,32"
+    assert abs(int(cover(triangle, (64, 96)).sum()) - 40 * 22 / 2) < 20
+
+
+@pytest.mark.parametrize("text", ["ellipse:1,2", "ellipse:1,2,3,4,5,6", "1,2,3,4,5", "ellipse", "circle:1,2,3,4"])
+def test_wrong_shapes(text: str) -> None:
+    with pytest.raises(ValueError, match="--region must be four whole numbers"):
+        parse_region(text, "--region", (64, 96), "in")
 
 
 def test_percentages_are_exact() -> None:
     for percent in range(100):
-        rectangle = Rectangle.parse(f"{percent}%,{percent}%,{100 - percent}%,{100 - percent}%", "--region", (100, 300))
-        assert (rectangle.rows, rectangle.columns) == (slice(percent, 100), slice(3 * percent, 300))
+        text = f"{percent}%,{percent}%,{100 - percent}%,{100 - percent}%"
+        region, _ = parse_region(text, "--region", (100, 300), "in")
+        assert torch.equal(cover(region, (100, 300)), box(percent, 3 * percent, 100, 300, (100, 300))[0, 0] > 0)
 
 
 SHARES = [
@@ -48,7 +83,7 @@ SHARES = [
 
 def test_shares_and_points() -> None:
     for text, wanted in SHARES:
-        assert str(Rectangle.parse(text, "--region", (64, 96))) == wanted
+        assert placed(text, (64, 96)) == wanted
 
 
 WRONG_SHARES = ["50%", "1,2,3", "a%,2", "nan%,2,3,4", "50%,50%,60%,10%", "0,0,0%,5", "1.5,2,3,4"]
@@ -57,7 +92,7 @@ WRONG_SHARES = ["50%", "1,2,3", "a%,2", "nan%,2,3,4", "50%,50%,60%,10%", "0,0,0%
 def test_wrong_shares() -> None:
     for text in WRONG_SHARES:
         with pytest.raises(ValueError, match="--region must"):
-            Rectangle.parse(text, "--region", (64, 96))
+            placed(text, (64, 96))
 
 
 POINTS_OUTSIDE = ["97,20", "20,65", "-1,20", "101%,50%", "50%,-1%"]
@@ -68,7 +103,7 @@ def test_points_outside() -> None:
         with pytest.raises(
             ValueError, match="--region must be a point in the photograph, which is 96 pixels wide and 64 "
         ):
-            Rectangle.parse(text, "--region", (64, 96))
+            placed(text, (64, 96))
 
 
 def test_a_share_does_what_pixels_do(photo: Path, tmp_path: Path) -> None:
@@ -97,9 +132,8 @@ def test_what_is_transparent_in_a_mask_is_not_selected(tmp_path: Path) -> None:
     planes = torch.ones(1, 3, HEIGHT, WIDTH)
     write_photograph(Photograph(planes, "uint8", box(8, 10, 6, 8, SIZE)), tmp_path / "layer.png")
     with open_picture(tmp_path / "layer.png", 10**9) as stored:
-        region = selection((HEIGHT, WIDTH), tmp_path / "layer.png", None, "--region", lambda _: stored)
-        assert region is not None
-        assert torch.equal(region.at_once(), box(8, 10, 6, 8, SIZE))
+        drawn = ScribbleOptions(mask=tmp_path / "layer.png").on(MASK, SIZE, lambda _: stored).tensors()
+        assert torch.equal(drawn.masks["scribbles"], box(8, 10, 6, 8, SIZE))
 
 
 def test_strokes_that_cover_the_photograph_are_refused(
@@ -210,8 +244,8 @@ DESATURATE = Edit(
     "",
     (),
     scribbles=(
-        Scribble("scribbles", "in", "Object", needed=True, advice="give --region X,Y,W,H, the part to desaturate"),
-        Scribble("keep", "keep", "Keep", role="background", option="--keep", option_help="Pixels to keep."),
+        Scribble("scribbles", "Object", needed=True, advice="give --region X,Y,W,H, the part to desaturate"),
+        Scribble("keep", "Keep", role="background", option="--keep", option_help="Pixels to keep."),
     ),
 )
 
@@ -237,68 +271,159 @@ def test_what_options_mark() -> None:
 
 def test_two_kinds_of_scribbles() -> None:
     options = ScribbleOptions(["2,3,4,5", "10,3,4,5"], rectangles={"--keep": ["20,30,4,5"]})
-    drawn = of_edit(DESATURATE, None, SIZE, options, unread)
+    both = marked(DESATURATE, options)
+    drawn = both.tensors()
     assert (drawn.colours, drawn.sliders) == (None, None)
-    assert [option for _, option, _ in overlays(DESATURATE, drawn)] == ["--region", "--keep"]
-    tensors = at_once(DESATURATE, drawn).masks
-    assert torch.equal(tensors["scribbles"], box(3, 2, 5, 4, SIZE) + box(3, 10, 5, 4, SIZE))
-    assert torch.equal(tensors["keep"], box(30, 20, 5, 4, SIZE))
-    assert torch.equal(drawn.masks["keep"].planes(slice(28, 32)), tensors["keep"][..., 28:32, :])
+    assert [option for option, _ in both.drawn_regions()] == ["--region", "--region", "--keep"]
+    assert torch.equal(drawn.masks["scribbles"], box(3, 2, 5, 4, SIZE) + box(3, 10, 5, 4, SIZE))
+    assert torch.equal(drawn.masks["keep"], box(30, 20, 5, 4, SIZE))
+    rows = plane_rows(both.rows().masks["keep"], slice(28, 32))
+    assert torch.equal(torch.from_numpy(rows)[..., 0], drawn.masks["keep"][0, 0, 28:32])
 
 
 def test_an_object_may_be_needed() -> None:
     with pytest.raises(ValueError, match="give --region X,Y,W,H, the part to desaturate"):
-        of_edit(DESATURATE, None, SIZE, ScribbleOptions(rectangles={"--keep": ["1,2,3,4"]}), unread)
-    assert not of_edit(EDITS["detail"], (2.0, 1.0), SIZE, ScribbleOptions(), unread).masks
+        marked(DESATURATE, ScribbleOptions(rectangles={"--keep": ["1,2,3,4"]}))
+    assert not marked(EDITS["detail"], ScribbleOptions(), (2.0, 1.0)).tensors().masks
+
+
+def test_what_is_outside_must_not_be_hidden_by_the_object() -> None:
+    hidden = marked(DESATURATE, ScribbleOptions(["2,3,9,9"], rectangles={"--keep": ["3,4,2,2"]}))
+    with pytest.raises(ValueError, match="--keep must hold a painted pixel outside the scribbles on the object"):
+        hidden.tensors()
 
 
 def test_regions_have_sliders() -> None:
     options = ScribbleOptions(["2,3,4,5", "10,3,4,5:0,1,2"])
-    drawn = of_edit(EDITS["detail"], (3.0, 2.0, 1.0), SIZE, options, unread)
+    drawn = marked(EDITS["detail"], options, (3.0, 2.0, 1.0)).tensors()
     assert drawn.sliders is not None
     assert drawn.sliders.tolist() == [[3, 2, 1], [0, 1, 2]]
-    (regions,) = at_once(EDITS["detail"], drawn).masks.values()
+    (regions,) = drawn.masks.values()
     assert torch.equal(regions, torch.cat([box(3, 2, 5, 4, SIZE), box(3, 10, 5, 4, SIZE)], dim=1))
 
 
 def test_masks_are_painted_by_rectangles() -> None:
     rectangles = {"--add": ["2,3,4,5", "10,3,4,5:0,1,2"], "--remove": ["2,3,1,1"]}
-    drawn = of_edit(
-        EDITS["detail"], (3.0, 2.0, 1.0), SIZE, ScribbleOptions(["20,3,4,5:0,1,2"], rectangles=rectangles), unread
-    )
+    options = ScribbleOptions(["20,3,4,5:0,1,2"], rectangles=rectangles)
+    drawn = marked(EDITS["detail"], options, (3.0, 2.0, 1.0)).tensors()
     assert drawn.sliders is not None
     assert drawn.sliders.tolist() == [[0, 1, 2], [3, 2, 1]]
-    masks = at_once(EDITS["detail"], drawn).masks
-    assert torch.equal(masks["added"], torch.cat([box(3, 10, 5, 4, SIZE), box(3, 2, 5, 4, SIZE)], dim=1))
-    assert torch.equal(masks["removed"], box(3, 2, 1, 1, SIZE))
+    masks, removed = drawn.masks, box(3, 2, 1, 1, SIZE)
+    added = torch.cat([box(3, 10, 5, 4, SIZE), box(3, 2, 5, 4, SIZE) - removed], dim=1)
+    assert torch.equal(masks["added"], added)
+    assert torch.equal(masks["removed"], removed)
     assert torch.equal(masks["regions"][:, 1:], torch.zeros(1, 1, *SIZE))
-    coloured = at_once(
-        EDITS["recolor"],
-        of_edit(EDITS["recolor"], None, SIZE, ScribbleOptions(rectangles={"--add": ["2,3,4,5:red"]}), unread),
-    )
+    coloured = marked(EDITS["recolor"], ScribbleOptions(rectangles={"--add": ["2,3,4,5:red"]})).tensors()
     assert coloured.colours is None
     red = box(3, 2, 5, 4, SIZE)
     assert torch.equal(coloured.masks["added"], torch.cat([red, 0 * red, 0 * red, red], dim=1))
     with pytest.raises(ValueError, match="--add must end in a colour"):
-        of_edit(EDITS["recolor"], None, SIZE, ScribbleOptions(rectangles={"--add": ["2,3,4,5"]}), unread)
+        marked(EDITS["recolor"], ScribbleOptions(rectangles={"--add": ["2,3,4,5"]}))
 
 
 def test_colours_and_their_mask() -> None:
-    drawn = of_edit(EDITS["colorize"], None, SIZE, ScribbleOptions(["2,3,4,5:#0000ff", "4,3,4,5:red"]), unread)
-    assert [option for _, option, _ in overlays(EDITS["colorize"], drawn)] == ["--region"]
-    tensors = at_once(EDITS["colorize"], drawn)
-    assert tensors.colours is not None
+    both = marked(EDITS["colorize"], ScribbleOptions(["2,3,4,5:#0000ff", "4,3,4,5:red"]))
+    drawn = both.tensors()
+    assert drawn.colours is not None
     red, blue = box(3, 4, 5, 4, SIZE), box(3, 2, 5, 2, SIZE)  # the later rectangle covers the earlier one
-    assert torch.equal(tensors.colours, torch.cat([red, torch.zeros_like(red), blue], dim=1))
-    (mask,) = tensors.masks.values()
-    assert torch.equal(mask, red + blue)
+    assert torch.equal(drawn.colours, torch.cat([red, torch.zeros_like(red), blue, red + blue], dim=1))
 
 
 def test_rectangles_of_the_same_sliders_are_one_region() -> None:
     texts = ["2,3,4,5", "20,3,4,5:1,2,3", "2,13,4,5:3,2,1", "40,3,4,5:1,2,3"]
-    drawn = at_once(EDITS["detail"], of_edit(EDITS["detail"], (3.0, 2.0, 1.0), SIZE, ScribbleOptions(texts), unread))
+    drawn = marked(EDITS["detail"], ScribbleOptions(texts), (3.0, 2.0, 1.0)).tensors()
     assert drawn.sliders is not None
     assert drawn.sliders.tolist() == [[3, 2, 1], [1, 2, 3]]
     regions = drawn.masks["regions"]
     assert torch.equal(regions[0, 0], (box(3, 2, 5, 4, SIZE) + box(13, 2, 5, 4, SIZE))[0, 0])
     assert torch.equal(regions[0, 1], (box(3, 20, 5, 4, SIZE) + box(3, 40, 5, 4, SIZE))[0, 0])
+
+
+#: Marks of an edit of a file, and the same as options in a photograph of :data:`SIZE`.
+SAVED = (
+    Region.upright((30 / 90, 20 / 60, 10 / 90, 12 / 60), "rectangle", "in"),
+    Region.upright((50 / 90, 20 / 60, 10 / 90, 12 / 60), "ellipse", "in"),
+    Region(((5 / 90, 5 / 60), (20 / 90, 5 / 60), (5 / 90, 20 / 60)), "polygon", "out"),
+)
+TYPED = ("30,20,10,12", "ellipse:50,20,10,12", "5,5,20,5,5,20")
+
+
+@pytest.mark.parametrize(
+    ("verb", "background", "further"),
+    [
+        ("defocus", "--background", ()),
+        ("mask", "--background", ()),
+        ("recolor", "--keep", ("--colour", "blue")),
+        ("detail", "--background", ("--alpha", "3,2,1")),
+    ],
+)
+@pytest.mark.usefixtures("tiled")
+def test_strokes_saved_for_one_edit_are_those_of_every_command(
+    photo: Path, tmp_path: Path, verb: str, background: str, further: tuple[str, ...]
+) -> None:
+    saved, one, other = (tmp_path / name for name in ("edit.json", "one.png", "other.png"))
+    saved.write_text(Recipe((Step("tone"), Step("defocus", SAVED))).to_json())
+    assert main([verb, str(photo), str(one), "--strokes", str(saved), *further]) == 0
+    typed = ["--region", TYPED[0], "--region", TYPED[1], background, TYPED[2]]
+    assert main([verb, str(photo), str(other), *typed, *further]) == 0
+    np.testing.assert_array_equal(rgb(one), rgb(other))
+
+
+def test_a_step_of_a_file_does_what_its_command_does(photo: Path, tmp_path: Path) -> None:
+    saved, one, other = (tmp_path / name for name in ("edit.json", "one.png", "other.png"))
+    mask = np.zeros(SIZE, np.uint8)
+    mask[30:40, 40:60] = 255
+    Image.fromarray(mask).save(tmp_path / "mask.png")
+    step = Step("defocus", (*SAVED, Region.of_file("mask.png", "mask", "in")))  # beside the file
+    saved.write_text(Recipe((step,)).to_json())
+    assert main(["apply", str(photo), str(one), "--preset", str(saved)]) == 0
+    assert main(["defocus", str(photo), str(other), "--strokes", str(saved)]) == 0
+    np.testing.assert_array_equal(rgb(one), rgb(other))
+    by_mask = [
+        "--mask",
+        str(tmp_path / "mask.png"),
+        "--region",
+        TYPED[0],
+        "--region",
+        TYPED[1],
+        "--background",
+        TYPED[2],
+    ]
+    assert main(["defocus", str(photo), str(other), *by_mask]) == 0
+    np.testing.assert_array_equal(rgb(one), rgb(other))
+
+
+def test_pictures_of_scribbles_are_marks_of_every_command(photo: Path, tmp_path: Path) -> None:
+    layer, mask, one, other = (tmp_path / name for name in ("layer.png", "mask.png", "one.png", "other.png"))
+    pixels = np.zeros((*SIZE, 4), np.uint8)
+    pixels[20:32, 30:40] = 0, 0, 255, 255
+    Image.fromarray(pixels).save(layer)
+    Image.fromarray(pixels[..., 3]).save(mask)
+    for verb in ("mask", "defocus", "detail"):
+        assert main([verb, str(photo), str(one), "--strokes", str(layer)]) == 0
+        assert main([verb, str(photo), str(other), "--mask", str(mask)]) == 0
+        np.testing.assert_array_equal(rgb(one), rgb(other))
+    for verb in ("recolor", "colorize"):
+        assert main([verb, str(photo), str(one), "--strokes", str(layer)]) == 0
+        assert main([verb, str(photo), str(other), "--mask", str(mask), "--colour", "blue"]) == 0
+        np.testing.assert_array_equal(rgb(one), rgb(other))
+
+
+def test_files_of_strokes_that_do_not_suit_are_refused(
+    photo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    saved, out = tmp_path / "edit.json", tmp_path / "out.png"
+    saved.write_text(Recipe((Step("defocus", SAVED),)).to_json())
+    for verb, options, sentence in (
+        ("recolor", (), "must come with --colour, such as --colour red, got none; add it"),
+        ("recolor", ("--colour", "reddish"), "--colour must end in a colour, such as red"),
+        ("colorize", ("--colour", "red"), "must be one of a colour such as #c04020, got 'out'"),
+    ):
+        assert sentence in refusal(capsys, verb, photo, out, "--strokes", saved, *options)
+    saved.write_text(Recipe((Step("tone"),)).to_json())
+    assert "must hold one step with strokes, or one of mask, got 0; keep one" in refusal(
+        capsys, "mask", photo, out, "--strokes", saved
+    )
+    Image.new("L", (WIDTH, HEIGHT), 255).save(tmp_path / "mask.png")
+    assert "--mask must come with --colour" in refusal(capsys, "recolor", photo, out, "--mask", tmp_path / "mask.png")
+    assert not out.exists()

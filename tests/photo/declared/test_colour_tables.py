@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 import torch
 
-from nlfilter_torch.photo.declared.colour_tables import cube_of, hald_of, in_order, step_of_cube, step_of_hald
+from nlfilter_torch.photo.declared.colour_tables import cube_of, hald_of, lattice_of_cube, lattice_of_hald, table_rows
 from nlfilter_torch.photo.declared.presets import Recipe, find_recipe
+from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.edits.applying import apply_step
 from tests.looks import CAT
 from tests.pairwise import each_value
@@ -19,13 +20,13 @@ ROWS = "0 0 0\n1 0 0\n0 1 0\n1 1 0\n0 0 1\n1 0 1\n0 1 1\n1 1 1\n"
 
 def test_red_changes_first() -> None:
     swapped = HEAD + "".join(f"{row[4]} {row[2]} {row[0]}\n" for row in ROWS.splitlines())  # red and blue
-    result = apply_step(step_of_cube(swapped, "it"), CAT)
+    result = apply_step(Step("look", lattice=lattice_of_cube(swapped, "it")), CAT)
     torch.testing.assert_close(result, CAT.flip(1), atol=1e-6, rtol=0)
 
 
 def test_comments_titles_and_ranges_from_zero_to_one_are_read() -> None:
     text = f'# by hand\nTITLE "a b"\n\n{HEAD}DOMAIN_MIN 0 0 0\nDOMAIN_MAX 1.0 1 1\nLUT_3D_INPUT_RANGE 0.0 1.0\n'
-    step = step_of_cube(text + ROWS.replace("1 1 1\n", "1 1 1 # white\n"), "it")
+    step = Step("look", lattice=lattice_of_cube(text + ROWS.replace("1 1 1\n", "1 1 1 # white\n"), "it"))
     torch.testing.assert_close(apply_step(step, CAT), CAT, atol=1e-6, rtol=0)
     assert step["lattice"] == (0.0,) * 24
 
@@ -56,7 +57,7 @@ WRONG_TABLES = [
 def test_other_tables_are_refused_in_a_sentence() -> None:
     for text, message in WRONG_TABLES:
         with pytest.raises(ValueError, match=message) as error:
-            step_of_cube(text, "it")
+            lattice_of_cube(text, "it")
         assert "\n" not in str(error.value)
 
 
@@ -64,8 +65,9 @@ def test_other_tables_are_refused_in_a_sentence() -> None:
 def test_halds_of_all_depths(dtype: str) -> None:
     levels = {"uint8": 255, "uint16": 65535}.get(dtype, 1)
     colours = np.stack(np.meshgrid(*[np.arange(16) / 15] * 3, indexing="ij"))
-    picture = in_order(1 - colours).reshape(64, 64, 3) * levels
-    step = step_of_hald((np.rint(picture) if levels > 1 else picture).astype(dtype), "it")
+    picture = table_rows(1 - colours).reshape(64, 64, 3) * levels
+    stored = (np.rint(picture) if levels > 1 else picture).astype(dtype)
+    step = Step("look", lattice=lattice_of_hald(stored, "it"))
     torch.testing.assert_close(apply_step(step, CAT), 1 - CAT, atol=1e-5 if levels != 255 else 1e-3, rtol=0)
 
 
@@ -81,7 +83,7 @@ NO_HALDS = [
 def test_pictures_that_are_no_halds_are_refused() -> None:
     for shape, message in NO_HALDS:
         with pytest.raises(ValueError, match=message):
-            step_of_hald(np.zeros(shape, np.uint8), "it")
+            lattice_of_hald(np.zeros(shape, np.uint8), "it")
 
 
 @pytest.mark.parametrize(

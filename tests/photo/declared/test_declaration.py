@@ -20,8 +20,8 @@ EDIT = Edit(
     "",
     (NUMBER, LEVEL, LENGTH),
     scribbles=(
-        Scribble("strokes", "colour", "Paint", "colours", needed=True),
-        Scribble("keep", "keep", "Keep", role="background", option="--keep"),
+        Scribble("strokes", "Paint", "colours", needed=True),
+        Scribble("keep", "Keep", role="background", option="--keep"),
     ),
 )
 
@@ -135,12 +135,12 @@ def test_an_edit_knows_its_parameters_by_name_and_by_argument() -> None:
 
 
 def test_an_edit_tells_its_scribbles() -> None:
-    assert EDIT.words == ("colour", "keep")
+    assert EDIT.words == ("colour", "out")
     assert EDIT.requires_strokes
     assert [scribble.argument for scribble in EDIT.with_options] == ["keep"]
     assert [scribble.argument for scribble in EDIT.with_role("background", "added")] == ["keep"]
     assert EDIT.regional is None
-    regions = Scribble("regions", "in", "Edit this", "sliders")
+    regions = Scribble("regions", "Edit this", "sliders")
     regional = Edit("detail", "", (SLIDERS,), scribbles=(regions,))
     assert regional.regional is regions
     assert not regional.requires_strokes

@@ -37,7 +37,7 @@ def test_points_there_and_back(size: tuple[int, int], crop: Crop, degrees: float
         return
     assert frame.outward(*frame.inward(x, y)) == pytest.approx((x, y), abs=1e-9)
     stroke = Stroke(((x, y),), 0.1, "in")
-    back = frame.stroke_outward(frame.stroke_inward(stroke))
+    back = frame.mark_outward(frame.mark_inward(stroke))
     assert back.points[0] == pytest.approx((x, y), abs=1e-9)
     assert back.radius == pytest.approx(0.1)
 
@@ -122,7 +122,7 @@ def test_strokes_of_steps_are_mapped() -> None:
 
 def test_steps_whose_strokes_are_cropped_away_change_nothing() -> None:
     corner, out = Stroke(((0.1, 0.1),), 0.02, "in"), Stroke(((0.9, 0.9),), 0.02, "out")
-    recolor = Step("recolor", (replace(corner, paint="#2040e0"), replace(out, paint="keep")))
+    recolor = Step("recolor", (replace(corner, paint="#2040e0"), replace(out, paint="out")))
     region = Step("detail", (corner,), alpha=(2.0, 1.0), inside=(4.0, 1.0))
     recipe = Recipe((recolor, region, Step("tone")), Development(crop=(0.5, 0.5, 1.0, 1.0)))
     mapped = recipe.on_developed((100, 200)).steps

@@ -8,8 +8,7 @@ import skimage.data
 import torch
 
 from nlfilter_torch.photo.cli import main
-from nlfilter_torch.photo.declared.looks import CHARACTERS, LOOKS
-from nlfilter_torch.photo.declared.presets import PRESETS, PURPOSES, Recipe, find_recipe
+from nlfilter_torch.photo.declared.presets import CHARACTERS, LOOKS, PRESETS, PURPOSES, Recipe, find_recipe
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.edits.applying import apply_recipe
 from nlfilter_torch.photo.picture.photographs import Photograph, read_photograph, write_photograph
@@ -202,7 +201,7 @@ NO_EDITS = [
     ),
     (
         step_file("recolor", '"strokes": [{"points": [[0, 0]], "radius": 0.1, "paint": "blue"}]'),
-        "must be one of a colour such as #c04020, keep, add with a colour such as add #c04020, remove, got 'blue'",
+        "must be one of a colour such as #c04020, out, add with a colour such as add #c04020, remove, got 'blue'",
     ),
 ]
 

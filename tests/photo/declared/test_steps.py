@@ -41,11 +41,11 @@ def test_a_step_holds_what_differs_from_the_defaults() -> None:
 
 
 def test_strokes_belong_to_the_scribbles_of_the_edit() -> None:
-    assert RECOLOR.painted("colour") == (BLUE,)
-    assert RECOLOR.painted("keep") == RECOLOR.strokes[1:]
+    assert RECOLOR.painted_as("object") == (BLUE,)
+    assert RECOLOR.painted_as("background") == RECOLOR.strokes[1:]
     assert RECOLOR.is_drawn()
     assert not RECOLOR.has_region()
-    assert RECOLOR.changed(strokes=()).painted("colour") == ()
+    assert RECOLOR.changed(strokes=()).painted_as("object") == ()
     assert not RECOLOR.changed(strokes=RECOLOR.strokes[1:]).changes()  # nothing has a colour
 
 

@@ -34,13 +34,14 @@ from nlfilter_torch.photo.edits.applying import (
     viewed_stride,
 )
 from nlfilter_torch.photo.picture.colour import edit_luminance
-from nlfilter_torch.photo.picture.painting import TensorPainter, mask_of, paint
+from nlfilter_torch.photo.picture.painting import TensorPainter
+from tests.strokes import mask_of, paint
 
 SIZE = (48, 64)
 LINE = ((0.25, 0.25), (0.5, 0.25))
 IN, OUT = Stroke(LINE, 0.05, "in"), Stroke(((0.8, 0.8),), 0.1, "out")
 ADD, REMOVE = Stroke(((0.3, 0.7), (0.5, 0.7)), 0.08, "add"), Stroke(((0.4, 0.3),), 0.08, "remove")
-BLUE, KEEP = Stroke(LINE, 0.05, "#2040e0"), Stroke(((0.8, 0.8),), 0.1, "keep")
+BLUE, KEEP = Stroke(LINE, 0.05, "#2040e0"), Stroke(((0.8, 0.8),), 0.1, "out")
 ALPHA, INSIDE = (0.5, 1.0, 1.0, 1.0), (3.0, 3.0, 2.0, 1.0)
 DETAIL = Step("detail", (IN, OUT), alpha=ALPHA, inside=INSIDE, reach=0.7, bandwidth=30.0)
 COLORIZE = Step("colorize", (BLUE,), strength=0.5)
@@ -199,7 +200,7 @@ def test_edits_have_the_settings_of_their_steps() -> None:
         (DEFOCUS, (IN, ADD, REMOVE), ["focus_region", "added", "removed"]),
         (DEFOCUS, (ADD,), ["added"]),
         (DETAIL, (ADD, REMOVE), ["added", "removed"]),
-        (RECOLOR, (BLUE, REMOVE, replace(ADD, paint="add #c04020")), ["stroke_mask", "added", "removed"]),
+        (RECOLOR, (BLUE, REMOVE, replace(ADD, paint="add #c04020")), ["added", "removed"]),
         (RECOLOR, (replace(ADD, paint="add #c04020"),), ["added"]),
     ],
 )
@@ -236,8 +237,7 @@ def test_scribbles_are_painted_under_the_names_of_the_arguments() -> None:
     recoloured = scribbles_of(RECOLOR, SIZE, painter)
     colours, painted = paint([BLUE], SIZE)
     assert recoloured.colours is not None
-    assert torch.equal(recoloured.colours, colours)
-    assert torch.equal(recoloured.masks["stroke_mask"], painted)
+    assert torch.equal(recoloured.colours, torch.cat([colours, painted], dim=1))
     assert torch.equal(recoloured.masks["keep"], mask_of([KEEP], SIZE, above=[BLUE]))
     regional = scribbles_of(DETAIL, SIZE, painter)
     assert list(regional.masks) == ["regions", "negative"]

@@ -39,7 +39,7 @@ def test_denoising_by_a_sample_is_within_a_grey_level() -> None:
         Recipe((DETAIL.changed(strokes=(IN, FAR)),)),
         Recipe((COLORIZE,)),
         Recipe((RECOLOR,)),
-        Recipe((RECOLOR.changed(strokes=(BLUE, replace(FAR, paint="keep"))),)),
+        Recipe((RECOLOR.changed(strokes=(BLUE, replace(FAR, paint="out"))),)),
         Recipe((Step("denoise", landmarks=60),)),
         Recipe((Step("denoise", noise_level=8.0, landmarks=60),)),
         Recipe((Step("sharpen", landmarks=60).mixed(opacity=0.3),)),

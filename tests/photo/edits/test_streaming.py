@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from nlfilter_torch.photo import Drawn, Step, Stroke, apply_step, stream
-from nlfilter_torch.photo.picture.painting import mask_of, paint
 from tests.problems import cat as image_of_cat
 from tests.recipes import BLUE, COLORIZE, DETAIL, IN, KEEP, RECOLOR, rows_of
+from tests.strokes import mask_of, paint
 from tests.tiles import FEW, Array, cat, streamed
 
 STEPS = [

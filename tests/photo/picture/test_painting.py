@@ -1,14 +1,18 @@
-"""Brush strokes as masks and colours."""
+"""Strokes and regions as masks and colours."""
 
 import math
 from dataclasses import replace
 from itertools import pairwise
+from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
+from PIL import Image
 
-from nlfilter_torch.photo.declared.strokes import Stroke
-from nlfilter_torch.photo.picture.painting import colour_of, cover, mask_of, paint, painted_on_mask
+from nlfilter_torch.photo.declared.strokes import Region, Stroke
+from nlfilter_torch.photo.picture.painting import colour_of, cover, opened_picture, rasterised
+from tests.strokes import mask_of, paint
 
 SIZE = (40, 60)
 HORIZONTAL = Stroke(((0.25, 0.25), (0.5, 0.25)), 0.05, "in")
@@ -46,23 +50,74 @@ def test_rows_are_those_of_the_whole(rows: slice) -> None:
 
 def test_what_is_painted_on_a_mask_has_a_border_of_a_pixel() -> None:
     line = replace(LINE, radius=2.12 / 40)
-    soft = painted_on_mask([line], "in", SIZE)[0, 0]
+    soft = rasterised([((line, True),)], SIZE, soft=True)[0, 0]
     inner, outer = (cover(replace(LINE, radius=radius / 40), SIZE) for radius in (1.62, 2.62))
     assert torch.equal(soft == 1, inner)
     assert torch.equal(soft > 0, outer)
     rows = slice(5, 13)
-    assert torch.equal(painted_on_mask([line], "in", SIZE, rows), soft[None, None, rows])
+    assert torch.equal(rasterised([((line, True),)], SIZE, rows, soft=True), soft[None, None, rows])
 
 
-def test_brush_and_eraser_act_in_the_order_drawn() -> None:
-    brush, eraser = replace(LINE, paint="add #ff0033"), replace(HORIZONTAL, paint="remove")
-    planes = painted_on_mask([eraser, brush, eraser], "add colour", SIZE)[0]
-    soft = painted_on_mask([brush], "add colour", SIZE)[0, 3]
-    erased = painted_on_mask([eraser], "remove", SIZE)[0, 0]
-    torch.testing.assert_close(planes[3], soft * (1 - erased))
-    assert torch.equal(planes[:3, soft > 0], colour_of("#ff0033").unsqueeze(1).expand(-1, int((soft > 0).sum())))
-    removed = painted_on_mask([eraser, brush], "remove", SIZE)[0, 0]
-    torch.testing.assert_close(removed, erased * (1 - soft))
+@pytest.mark.parametrize("rows", [None, slice(8, 20)])
+def test_regions_cover_the_pixels_whose_centres_they_hold(rows: slice | None) -> None:
+    y, x = torch.meshgrid(torch.arange(40) + 0.5, torch.arange(60) + 0.5, indexing="ij")
+    box = (6 / 60, 5 / 40, 30 / 60, 20 / 40)
+    within = (x > 6) & (x < 36) & (y > 5) & (y < 25)
+    ellipse = ((x - 21) / 15).square() + ((y - 15) / 10).square() <= 1
+    below = within & ((x - 6) / 30 > (y - 5) / 20)  # of the diagonal
+    corners = ((6 / 60, 5 / 40), (36 / 60, 5 / 40), (36 / 60, 25 / 40))
+    for region, wanted in (
+        (Region.upright(box, "rectangle", "in"), within),
+        (Region.upright(box, "ellipse", "in"), ellipse),
+        (Region(corners, "polygon", "in"), below),
+    ):
+        covered = cover(region, SIZE, rows)
+        differs = covered != (wanted if rows is None else wanted[rows])
+        assert int(differs.sum()) <= (20 if region.shape == "polygon" else 0)  # centres on the diagonal
+
+
+def test_a_region_turns_with_the_picture() -> None:
+    region = Region.upright((0.2, 0.25, 0.4, 0.5), "ellipse", "in")
+    turned = region.mapped(lambda x, y: (1 - y, x), 1.0)  # a quarter
+    assert torch.equal(cover(turned, (40, 40)), cover(region, (40, 40)).rot90(-1))
+    assert turned != region
+    assert Region.upright((0.0, 0.0, 1.0, 0.0), "rectangle", "in").outline  # a line covers a pixel
+    assert cover(Region.upright((0.0, 0.5, 1.0, 0.0), "rectangle", "in"), (41, 41)).sum() == 1
+
+
+def test_a_small_region_does_not_vanish_in_a_preview() -> None:
+    for shape in ("rectangle", "ellipse"):
+        region = Region.upright((0.42, 0.31, 0.001, 0.001), shape, "in")
+        assert cover(region, SIZE).nonzero().tolist() == [[12, 25]]
+        assert cover(region, SIZE, slice(10, 14)).nonzero().tolist() == [[2, 25]]
+        assert not cover(region, SIZE, slice(0, 10)).any()
+        assert not cover(replace(region, points=tuple((x + 2, y) for x, y in region.points)), SIZE).any()
+
+
+def test_regions_of_pictures(tmp_path: Path) -> None:
+    mask = np.zeros((*SIZE, 1), np.uint8)
+    mask[10:20, 12:30], mask[20:22, 12:30], mask[30:, :] = 255, 200, 100  # the last are too dark
+    Image.fromarray(mask[..., 0]).save(tmp_path / "mask.png")
+    layer = np.zeros((*SIZE, 4), np.uint8)
+    layer[5:9, 7:20] = 0, 0, 255, 255
+    Image.fromarray(layer).save(tmp_path / "layer.png")
+    region = Region.of_file(str(tmp_path / "mask.png"), "mask", "in")
+    plane = mask_of([region], SIZE)[0, 0]
+    assert torch.equal(plane, torch.from_numpy(np.where(mask[..., 0] > 127, mask[..., 0], 0)) / 255)
+    assert torch.equal(mask_of([region], SIZE, slice(15, 25))[0, 0], plane[15:25])
+    half = mask_of([region], (20, 30))[0, 0]  # of a preview
+    assert torch.equal(half, plane[1::2, 1::2])
+    right = region.mapped(lambda x, y: (2 * x - 1, y), 1.0)  # of a picture cropped to its right half
+    assert torch.equal(mask_of([right], (40, 30))[0, 0], plane[:, 30:])
+    painted = Region.of_file(str(tmp_path / "layer.png"), "layer", "in")
+    colours, covered = paint([painted], SIZE)
+    assert torch.equal(covered[0, 0] > 0, torch.from_numpy(layer[..., 3] > 0))
+    assert torch.equal(colours[0, :, 6, 8], torch.tensor([0.0, 0.0, 1.0]))
+    assert torch.equal(
+        paint([replace(painted, paint="in #ff0000")], SIZE)[0][0, :, 6, 8], torch.tensor([1.0, 0.0, 0.0])
+    )
+    with pytest.raises(ValueError, match=r"none\.png must be a picture of marks"):
+        opened_picture(str(tmp_path / "none.png"))
 
 
 def test_strokes_above_hide_those_below() -> None:

@@ -14,13 +14,14 @@ from nlfilter_torch.operator.options import FilterOptions
 from nlfilter_torch.photo import colorize, recolor
 from nlfilter_torch.photo.picture import sampling, tiles
 from nlfilter_torch.photo.picture.colour import split_luminance
-from nlfilter_torch.photo.picture.painting import cover, mask_of, paint
+from nlfilter_torch.photo.picture.painting import cover
 from nlfilter_torch.photo.picture.pictures import Picture
 from nlfilter_torch.photo.picture.tiled_scribbles import read_scribbles
 from tests import problems
 from tests.pairwise import each_value
 from tests.recipes import BLUE, rows_of
 from tests.streams import stream_colorize, stream_detail, stream_recolor
+from tests.strokes import mask_of, paint
 from tests.tiles import FEW, LEVEL, Rows, Shrinking, cat
 
 
