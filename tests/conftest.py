@@ -33,7 +33,7 @@ def tiled(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> bo
     """Whether commands and the editor work as for large photographs."""
     if request.param:
         monkeypatch.setattr("nlfilter_torch.photo.cli.editing.read_if_it_fits", lambda *_: None)
-        monkeypatch.setattr("nlfilter_torch.photo.app.session.WHOLE", 0)
+        monkeypatch.setattr("nlfilter_torch.photo.app.session.WHOLE_MEMORY", 0)
     return bool(request.param)
 
 

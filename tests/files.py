@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from PIL import ExifTags, Image, ImageCms
 
 from nlfilter_torch.photo.files.rows import open_picture
-from nlfilter_torch.photo.files.tables import POINTERS, Tables
+from nlfilter_torch.photo.files.tables import POINTERS, TiffTables
 from nlfilter_torch.photo.picture.photographs import Photograph
 from nlfilter_torch.photo.picture.pictures import stored_as
 
@@ -147,7 +147,7 @@ def camera_block(order: str = "<", thumbnail: bool = True) -> bytes:
 
 def fields_of(block: bytes | None) -> dict[tuple[int, int], bytes]:
     """Values by code and type of all fields of a block but the pointers, and where the maker note stands."""
-    tables = Tables((block or b"").removeprefix(b"Exif\0\0"))
+    tables = TiffTables((block or b"").removeprefix(b"Exif\0\0"))
     fields = [field for field in tables.walk() if field.code not in POINTERS]
     places = {(field.code, 0): bytes([field.place % 251]) for field in fields if field.code == 37500}
     return {(field.code, field.kind): tables.raw(field) for field in fields} | places

@@ -22,7 +22,7 @@ from nlfilter_torch.photo.files.writing import open_beside
 
 DPI = 100
 POINTS = 72  # typographic points per inch
-SIDE = 512  # pixels along the longer side of a picture
+PANEL_SIDE = 512  # pixels along the longer side of a picture
 LABEL = 35  # pixels above a picture for its title
 BREADTH, LINE = 0.6, 1.2  # width of a letter and height of a line, relative to the letter height
 GAP = 15  # pixels between pictures
@@ -30,7 +30,7 @@ FAR = 0.995  # colour scales end at this quantile, so that one outlier does not 
 
 
 def show_images(
-    images: Mapping[str, Tensor], *, columns: int | None = None, side: int = SIDE, letters: int | None = None
+    images: Mapping[str, Tensor], *, columns: int | None = None, side: int = PANEL_SIDE, letters: int | None = None
 ) -> Figure:
     """Draw titled pictures side by side.
 
@@ -55,7 +55,7 @@ def show_images(
     return figure
 
 
-def show_layers(layers: Tensor, *, side: int = SIDE) -> Figure:
+def show_layers(layers: Tensor, *, side: int = PANEL_SIDE) -> Figure:
     """Draw detail layers (1, k+1, C, H, W) from fine to coarse, around mid-grey, and the last layer unchanged."""
     stack = layers[0].mean(1).numpy(force=True)  # (k+1, H, W)
     figure, axes = _panels(stack.shape[1:], len(stack), columns=math.ceil(math.sqrt(len(stack))), side=side)
@@ -68,7 +68,7 @@ def show_layers(layers: Tensor, *, side: int = SIDE) -> Figure:
 
 
 def show_eigenvectors(
-    spectrum: Spectrum, numbers: Sequence[int] = (2, 3, 4, 5, 7, 10, 20, 35, 50), *, side: int = SIDE
+    spectrum: Spectrum, numbers: Sequence[int] = (2, 3, 4, 5, 7, 10, 20, 35, 50), *, side: int = PANEL_SIDE
 ) -> Figure:
     """Draw eigenvectors, numbered from 1, as in the paper's Fig. 1; numbers beyond the last are left out.
 
@@ -83,7 +83,7 @@ def show_eigenvectors(
     return figure
 
 
-def show_mask(image: Tensor, region: Tensor, mask: Tensor, *, side: int = SIDE) -> Figure:
+def show_mask(image: Tensor, region: Tensor, mask: Tensor, *, side: int = PANEL_SIDE) -> Figure:
     """Draw a photograph with a region outlined, the region's mask, and the photograph faded outside the mask.
 
     Args:

@@ -25,7 +25,7 @@ def test_the_command_line_goes_to_tiles(tmp_path: Path, monkeypatch: pytest.Monk
     monkeypatch.setattr(editing, "read_if_it_fits", watched)
     assert main(arguments) == 0
     whole = read_photograph(tmp_path / "out.tif").pixels
-    monkeypatch.setattr(editing, "WHOLE", 38_000_000)
+    monkeypatch.setattr(editing, "WHOLE_MEMORY", 38_000_000)
     assert main(arguments) == 0
     assert used == [False, True]
     assert difference(read_photograph(tmp_path / "out.tif").pixels, whole) <= 2
@@ -37,7 +37,7 @@ def test_saving_in_the_editor_reports_its_progress(session: Session, monkeypatch
     session.add_stroke("recolor", LINE, 0.03, "#2040e0")
     saved = []
     for name, memory, in_tiles in (("small.png", 10**9, False), ("large.png", 0, True)):
-        monkeypatch.setattr("nlfilter_torch.photo.app.session.WHOLE", memory)
+        monkeypatch.setattr("nlfilter_torch.photo.app.session.WHOLE_MEMORY", memory)
         stages: list[str] = []
         saved.append(read_photograph(session.save(name, lambda stage, *_, told=stages: told.append(stage))).pixels)
         assert stages[-1] == "Writing"

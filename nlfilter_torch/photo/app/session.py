@@ -26,7 +26,7 @@ from nlfilter_torch.photo.edits.recipe import edit_rows
 from nlfilter_torch.photo.files import tiff
 from nlfilter_torch.photo.files.exif import read_upright
 from nlfilter_torch.photo.files.formats import BITS, DEPTHS, SUFFIXES, check_memory, first_bytes
-from nlfilter_torch.photo.files.rows import TILED, WHOLE, usual_memory
+from nlfilter_torch.photo.files.rows import TILED_MEMORY, WHOLE_MEMORY, usual_memory
 from nlfilter_torch.photo.files.writing import open_beside
 from nlfilter_torch.photo.picture.developing import balance_of
 from nlfilter_torch.photo.picture.photographs import Photograph, check_output, read_photograph, write_photograph
@@ -425,7 +425,7 @@ class Session:
         """How an edit passes over the photograph in tiles."""
         statistics: Statistics = "full" if math.prod(photograph.size) <= SMALL else "sample"
         kind = str(photograph.pixels.numpy().dtype)
-        return Passes(kind, statistics, memory=usual_memory(TILED), report=report, folder=self.folder)
+        return Passes(kind, statistics, memory=usual_memory(TILED_MEMORY), report=report, folder=self.folder)
 
     def target(self, name: str) -> Path:
         """The file of that name in the folder; raises ValueError if ``name`` is invalid or leads out of the folder."""
@@ -512,7 +512,7 @@ class Session:
 
 def _in_tiles(size: tuple[int, int], recipe: Recipe) -> bool:
     """Whether a photograph (H, W) is edited in tiles, since that at once needs too much memory."""
-    return math.prod(size) * recipe.bytes_per_pixel > WHOLE
+    return math.prod(size) * recipe.bytes_per_pixel > WHOLE_MEMORY
 
 
 def reduced_size(photograph: Photograph, side: int | None) -> tuple[int, int]:

@@ -20,9 +20,9 @@ def main(arguments: list[str] | None = None, others: Commands = tuple) -> int:
     process.collect_seldom()
     try:
         with process.handled():
-            from nlfilter_torch.photo.cli.application import run
+            from nlfilter_torch.photo.cli.application import run_program
 
-            return run(arguments, others())
+            return run_program(arguments, others())
     except KeyboardInterrupt:
         return process.tell()
     except process.Ended as ended:

@@ -90,7 +90,7 @@ def assembled(others: Iterable[Callable[..., None]]) -> typer.Typer:
     return whole
 
 
-def run(arguments: list[str] | None, others: Iterable[Callable[..., None]]) -> int:
+def run_program(arguments: list[str] | None, others: Iterable[Callable[..., None]]) -> int:
     """Run the command line and return its exit status: 2 after one sentence for invalid input, 130 for Ctrl-C."""
     arguments = sys.argv[1:] if arguments is None else arguments
     with warnings.catch_warnings():

@@ -17,17 +17,17 @@ from typing import Any
 
 import typer
 
-from nlfilter_torch.photo.cli.editing import allowed_memory, check_quality_of, check_workers, is_jpeg
+from nlfilter_torch.photo.cli.editing import allowed_memory, check_quality_of, check_workers, has_jpeg_suffix
 from nlfilter_torch.photo.cli.edits import edit_photograph
 from nlfilter_torch.photo.cli.folders import left_out, pictures, prepare, subfolders
-from nlfilter_torch.photo.cli.options import NOTE, FileOptions, FolderOptions
+from nlfilter_torch.photo.cli.options import NOTE, FolderOptions, PhotographOptions
 from nlfilter_torch.photo.cli.process import INTERRUPTED
 from nlfilter_torch.photo.cli.progress import steps
 from nlfilter_torch.photo.cli.recipe_job import apply_files
 from nlfilter_torch.photo.cli.workers import Crew, worker_pool
 from nlfilter_torch.photo.declared.parameters import EDITS
 from nlfilter_torch.photo.declared.presets import Recipe, named_recipe
-from nlfilter_torch.photo.files.rows import WHOLE, free_memory
+from nlfilter_torch.photo.files.rows import WHOLE_MEMORY, free_memory
 from nlfilter_torch.photo.files.writing import remove_stale
 
 DEATHS = 3  # per worker and in a row: after so many deaths the cause is not in the files
@@ -35,7 +35,7 @@ NAMED = 5  # subfolders that are left out and named
 DIED = "the process that worked on it died; use fewer --workers, so that each has more memory, or check the file"
 
 Edit = Callable[[str, str], object]  # edits the file of the first name to that of the second; can be pickled
-FileEdit = Callable[[str, str, FileOptions], object]
+FileEdit = Callable[[str, str, PhotographOptions], object]
 Outcome = list[str] | str  # warnings of a file that was edited, or why it could not be edited
 
 
@@ -93,14 +93,14 @@ def edit_photographs(
     tally, interrupted = Tally(), False
     count = min(files.workers or _cores(), len(paths))
     room = files.memory  # of a worker; None is as much as the command of an edit uses
-    if files.cluster is None and (files.memory is not None or shared < count * WHOLE):
+    if files.cluster is None and (files.memory is not None or shared < count * WHOLE_MEMORY):
         room = shared / count / 1e9
     try:
         with steps(len(paths), lines=False) as begin:  # files that fail are told by lines
             edit_folder(
                 paths,
                 target,
-                partial(_edited, edit, FileOptions(quality=files.quality, memory=room)),
+                partial(_edited, edit, PhotographOptions(quality=files.quality, memory=room)),
                 Crew(count, max(1, _cores() // count), files.cluster),
                 tell=_tell,
                 begin=begin,
@@ -116,9 +116,9 @@ def edit_photographs(
         raise typer.Exit(1)
 
 
-def _edited(edit: FileEdit, files: FileOptions, source: str, target: str) -> None:
+def _edited(edit: FileEdit, files: PhotographOptions, source: str, target: str) -> None:
     """Edit a file, with the quality of these options if it is a JPEG."""
-    edit(source, target, files if is_jpeg(target) else replace(files, quality=None))
+    edit(source, target, files if has_jpeg_suffix(target) else replace(files, quality=None))
 
 
 def _cores() -> int:

@@ -38,7 +38,12 @@ Aspect = Annotated[
 
 @with_declared(DEVELOP)
 def develop(
-    source: options.Source, target: options.Target, *, aspect: Aspect = None, files: options.FileOptions, **values: Any
+    source: options.Source,
+    target: options.Target,
+    *,
+    aspect: Aspect = None,
+    files: options.PhotographOptions,
+    **values: Any,
 ) -> None:
     """Develop a photograph; the help is that of the declaration."""
     recipe = Recipe((), Development(**values | {"crop": options.parse_crop(values["crop"])}))
@@ -68,7 +73,7 @@ def apply(
     preset: Edits,
     *,
     mask: options.Masks = None,
-    files: options.FileOptions,
+    files: options.PhotographOptions,
     full: options.Full = False,
 ) -> None:
     """Apply an edit saved in the browser to a photograph, including its sliders, strokes and crop.

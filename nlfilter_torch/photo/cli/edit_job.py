@@ -14,7 +14,7 @@ from torch import Tensor
 
 from nlfilter_torch.core.workers import single_threaded
 from nlfilter_torch.photo.cli import editing, options
-from nlfilter_torch.photo.cli.editing import MAP_DEPTH, Job, pixels_of, rows_of
+from nlfilter_torch.photo.cli.editing import MAP_DEPTH, Job, pixels_of, rows_in_memory
 from nlfilter_torch.photo.cli.scribbles import MarkedPhotograph, Opener, ScribbleOptions
 from nlfilter_torch.photo.cli.showing import Scribbled
 from nlfilter_torch.photo.declared.development import AS_IT_IS, Development
@@ -57,7 +57,7 @@ class EditJob:
     scribbles: ScribbleOptions
     show: Path | None
     map: Path | None
-    files: options.FileOptions
+    files: options.PhotographOptions
     seed: int
     full: bool
     notes: Sequence[str] = ()
@@ -92,7 +92,7 @@ class EditJob:
 
     def edited(self, photograph: Photograph) -> Tensor:
         """The edited pixels of a photograph in memory, (1, C, H, W)."""
-        rows = rows_of(photograph, self.source)
+        rows = rows_in_memory(photograph, self.source)
         with ExitStack() as opened:
             marked = self._marked(rows, PictureOpener(opened, editing.allowed_memory(self.files.memory)))
             self._tell(rows, marked)
@@ -100,7 +100,7 @@ class EditJob:
             edit = self._measured(InMemory(photograph.pixels, weights=weights), rows)
             pixels = edit_image(edit, photograph.pixels, marked.tensors(), weights=weights)
         if edit.reports_change:
-            kind = options.DEPTHS[self.files.depth] if self.files.depth else photograph.depth  # the files are compared
+            kind = options.DTYPES[self.files.depth] if self.files.depth else photograph.depth  # the files are compared
             planes = [photograph.pixels] if weights is None else [photograph.pixels, weights]
             before = stored_as(torch.cat(planes, dim=1), photograph.depth)
             after = stored_as(pixels, kind)
@@ -186,7 +186,7 @@ class ChangeMeter:
     @property
     def change(self) -> float:
         """The change of the pixels that were added."""
-        return options.LEVELS * (self._squares / max(self._count, 1)) ** 0.5
+        return options.GREY_LEVELS * (self._squares / max(self._count, 1)) ** 0.5
 
 
 def write_map(map_of: Callable[[Tensor], Tensor], rows: Rows, path: Path) -> None:

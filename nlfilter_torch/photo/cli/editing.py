@@ -17,8 +17,8 @@ from nlfilter_torch.photo.declared.development import Development
 from nlfilter_torch.photo.declared.steps import Step, working_bytes
 from nlfilter_torch.photo.files.formats import Depth, TooLarge, check_depth, check_memory, check_type
 from nlfilter_torch.photo.files.rows import (
-    TILED,
-    WHOLE,
+    TILED_MEMORY,
+    WHOLE_MEMORY,
     StoredPicture,
     check_place,
     is_zarr,
@@ -40,14 +40,14 @@ from nlfilter_torch.photo.picture.tiles import Passes, Processes, Statistics, Ti
 from nlfilter_torch.photo.picture.viewing import viewed_size
 
 MAP_DEPTH: Depth = "uint16"
-MOST = 1e6  # gigabytes; upper limit of ``--memory``
+MOST_GIGABYTES = 1e6  # gigabytes; upper limit of ``--memory``
 
 
 def allowed_memory(gigabytes: float | None, most: int = sys.maxsize) -> int:
     """``--memory`` in bytes, or without it the usual memory, and at most so many bytes."""
     if gigabytes is None:
         return usual_memory(most)
-    if not 0 < gigabytes <= MOST:
+    if not 0 < gigabytes <= MOST_GIGABYTES:
         raise ValueError(f"--memory must be a positive number of gigabytes, such as 4, got {gigabytes:g}")
     return int(gigabytes * 1e9)
 
@@ -68,7 +68,7 @@ def read_if_it_fits(source: str, target: str, bytes_per_pixel: int, gigabytes: f
     if is_zarr(Path(source)) or is_zarr(Path(target)):
         return None
     try:
-        return read_photograph(source, bytes_per_pixel=bytes_per_pixel, memory=allowed_memory(gigabytes, WHOLE))
+        return read_photograph(source, bytes_per_pixel=bytes_per_pixel, memory=allowed_memory(gigabytes, WHOLE_MEMORY))
     except TooLarge:
         return None
 
@@ -115,7 +115,7 @@ def check_not_input(source: str, target: str, *, force: bool) -> None:
 
 def check_quality(target: str, quality: int | None) -> None:
     """Raise ValueError if a quality is set for a file that is no JPEG."""
-    if quality is not None and not is_jpeg(target):
+    if quality is not None and not has_jpeg_suffix(target):
         raise ValueError(
             f"--quality must be used with a JPEG file, got {quality} for {target}; name a .jpg file, or leave it out"
         )
@@ -123,13 +123,13 @@ def check_quality(target: str, quality: int | None) -> None:
 
 def check_quality_of(paths: Sequence[Path], quality: int) -> None:
     """Raise ValueError if a quality is set for a folder of files of which none is a JPEG."""
-    if not any(is_jpeg(path) for path in paths):
+    if not any(has_jpeg_suffix(path) for path in paths):
         raise ValueError(
             f"--quality must be used with JPEG files, got {quality} for {paths[0].parent}, which has none; leave it out"
         )
 
 
-def is_jpeg(path: str | Path) -> bool:
+def has_jpeg_suffix(path: str | Path) -> bool:
     """Whether a path has the suffix of a JPEG file."""
     return Path(path).suffix.lower() in (".jpg", ".jpeg")
 
@@ -226,7 +226,7 @@ def pixels_of(picture: Picture, rows: slice) -> Tensor:
     return picture.tile(rows.start, rows.stop, 0).pixels
 
 
-def rows_of(photograph: Photograph, name: str) -> Rows:
+def rows_in_memory(photograph: Photograph, name: str) -> Rows:
     """The rows of a photograph in memory."""
     pixels = photograph.pixels
     return Rows(name, photograph.size, pixels.shape[1], lambda rows: pixels[..., rows, :])
@@ -283,12 +283,12 @@ class FileEdit(Protocol):
         """The edited rows of a photograph that does not fit in memory, which are computed within the block."""
 
 
-def edit_file(edit: FileEdit, source: str, target: str, files: options.FileOptions) -> None:
+def edit_file(edit: FileEdit, source: str, target: str, files: options.PhotographOptions) -> None:
     """Edit the photograph in a file, and write it to another file, with its metadata."""
     check_not_input(source, target, force=files.force)
     check_quality(target, files.quality)
     check_processes(source, target, files.workers, files.cluster)
-    allowed, kind = allowed_memory(files.memory), None if files.depth is None else options.DEPTHS[files.depth]
+    allowed, kind = allowed_memory(files.memory), None if files.depth is None else options.DTYPES[files.depth]
     with steps(3) as begin:
         begin("Reading")
         photograph = read_if_it_fits(source, target, edit.bytes_per_pixel, files.memory)
@@ -318,7 +318,13 @@ def edit_file(edit: FileEdit, source: str, target: str, files: options.FileOptio
         processes = processes_for(files.workers, files.cluster, stack)
         report = stack.enter_context(stages())
         job = Job(
-            picture, stored, allowed - picture.cached, allowed_memory(files.memory, TILED), report, stack, processes
+            picture,
+            stored,
+            allowed - picture.cached,
+            allowed_memory(files.memory, TILED_MEMORY),
+            report,
+            stack,
+            processes,
         )
         with edit.tiling(job) as tiling:
             write_picture(Path(target), tiling, stored, like, files.quality, tiling.fill)

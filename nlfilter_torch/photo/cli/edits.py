@@ -93,7 +93,7 @@ METAVARS: dict[ScribbleKind, str] = {
     "sliders": "X,Y,W,H[:SLIDERS]",
 }
 #: The option ``--region`` for each kind of scribbles on an object.
-REGIONS: dict[ScribbleKind, object] = {
+REGION_OPTIONS: dict[ScribbleKind, object] = {
     "colours": options.ColourRegions,
     "mask": options.Regions,
     "sliders": options.SliderRegions,
@@ -105,7 +105,7 @@ def scribble_options(edit: Edit) -> dict[str, object]:
     kinds = [scribble.kind for scribble in edit.scribbles if scribble.role == "object"]
     annotations: dict[str, object] = {"preset": PresetName} if edit.presets else {}
     for kind in kinds:
-        annotations |= {"strokes": options.StrokesFile, "region": REGIONS[kind]}
+        annotations |= {"strokes": options.StrokesFile, "region": REGION_OPTIONS[kind]}
     for scribble in edit.with_options:
         name = scribble.option.removeprefix("--")
         annotations[name] = options.rectangles(scribble.option, METAVARS[scribble.kind], scribble.option_help)
@@ -218,7 +218,7 @@ def command(edit: Edit) -> Command:
         source: options.Source,
         target: options.Target,
         context: typer.Context,
-        files: options.FileOptions,
+        files: options.PhotographOptions,
         seed: options.Seed = 0,
         full: options.Full = False,
         **values: Any,
@@ -250,7 +250,7 @@ def edit_photograph(
     edit: Edit,
     source: str,
     target: str,
-    files: options.FileOptions,
+    files: options.PhotographOptions,
     *,
     typed: Collection[str] = (),
     seed: int = 0,

@@ -14,7 +14,7 @@ from nlfilter_torch.photo.cli.showing import notes_if_idle
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.edits.film import FilmEdit, FrameArray, film_steps
 from nlfilter_torch.photo.files.films import check_film_output, is_film, open_film, write_film
-from nlfilter_torch.photo.files.rows import TILED
+from nlfilter_torch.photo.files.rows import TILED_MEMORY
 from nlfilter_torch.photo.files.writing import check_folder
 from nlfilter_torch.photo.picture.photographs import Photograph, check_output, read_photograph, write_photograph
 from nlfilter_torch.photo.picture.tiles import Passes
@@ -33,8 +33,8 @@ def edit_frames(
     film = is_film(source) and not source.is_dir()
     what = "the film is encoded again" if film else "the photographs are written"
     notes = notes_if_idle(recipe, name, what)
-    passes = Passes("float32", memory=allowed_memory(memory, TILED))
-    work = edit_film if film else edit_folder
+    passes = Passes("float32", memory=allowed_memory(memory, TILED_MEMORY))
+    work = edit_film if film else edit_stills
     return work(source, target, references, partial(fitted, recipe, passes, seed, notes))
 
 
@@ -56,7 +56,7 @@ def edit_film(source: Path, target: Path, references: int, fit: Callable[[list[F
         return write_film(film, target, edit, lambda number: begin(f"Frame {number + 1} of {film.count}"))
 
 
-def edit_folder(source: Path, target: Path, references: int, fit: Callable[[list[FrameArray]], FilmEdit]) -> int:
+def edit_stills(source: Path, target: Path, references: int, fit: Callable[[list[FrameArray]], FilmEdit]) -> int:
     """Edit the photographs in a folder, and return their number."""
     paths = frames_of(source, target)
     folder, reader = EditedFrames(target, check_replaced(paths, target)), FrameReader()

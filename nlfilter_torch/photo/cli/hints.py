@@ -6,7 +6,7 @@ Does not import torch, so that errors in options appear at once.
 import re
 from collections.abc import Collection, Mapping, Sequence
 
-DEVELOPING = ("--exposure", "--temperature", "--tint", "--straighten", "--crop", "--aspect")  # options of develop
+DEVELOP_OPTIONS = ("--exposure", "--temperature", "--tint", "--straighten", "--crop", "--aspect")  # options of develop
 #: What other programs call an option: our options, of which those of the command are named, or a sentence.
 OTHER_NAMES: Mapping[str, tuple[str, ...] | str] = {
     "--sigma": ("--noise-level", "--bandwidth", "--radius", "--tolerance"),
@@ -50,7 +50,7 @@ OTHER_NAMES: Mapping[str, tuple[str, ...] | str] = {
     "--input": "the photograph is the first argument: nlfilter-torch COMMAND IN OUT",
     "--overwrite": ("--force",),
     "--yes": ("--force",),
-    **{option: (option,) for option in DEVELOPING},
+    **{option: (option,) for option in DEVELOP_OPTIONS},
     "--brightness": ("--exposure",),
     "--wb": ("--temperature", "--tint"),
     "--white-balance": ("--temperature", "--tint"),
@@ -151,8 +151,8 @@ def _meant(option: str, options: Collection[str]) -> str:
     own = [meaning for meaning in ((name,) if name in options else meanings) if meaning.split()[0] in options]
     if own:
         return f"here it is {' or '.join(own[:2])}"
-    if any(meaning in DEVELOPING for meaning in meanings):
-        return f"nlfilter-torch develop has {', '.join(DEVELOPING[:-1])} and {DEVELOPING[-1]}"
+    if any(meaning in DEVELOP_OPTIONS for meaning in meanings):
+        return f"nlfilter-torch develop has {', '.join(DEVELOP_OPTIONS[:-1])} and {DEVELOP_OPTIONS[-1]}"
     return "nlfilter-torch batch has --workers" if "--workers" in meanings else ""
 
 

@@ -43,7 +43,7 @@ from nlfilter_torch.photo.plotting import (
     show_mask,
 )
 
-MEASURED = 32  # eigenvectors, of the 300: all of them would take five times as long as the rest
+MEASURED_VECTORS = 32  # eigenvectors, of the 300: all of them would take five times as long as the rest
 READ_BYTES = 40  # per pixel, of a photograph that is read and reduced
 # Meaning of each diagnostic, for readers who do not know the paper.
 MEANINGS = {
@@ -56,7 +56,7 @@ MEANINGS = {
     "row_sum_residual": "largest deviation of a pixel's total weight from 1",
     "smallest_row_sum": "smallest total weight before balancing; 1: a pixel that resembles no other",
     "largest_eigenvalue": "1 for a correct filter",
-    "eigenvector_residual": f"largest error of an eigenvector, of {MEASURED} that are measured",
+    "eigenvector_residual": f"largest error of an eigenvector, of {MEASURED_VECTORS} that are measured",
     "orthogonality": "largest deviation of the eigenvectors from orthonormality",
     "diagonal_share": "average weight of a pixel in its own filtered value",
     "badly_covered": "share of the pixels that have similar ones which the landmarks miss; lower with more landmarks",
@@ -73,7 +73,7 @@ def write_diagnostics(source: str, folder: Path, step: Step, seed: int) -> None:
         size = viewed_within_memory(source, photograph.size, step, factors=5)
         guide = reduce_channels(resize(photograph.pixels, size), "luminance")
         begin("Comparing patches")
-        operator = build_operator(guide, step, seed)
+        operator = operator_of_step(guide, step, seed)
         begin("Finding patterns")
         spectrum = operator.spectrum()
         figures = summarize(operator, spectrum, guide)
@@ -88,7 +88,7 @@ def write_diagnostics(source: str, folder: Path, step: Step, seed: int) -> None:
     print_table(figures, f"The filter of {source}")
 
 
-def build_operator(guide: Tensor, step: Step, seed: int = 0) -> NonlocalOperator:
+def operator_of_step(guide: Tensor, step: Step, seed: int = 0) -> NonlocalOperator:
     """The operator of a guide (1, 1, H, W), with the filter parameters of a step."""
     parameters = step.filter_options((guide.shape[-2], guide.shape[-1]))
     return operator_from_guide(guide, FilterOptions(**parameters, generator=seeded(seed)))
@@ -98,7 +98,7 @@ def summarize(operator: NonlocalOperator, spectrum: Spectrum, guide: Tensor) -> 
     """The diagnostics of an operator of a single image as plain numbers, with the bandwidth in grey levels."""
     figures = {
         name: value[0] if isinstance(value, list) else value
-        for name, value in asdict(operator.diagnostics(MEASURED, spectrum)).items()
+        for name, value in asdict(operator.diagnostics(MEASURED_VECTORS, spectrum)).items()
     }
     del figures["pixels"]
     height, width = guide.shape[-2:]
@@ -107,7 +107,7 @@ def summarize(operator: NonlocalOperator, spectrum: Spectrum, guide: Tensor) -> 
         "width": width,
         "landmarks": figures.pop("num_landmarks"),
         "rank": figures.pop("rank"),
-        "bandwidth": options.LEVELS * figures.pop("photometric_bandwidth"),
+        "bandwidth": options.GREY_LEVELS * figures.pop("photometric_bandwidth"),
         **figures,
         "captured_energy": float(captured_energy(spectrum, guide)),
     }
@@ -124,19 +124,19 @@ def print_table(figures: dict[str, float], title: str) -> None:
     Console().print(table)
 
 
-ALPHA = (3.0, 3.0, 4.0, 1.05)  # of the response that is drawn
+EXAMPLE_SLIDERS = (3.0, 3.0, 4.0, 1.05)  # of the response that is drawn
 BLUE = (0.1, 0.3, 0.9)  # of the stroke on the suit
 SELECTION = (slice(300, 320), slice(60, 80))  # rows and columns of a patch of the astronaut's suit
 # Chosen by eye: half the default width keeps the mask on the suit, three times the default time fills its folds.
 SELECTION_WIDTH = 2.0
 SELECTION_TIME = 3.0
-SELECTION_BANDWIDTH = 25 / options.LEVELS
+SELECTION_BANDWIDTH = 25 / options.GREY_LEVELS
 
 
 def write_examples(folder: Path) -> None:
     """Write pictures of each step of the filter on an example photograph, and print the figures of its filter."""
     check_folder(folder)
-    image = torch.from_numpy(skimage.data.astronaut()).permute(2, 0, 1)[None].float() / options.LEVELS
+    image = torch.from_numpy(skimage.data.astronaut()).permute(2, 0, 1)[None].float() / options.GREY_LEVELS
     with steps(4) as begin:
         begin("Comparing patches")
         luminance = reduce_channels(image, "luminance")
@@ -168,7 +168,7 @@ def write_examples(folder: Path) -> None:
                 ),
                 "2-layers": show_layers(detail_layers(operator, luminance)),
                 "3-eigenvectors": show_eigenvectors(spectrum),
-                "4-sliders": plot_response(torch.tensor(ALPHA), spectrum),
+                "4-sliders": plot_response(torch.tensor(EXAMPLE_SLIDERS), spectrum),
                 "5-selection": show_mask(image, select(luminance), mask),
             },
         )

@@ -9,7 +9,7 @@ from pathlib import Path
 from nlfilter_torch.core.workers import single_threaded
 from nlfilter_torch.photo.cli import editing, options
 from nlfilter_torch.photo.cli.edit_job import PictureOpener
-from nlfilter_torch.photo.cli.editing import pixels_of, rows_of
+from nlfilter_torch.photo.cli.editing import pixels_of, rows_in_memory
 from nlfilter_torch.photo.cli.progress import stages, steps
 from nlfilter_torch.photo.cli.scribbles import MarkedPhotograph, Opener, ScribbleOptions
 from nlfilter_torch.photo.cli.showing import Scribbled, tell_selected
@@ -18,7 +18,7 @@ from nlfilter_torch.photo.declared.parameters import MASK
 from nlfilter_torch.photo.declared.steps import working_bytes
 from nlfilter_torch.photo.files.formats import PFM, Depth, check_depth, check_memory, write_pfm
 from nlfilter_torch.photo.files.metadata import NO_METADATA
-from nlfilter_torch.photo.files.rows import TILED, StoredPicture, check_place, open_picture, write_picture
+from nlfilter_torch.photo.files.rows import TILED_MEMORY, StoredPicture, check_place, open_picture, write_picture
 from nlfilter_torch.photo.files.writing import check_file
 from nlfilter_torch.photo.picture.drawn import Drawn, M
 from nlfilter_torch.photo.picture.edit import Rows
@@ -75,7 +75,7 @@ class MaskJob:
     @property
     def kind(self) -> Depth:
         """Depth of a file that is not PFM."""
-        return options.DEPTHS[self.depth or ("16" if self.target.suffix.lower() in (".tif", ".tiff") else "8")]
+        return options.DTYPES[self.depth or ("16" if self.target.suffix.lower() in (".tif", ".tiff") else "8")]
 
     def check_depth(self) -> None:
         """Raise ValueError if the file cannot have that depth."""
@@ -105,13 +105,13 @@ class MaskJob:
             report = files.enter_context(stages())
             plain = self._check_rows(picture, allowed)
             processes = editing.processes_for(workers, cluster, files)
-            limit = editing.allowed_memory(self.memory, TILED)
+            limit = editing.allowed_memory(self.memory, TILED_MEMORY)
             job = editing.Job(picture, self.kind, allowed - picture.cached, limit, report, files, processes)
             self._by_rows(job, plain)
 
     def _in_memory(self, photograph: Photograph, mask: Photograph, allowed: int) -> Photograph:
         """The mask of a photograph in memory."""
-        rows = rows_of(photograph, self.source)
+        rows = rows_in_memory(photograph, self.source)
         with ExitStack() as files:
             marked = self._marked(rows, PictureOpener(files, allowed))
             drawn = marked.tensors()

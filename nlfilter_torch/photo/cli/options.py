@@ -19,14 +19,14 @@ if TYPE_CHECKING:
     from nlfilter_torch.photo.files.formats import Depth
 
 FILES_PANEL = "Files and memory"  # section in the help
-LEVELS = 255.0  # grey levels between black and white, whatever the depth of the file
+GREY_LEVELS = 255.0  # grey levels between black and white, whatever the depth of the file
 
 
 FileDepth = Literal["8", "16", "float"]  # what a channel of the output file holds
-DEPTHS: dict[FileDepth, "Depth"] = {"8": "uint8", "16": "uint16", "float": "float32"}
+DTYPES: dict[FileDepth, "Depth"] = {"8": "uint8", "16": "uint16", "float": "float32"}
 
 
-SIDES = (0.01, 100_000.0)  # range of the two numbers in the proportions of a crop
+ASPECT_SIDES = (0.01, 100_000.0)  # range of the two numbers in the proportions of a crop
 NOTE = "nlfilter-torch: note: "  # begins every note on standard error
 
 
@@ -45,10 +45,10 @@ def parse_aspect(text: str) -> float:
         wide, high = (float(part) for part in text.split(":"))
     except ValueError:
         wide = high = 0.0
-    if not (SIDES[0] <= wide <= SIDES[1] and SIDES[0] <= high <= SIDES[1]):
+    if not (ASPECT_SIDES[0] <= wide <= ASPECT_SIDES[1] and ASPECT_SIDES[0] <= high <= ASPECT_SIDES[1]):
         raise ValueError(
-            f"--aspect must be a width and a height from {SIDES[0]:g} to {SIDES[1]:g}, such as 3:2, got {text!r}; "
-            "correct it"
+            f"--aspect must be a width and a height from {ASPECT_SIDES[0]:g} to {ASPECT_SIDES[1]:g}, such as 3:2, got "
+            f"{text!r}; correct it"
         )
     return wide / high
 
@@ -223,7 +223,7 @@ Cluster = Annotated[
 
 
 @dataclass(frozen=True)
-class FileOptions:
+class PhotographOptions:
     """The options of a command that reads one photograph and writes another, in the order of its help."""
 
     depth: OutputDepth = None

@@ -22,7 +22,7 @@ from nlfilter_torch.photo.picture.tiles import Comparison, Tiling
 
 TASK_PIXELS = 1 << 20  # that a worker computes before it is given others, if there are enough of them
 TASKS = 4  # per worker at least, so that they end at about the same time
-STRIP = 32  # rows of a chunk of an array between two steps
+STEP_ROWS = 32  # rows of a chunk of an array between two steps
 JOB = "tiling.pickle"  # in the folder of an array that is being written
 
 
@@ -81,7 +81,7 @@ class ZarrProcesses:
             zarr_package().create_array(
                 store=beside,
                 shape=(height, width, values.shape[2]),
-                chunks=(min(STRIP, height), width, values.shape[2]),
+                chunks=(min(STEP_ROWS, height), width, values.shape[2]),
                 dtype=values.dtype,
                 compressors=None,
             )

@@ -21,7 +21,7 @@ from rich.progress import (
 
 from nlfilter_torch.core import progress
 
-PAUSE = 10.0  # seconds between two lines
+LINE_PAUSE = 10.0  # seconds between two lines
 
 
 def _bar(*columns: ProgressColumn) -> Progress:
@@ -47,7 +47,7 @@ def _lines(current: progress.Progress, wanted: bool) -> Iterator[progress.Progre
 
 
 def _print_lines(current: progress.Progress, ended: threading.Event) -> None:
-    while not ended.wait(PAUSE):
+    while not ended.wait(LINE_PAUSE):
         if text := str(current):
             sys.stderr.write(f"{text}\n")
             sys.stderr.flush()

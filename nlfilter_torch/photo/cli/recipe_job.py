@@ -10,7 +10,7 @@ from pathlib import Path
 from torch import Tensor
 
 from nlfilter_torch.photo.cli import editing, options
-from nlfilter_torch.photo.cli.editing import Job, pixels_of, rows_of
+from nlfilter_torch.photo.cli.editing import Job, pixels_of, rows_in_memory
 from nlfilter_torch.photo.cli.showing import notes_if_idle
 from nlfilter_torch.photo.declared.development import Development
 from nlfilter_torch.photo.declared.presets import Recipe, find_recipe
@@ -92,7 +92,7 @@ class RecipeJob:
     def edited(self, photograph: Photograph) -> Tensor:
         """The edited pixels of a developed photograph in memory, (1, C, H, W)."""
         masks = editing.read_masks(self.masks, self.source, photograph.size) if self.masks else None
-        self._tell(rows_of(photograph, self.source))
+        self._tell(rows_in_memory(photograph, self.source))
         weights, recipes = photograph.weights, self.recipes
         if weights is not None:
             recipes = self._seen(InMemory(photograph.pixels, weights=weights), TensorPainter())
@@ -148,7 +148,9 @@ class RecipeJob:
             options.note(note)
 
 
-def develop_file(recipe: Recipe, aspect: float | None, source: str, target: str, files: options.FileOptions) -> None:
+def develop_file(
+    recipe: Recipe, aspect: float | None, source: str, target: str, files: options.PhotographOptions
+) -> None:
     """Develop a photograph by a recipe without steps, whose crop is trimmed to width by height, or not for None."""
     notes = [f"no option changes anything: {target} is written without an edit"] if recipe.develop.is_idle else []
     editing.edit_file(RecipeJob([recipe], [], source, target, False, notes, aspect=aspect), source, target, files)
@@ -159,7 +161,7 @@ def apply_files(
     masks: Sequence[Path],
     source: str,
     target: str,
-    files: options.FileOptions,
+    files: options.PhotographOptions,
     *,
     full: bool = False,
 ) -> None:

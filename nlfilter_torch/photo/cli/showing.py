@@ -35,8 +35,8 @@ MAX_PIXELS = 500_000  # largest size of the picture that shows scribbles
 LARGE_DISTANCE = 0.2  # Lab distance, divided by 100, beyond which two colours are very different
 BORDER_SHARE = 0.9  # selected share of the picture's borders above which a note is printed
 NOTE_SHARE = 0.15  # share of such pixels above which a note is printed
-CHUNK_ROWS = 64
-HATCHING = 4  # pixels from one line to the next
+SHOWN_ROWS = 64
+HATCH_STEP = 4  # pixels from one line to the next
 OUTSIDE_BRIGHTNESS = 0.4  # brightness outside the mask, where the picture is shown in grey
 
 
@@ -164,7 +164,7 @@ def drawn_over(image: Tensor, mask: Tensor, colours: Tensor | None, painted: Ten
 def hatched(shown: Tensor, places: Tensor) -> Tensor:
     """A picture (1, 3, H, W) with black lines on some pixels, (1, 1, H, W)."""
     height, width = shown.shape[-2:]
-    lines = (torch.arange(height).unsqueeze(1) + torch.arange(width)) % HATCHING < HATCHING // 2
+    lines = (torch.arange(height).unsqueeze(1) + torch.arange(width)) % HATCH_STEP < HATCH_STEP // 2
     return torch.where((places > 0) & lines, torch.zeros_like(shown), shown)
 
 
@@ -199,6 +199,6 @@ def _planes(source: RowSource, rows: slice) -> Tensor:
 
 def _reduced(read: Read, size: tuple[int, int], stride: int, pool: Callable[..., Tensor]) -> Tensor:
     """Pool blocks of ``stride`` pixels along each axis, with only some rows in memory at once; the last are smaller."""
-    starts = range(0, size[0], CHUNK_ROWS * stride)
-    parts = (read(slice(start, min(start + CHUNK_ROWS * stride, size[0]))) for start in starts)
+    starts = range(0, size[0], SHOWN_ROWS * stride)
+    parts = (read(slice(start, min(start + SHOWN_ROWS * stride, size[0]))) for start in starts)
     return torch.cat([pool(part, stride, ceil_mode=True) for part in parts], dim=2)

@@ -17,7 +17,7 @@ from typing import TypeVar
 import psutil
 
 CONNECTING = 30  # seconds for a cluster to answer
-PAUSE = 0.5  # seconds between two looks at the main process
+LOOK_PAUSE = 0.5  # seconds between two looks at the main process
 
 Key = TypeVar("Key")
 Result = TypeVar("Result")
@@ -154,5 +154,5 @@ def be_worker(parent: int) -> None:
 
 def _end_with(parent: int) -> None:
     while os.getppid() == parent and psutil.pid_exists(parent):  # the first on POSIX, the second on Windows
-        time.sleep(PAUSE)
+        time.sleep(LOOK_PAUSE)
     os._exit(1)

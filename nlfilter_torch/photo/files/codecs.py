@@ -21,15 +21,15 @@ from nlfilter_torch.photo.files import exif_in_tiff, jpeg
 from nlfilter_torch.photo.files.decoded import CheckSize, Decoded, decoding, quiet
 from nlfilter_torch.photo.files.metadata import (
     DEPTH,
+    FURTHER_PICTURES,
     GAIN_MAP,
-    PICTURES,
     Extras,
     Metadata,
     UnhandledImage,
     check_colour_numbers,
     upright_packet,
 )
-from nlfilter_torch.photo.files.tables import EXIF, Tables
+from nlfilter_torch.photo.files.tables import EXIF, TiffTables
 
 ENCODING: dict[str, dict[str, object]] = {
     "WebP": {"lossless": True, "exact": True},  # exact: also where it is transparent
@@ -37,7 +37,7 @@ ENCODING: dict[str, dict[str, object]] = {
 }
 MOST_AVIF, LONGEST_AVIF = 1 << 28, 1 << 15  # pixels, and those of a side, that libavif decodes
 HEAD = 1 << 16  # bytes that hold the description of an AVIF file
-PIXELS = (b"VP8 ", b"VP8L", b"ALPH", b"ANMF")
+WEBP_PIXELS = (b"VP8 ", b"VP8L", b"ALPH", b"ANMF")
 WEBP_CHUNKS = (b"VP8 ", b"VP8L", b"VP8X", b"ALPH", b"ICCP", b"EXIF", b"XMP ", b"ANIM", b"ANMF")
 
 
@@ -73,7 +73,7 @@ def _webp_chunks(data: bytes | mmap) -> list[tuple[bytes, bytes]]:
         name, length = struct.unpack_from("<4sI", data, place)
         if place + 8 + length > len(data):
             raise EOFError("it ends too early")
-        chunks.append((name, bytes(data[place + 8 : place + 8 + (length if name not in PIXELS else 16)])))
+        chunks.append((name, bytes(data[place + 8 : place + 8 + (length if name not in WEBP_PIXELS else 16)])))
         place += 8 + length + length % 2
     return chunks
 
@@ -211,7 +211,7 @@ def _own_exif(path: Path) -> tuple[bytes | None, bool]:
     """The EXIF block of a RAW file that is a TIFF file, and whether its maker note was moved."""
     try:
         with path.open("rb") as stream, mmap(stream.fileno(), 0, access=ACCESS_READ) as data:
-            return exif_in_tiff.block_of(Tables(data))
+            return exif_in_tiff.block_of(TiffTables(data))
     except (ValueError, struct.error):
         return None, False
 
@@ -243,8 +243,8 @@ def read_heic(path: Path, check_size: CheckSize) -> Decoded:
         # The pixels are upright already.
         upright = exif_tags.read_upright(info.get("exif"), 1)
         packet, left_out = upright_packet(info.get("xmp"))
-        left_out += [PICTURES] * (len(picture) > 1) + [DEPTH] * bool(info.get("depth_images"))
-        left_out += [PICTURES] * bool(info.get("aux"))
+        left_out += [FURTHER_PICTURES] * (len(picture) > 1) + [DEPTH] * bool(info.get("depth_images"))
+        left_out += [FURTHER_PICTURES] * bool(info.get("aux"))
         extras = Extras(packet, left_out=(*left_out, *upright.left_out))
         metadata = Metadata(info.get("icc_profile"), upright.block, extras)
         return Decoded(channels.reshape(*channels.shape[:2], -1), 1, metadata)

@@ -28,7 +28,7 @@ from nlfilter_torch.photo.files.tables import (
     SHORT,
     Field,
     Range,
-    Tables,
+    TiffTables,
 )
 
 Scalar = TypeVar("Scalar", bound=np.generic)
@@ -39,9 +39,9 @@ IN_PIXELS = (Base.ImageWidth, Base.ExifImageWidth)
 FOCAL_PLANE = (Base.FocalPlaneXResolution, Base.FocalPlaneYResolution)
 #: Horizontal and vertical; swapped by a quarter turn.
 SIZES = ((Base.ImageWidth, Base.ImageLength), IN_EXIF, RESOLUTION[:2], FOCAL_PLANE)
-SCALES: dict[int, float] = {tifffile.RESUNIT.INCH: 1.0, tifffile.RESUNIT.CENTIMETER: 2.54}
+IN_INCHES: dict[int, float] = {tifffile.RESUNIT.INCH: 1.0, tifffile.RESUNIT.CENTIMETER: 2.54}
 AREAS = (37396, Base.SubjectLocation)  # places of the main subject: centre, and perhaps diameter, or width and height
-HIDDEN = 0xFFFE  # the number of no tag
+NO_TAG = 0xFFFE  # the number of no tag
 COMPRESSION, PLACE, LENGTH = Base.Compression, Base.JpegIFOffset, Base.JpegIFByteCount  # of a thumbnail
 OJPEG = tifffile.COMPRESSION.OJPEG
 THUMBNAIL_SIDES = (160, 80, 40)  # the longest side of thumbnails, until one fits
@@ -60,7 +60,7 @@ def upright(channels: NDArray[Scalar], orientation: int) -> NDArray[Scalar]:
     return channels[:: -1 if orientation in (3, 4, 7, 8) else 1, :: -1 if orientation in (2, 3, 6, 7) else 1]
 
 
-def orientation_of(value: object) -> int:
+def exif_orientation(value: object) -> int:
     """Return the EXIF orientation, 1 to 8; 1 (upright) if ``value`` is invalid.
 
     >>> orientation_of(6), orientation_of("upside down")
@@ -69,16 +69,16 @@ def orientation_of(value: object) -> int:
     return int(value) if isinstance(value, int) and 1 <= value <= 8 else 1
 
 
-class Block(Tables):
+class ExifBlock(TiffTables):
     """The tables of an EXIF block, whose bytes may be changed in place."""
 
     data: bytearray
 
 
-def parsed(block: bytes | None) -> Block | None:
+def parsed(block: bytes | None) -> ExifBlock | None:
     """The tables of a block; None if it is empty, or damaged from the start."""
     try:
-        tables = Block(bytearray((block or b"").removeprefix(PREFIX)))
+        tables = ExifBlock(bytearray((block or b"").removeprefix(PREFIX)))
     except (ValueError, struct.error):
         return None
     return tables if not tables.big and tables.fields(tables.first) else None
@@ -111,7 +111,7 @@ def read_upright(block: bytes | None, orientation: int | None = None, size: tupl
         return Upright(orientation or 1, None, ("a damaged EXIF block",) if block else ())
     first = [field for field in tables.fields(tables.first) if field.code == ORIENTATION]
     if orientation is None:
-        orientation = orientation_of(tables.number(first[0])) if first else 1
+        orientation = exif_orientation(tables.number(first[0])) if first else 1
     for field in first:
         _straighten(tables, field)
     damaged = _drop(tables)
@@ -132,7 +132,7 @@ def of_part(block: bytes | None, size: tuple[int, int]) -> bytes | None:
     return read_upright(PREFIX + bytes(tables.data), size=size).block
 
 
-def _turn_areas(tables: Block, orientation: int) -> bool:
+def _turn_areas(tables: ExifBlock, orientation: int) -> bool:
     """Turn the places of the subject with the picture, whose stored size the block says; False if that fails."""
     fields = {field.code: field for field in tables.walk()}
     numbers = [tables.number(fields[code]) for code in IN_EXIF if code in fields]
@@ -161,7 +161,7 @@ def turned_place(place: Sequence[int], orientation: int, width: int, height: int
     return [max(across, 0), max(down, 0), *extent]
 
 
-def _drop(tables: Block, unwanted: Container[int] = ()) -> bool:
+def _drop(tables: ExifBlock, unwanted: Container[int] = ()) -> bool:
     """Remove fields without a valid value, or unwanted, from the first table and that of EXIF; whether any were."""
     starts = [tables.first, *(tables.number(f) or 0 for f in tables.fields(tables.first) if f.code == EXIF)]
     damaged = False
@@ -189,7 +189,7 @@ def resolution(block: bytes | None) -> tuple[float, float] | None:
         return None
     fields = {field.code: field for field in tables.fields(tables.first) if field.code in RESOLUTION}
     values = [tables.ratio(fields[code]) for code in RESOLUTION[:2] if code in fields]
-    scale = SCALES.get(tables.number(fields[RESOLUTION[2]]) or 0) if RESOLUTION[2] in fields else 1.0
+    scale = IN_INCHES.get(tables.number(fields[RESOLUTION[2]]) or 0) if RESOLUTION[2] in fields else 1.0
     return (values[0] * scale, values[1] * scale) if scale is not None and len(values) == 2 else None
 
 
@@ -200,18 +200,18 @@ def hidden_orientation(block: bytes) -> bytes:
         return block
     for field in tables.fields(tables.first):
         if field.code == ORIENTATION:
-            tables.data[field.entry : field.entry + 2] = struct.pack(tables.order + "H", HIDDEN)
+            tables.data[field.entry : field.entry + 2] = struct.pack(tables.order + "H", NO_TAG)
     return block[: len(block) - len(tables.data)] + bytes(tables.data)
 
 
-def _straighten(tables: Block, field: Field) -> None:
+def _straighten(tables: ExifBlock, field: Field) -> None:
     """Set an orientation to 1; as a short integer if it was no integer."""
     kind = field.kind if field.count == 1 and field.kind in INTEGERS else SHORT
     struct.pack_into(tables.order + "HHI4x", tables.data, field.entry, field.code, kind, 1)
     struct.pack_into(tables.order + INTEGERS[kind], tables.data, field.entry + 8, 1)
 
 
-def _resize(tables: Block, fields: dict[int, Field], turned: bool, size: tuple[int, int] | None) -> None:
+def _resize(tables: ExifBlock, fields: dict[int, Field], turned: bool, size: tuple[int, int] | None) -> None:
     """Set the sizes in a block, or swap those that a quarter turn swaps."""
     for across, down in SIZES:
         pair = [fields[code] for code in (across, down) if code in fields and fields[code].count == 1]
@@ -224,7 +224,7 @@ def _resize(tables: Block, fields: dict[int, Field], turned: bool, size: tuple[i
             tables.data[field.place : field.end] = value
 
 
-def _thumbnail(tables: Tables) -> int:
+def _thumbnail(tables: TiffTables) -> int:
     """Offset of the table of the thumbnail, or 0."""
     pointer = tables.next(tables.first)
     return tables.unpack("I", pointer) if pointer is not None else 0
@@ -264,7 +264,7 @@ def _overlaps(place: Range, ranges: Iterable[Range]) -> bool:
     return any(start < place[1] and place[0] < stop for start, stop in ranges)
 
 
-def _without_table(tables: Block, start: int, room: Range) -> bytes:
+def _without_table(tables: ExifBlock, start: int, room: Range) -> bytes:
     """The bytes of a block without the table of its thumbnail, cut where nothing follows."""
     pointer = tables.next(tables.first)
     assert pointer is not None  # it led to the table

@@ -12,7 +12,7 @@ from typing import BinaryIO
 from PIL.ExifTags import Base
 
 from nlfilter_torch.photo.files.exif import PREFIX, parsed, refreshed
-from nlfilter_torch.photo.files.metadata import STORAGE, Tag
+from nlfilter_torch.photo.files.metadata import STORAGE_TAGS, Tag
 from nlfilter_torch.photo.files.tables import (
     EXIF,
     GPS,
@@ -24,7 +24,7 @@ from nlfilter_torch.photo.files.tables import (
     POINTERS,
     RESOLUTION,
     Field,
-    Tables,
+    TiffTables,
 )
 
 # Fields of the first table that describe the photograph and belong to the EXIF block.
@@ -33,24 +33,24 @@ DESCRIPTIVE = (
     *(Base.Software, Base.DateTime, Base.Artist, Base.HostComputer, Base.Rating, Base.RatingPercent, Base.Copyright),
     *(Base.XPTitle, Base.XPComment, Base.XPAuthor, Base.XPKeywords, Base.XPSubject),
 )
-NEAR = 1 << 20  # bytes of a TIFF file in which tables can keep their place
+NEAR_START = 1 << 20  # bytes of a TIFF file in which tables can keep their place
 START = 16  # of tables that are moved, after the longest header
 MOVED = "the offsets inside the maker note, which is moved"
 
 
-def block_of(tables: Tables) -> tuple[bytes | None, bool]:
+def block_of(tables: TiffTables) -> tuple[bytes | None, bool]:
     """The EXIF block of a TIFF file, and whether the maker note in it was moved."""
     kept = [field for field in tables.fields(tables.first) if field.code in DESCRIPTIVE]
     if not kept:
         return None, False
     has_note = any(field.code == MAKER_NOTE for field in tables.walk())
     end = max(stop for _, stop in tables.ranges(DESCRIPTIVE))
-    if has_note and not tables.big and end <= NEAR:
+    if has_note and not tables.big and end <= NEAR_START:
         return PREFIX + _copied(tables, kept, end), False
     return PREFIX + packed(tables, DESCRIPTIVE), has_note
 
 
-def _copied(tables: Tables, kept: list[Field], end: int) -> bytes:
+def _copied(tables: TiffTables, kept: list[Field], end: int) -> bytes:
     """The tables and their values at the offsets that they have, with zeros between them."""
     block = bytearray(end)
     for start, stop in tables.ranges(DESCRIPTIVE):
@@ -66,7 +66,7 @@ def _header(order: str, first: int) -> bytes:
     return (b"II*\0" if order == "<" else b"MM\0*") + struct.pack(order + "I", first)
 
 
-def packed(tables: Tables, codes: Container[int] | None, without: Container[int] = ()) -> bytes:
+def packed(tables: TiffTables, codes: Container[int] | None, without: Container[int] = ()) -> bytes:
     """A block with those fields of the first table, and what is nested in them, moved together.
 
     Fields of the codes ``without`` are left out in every table.
@@ -77,7 +77,7 @@ def packed(tables: Tables, codes: Container[int] | None, without: Container[int]
 
 
 def _packed_table(
-    tables: Tables, fields: list[Field], base: int, without: Container[int], pointers: tuple[int, ...]
+    tables: TiffTables, fields: list[Field], base: int, without: Container[int], pointers: tuple[int, ...]
 ) -> bytes:
     """A table at the offset ``base``, followed by what its fields hold and point to."""
     fields = [field for field in fields if field.code not in without and (field.kind < LONG8 or field.code in POINTERS)]
@@ -134,15 +134,15 @@ class Opening:
 
 def opening(block: bytes | None, order: str, big: bool) -> Opening:
     """What a TIFF or BigTIFF file begins with to hold a block; without a block it has that byte order."""
-    tables: Tables | None = parsed(None if block is None else refreshed(block, None))
+    tables: TiffTables | None = parsed(None if block is None else refreshed(block, None))
     if tables is None:
         return Opening(order, b"", (), {})
     moved = False
     if big and any(start < START for start, _ in tables.ranges()):
         moved = any(field.code == MAKER_NOTE for field in tables.walk())
-        tables = Tables(packed(tables, None))
+        tables = TiffTables(packed(tables, None))
     fields = tables.fields(tables.first)
-    kept = [field for field in fields if field.code not in (*POINTERS, *RESOLUTION, *STORAGE, ORIENTATION)]
+    kept = [field for field in fields if field.code not in (*POINTERS, *RESOLUTION, *STORAGE_TAGS, ORIENTATION)]
     tags = tuple(Tag(field.code, field.kind, tables.raw(field), tables.order) for field in kept)
     nested = {
         field.code: tables.number(field) or 0 for field in fields if field.code in POINTERS and tables.inner(field)
@@ -153,7 +153,7 @@ def opening(block: bytes | None, order: str, big: bool) -> Opening:
     return Opening(tables.order, body[START if big else 8 :], tags, nested, moved)
 
 
-def _as_big(tables: Tables, fields: list[Field], body: bytes) -> tuple[dict[int, int], bytes]:
+def _as_big(tables: TiffTables, fields: list[Field], body: bytes) -> tuple[dict[int, int], bytes]:
     """Append the nested tables of a block in the form of a BigTIFF; their values stay where they are."""
     nested = {}
     for field in fields:
@@ -168,7 +168,7 @@ def _as_big(tables: Tables, fields: list[Field], body: bytes) -> tuple[dict[int,
     return nested, body
 
 
-def _big_table(tables: Tables, fields: list[Field], inner: dict[int, int]) -> bytes:
+def _big_table(tables: TiffTables, fields: list[Field], inner: dict[int, int]) -> bytes:
     table = struct.pack(tables.order + "Q", sum(field.code not in POINTERS or field.code in inner for field in fields))
     for field in fields:
         kind, count, raw = field.kind, field.count, tables.raw(field)

@@ -328,7 +328,7 @@ def stored_format(wanted: "VideoFormat", name: str) -> tuple[str, "VideoFormat"]
 
 def _distance(wanted: "VideoFormat", stored: "VideoFormat") -> tuple[object, ...]:
     """What a format lacks of another one, most important first, and then what it has more."""
-    (across, down), (stored_across, stored_down) = block_of(wanted), block_of(stored)
+    (across, down), (stored_across, stored_down) = chroma_block(wanted), chroma_block(stored)
     bits, stored_bits = wanted.components[0].bits, stored.components[0].bits
     return (
         len(stored.components) < len(wanted.components),
@@ -344,15 +344,15 @@ def _distance(wanted: "VideoFormat", stored: "VideoFormat") -> tuple[object, ...
     )
 
 
-def block_of(form: "VideoFormat") -> tuple[int, int]:
+def chroma_block(form: "VideoFormat") -> tuple[int, int]:
     """Width and height in pixels of the block that shares a chroma sample."""
     return 64 // form.chroma_width(64), 64 // form.chroma_height(64)
 
 
 def changes_between(wanted: "VideoFormat", stored: "VideoFormat") -> Iterator[str]:
     """What differs between the format of a film and that of the edited one, in words."""
-    if block_of(wanted) != block_of(stored):
-        blocks = ("x".join(map(str, block_of(form))) for form in (stored, wanted))
+    if chroma_block(wanted) != chroma_block(stored):
+        blocks = ("x".join(map(str, chroma_block(form))) for form in (stored, wanted))
         yield " in place of ".join(blocks) + " pixels share a colour"
     if wanted.is_rgb and not stored.is_rgb:
         yield "YCbCr in place of RGB"
@@ -374,7 +374,7 @@ def _encoder(film: Film, output: "OutputContainer", path: Path) -> "VideoStream"
     target = cast("VideoStream", output.add_stream(name, rate=rate, options=options))
     target.pix_fmt = stored.name
     target.width, target.height = source.width, source.height
-    across, down = block_of(stored)
+    across, down = chroma_block(stored)
     if target.width % across or target.height % down:
         raise ValueError(
             f"{film.path} must have an even width and height to be stored as {target.pix_fmt}, got "

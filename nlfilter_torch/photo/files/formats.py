@@ -35,7 +35,7 @@ DEPTHS: dict[str, tuple[str, ...]] = {
     "TIFF": ("uint8", "uint16", "float16", "float32", "float64"),
 }
 # Pixels. Those of libpng and libavif are what they decode.
-LONGEST_SIDE = {"WebP": 16383, "JPEG": 65500, "PNG": png.LONGEST_SIDE, "AVIF": codecs.LONGEST_AVIF}
+LONGEST_SIDE = {"WebP": 16383, "JPEG": 65500, "PNG": png.LONGEST_PNG, "AVIF": codecs.LONGEST_AVIF}
 MOST_PIXELS = {"AVIF": codecs.MOST_AVIF}
 LONGEST_EXIF = jpeg.LONGEST  # bytes, in JPEG
 SUFFIXES = {".png": "PNG", ".jpg": "JPEG", ".jpeg": "JPEG", ".webp": "WebP", ".avif": "AVIF"}
@@ -156,7 +156,7 @@ def encode(
     elif kind == "JPEG":
         metadata, lacking = fitting_jpeg(metadata)
         left_out += lacking
-        jpeg.write_jpeg(stream, rows, shape, metadata, quality or jpeg.QUALITY)
+        jpeg.write_jpeg(stream, rows, shape, metadata, quality or jpeg.USUAL_QUALITY)
     else:
         if extras.dpi is not None and exif_tags.resolution(metadata.exif) is None:
             left_out.append("the print resolution")

@@ -16,20 +16,20 @@ from nlfilter_torch.photo.declared.rows import Stored
 from nlfilter_torch.photo.files import exif as exif_tags
 from nlfilter_torch.photo.files.decoded import bands, quiet
 from nlfilter_torch.photo.files.metadata import (
+    FURTHER_PICTURES,
     GAIN_MAP,
     MOTION,
-    PICTURES,
     Extras,
+    FilePart,
     Metadata,
-    Part,
     UnhandledImage,
     sound,
-    turned,
+    turned_pair,
     upright_packet,
 )
 
-QUALITY = 95
-XMP_KEY = b"http://ns.adobe.com/xap/1.0/\0"
+USUAL_QUALITY = 95
+XMP_SEGMENT = b"http://ns.adobe.com/xap/1.0/\0"
 EXTENSION_KEY = b"http://ns.adobe.com/xmp/extension/\0"
 ICC_KEY = b"ICC_PROFILE\0"
 LONGEST = 65_533  # bytes in a segment
@@ -43,9 +43,9 @@ LONGEST_XMP = 65_000  # bytes; longer packets are not written
 LONGEST_SCAN = 64  # bytes of the header of a scan, at most
 BEHIND = 1 << 26  # bytes behind the first picture that are looked at
 THUMBNAILS = (b"8BIM\x04\x0c", b"8BIM\x04\x09")  # of Photoshop
-NAMES = {
+SEGMENT_NAMES = {
     EXTENSION_KEY: "an extension of XMP",
-    b"MPF\0": PICTURES,
+    b"MPF\0": FURTHER_PICTURES,
     b"urn:iso:std:iso:ts:21496:-1": GAIN_MAP,
     b"JFXX\0": "the thumbnail of JFIF",
     b"Photoshop 3.0\0": "the fields and thumbnail of Photoshop",
@@ -53,9 +53,9 @@ NAMES = {
 }
 BARE = (0x01, *range(0xD0, 0xD8))  # markers without content
 MARKER = re.compile(rb"\xff+[^\0\xd0-\xd7\xff]")  # in the pixels: not a byte of 255, nor a restart
-BLOCK = 8  # side of the squares of pixels that are coded
+CODED_SIDE = 8  # side of the squares of pixels that are coded
 INCH, CENTIMETRE = 1, 2  # units of the density
-STRIP = 64  # rows that are coded at a time; a multiple of BLOCK
+CODED_ROWS = 64  # rows that are coded at a time; a multiple of BLOCK
 
 
 class Segment(NamedTuple):
@@ -163,13 +163,13 @@ def _metadata(contents: list[tuple[int, bytes]], behind: bytes) -> tuple[int, Me
             dpi = _density(content)
         elif marker == APP + 1 and content.startswith(exif_tags.PREFIX):
             blocks.append(content.removeprefix(exif_tags.PREFIX))
-        elif marker == APP + 1 and content.startswith(XMP_KEY):
-            packet = content.removeprefix(XMP_KEY)
+        elif marker == APP + 1 and content.startswith(XMP_SEGMENT):
+            packet = content.removeprefix(XMP_SEGMENT)
         elif marker == APP + 2 and content.startswith(ICC_KEY):
             profile[content[len(ICC_KEY)]] = content[len(ICC_KEY) + 2 :]
         elif marker == COM or (marker == APP + 13 and not any(key in content for key in THUMBNAILS)):
             name = "the comment" if marker == COM else "IPTC fields"
-            parts.append(Part("JPEG", name, bytes((0xFF, marker)) + struct.pack(">H", len(content) + 2) + content))
+            parts.append(FilePart("JPEG", name, bytes((0xFF, marker)) + struct.pack(">H", len(content) + 2) + content))
         elif APP <= marker < APP + 16 and marker != ADOBE:
             left_out.append(_described(marker, content))
     orientation, exif, damaged = exif_tags.read_upright(exif_tags.PREFIX + b"".join(blocks) if blocks else None)
@@ -177,7 +177,7 @@ def _metadata(contents: list[tuple[int, bytes]], behind: bytes) -> tuple[int, Me
     dpi = sound(dpi) or sound(exif_tags.resolution(exif))
     extras = Extras(
         packet,
-        None if dpi is None else turned(dpi, orientation),
+        None if dpi is None else turned_pair(dpi, orientation),
         parts=tuple(parts),
         left_out=(*left_out, *damaged, *stated, *_behind(behind)),
     )
@@ -196,7 +196,7 @@ def _density(content: bytes) -> tuple[float, float] | None:
 
 def _described(marker: int, content: bytes) -> str:
     """What a segment holds, in words."""
-    for key, name in NAMES.items():
+    for key, name in SEGMENT_NAMES.items():
         if content.startswith(key):
             return name
     return f"the segment APP{marker - APP}"
@@ -208,7 +208,7 @@ def _behind(content: bytes) -> Iterator[str]:
         return
     further, film = b"\xff\xd8\xff" in content, b"ftyp" in content
     if further:
-        yield PICTURES
+        yield FURTHER_PICTURES
     if film:
         yield MOTION
     if not further and not film:
@@ -220,14 +220,14 @@ def write_jpeg(
     rows: Iterable[Stored],
     shape: tuple[int, int, int],
     metadata: Metadata,
-    quality: int = QUALITY,
+    quality: int = USUAL_QUALITY,
 ) -> None:
     """Write rows (h, W, S) of 8 bits of a picture of ``shape`` as they arrive, without chroma subsampling.
 
     Strips are coded alone and joined by restart markers, after which a decoder begins anew.
     """
     height, width, _ = shape
-    for number, strip in enumerate(bands(rows, STRIP)):
+    for number, strip in enumerate(bands(rows, CODED_ROWS)):
         picture = strip[..., 0] if strip.shape[2] == 1 else strip
         encoded = bytes(imagecodecs.jpeg8_encode(np.ascontiguousarray(picture), level=quality, subsampling="444"))
         parts = list(segments(encoded[: encoded.index(b"\xff\xda") + LONGEST_SCAN] + b"\xff\xd9"))
@@ -242,8 +242,8 @@ def write_jpeg(
                 content = encoded[part.start : part.stop]
                 if part.marker in PLAIN_FRAMES:
                     content = content[:1] + struct.pack(">H", height) + content[3:]
-                if part.marker == SOS and height > STRIP:
-                    _write_segment(stream, DRI, struct.pack(">H", -(-width // BLOCK) * (STRIP // BLOCK)))
+                if part.marker == SOS and height > CODED_ROWS:
+                    _write_segment(stream, DRI, struct.pack(">H", -(-width // CODED_SIDE) * (CODED_ROWS // CODED_SIDE)))
                 if part.marker not in (APP, EOI) and part.start <= scan.start:
                     _write_segment(stream, part.marker, content)
         stream.write(memoryview(encoded)[scan.stop : -2])
@@ -257,7 +257,7 @@ def _written(metadata: Metadata) -> Iterator[tuple[int, bytes]]:
     if metadata.exif is not None:
         yield APP + 1, exif_tags.PREFIX + metadata.exif.removeprefix(exif_tags.PREFIX)
     if extras.xmp is not None and len(extras.xmp) <= LONGEST_XMP:
-        yield APP + 1, XMP_KEY + extras.xmp
+        yield APP + 1, XMP_SEGMENT + extras.xmp
     pieces = [icc[start : start + ICC_PIECE] for start in range(0, len(icc), ICC_PIECE)]
     for number, piece in enumerate(pieces, 1):
         yield APP + 2, ICC_KEY + bytes((number, len(pieces))) + piece

@@ -16,9 +16,9 @@ from nlfilter_torch.photo.files.tables import LENGTHS, RESOLUTION
 
 SWAPPED: dict[int, int] = {Base.XResolution: Base.YResolution, Base.YResolution: Base.XResolution}
 # Tags that say how a TIFF file stores its pixels. The output has its own.
-STORAGE = frozenset((*range(254, 260), 262, *range(263, 267), 273, *range(277, 280), 284, 288, 289, 292, 293))
-STORAGE |= {317, 320, 321, *range(322, 329), 332, 333, 334, 336, 338, 339, 347, *range(512, 522), *range(529, 533)}
-STORAGE |= {32995, 32996, 32997, 32998, 34675}
+STORAGE_TAGS = frozenset((*range(254, 260), 262, *range(263, 267), 273, *range(277, 280), 284, 288, 289, 292, 293))
+STORAGE_TAGS |= {317, 320, 321, *range(322, 329), 332, 333, 334, 336, 338, 339, 347, *range(512, 522), *range(529, 533)}
+STORAGE_TAGS |= {32995, 32996, 32997, 32998, 34675}
 #: Tags of GeoTIFF and GDAL: where the pixels lie on the ground, notes, and the value without data.
 GEO_KEYS = ("GeoKeyDirectoryTag", "GeoDoubleParamsTag", "GeoAsciiParamsTag")
 TIES = ("ModelPixelScaleTag", "ModelTiepointTag", "ModelTransformationTag")
@@ -60,7 +60,7 @@ class Tag:
         return self.code, self.kind, 0, data if isinstance(data, bytes) else data.byteswap().tobytes(), True
 
 
-class Part(NamedTuple):
+class FilePart(NamedTuple):
     """A part of a file that only files of the same type can hold.
 
     Attributes:
@@ -93,7 +93,7 @@ class Extras:
     tags: tuple[Tag, ...] = ()
     size: tuple[int, int] | None = None
     depth: str = ""
-    parts: tuple[Part, ...] = ()
+    parts: tuple[FilePart, ...] = ()
     left_out: tuple[str, ...] = ()
 
     @property
@@ -128,7 +128,7 @@ def note_left_out(path: Path, names: Sequence[str]) -> None:
         warn(f"{path} is written without some metadata of the input: {', '.join(dict.fromkeys(names))}")
 
 
-def turned(pair: tuple[float, float], orientation: int) -> tuple[float, float]:
+def turned_pair(pair: tuple[float, float], orientation: int) -> tuple[float, float]:
     """A horizontal and a vertical number after a picture stored with an EXIF orientation was turned upright."""
     return pair[::-1] if orientation >= 5 else pair
 
@@ -174,7 +174,7 @@ class UnhandledImage(ValueError):
 # Pixels are turned upright when read, but XMP may repeat the original orientation.
 XMP_ORIENTATION = re.compile(rb"(tiff:Orientation\s*(?:=\s*[\"']|>)\s*)[1-8]")
 MOTION = "the video of a motion photo"
-PICTURES = "further pictures"
+FURTHER_PICTURES = "further pictures"
 GAIN_MAP = "a gain map"
 DEPTH = "a depth map"
 GOOGLE = b"http://ns.google.com/photos/1.0/"
@@ -183,21 +183,21 @@ XMP_STATEMENTS: dict[bytes, tuple[bytes, bytes | None, str]] = {
     b"http://ns.adobe.com/hdr-gain-map/1.0/": (b"hdrgm", None, GAIN_MAP),
     b"http://ns.apple.com/HDRGainMap/1.0/": (b"HDRGainMap", None, GAIN_MAP),
     GOOGLE + b"camera/": (b"GCamera", rb"(?:MotionPhoto|MicroVideo)\w*", MOTION),
-    GOOGLE + b"container/": (b"Container", None, PICTURES),
-    GOOGLE + b"container/item/": (b"Item", None, PICTURES),
+    GOOGLE + b"container/": (b"Container", None, FURTHER_PICTURES),
+    GOOGLE + b"container/item/": (b"Item", None, FURTHER_PICTURES),
     GOOGLE + b"depthmap/": (b"GDepth", None, DEPTH),
-    GOOGLE + b"image/": (b"GImage", None, PICTURES),
+    GOOGLE + b"image/": (b"GImage", None, FURTHER_PICTURES),
     GOOGLE + b"audio/": (b"GAudio", None, "sound"),
-    b"http://ns.google.com/photos/dd/1.0/device/": (b"Device", None, PICTURES),
-    b"http://ns.apple.com/pixeldatainfo/1.0/": (b"apdi", None, PICTURES),
+    b"http://ns.google.com/photos/dd/1.0/device/": (b"Device", None, FURTHER_PICTURES),
+    b"http://ns.apple.com/pixeldatainfo/1.0/": (b"apdi", None, FURTHER_PICTURES),
     b"http://ns.adobe.com/xmp/note/": (b"xmpNote", b"HasExtendedXMP", "an extension of XMP"),
 }
-REGIONS = "regions of the picture such as faces, as it is turned"
+MARKED_REGIONS = "regions of the picture such as faces, as it is turned"
 #: Statements about places in the picture.
 XMP_PLACES: dict[bytes, tuple[bytes, bytes | None, str]] = {
-    b"http://www.metadataworkinggroup.com/schemas/regions/": (b"mwg-rs", None, REGIONS),
-    b"http://ns.microsoft.com/photo/1.2/": (b"MP", b"RegionInfo", REGIONS),
-    b"http://ns.apple.com/faceinfo/1.0/": (b"apple-fi", None, REGIONS),
+    b"http://www.metadataworkinggroup.com/schemas/regions/": (b"mwg-rs", None, MARKED_REGIONS),
+    b"http://ns.microsoft.com/photo/1.2/": (b"MP", b"RegionInfo", MARKED_REGIONS),
+    b"http://ns.apple.com/faceinfo/1.0/": (b"apple-fi", None, MARKED_REGIONS),
 }
 
 
@@ -254,7 +254,7 @@ HDR = (16, 18)
 
 # Of PNG files.
 SRGB = (0.3127, 0.329, 0.64, 0.33, 0.3, 0.6, 0.15, 0.06)  # x and y of white, red, green and blue
-NEAR = 0.01
+NEAR_SRGB = 0.01
 GAMMA = 1 / 2.2
 NEAR_GAMMA = 0.05  # share
 
@@ -279,7 +279,7 @@ def check_colour_numbers(path: Path, primaries: int, transfer: int) -> None:
 def check_png_colours(path: Path, gamma: float | None, chromaticities: Sequence[float] | None) -> None:
     """Warn if the chunks gAMA and cHRM of a PNG file describe other colours than sRGB; None if a chunk is missing."""
     unusual = []
-    if chromaticities is not None and max(abs(a - b) for a, b in zip(chromaticities, SRGB, strict=True)) > NEAR:
+    if chromaticities is not None and max(abs(a - b) for a, b in zip(chromaticities, SRGB, strict=True)) > NEAR_SRGB:
         unusual.append("other primaries than sRGB")
     if gamma is not None and gamma > 0 and abs(gamma / GAMMA - 1) > NEAR_GAMMA:
         unusual.append(f"a gamma of {1 / gamma:.2g}")

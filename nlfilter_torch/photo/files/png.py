@@ -21,18 +21,18 @@ from nlfilter_torch.photo.files import exif as exif_tags
 from nlfilter_torch.photo.files.decoded import bands, release
 from nlfilter_torch.photo.files.metadata import (
     Extras,
+    FilePart,
     Metadata,
-    Part,
     UnhandledImage,
     check_colour_numbers,
     check_png_colours,
     sound,
-    turned,
+    turned_pair,
     upright_packet,
 )
 
 SIGNATURE = b"\x89PNG\r\n\x1a\n"
-XMP_KEY = b"XML:com.adobe.xmp"
+XMP_TEXT = b"XML:com.adobe.xmp"
 RAW_KEY = b"Raw profile type "  # of texts in which some programs write EXIF, XMP and IPTC as hexadecimal numbers
 SAMPLES = {0: 1, 2: 3, 3: 3, 4: 2, 6: 4}  # by the type of colours
 PALETTE = 3
@@ -46,16 +46,16 @@ ADAM7 = (
     (1, 0, 2, 1),
 )  # y, x, steps
 # Chunks that describe the pixels of the file. Colours are checked, see colours.py.
-STORAGE = (b"IHDR", b"PLTE", b"tRNS", b"IDAT", b"IEND", b"gAMA", b"cHRM", b"sRGB", b"cICP")
-PIXELS = (b"IHDR", b"PLTE", b"tRNS", b"IDAT", b"IEND")
+STORAGE_CHUNKS = (b"IHDR", b"PLTE", b"tRNS", b"IDAT", b"IEND", b"gAMA", b"cHRM", b"sRGB", b"cICP")
+PIXEL_CHUNKS = (b"IHDR", b"PLTE", b"tRNS", b"IDAT", b"IEND")
 TEXTS = (b"tEXt", b"zTXt", b"iTXt")
 READ = (b"iCCP", b"eXIf", b"pHYs", b"acTL", b"fcTL", b"fdAT")
-KEYS = (XMP_KEY, RAW_KEY + b"exif", RAW_KEY + b"xmp")  # of texts that are read
+KEYS = (XMP_TEXT, RAW_KEY + b"exif", RAW_KEY + b"xmp")  # of texts that are read
 LONGEST_TEXT = 1 << 28  # bytes of a text or profile
 BAND = 1 << 22  # bytes that are compressed at a time
-ROOM = 1 << 16  # bytes for chunks
+CHUNK_ROOM = 1 << 16  # bytes for chunks
 INCH = 0.0254  # metres
-LONGEST_SIDE = 1_000_000  # pixels; a limit of libpng
+LONGEST_PNG = 1_000_000  # pixels; a limit of libpng
 
 
 class Chunk(NamedTuple):
@@ -128,7 +128,7 @@ class Png:
         stream.write(SIGNATURE)
         with memoryview(data) as view:
             for chunk in self.parts:
-                if chunk.name in PIXELS:
+                if chunk.name in PIXEL_CHUNKS:
                     stream.write(view[chunk.start - 8 : chunk.stop + 4])
 
 
@@ -144,9 +144,9 @@ def open_png(path: Path, data: bytes | mmap) -> Png:
     if not parts or names[0] != b"IHDR" or b"IDAT" not in names:
         raise ValueError("it has no picture")
     width, height, bits, kind, _, _, interlace = struct.unpack_from(">IIBBBBB", data, parts[0].start)
-    if max(width, height) > LONGEST_SIDE:
+    if max(width, height) > LONGEST_PNG:
         raise UnhandledImage(
-            f"{path} has {width}x{height} pixels, and libpng, which decodes it, takes at most {LONGEST_SIDE} per side; "
+            f"{path} has {width}x{height} pixels, and libpng, which decodes it, takes at most {LONGEST_PNG} per side; "
             "convert it to TIFF"
         )
     contents = [(chunk.name, bytes(data[chunk.start : chunk.stop])) for chunk in parts if chunk.name != b"IDAT"]
@@ -179,21 +179,21 @@ def _metadata(contents: list[tuple[bytes, bytes]]) -> tuple[int, Metadata]:
     """The orientation, and the metadata of the upright picture."""
     by_name = dict(contents)
     texts = {key: text for name, content in contents for key, text in _text(name, content)}
-    exif, packet = by_name.get(b"eXIf"), texts.get(XMP_KEY)
+    exif, packet = by_name.get(b"eXIf"), texts.get(XMP_TEXT)
     orientation, exif, damaged = exif_tags.read_upright(exif or _from_hexadecimal(texts.get(RAW_KEY + b"exif")))
     packet, left_out = upright_packet(packet or _from_hexadecimal(texts.get(RAW_KEY + b"xmp")), orientation)
     kept = []
     for name, content in contents:
-        if name in STORAGE or name in READ or (name in TEXTS and _key(content) in KEYS):
+        if name in STORAGE_CHUNKS or name in READ or (name in TEXTS and _key(content) in KEYS):
             continue
         if chr(name[3]).islower():  # safe to copy, according to the standard
-            kept.append(Part("PNG", _described(name, content), struct.pack(">4s", name) + content))
+            kept.append(FilePart("PNG", _described(name, content), struct.pack(">4s", name) + content))
         else:
             left_out.append(_described(name, content))
     dpi = None
     if (size := by_name.get(b"pHYs")) is not None and len(size) == 9:
         across, down, unit = struct.unpack(">IIB", size)
-        dpi = sound(turned((across * INCH, down * INCH), orientation)) if unit == 1 else None
+        dpi = sound(turned_pair((across * INCH, down * INCH), orientation)) if unit == 1 else None
         if unit == 0 and across != down:
             left_out.append("the aspect of pixels")
     icc = None
@@ -216,7 +216,7 @@ def _text(name: bytes, content: bytes) -> Iterator[tuple[bytes, bytes]]:
         packed, text = text[:1] == b"\1", text[2:].split(b"\0", 2)[-1]
     elif packed:
         text = text[1:]
-    if key == XMP_KEY or key.startswith(RAW_KEY):
+    if key == XMP_TEXT or key.startswith(RAW_KEY):
         yield key, _inflated(text) if packed else text
 
 
@@ -315,7 +315,7 @@ def write_png(
     for band in bands(rows, max(1, BAND // length)):
         # libpng chooses the filters, which need the row above.
         part = np.ascontiguousarray(band if above is None else np.concatenate([above, band]))
-        room = bytearray(part.nbytes + part.nbytes // 64 + 16 * len(part) + ROOM)  # imagecodecs' own is too small
+        room = bytearray(part.nbytes + part.nbytes // 64 + 16 * len(part) + CHUNK_ROOM)  # imagecodecs' own is too small
         encoded = bytes(imagecodecs.png_encode(part, level=0, out=room))
         filtered = zlib.decompress(b"".join(encoded[c.start : c.stop] for c in chunks(encoded) if c.name == b"IDAT"))
         packed = packer.compress(memoryview(filtered)[0 if above is None else length :])
@@ -336,7 +336,7 @@ def _written(metadata: Metadata) -> Iterator[tuple[bytes, bytes]]:
     if extras.dpi is not None:
         yield b"pHYs", struct.pack(">IIB", *(round(value / INCH) for value in extras.dpi), 1)
     if extras.xmp is not None:
-        yield b"iTXt", XMP_KEY + bytes(5) + extras.xmp
+        yield b"iTXt", XMP_TEXT + bytes(5) + extras.xmp
     for part in extras.parts:
         if part.kind == "PNG":
             yield part.data[:4], part.data[4:]

@@ -40,11 +40,11 @@ from nlfilter_torch.photo.files.tiff import TiffRows
 from nlfilter_torch.photo.files.writing import check_file, claimed, link_target, name_beside, open_beside, part_beside
 
 ZARR = ".zarr"
-CHUNK = 256  # side of the chunks of a new zarr array
+CHUNK_SIDE = 256  # side of the chunks of a new zarr array
 # Bytes that a command may use if no limit is given.
 FIFTH = psutil.virtual_memory().total // 5
-WHOLE = min(FIFTH, 2_000_000_000)  # a photograph that needs more is edited in tiles
-TILED = 1_000_000_000  # for tiles; with more they are no faster
+WHOLE_MEMORY = min(FIFTH, 2_000_000_000)  # a photograph that needs more is edited in tiles
+TILED_MEMORY = 1_000_000_000  # for tiles; with more they are no faster
 UNPACKED = 1_000_000_000  # to decode a photograph in memory rather than in a temporary file
 COPIED = 64  # rows of that file that are turned at a time
 CODEC_MEMORY_FACTOR = 8  # memory to decode or encode other formats, as a multiple of the picture's size in bytes
@@ -352,7 +352,7 @@ def _write_zarr(
     shape = tuple(like.rows.shape)
     path = link_target(path)
     replaced = name_beside(path)
-    chunks = (min(CHUNK, shape[0]), min(CHUNK, shape[1]), *shape[2:])
+    chunks = (min(CHUNK_SIDE, shape[0]), min(CHUNK_SIDE, shape[1]), *shape[2:])
     with part_beside(path) as beside:
         array = zarr_package().create_array(
             store=beside, shape=shape, chunks=chunks, dtype=dtype, attributes=like.attributes or {}
@@ -362,7 +362,7 @@ def _write_zarr(
                 fill(beside)
             else:
                 start = 0
-                for band in bands((part for _, part in rows), CHUNK):
+                for band in bands((part for _, part in rows), CHUNK_SIDE):
                     write_band(array, start, band)
                     start += len(band)
             if path.exists():

@@ -55,7 +55,7 @@ class Field:
         return self.place + LENGTHS[self.kind] * self.count
 
 
-class Tables:
+class TiffTables:
     """The tables of a block or of a TIFF file.
 
     Attributes:

@@ -18,17 +18,17 @@ from nlfilter_torch.photo.files import exif_in_tiff
 from nlfilter_torch.photo.files.decoded import CheckSize, Decoded, bands, decoding
 from nlfilter_torch.photo.files.metadata import (
     GROUND,
-    STORAGE,
+    STORAGE_TAGS,
     Extras,
     Metadata,
     Tag,
     UnhandledImage,
     sound,
-    turned,
+    turned_pair,
     turned_tag,
     upright_packet,
 )
-from nlfilter_torch.photo.files.tables import LONG, ORIENTATION, RATIONAL, RESOLUTION, SHORT, Tables
+from nlfilter_torch.photo.files.tables import LONG, ORIENTATION, RATIONAL, RESOLUTION, SHORT, TiffTables
 
 # tifffile logs problems with a file. Without a handler Python would print them beside our error message.
 logging.getLogger("tifffile").addHandler(logging.NullHandler())
@@ -71,7 +71,7 @@ def read(path: Path, check_size: CheckSize) -> Decoded:
         if rows.page.axes == "SYX":
             channels = np.moveaxis(channels, 0, -1)
         warn_of_pages(path)
-        return Decoded(plain(rows.page, channels.reshape(rows.shape)), rows.orientation, rows.metadata)
+        return Decoded(plain_channels(rows.page, channels.reshape(rows.shape)), rows.orientation, rows.metadata)
 
 
 def count_pages(path: Path) -> int:
@@ -120,7 +120,7 @@ def _native(page: tifffile.TiffPage) -> np.dtype[np.generic]:
     return np.dtype(page.dtype).newbyteorder("=")
 
 
-def plain(page: tifffile.TiffPage, channels: Stored) -> Stored:
+def plain_channels(page: tifffile.TiffPage, channels: Stored) -> Stored:
     """Convert channels (H, W, S) of a page, or some of its rows, to black as 0 and no premultiplied alpha."""
     channels = channels.astype(_native(page), copy=True)
     if page.photometric == tifffile.PHOTOMETRIC.MINISWHITE:
@@ -134,18 +134,20 @@ def read_metadata(file: tifffile.TiffFile, stream: BinaryIO, depth: str) -> tupl
     profile = file.pages.first.tags.get(34675)
     icc = profile.value if profile is not None and isinstance(profile.value, bytes) else None
     with mmap(stream.fileno(), 0, access=ACCESS_READ) as data:
-        tables = Tables(data)
+        tables = TiffTables(data)
         fields = tables.fields(tables.first)
         block, moved = exif_in_tiff.block_of(tables)
         orientation, exif, damaged = exif_tags.read_upright(block)
-        stored = [field for field in fields if field.code not in (*exif_in_tiff.DESCRIPTIVE, *STORAGE, XMP, SUB_FILES)]
+        stored = [
+            field for field in fields if field.code not in (*exif_in_tiff.DESCRIPTIVE, *STORAGE_TAGS, XMP, SUB_FILES)
+        ]
         tags = [Tag(field.code, field.kind, tables.raw(field), tables.order) for field in stored]
         packet = next((tables.raw(field) for field in fields if field.code == XMP), None)
         ratios = {field.code: tables.ratio(field) for field in fields if field.code in RESOLUTION[:2]}
         units = [tables.number(field) for field in fields if field.code == RESOLUTION[2]]
     packet, left_out = upright_packet(packet, orientation)
     left_out += [exif_in_tiff.MOVED] * moved + ["smaller versions and masks"] * any(f.code == SUB_FILES for f in fields)
-    scale = exif_tags.SCALES.get((units or [tifffile.RESUNIT.INCH])[0] or 0)
+    scale = exif_tags.IN_INCHES.get((units or [tifffile.RESUNIT.INCH])[0] or 0)
     pair = None if scale is None or len(ratios) < 2 else sound([ratios[code] * scale for code in RESOLUTION[:2]])
     if units == [1] and set(ratios.values()) == {1.0}:  # says nothing
         tags = [tag for tag in tags if tag.code not in RESOLUTION]
@@ -156,7 +158,7 @@ def read_metadata(file: tifffile.TiffFile, stream: BinaryIO, depth: str) -> tupl
     size = (width, height) if orientation >= 5 else (height, width)
     extras = Extras(
         packet,
-        None if pair is None else turned(pair, orientation),
+        None if pair is None else turned_pair(pair, orientation),
         tuple(tags),
         size if tags else None,
         depth if tags else "",
@@ -333,7 +335,7 @@ class TiffRows:
                 stored = self._read_raw(first, last) if self._raw else self._decode(first, last)
         finally:
             self._check_unchanged()
-        return exif_tags.upright(plain(self.page, stored), 1 if self.turned else self.orientation)
+        return exif_tags.upright(plain_channels(self.page, stored), 1 if self.turned else self.orientation)
 
     @property
     def _raw(self) -> bool:

@@ -21,7 +21,7 @@ def terminal(monkeypatch: pytest.MonkeyPatch) -> Iterator[Console]:
 
 
 def test_lines_where_there_is_no_terminal(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.setattr(progress, "PAUSE", 0.01)
+    monkeypatch.setattr(progress, "LINE_PAUSE", 0.01)
     said = ""
     with progress.stages() as report:
         report("Averaging", 0, 10)

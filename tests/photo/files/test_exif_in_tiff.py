@@ -12,7 +12,7 @@ from PIL import Image
 from nlfilter_torch.photo.files import exif as exif_tags
 from nlfilter_torch.photo.files import exif_in_tiff, tiff
 from nlfilter_torch.photo.files.rows import open_picture, write_picture
-from nlfilter_torch.photo.files.tables import Tables
+from nlfilter_torch.photo.files.tables import TiffTables
 from nlfilter_torch.photo.picture.photographs import Photograph, read_photograph, write_photograph
 from tests.files import MAKER_NOTE, PLENTY, camera_block, fields_of, photograph, stored_values
 from tests.pairwise import each_value
@@ -85,10 +85,10 @@ def test_a_block_too_long_for_jpeg_loses_its_maker_note(tmp_path: Path) -> None:
 def test_tables_with_loops_and_cuts_end() -> None:
     block = camera_block()[6:]
     for length in range(8, len(block), 7):
-        list(Tables(block[:length]).walk())
-        list(Tables(block[:length]).ranges())
+        list(TiffTables(block[:length]).walk())
+        list(TiffTables(block[:length]).ranges())
         exif_tags.read_upright(block[:length])
     place = struct.unpack("<I", block[4:8])[0] + 2 + 2 * 12 + 8
     loop = block[:place] + struct.pack("<I", 8) + block[place + 4 :]  # the table of EXIF is the first one
-    assert len(list(Tables(loop).walk())) < 100
+    assert len(list(TiffTables(loop).walk())) < 100
     assert exif_tags.read_upright(loop).block is not None

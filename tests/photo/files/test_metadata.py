@@ -13,7 +13,14 @@ from PIL import Image, PngImagePlugin
 
 from nlfilter_torch.photo.cli import main
 from nlfilter_torch.photo.files.jpeg import LONGEST_XMP
-from nlfilter_torch.photo.files.metadata import GAIN_MAP, MOTION, PICTURES, REGIONS, Extras, upright_packet
+from nlfilter_torch.photo.files.metadata import (
+    FURTHER_PICTURES,
+    GAIN_MAP,
+    MARKED_REGIONS,
+    MOTION,
+    Extras,
+    upright_packet,
+)
 from nlfilter_torch.photo.picture.photographs import Photograph, read_photograph, write_photograph
 from tests.files import photograph, stored_values
 from tests.problems import cat
@@ -110,7 +117,7 @@ PACKET = b"""<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF><rdf:Description
 def test_statements_about_other_pictures_are_removed() -> None:
     packet, named = upright_packet(PACKET)
     assert packet is not None
-    assert named == [GAIN_MAP, MOTION, PICTURES]
+    assert named == [GAIN_MAP, MOTION, FURTHER_PICTURES]
     for gone in (b"hdr-gain-map", b"h:", b"MotionPhoto", b"Container", b"Item"):
         assert gone not in packet.replace(b"xmp", b"").replace(b"http:", b"").replace(b"adobe:ns", b"")
     assert b'GCamera:Other="2" xmp:Rating="4"' in packet
@@ -136,7 +143,7 @@ def test_places_in_a_turned_picture_are_removed() -> None:
     assert upright_packet(FACES) == (FACES, [])
     packet, named = upright_packet(FACES, 6)
     assert packet is not None
-    assert set(named) == {REGIONS}
+    assert set(named) == {MARKED_REGIONS}
     assert b"Area " not in packet
     assert b"mwg" not in packet
     assert b"MP:" not in packet
@@ -145,7 +152,7 @@ def test_places_in_a_turned_picture_are_removed() -> None:
 
 def test_long_padding_takes_little_time() -> None:
     packet = PACKET.replace(b"</x:xmpmeta>", b" " * 1_000_000 + b"</x:xmpmeta>")  # quadratic time would be an hour
-    assert upright_packet(packet)[1] == [GAIN_MAP, MOTION, PICTURES]
+    assert upright_packet(packet)[1] == [GAIN_MAP, MOTION, FURTHER_PICTURES]
 
 
 def with_chunk(path: Path, name: bytes, content: bytes) -> None:

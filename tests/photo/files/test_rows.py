@@ -35,17 +35,20 @@ def test_a_fifth_of_the_memory_and_no_more_than_is_free(monkeypatch: pytest.Monk
     for free, wanted in ((500, 400), (10_000, 1000)):
         machine = type("Memory", (), {"available": free})
         monkeypatch.setattr(rows.psutil, "virtual_memory", lambda machine=machine: machine)
-        assert editing.allowed_memory(None) == editing.allowed_memory(None, rows.TILED) == wanted
-    assert editing.allowed_memory(2.0) == editing.allowed_memory(2.0, rows.TILED) == 2_000_000_000
+        assert editing.allowed_memory(None) == editing.allowed_memory(None, rows.TILED_MEMORY) == wanted
+    assert editing.allowed_memory(2.0) == editing.allowed_memory(2.0, rows.TILED_MEMORY) == 2_000_000_000
 
 
 def test_tiles_use_little_unless_more_is_given(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(rows, "FIFTH", 8_000_000_000)
     machine = type("Memory", (), {"available": 20_000_000_000})
     monkeypatch.setattr(rows.psutil, "virtual_memory", lambda: machine)
-    assert (editing.allowed_memory(None), editing.allowed_memory(None, rows.TILED)) == (8_000_000_000, 1_000_000_000)
+    assert (editing.allowed_memory(None), editing.allowed_memory(None, rows.TILED_MEMORY)) == (
+        8_000_000_000,
+        1_000_000_000,
+    )
     for free, wanted in ((7_900_000_000, 1_000_000_000), (300_000_000, 300_000_000), (-5, 1)):
-        job = editing.Job(None, "uint8", free, editing.allowed_memory(None, rows.TILED), lambda *_: None, None)  # type: ignore[arg-type]
+        job = editing.Job(None, "uint8", free, editing.allowed_memory(None, rows.TILED_MEMORY), lambda *_: None, None)  # type: ignore[arg-type]
         assert job.passes(False, Path()).memory == wanted
 
 

@@ -4,13 +4,13 @@ import math
 
 import pytest
 
-from nlfilter_torch.photo.files.tables import Tables
+from nlfilter_torch.photo.files.tables import TiffTables
 from tests.files import MAKER_NOTE, camera_block
 
 
 @pytest.mark.parametrize("order", ["<", ">"])
 def test_fields_have_types_places_and_values(order: str) -> None:
-    tables = Tables(camera_block(order)[6:])
+    tables = TiffTables(camera_block(order)[6:])
     fields = {field.code: field for field in tables.walk()}
     assert (tables.order, tables.big, tables.first) == (order, False, 8)
     assert tables.raw(fields[37500]) == MAKER_NOTE
@@ -24,4 +24,4 @@ def test_fields_have_types_places_and_values(order: str) -> None:
 
 def test_other_data_is_refused() -> None:
     with pytest.raises(ValueError, match="no header of TIFF"):
-        Tables(b"JFIF and more")
+        TiffTables(b"JFIF and more")
