@@ -35,7 +35,7 @@ def arguments(dtype: torch.dtype) -> dict[str, tuple[Any, ...]]:
     images = random(BATCH, ROWS, PIXELS, seed=4).to(dtype)
     weights = images[:, 0].exp()
     images16, weight = random(BATCH, 16, 7, 9, seed=5).to(dtype), random(5, 16, 3, 3, seed=6).to(dtype)
-    coefficients = random(BATCH, 3, 3, 3, 4, seed=9).to(dtype)
+    coefficients = random(1, 3, 3, 2, 3, seed=9).to(dtype)
     coefficients[:, 1, 1] = coefficients.abs().sum((1, 2))
     backward = (*inputs, True, factor, norms.clamp(min=1.0).rsqrt())
     return {
@@ -53,7 +53,7 @@ def arguments(dtype: torch.dtype) -> dict[str, tuple[Any, ...]]:
         "without": (factor, norms > norms.median()),
         "convolve": (images16, weight, random(5, seed=7).to(dtype), 2, random(BATCH, 5, 7, 9, seed=8).to(dtype)),
         "interpolate": (images.sigmoid(), random(BATCH, 3, 4, 4, 4, seed=11).to(dtype)),
-        "solve": (coefficients, random(BATCH, 2, 3, 4, seed=10).to(dtype)),
+        "solve": (coefficients, random(1, 2, 2, 3, seed=10).to(dtype)),
         "sinkhorn": (factor, (1 - norms).clamp(min=0.0), 1e-5, True, False),
     }
 
