@@ -77,22 +77,22 @@ types: $(VENV)/.installed-test
 # All speed measurements, in ten minutes, on an otherwise idle machine; then 25 megapixels in tiles beside busy processes.
 bench: $(VENV)/.installed-test
 	$(BIN)/python -m benchmarks.speed --out out/speed.json
-	$(BIN)/python -m benchmarks.report out/speed.json
-	$(BIN)/python -m benchmarks.streaming_busy --megapixels 25 --edits detail --repeats 1
+	$(BIN)/python -m docs.speed out/speed.json
+	$(BIN)/python -m benchmarks.streaming busy --megapixels 25 --edits detail --repeats 1
 
 # Checks that every benchmark runs, on sizes that take seconds. One single-threaded benchmark per core.
 bench-quick: export OMP_NUM_THREADS = 1
 bench-quick: $(VENV)/.installed-test
 	printf '%s\n' $(QUICK) | $(BIN)/python -m benchmarks.quick
-	$(BIN)/python -m benchmarks.report out/quick/speed.json
+	$(BIN)/python -m docs.speed out/quick/speed.json
 
 QUICK := \
 	'speed --quick --out out/quick/speed.json' \
-	'whole --quick' \
+	'commands whole --quick' \
 	'streaming --quick' \
-	'streaming_strokes --quick' \
-	'streaming_cpu --quick' \
-	'streaming_busy --quick' \
+	'streaming strokes --quick' \
+	'streaming memory --quick' \
+	'streaming busy --quick' \
 	'busy --quick sharpen' \
 	'commands --quick' \
 	'scribbles --quick' \
@@ -105,32 +105,31 @@ QUICK := \
 	'detail --quick' \
 	'detail --quick --scales' \
 	'distributed --ranks 2 --widths 64 --landmarks 20' \
-	'tables --long-side 32' \
+	'docs.tables --long-side 32' \
 	'masks --quick' \
 	'outlines --quick' \
 	'recolor --quick' \
 	'colorize --quick' \
 	'colorize --quick --lines' \
 	'compilation --quick --only export' \
-	'memory --side 128 --repeats 1' \
-	'training points block floors refinement clusters --quick' \
-	'training functions sizes equivariance styles --quick'
+	'layers points block floors refinement clusters --quick' \
+	'layers functions styles --quick'
 
 # Trains the denoiser further, from the weights of the package, on the pictures of scikit-image and on all of a folder:
 # make train PICTURES=folder. A stopped training is resumed; out/denoiser holds its state, weights and curve.
 PICTURES ?=
 train: $(VENV)/.installed-test
-	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.denoiser_training --half $(if $(PICTURES),--pictures "$(PICTURES)")
+	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.training --half $(if $(PICTURES),--pictures "$(PICTURES)")
 
 # The pictures of the README and of docs/.
 pictures: $(VENV)/.installed
-	$(BIN)/python -m benchmarks.detail_pictures docs
-	$(BIN)/python -m benchmarks.gallery docs
-	$(BIN)/python -m benchmarks.guide_pictures docs/pictures
+	$(BIN)/python -m docs.detail_pictures docs
+	$(BIN)/python -m docs.gallery docs
+	$(BIN)/python -m docs.guide_pictures docs/pictures
 
 # Counterparts of the paper's figures and Table I in out/figures, with their numbers, in a few minutes.
 figures: $(VENV)/.installed-test
-	$(BIN)/python -m benchmarks.figures --out out/figures
+	$(BIN)/python -m docs.figures --out out/figures
 
 # A source distribution and wheels in out/wheels, checked; AArch64 by a cross compiler if one can be installed.
 wheels: $(VENV)/.installed
@@ -144,7 +143,7 @@ docs: $(VENV)/.installed-test
 
 # Executes every notebook from its paired script, with small pictures, in a few minutes.
 notebooks: $(VENV)/.installed-test
-	$(BIN)/python -m benchmarks.notebooks notebooks
+	$(BIN)/python -m docs.notebooks notebooks
 
 clean:
 	rm -rf $(VENV) node_modules out dist build .mypy_cache .pytest_cache .ruff_cache .hypothesis

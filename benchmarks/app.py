@@ -7,7 +7,6 @@ is all new; the time to open it and to save three edits of it as a JPEG, beside 
 the same edit, and the memory at the peak, above that before the photograph was opened.
 """
 
-import argparse
 import asyncio
 import multiprocessing
 import platform
@@ -20,13 +19,12 @@ from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
-import skimage.data
 import torch
-import torch.nn.functional as F
 
-from benchmarks.memory import MIB, forget_peak, resident
+from benchmarks.commands import cost
+from benchmarks.harness import MIB, forget_peak, options, resident, seconds
+from benchmarks.photographs import enlarged
 from benchmarks.preview import RECIPES
-from benchmarks.whole import measure
 from nlfilter_torch.photo.app import drawing
 from nlfilter_torch.photo.app.closeup import Closeup
 from nlfilter_torch.photo.app.session import Session
@@ -38,17 +36,9 @@ VIEW = (864, 648)  # width and height of the canvas in a window of 1280x800
 SAVED = ("detail", "recolor", "denoise")
 
 
-def photograph(height: int, width: int) -> torch.Tensor:
-    """(1, 3, height, width) in [0, 1]."""
-    pixels = torch.from_numpy(skimage.data.astronaut().copy()).permute(2, 0, 1)[None].float() / 255
-    return F.interpolate(pixels, size=(height, width), mode="bicubic", antialias=True).clamp(0, 1)
-
-
 def milliseconds(work: Callable[[], object]) -> float:
     """Time of one call."""
-    start = time.perf_counter()
-    work()
-    return 1e3 * (time.perf_counter() - start)
+    return 1e3 * seconds(work)
 
 
 def report(name: str, times: list[float]) -> None:
@@ -146,8 +136,7 @@ def at_full_size(path: Path, repeats: int) -> None:
 def opened_and_saved(path: Path, edit: str) -> tuple[float, float, float]:
     """Milliseconds to open the first photograph of a process and to save an edit of it, and MB above the start."""
     session = Session(path.parent)
-    forget_peak()
-    before = resident("VmRSS")
+    before = forget_peak()
     opening = milliseconds(lambda: session.open(path))
     session.load(RECIPES[edit])
     saving = milliseconds(lambda: session.save("saved.jpg"))
@@ -165,7 +154,7 @@ def files(path: Path, quick: bool) -> None:
         preset = folder / "edit.json"
         preset.write_text(RECIPES[edit].to_json())
         call = ["-m", "nlfilter_torch", "apply", str(path), str(folder / "out" / "out.jpg"), "--preset", str(preset)]
-        _, wall, _ = measure("apply", [sys.executable, *call], folder)
+        _, wall, _ = cost("apply", [sys.executable, *call], folder)
         report("open", [opening])
         report(f"save {edit}, {memory:.0f} MB above the start", [saving])
         report("the same on the command line", [1e3 * wall])
@@ -202,24 +191,23 @@ def in_the_browser(path: Path, repeats: int) -> None:
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = options("app", __doc__, "saves one edit only as the first one of a process")
     parser.add_argument("--side", type=int, default=1000, help="pixels of a square preview")
     parser.add_argument("--megapixels", type=float, default=24, help="of the photograph that is seen at 100 %%")
     parser.add_argument("--browser", action="store_true", help="with headless Chromium too")
     parser.add_argument("--repeats", type=int, default=20, help="of each movement")
-    parser.add_argument("--quick", action="store_true", help="save one edit only as the first one of a process")
     arguments = parser.parse_args()
     print(f"{arguments.side}x{arguments.side} pixels, {torch.get_num_threads()} threads, {platform.machine()}")
     print(f"{'milliseconds, median and quartiles':<52}")
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "photograph.png"
-        write_photograph(Photograph(photograph(arguments.side, arguments.side)), path)
+        write_photograph(Photograph(enlarged("astronaut", arguments.side, arguments.side)), path)
         in_the_library(path, arguments.repeats)
         print(f"\n{arguments.megapixels:g} megapixels")
         large, compressed = Path(folder) / "large.tif", Path(folder) / "large.jpg"
         height = round((arguments.megapixels * 1e6 / 1.5) ** 0.5)
         for file in (large, compressed):
-            write_photograph(Photograph(photograph(height, round(1.5 * height))), file)
+            write_photograph(Photograph(enlarged("astronaut", height, round(1.5 * height))), file)
         in_the_library(compressed, arguments.repeats)
         files(compressed, arguments.quick)
         at_full_size(large, arguments.repeats)

@@ -1,77 +1,53 @@
-"""Two threads against one beside busy processes: ``python -m benchmarks.busy [JOB ...]``.
+"""Whether threads get in each other's way where other programs use the cores: ``python -m benchmarks.busy [JOB ...]``.
 
 Every edit, the operator, the denoiser and steps of training take turns with one thread and with two, alone and beside
 one and two processes that keep a core busy each. Threads wait for each other as in the program
 (``nlfilter_torch.photo.cli.process``). With two threads nothing must take more than 1.3 times as long as with one, and
 alone not more than 1.1 times as long as where threads wait as torch has it, by spinning. Ratios are medians over
-``--repeats``. ``--spinning`` shows what spinning costs beside busy processes. ``--quick`` runs it on a small picture.
+``--repeats``. ``--spinning`` shows what spinning costs beside busy processes.
 """
 
 import argparse
 import os
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from statistics import median
-from typing import TYPE_CHECKING, Self
+from typing import Self
 
-from benchmarks.streaming_busy import neighbours
-from benchmarks.training.figures import Figure, table
+import torch
+from torch import Tensor, nn
+
+from benchmarks.harness import Figure, options, report, seconds
+from benchmarks.photographs import photograph
+from benchmarks.streaming import neighbours
+from nlfilter_torch import NonlocalDenoiser, NonlocalFilter, nonlocal_operator, photo, polynomial_filter
+from nlfilter_torch.photo import region_mask
 from nlfilter_torch.photo.cli.process import VARIABLES, sleep_while_waiting
-
-if TYPE_CHECKING:
-    import torch
 
 NEIGHBOURS = (0, 1, 2)
 BESIDE, IDLE = 1.3, 1.1  # limits of the ratios of times
-
-JOBS = (
-    *(
-        "detail",
-        "detail of a region",
-        "sharpen",
-        "tone",
-        "denoise",
-        "recolor",
-        "colorize",
-        "defocus",
-        "mask",
-        "abstract",
-    ),
-    *("look", "operator", "operator and filter", "training step", "denoiser", "training step of the denoiser"),
-)
-
 Job = Callable[[], object]
 
 
-def picture(side: int) -> "torch.Tensor":
-    """The astronaut, (1, 3, side, side)."""
-    import skimage.data
-    import torch
-    import torch.nn.functional as F
-
-    pixels = torch.from_numpy(skimage.data.astronaut()).permute(2, 0, 1)[None].float() / 255
-    return F.interpolate(pixels, (side, side), mode="area")
-
-
-def edits(image: "torch.Tensor") -> dict[str, Job]:
-    """Every edit of an image (1, 3, H, W), by its name."""
-    import torch
-
-    from nlfilter_torch import photo
-    from nlfilter_torch.photo import region_mask
-
-    side = image.shape[-1]
+def jobs(side: int) -> dict[str, Job]:
+    """Every edit of the astronaut in that size, the operator, and steps of training, by their names."""
+    image = nn.functional.interpolate(photograph("astronaut"), (side, side), mode="area")
     region, other = torch.zeros_like(image[:, :1]), torch.zeros_like(image[:, :1])
     region[..., side * 6 // 10 : side * 7 // 10, side // 8 : side // 6] = 1  # on the suit
     other[..., : side // 10, : side // 10] = 1
     colours = torch.tensor([0.1, 0.3, 0.9]).view(1, 3, 1, 1) * region
     noisy = image + 0.06 * torch.randn(image.shape, generator=torch.Generator().manual_seed(1))
-    grey = image.mean(dim=1, keepdim=True)
+    grey, small = image.mean(dim=1, keepdim=True), image[..., : side // 2, : side // 2].contiguous()
     look = photo.fit_look([(image[..., ::4, ::4], image[..., ::4, ::4] ** 0.8)])
-    alpha = torch.tensor([3.0, 3.0, 4.0, 1.05])
+    alpha, weights = torch.tensor([3.0, 3.0, 4.0, 1.05]), torch.tensor([0.2, 0.5, 1.0, 1.0])
+    layer = NonlocalFilter(learn=("alpha", "photometric_bandwidth"), photometric_bandwidth=0.3)
+    features, denoiser = nn.Conv2d(3, 8, 5, padding=2), NonlocalDenoiser.trained()
+
+    def train(network: Callable[[], Tensor]) -> Job:
+        return lambda: (network() - small).square().mean().backward()
+
     return {
         "detail": lambda: photo.enhance(image, alpha),
         "detail of a region": lambda: photo.enhance(image, alpha, region),
@@ -84,50 +60,20 @@ def edits(image: "torch.Tensor") -> dict[str, Job]:
         "mask": lambda: region_mask(image, region, other),
         "abstract": lambda: photo.abstract(image),
         "look": lambda: look.apply(image),
-    }
-
-
-def steps(image: "torch.Tensor") -> dict[str, Job]:
-    """The operator, and steps of training."""
-    import torch
-    from torch import nn
-
-    from nlfilter_torch import NonlocalDenoiser, NonlocalFilter, nonlocal_operator, polynomial_filter
-
-    small = image[..., : image.shape[-2] // 2, : image.shape[-1] // 2].contiguous()
-    features, layer = (
-        nn.Conv2d(3, 8, 5, padding=2),
-        NonlocalFilter(learn=("alpha", "photometric_bandwidth"), photometric_bandwidth=0.3),
-    )
-    denoiser = NonlocalDenoiser.trained()
-
-    def train() -> None:
-        (layer(small, guide=features(small)) - small).square().mean().backward()
-
-    def train_denoiser() -> None:
-        (denoiser(small, 0.1) - small).square().mean().backward()
-
-    weights = torch.tensor([0.2, 0.5, 1.0, 1.0])
-    return {
         "operator": lambda: nonlocal_operator(image),
         "operator and filter": lambda: polynomial_filter(nonlocal_operator(image), image, weights),
-        "training step": train,
+        "training step": train(lambda: layer(small, guide=features(small))),
         "denoiser": lambda: denoiser(image, 0.1).detach(),
-        "training step of the denoiser": train_denoiser,
+        "training step of the denoiser": train(lambda: denoiser(small, 0.1)),
     }
 
 
 def serve(name: str, side: int) -> None:
     """Run a job with as many threads as each line of the standard input says, and print the seconds that it took."""
-    import torch
-
-    image = picture(side)
-    job = {**edits(image), **steps(image)}[name]
+    job = jobs(side)[name]
     for line in sys.stdin:
         torch.set_num_threads(int(line))
-        began = time.perf_counter()
-        job()
-        print(time.perf_counter() - began, flush=True)
+        print(seconds(job), flush=True)
 
 
 class Runner:
@@ -190,27 +136,23 @@ def measure(name: str, options: argparse.Namespace) -> Iterator[Figure]:
 
 
 def main() -> int:
-    """Measure and print a table; return 1 if a figure falls short of its limit."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.busy", description=__doc__)
+    """Measure and print figures; return 1 if one falls short of its limit."""
+    parser = options("busy", __doc__, "a small picture, once")
     parser.add_argument("jobs", nargs="*", metavar="JOB", help="default: all")
     parser.add_argument("--side", type=int, default=384, help="of the picture in pixels")
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--spinning", action="store_true", help="threads wait as torch has it")
-    parser.add_argument("--quick", action="store_true", help="a small picture, once, to see that everything runs")
     parser.add_argument("--serve", action="store_true", help=argparse.SUPPRESS)
-    options = parser.parse_args()
-    if options.serve:
-        serve(options.jobs[0], options.side)
+    chosen = parser.parse_args()
+    if chosen.serve:
+        serve(chosen.jobs[0], chosen.side)
         return 0
-    if options.quick:
-        options.side, options.repeats = 48, 1
+    if chosen.quick:
+        chosen.side, chosen.repeats = 48, 1
     sleep_while_waiting()
     print(f"{os.cpu_count()} cores, load {os.getloadavg()[0]:.1f} before", flush=True)
-    figures: list[Figure] = []
-    for name in options.jobs or JOBS:
-        figures += (new := list(measure(name, options)))
-        print(table(new), flush=True)
-    return int(not options.quick and any(not each.holds for each in figures))
+    figures = (figure for name in chosen.jobs or jobs(48) for figure in measure(name, chosen))
+    return report(figures, quick=chosen.quick)
 
 
 if __name__ == "__main__":

@@ -8,7 +8,6 @@ are reported on :data:`REPORTING`, or on every photograph of a folder, with stro
 strokes are lines of one colour each, which end where the photograph's colour changes, as people draw them.
 """
 
-import argparse
 import statistics
 import time
 from collections.abc import Callable
@@ -20,6 +19,7 @@ import torch
 from torch import Tensor
 
 from benchmarks.denoising.cases import psnr
+from benchmarks.harness import options, save_picture
 from benchmarks.levin import propagate
 from benchmarks.photographs import photograph, pictures
 from nlfilter_torch.photo import colorize
@@ -30,6 +30,7 @@ REPORTING = ("retina", "immunohistochemistry", "hubble_deep_field")  # three cro
 SIDE, SHAPE = 160, (160, 240)  # pixels of the short side, and of crops
 COUNTS = (6, 20, 60)
 SEEDS = 3
+CHOSEN_BY = "0 to 404, 20000 to 20003, 50000 to 137001 and 500000 to 723003"
 BRUSH = 5
 LENGTHS, WIDTH = (0.1, 0.3), 3  # of lines: shortest and longest, relative to the short side, and width in pixels
 SAME_COLOUR = 0.07  # change of chroma at which a line ends
@@ -41,26 +42,18 @@ Method = Callable[[Tensor, Tensor, Tensor], Tensor]
 
 
 @dataclass(frozen=True)
-class Result:
-    """PSNR in dB and seconds of CPU time of one method in one case."""
-
-    psnr: float
-    seconds: float
-
-
-@dataclass(frozen=True)
 class Case:
     """Results of all methods for one photograph with one set of strokes."""
 
     name: str
     count: int
     seed: int
-    results: dict[str, Result]
+    results: dict[str, tuple[float, float]]  # PSNR in dB, and seconds of CPU time, by method
 
     @property
     def lead(self) -> float:
         """PSNR of the default minus that of Levin, in dB."""
-        return self.results["default"].psnr - self.results["Levin"].psnr
+        return self.results["default"][0] - self.results["Levin"][0]
 
 
 def random_strokes(count: int, seed: int, size: tuple[int, int]) -> Tensor:
@@ -138,21 +131,19 @@ def measure(name: str, image: Tensor, count: int, seed: int, lines: bool, save: 
     for method, function in METHODS.items():
         start = time.process_time()
         colorized = function(grey, strokes, mask)
-        results[method] = Result(psnr(colorized, image), time.process_time() - start)
+        results[method] = (psnr(colorized, image), time.process_time() - start)
         shown.append(colorized)
     if save is not None:
-        from skimage.io import imsave
-
-        row = torch.cat([*shown, image], dim=3)[0].permute(1, 2, 0).numpy()
-        imsave(save / f"{name}-{count}-{seed}.png", np.rint(row * 255).astype(np.uint8), check_contrast=False)
+        panels = [panel.expand_as(image) for panel in (*shown, image)]
+        save_picture(save / f"{name}-{count}-{seed}.png", torch.cat(panels, dim=3))
     return Case(name, count, seed, results)
 
 
 def report(cases: list[Case]) -> bool:
     """Print wins, leads, times and lost comparisons; return whether the claim holds."""
     leads = [case.lead for case in cases]
-    seconds = {method: statistics.median(case.results[method].seconds for case in cases) for method in METHODS}
-    over_pieces = [case.results["default"].psnr - case.results["k-means"].psnr for case in cases]
+    seconds = {method: statistics.median(case.results[method][1] for case in cases) for method in METHODS}
+    over_pieces = [case.results["default"][0] - case.results["k-means"][0] for case in cases]
     won, median = sum(lead > 0 for lead in leads) / len(leads), statistics.median(leads)
     ratio = seconds["default"] / seconds["Levin"]
     print("median CPU time " + ", ".join(f"{method} {value:.3f} s" for method, value in seconds.items()))
@@ -164,47 +155,35 @@ def report(cases: list[Case]) -> bool:
     lost = sorted((case for case in cases if case.lead <= 0), key=lambda case: case.lead)
     print(f"\nlost against Levin: {len(lost)} of {len(cases)}")
     for case in lost:
-        values = "".join(f"{case.results[method].psnr:12.2f}" for method in METHODS)
+        values = "".join(f"{case.results[method][0]:12.2f}" for method in METHODS)
         print(f"{case.name:24}{case.count:4d} strokes, seed {case.seed:<6}{values}{case.lead:8.2f}")
     return won >= WON and median >= AHEAD and min(leads) >= WORST and ratio <= TIME
 
 
 def main(arguments: list[str] | None = None) -> None:
     """Print the tables and the claim."""
-    parser = argparse.ArgumentParser(description="Colourisation against Levin's optimisation.")
-    parser.add_argument("--quick", action="store_true", help="one seed at 40x60, to check that it runs")
-    parser.add_argument("--pictures", type=Path, help="folder of photographs; default: those of scikit-image")
-    parser.add_argument(
-        "--set", choices=("reporting", "choosing"), default="reporting", help="set of scikit-image's photographs"
-    )
-    parser.add_argument("--side", type=int, default=SIDE, help="short side in pixels of photographs of a folder")
-    parser.add_argument(
-        "--first-seed",
-        type=int,
-        default=1000,
-        help="first seed of the strokes; 0 to 404, 20000 to 20003, 50000 to 137001 and 500000 to 723003 were used to "
-        "choose parameters",
-    )
-    parser.add_argument("--lines", action="store_true", help="lines of one colour in place of squares of true colours")
-    parser.add_argument("--seeds", type=int, default=SEEDS, help="sets of strokes for each number of strokes")
-    parser.add_argument(
-        "--save", type=Path, help="folder for pictures of the scribbles, all results and the photograph, side by side"
-    )
-    options = parser.parse_args(arguments)
-    shape = (40, 60) if options.quick else SHAPE
-    seeds = range(options.first_seed, options.first_seed + (1 if options.quick else options.seeds))
-    if options.pictures is not None:
-        images = pictures(options.pictures, shape[0] if options.quick else options.side, ())
-    elif options.set == "choosing":
+    parser = options("colorize", __doc__, "one seed at 40x60")
+    add = parser.add_argument
+    add("--pictures", type=Path, help="folder of photographs; default: those of scikit-image")
+    add("--set", choices=("reporting", "choosing"), default="reporting", help="set of scikit-image's photographs")
+    add("--side", type=int, default=SIDE, help="short side in pixels of photographs of a folder")
+    add("--first-seed", type=int, default=1000, help=f"of the strokes; {CHOSEN_BY} were used to choose parameters")
+    add("--lines", action="store_true", help="lines of one colour in place of squares of true colours")
+    add("--seeds", type=int, default=SEEDS, help="sets of strokes for each number of strokes")
+    add("--save", type=Path, help="folder for pictures of the scribbles, all results and the photograph, side by side")
+    chosen = parser.parse_args(arguments)
+    shape = (40, 60) if chosen.quick else SHAPE
+    seeds = range(chosen.first_seed, chosen.first_seed + (1 if chosen.quick else chosen.seeds))
+    if chosen.pictures is not None:
+        images = pictures(chosen.pictures, shape[0] if chosen.quick else chosen.side, ())
+    elif chosen.set == "choosing":
         images = {name: photograph(name, *shape) for name in CHOOSING}
     else:
         images = crops(REPORTING, shape)
-    if options.save is not None:
-        options.save.mkdir(parents=True, exist_ok=True)
     for function in METHODS.values():  # the first call imports
         function(photograph("coffee", 16, 24)[:, :1], photograph("coffee", 16, 24), torch.ones(1, 1, 16, 24))
 
-    kind = "lines" if options.lines else "5x5 strokes"
+    kind = "lines" if chosen.lines else "5x5 strokes"
     print(f"PSNR in dB of coloured photographs, mean of {len(seeds)} sets of {kind}")
     print(f"{'photograph':24}{'strokes':>8}" + "".join(f"{method:>12}" for method in METHODS))
     cases: list[Case] = []
@@ -213,12 +192,12 @@ def main(arguments: list[str] | None = None) -> None:
             print(f"{name:24} is left out: it is grey")
             continue
         for count in COUNTS:
-            group = [measure(name, image, count, seed, options.lines, options.save) for seed in seeds]
-            means = [statistics.mean(case.results[method].psnr for case in group) for method in METHODS]
+            group = [measure(name, image, count, seed, chosen.lines, chosen.save) for seed in seeds]
+            means = [statistics.mean(case.results[method][0] for case in group) for method in METHODS]
             print(f"{name:24}{count:8d}" + "".join(f"{value:12.2f}" for value in means), flush=True)
             cases += group
     holds = report(cases)
-    if not options.quick:
+    if not chosen.quick:
         claim = f"at least {WON:.0%}, {AHEAD} dB, none below {WORST} dB, {TIME} times the time"
         print(f"\n{claim}: {'holds' if holds else 'FALLS SHORT'}")
 

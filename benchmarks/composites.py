@@ -4,7 +4,6 @@ The shapes are random: blobs, and blobs with hairs, holes, motion blur or defocu
 ``CHOOSING`` were used to choose the defaults of masks, recolouring and defocus; those in ``REPORTING`` were not.
 """
 
-import argparse
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,12 +14,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from benchmarks.photographs import photograph, pictures
+from benchmarks.harness import options
+from benchmarks.photographs import CHOOSING, REPORTING, photograph, pictures
 
 Plane = NDArray[np.float32]
 
-CHOOSING = ("astronaut", "coffee", "chelsea", "motorcycle", "rocket")
-REPORTING = ("hubble_deep_field", "immunohistochemistry", "retina", "colorwheel")
 SHAPES = ("blob", "hairs", "holes", "motion", "soft")
 SIZE = (112, 160)
 RADIUS, LENGTH = 0.014, 0.14  # of a scribble, as shares of the short side
@@ -172,16 +170,7 @@ def sources(folder: Path | None, kind: str) -> dict[str, Tensor]:
 
 @dataclass(frozen=True)
 class Setup:
-    """Options of a benchmark on composites.
-
-    Attributes:
-        count: number of composites.
-        size: (H, W) of each.
-        images: photographs that the composites are made of.
-        first: seed of the first composite.
-        kind: set of photographs and seeds.
-        quick: whether this is only a check that the benchmark runs.
-    """
+    """What a benchmark on composites is asked for: their number, size (H, W), photographs, first seed, and set."""
 
     count: int
     size: tuple[int, int]
@@ -191,17 +180,15 @@ class Setup:
     quick: bool
 
 
-def setup(description: str, arguments: list[str] | None) -> Setup:
-    """Read the options of the command line."""
-    parser = argparse.ArgumentParser(description=description)
-    parser.add_argument("--pictures", type=Path, help="folder of photographs; default: those of scikit-image")
-    parser.add_argument("--set", choices=tuple(FIRST_SEED), default="reporting", help="which photographs and seeds")
-    parser.add_argument(
-        "--first-seed", type=int, help="first seed of composites and scribbles; default: that of the set"
-    )
-    parser.add_argument("--composites", type=int, default=COMPOSITES, help="number of composites")
-    parser.add_argument("--quick", action="store_true", help="one composite of 40x56, to check that it runs")
-    options = parser.parse_args(arguments)
-    count, size = (1, (40, 56)) if options.quick else (options.composites, SIZE)
-    first = FIRST_SEED[options.set] if options.first_seed is None else options.first_seed
-    return Setup(count, size, sources(options.pictures, options.set), first, options.set, options.quick)
+def setup(name: str, description: str | None, arguments: list[str] | None) -> Setup:
+    """Read the options of the command line of a benchmark."""
+    parser = options(name, description, "one composite of 40x56")
+    add = parser.add_argument
+    add("--pictures", type=Path, help="folder of photographs; default: those of scikit-image")
+    add("--set", choices=tuple(FIRST_SEED), default="reporting", help="which photographs and seeds")
+    add("--first-seed", type=int, help="first seed of composites and scribbles; default: that of the set")
+    add("--composites", type=int, default=COMPOSITES, help="number of composites")
+    chosen = parser.parse_args(arguments)
+    count, size = (1, (40, 56)) if chosen.quick else (chosen.composites, SIZE)
+    first = FIRST_SEED[chosen.set] if chosen.first_seed is None else chosen.first_seed
+    return Setup(count, size, sources(chosen.pictures, chosen.set), first, chosen.set, chosen.quick)

@@ -1,4 +1,4 @@
-"""Detail against other methods at equal gain: ``python -m benchmarks.detail [--pictures FOLDER] [--quick] [--scales]``.
+"""What detail costs in halos, noise and clipping, beside other methods of equal gain: ``python -m benchmarks.detail``.
 
 The detail preset (sliders g, g, g, 1 and the defaults of ``enhance``) and other methods boost the detail of the
 luminance of the same photographs. Their strength is set by bisection so that the fine part, which a Gaussian of 2
@@ -16,19 +16,17 @@ With ``--scales``, one large photograph at 1.5, 6 and 24 megapixels under the sa
 reduced to 1.5 megapixels, and the differences between these results.
 """
 
-import argparse
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from benchmarks.detail_peers import clahe, detail_enhance, smoothers
-from benchmarks.photographs import pictures
-from benchmarks.unsharp import gaussian
-from nlfilter_torch.operator.features import reduce_channels
+from benchmarks.enhancers import clahe, detail_enhance, gaussian, smoothers
+from benchmarks.harness import options, row, strength_of
+from benchmarks.photographs import luminance, pictures
 from nlfilter_torch.photo import enhance
 from nlfilter_torch.photo.declared.parameters import DETAIL
 from nlfilter_torch.photo.declared.presets import PRESETS
@@ -72,11 +70,6 @@ class Figures:
         """Whether this result dominates another: no measurement is worse, and at least one is better."""
         pairs = list(zip(self.costs, other.costs, strict=True))
         return all(a <= b for a, b in pairs) and any(a < b for a, b in pairs)
-
-
-def luminance(image: Tensor) -> Tensor:
-    """The luminance (B, 1, H, W) of an image."""
-    return reduce_channels(image, "luminance")
 
 
 def shown(image: Tensor) -> Tensor:
@@ -147,34 +140,14 @@ def boosted(smooth: Callable[..., object]) -> Callable[[Tensor], Strength]:
     return of
 
 
-def equalized(image: Tensor) -> Strength:
-    """CLAHE of luminance."""
-
-    def edit(y: Tensor, strength: float) -> Tensor:
-        return torch.from_numpy(clahe(y[0, 0].numpy(), strength))[None, None]
-
-    return lambda strength: edit_luminance(image, lambda y: edit(y, strength))
-
-
 METHODS: dict[str, Callable[[Tensor], Strength]] = {
     OURS: ours,
     **{name: boosted(smooth) for name, smooth in smoothers().items()},
     "detailEnhance": lambda image: lambda strength: detail_enhance(image, strength),
-    "CLAHE": equalized,
+    "CLAHE": lambda image: (
+        lambda strength: edit_luminance(image, lambda y: torch.from_numpy(clahe(y[0, 0].numpy(), strength))[None, None])
+    ),
 }
-
-
-def reach(scene: Scene, strength: Strength, gain: float) -> float | None:
-    """Find the strength with the given gain, or None if there is none."""
-    low, high = 0.0, 1.0
-    while scene.gain(strength(high)) < gain:
-        low, high = high, 2 * high
-        if high > STRONGEST:
-            return None
-    for _ in range(12):
-        middle = (low + high) / 2
-        low, high = (middle, high) if scene.gain(strength(middle)) < gain else (low, middle)
-    return high
 
 
 def measure(scene: Scene) -> dict[float, dict[str, Figures | None]]:
@@ -183,17 +156,12 @@ def measure(scene: Scene) -> dict[float, dict[str, Figures | None]]:
     for name, method in METHODS.items():
         clean, *noisy = (method(image) for image in (scene.image, *scene.noisy))
         for gain in GAINS:
-            amount = reach(scene, clean, gain)
+            amount = strength_of(lambda strength: scene.gain(clean(strength)), gain, STRONGEST, 12)  # noqa: B023
             if amount is None:
                 figures[gain][name] = None
             else:
                 figures[gain][name] = scene.figures(clean(amount), [shown(edit(amount)) for edit in noisy])
     return figures
-
-
-def row(cells: list[str]) -> str:
-    """Format a row of a table."""
-    return f"{cells[0]:18}" + "".join(f"{cell:>9}" for cell in cells[1:])
 
 
 def compare(images: dict[str, Tensor]) -> None:
@@ -205,12 +173,11 @@ def compare(images: dict[str, Tensor]) -> None:
     for name, image in images.items():
         for gain, rows in measure(Scene(image)).items():
             print(f"\n{name}, detail gain {gain}")
-            print(row(["", "halo", "noise", "clipped", "chroma", "mean"]))
+            print(row("", ["halo", "noise", "clipped", "chroma", "mean"]))
             for method, f in rows.items():
-                cells = ["not reached"] if f is None else [
-                    f"{f.halo:.1f}", f"{f.noise:.2f}", f"{f.clipped:.2f}", f"{f.chroma:+.1f}", f"{f.mean:+.2f}"
-                ]  # fmt: skip
-                print(row([method, *cells]), flush=True)
+                told = "{halo:.1f} {noise:.2f} {clipped:.2f} {chroma:+.1f} {mean:+.2f}"
+                cells = ["not reached"] if f is None else told.format(**asdict(f)).split()
+                print(row(method, cells), flush=True)
                 if f is not None:
                     means.setdefault((gain, method), []).append(f)
             own = rows[OURS]
@@ -230,11 +197,11 @@ def compare(images: dict[str, Tensor]) -> None:
                     lost.append(f"{name}, gain {gain}: {figure} {own.costs[i]:.2f}: {', '.join(ahead)}")
     for gain in GAINS:
         print(f"\nmean of the pictures on which the gain is reached, detail gain {gain}")
-        print(row(["", "halo", "noise", "clipped", "reached"]))
+        print(row("", ["halo", "noise", "clipped", "reached"]))
         for method in METHODS:
             known = means.get((gain, method), [])
             columns = [sum(f.costs[i] for f in known) / len(known) for i in range(3)] if known else []
-            print(row([method, *(f"{mean:.2f}" for mean in columns), f"{len(known)}/{len(images)}"]))
+            print(row(method, [*(f"{mean:.2f}" for mean in columns), f"{len(known)}/{len(images)}"]))
     print(f"\non the Pareto front of halo, noise gain and clipped share: {fronts} of {cases}")
     print(f"clipped share at most that of the best peer: {least} of {cases}")
     print(f"largest change of chroma {worst[0]:.1f} %, of mean brightness {worst[1]:.2f} levels")
@@ -251,7 +218,7 @@ def compare_scales(name: str, image: Tensor, megapixels: float) -> None:
         size = [factor * length for length in viewed]
         return F.interpolate(picture, size, mode="bicubic", antialias=True).clamp(0, 1)
 
-    print(row(["", *(f"{factor**2 * megapixels:g} MP" for factor in FACTORS), "apart", "RMS"]))
+    print(row("", [*(f"{factor**2 * megapixels:g} MP" for factor in FACTORS), "apart", "RMS"]))
     for preset in PRESETS:
         gains, views = [], []
         for factor in FACTORS:
@@ -261,23 +228,22 @@ def compare_scales(name: str, image: Tensor, megapixels: float) -> None:
             gains.append(Scene(sized(large, 1)).gain(views[-1]))
         apart = 100 * (max(gains) / min(gains) - 1)
         rms = max(255 * float((view - views[0]).square().mean().sqrt()) for view in views)
-        print(row([preset, *(f"{gain:.2f}" for gain in gains), f"{apart:.1f} %", f"{rms:.2f}"]), flush=True)
+        print(row(preset, [*(f"{gain:.2f}" for gain in gains), f"{apart:.1f} %", f"{rms:.2f}"]), flush=True)
 
 
 def main(arguments: list[str] | None = None) -> None:
     """Print tables."""
-    parser = argparse.ArgumentParser(description="Detail against other methods at equal gain.")
+    parser = options("detail", __doc__, "two photographs at 64 pixels")
     parser.add_argument("--pictures", type=Path, help="folder of photographs; default: those of scikit-image")
     parser.add_argument("--side", type=int, default=SIDE, help="short side in pixels to which they are reduced")
     parser.add_argument("--scales", action="store_true", help="the same presets on one photograph in three sizes")
-    parser.add_argument("--quick", action="store_true", help="two photographs at 64 pixels, to check that it runs")
-    options = parser.parse_args(arguments)
-    names = CHOSEN_ON[:2] if options.quick else CHOSEN_ON
-    if options.scales:
-        name, image = next(iter(pictures(options.pictures, 1 << 14, (LARGE,)).items()))
-        compare_scales(name, image, 0.01 if options.quick else DETAIL["viewing_size"].default)
+    chosen = parser.parse_args(arguments)
+    names = CHOSEN_ON[:2] if chosen.quick else CHOSEN_ON
+    if chosen.scales:
+        name, image = next(iter(pictures(chosen.pictures, 1 << 14, (LARGE,)).items()))
+        compare_scales(name, image, 0.01 if chosen.quick else DETAIL["viewing_size"].default)
     else:
-        compare(pictures(options.pictures, 64 if options.quick else options.side, names))
+        compare(pictures(chosen.pictures, 64 if chosen.quick else chosen.side, names))
 
 
 if __name__ == "__main__":

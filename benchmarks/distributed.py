@@ -22,7 +22,8 @@ import torch.distributed as dist
 from torch import Tensor
 from torch.multiprocessing.spawn import spawn
 
-from benchmarks.memory import picture
+from benchmarks.harness import options, row
+from benchmarks.photographs import retina
 from nlfilter_torch import nonlocal_operator, polynomial_filter
 
 ALPHA = (3.0, 3.0, 4.0, 1.05)
@@ -83,7 +84,7 @@ def share(image: Tensor, rank: int, ranks: int) -> Tensor:
 def measure(side: int, height: int, landmarks: int, device: torch.device) -> list[str]:
     """Measure one case on this rank, and return a row of the table."""
     rank, ranks = dist.get_rank(), dist.get_world_size()
-    whole = picture(side).repeat(1, 1, -(-height // side), 1)[:, :, :height]
+    whole = retina(side).repeat(1, 1, -(-height // side), 1)[:, :, :height]
     rows = share(whole, rank, ranks).to(device).requires_grad_()
     alpha = torch.tensor(ALPHA, device=device, requires_grad=True)
     start = time.perf_counter()
@@ -122,10 +123,7 @@ def work(options: argparse.Namespace) -> None:
     cases = [(width, tall * width, m) for width in options.widths for tall in (1, 2, 4) for m in options.landmarks]
     rows = [measure(*case, device) for case in cases]
     if dist.get_rank() == 0:
-        table = [HEAD, *rows]
-        widths = [max(len(row[i]) for row in table) for i in range(len(HEAD))]
-        for row in table:
-            print("  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)), flush=True)
+        print("\n".join(row(cells[0], cells[1:], 11, 10) for cells in (HEAD, *rows)), flush=True)
 
 
 def _work_here(rank: int, options: argparse.Namespace, folder: str) -> None:
@@ -139,20 +137,20 @@ def _work_here(rank: int, options: argparse.Namespace, folder: str) -> None:
 
 def main(arguments: list[str] | None = None) -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description="Communication between ranks that share one image.")
+    parser = options("distributed", __doc__)
     parser.add_argument("--ranks", type=int, default=3, help="processes on this machine; ignored under torchrun")
     parser.add_argument("--widths", type=int, nargs="+", default=[128, 256], help="widths of the pictures")
     parser.add_argument("--landmarks", type=int, nargs="+", default=[50, 100], help="numbers of landmarks m")
-    options = parser.parse_args(arguments)
+    chosen = parser.parse_args(arguments)
     if "RANK" in os.environ:
         dist.init_process_group("nccl" if torch.cuda.is_available() else "gloo")
         try:
-            work(options)
+            work(chosen)
         finally:
             dist.destroy_process_group()
         return
     with tempfile.TemporaryDirectory() as folder:
-        spawn(_work_here, (options, folder), nprocs=options.ranks)
+        spawn(_work_here, (chosen, folder), nprocs=chosen.ranks)
 
 
 if __name__ == "__main__":

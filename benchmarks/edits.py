@@ -1,7 +1,7 @@
 """Claims about masks and edits, and whether they hold: ``python -m benchmarks.edits [--out FILE]``.
 
 Prints one line per claim, with its limit and the measured value, on photographs that ship with scikit-image. Larger
-comparisons have their own modules: ``benchmarks.colorize``, ``benchmarks.sharpening``, ``benchmarks.figures``.
+comparisons have their own modules: ``benchmarks.colorize``, ``benchmarks.sharpening``, ``docs.figures``.
 """
 
 import argparse
@@ -18,7 +18,7 @@ import torch.nn.functional as F
 from skimage.color import rgb2hsv
 from torch import Tensor
 
-from benchmarks.figures.scenes import luminance, scene, spots, strokes
+from benchmarks.photographs import luminance, scene, spots, strokes
 from nlfilter_torch import Spectrum, diffusion_mask, nonlocal_operator
 from nlfilter_torch.photo import abstract, adjust_tone, defocus, filter_frames, recolor
 from nlfilter_torch.photo.files.writing import open_beside

@@ -8,12 +8,11 @@ and says in ``keepers.json`` whether it would be kept and published as it is ("k
 counts these judgements. ``keepers_judged.json`` has the digests of the results that were judged; results that differ
 are named, and ``--judged`` stores the digests of those that have been looked at.
 
-``--pictures`` is the folder of :mod:`benchmarks.denoiser_training.free_photographs`; without it only scikit-image's
+``--pictures`` is the folder of :mod:`benchmarks.free_photographs`; without it only scikit-image's
 photographs are edited. Jobs on photographs of the choosing set may guide changes of the edits, those on the reporting
 set are counted only.
 """
 
-import argparse
 import base64
 import json
 import sys
@@ -26,9 +25,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from benchmarks.edited_photographs import edited_photographs
-from benchmarks.figures.scenes import luminance, scribbled
-from benchmarks.photographs import reduced_to
+from benchmarks.free_photographs import edited_photographs
+from benchmarks.harness import options, save_picture
+from benchmarks.photographs import luminance, reduced_to, scribbled
 from nlfilter_torch.photo import region_mask
 from nlfilter_torch.photo.app.brush import RADIUS
 from nlfilter_torch.photo.declared.parameters import EDITS, MASK
@@ -37,7 +36,6 @@ from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.declared.strokes import Mark
 from nlfilter_torch.photo.edits.applying import apply_recipe
 from nlfilter_torch.photo.picture.painting import colour_of, cover
-from nlfilter_torch.photo.picture.photographs import Photograph, write_photograph
 from nlfilter_torch.photo.picture.resizing import resize
 
 STORED = Path(__file__).with_suffix(".json")
@@ -53,29 +51,17 @@ KINDS = {"recolor": "recolouring", "mask": "masks and defocus", "defocus": "mask
 
 @dataclass(frozen=True)
 class Job:
-    """An edit of a photograph.
+    """An edit of a photograph."""
 
-    Attributes:
-        number: from 1.
-        photograph: its name.
-        what: is done.
-        edit: its name, "mask" or "preset".
-        recipe: the edit; empty for a mask.
-        strokes: drawn with the editor's brush.
-        noise: standard deviation in grey levels of the noise that is added to the photograph.
-        keeper: whether the result is kept; None if nobody has looked at it.
-        why: what is wrong with it, if it is not kept.
-    """
-
-    number: int
-    photograph: str
-    what: str
-    edit: str
-    recipe: Recipe
-    strokes: tuple[Mark, ...]
-    noise: float
-    keeper: bool | None
-    why: str
+    number: int  # from 1
+    photograph: str  # its name
+    what: str  # is done
+    edit: str  # its name, "mask" or "preset"
+    recipe: Recipe  # the edit; empty for a mask
+    strokes: tuple[Mark, ...]  # drawn with the editor's brush
+    noise: float  # standard deviation in grey levels of the noise that is added to the photograph
+    keeper: bool | None  # whether the result is kept; None if nobody has looked at it
+    why: str  # what is wrong with it, if it is not kept
 
     @staticmethod
     def of(number: int, entry: dict[str, Any]) -> "Job":
@@ -183,11 +169,10 @@ def results(listed: Sequence[Job], pictures: Path | None, out: Path) -> dict[str
         if pictures is None and not edited_photographs()[job.photograph].is_shipped:
             continue
         picture = panels(job, pictures)
-        out.mkdir(parents=True, exist_ok=True)
-        write_photograph(Photograph(picture), out / f"{job.name}.png")
+        save_picture(out / f"{job.name}.png", picture)
         written[job.name] = picture[..., -picture.shape[-1] // (3 if job.strokes else 2) :]
     if written:
-        write_photograph(Photograph(contact_sheet(list(written.values()))), out / "all.png")
+        save_picture(out / "all.png", contact_sheet(list(written.values())))
     return written
 
 
@@ -205,11 +190,9 @@ def counted(listed: Sequence[Job]) -> str:
     """A table of the judgements, by set and kind of edit."""
     lines = []
     for name in sorted({job.set for job in listed}):
-        for kind in ("recolouring", "masks and defocus", "other edits"):
-            own = [job for job in listed if job.set == name and KINDS.get(job.edit, "other edits") == kind]
+        for kind in ("recolouring", "masks and defocus", "other edits", "all"):
+            own = [job for job in listed if job.set == name and kind in ("all", KINDS.get(job.edit, "other edits"))]
             lines.append(f"{name:12}{kind:20}{sum(job.keeper is True for job in own):4} of {len(own)}")
-        own = [job for job in listed if job.set == name]
-        lines.append(f"{name:12}{'all':20}{sum(job.keeper is True for job in own):4} of {len(own)}")
     kept = sum(job.keeper is True for job in listed)
     verdict = "holds" if kept >= AIM * len(listed) else "FALLS SHORT"
     lines += ["", f"kept {kept} of {len(listed)}, at least {AIM:.0%}: {verdict}", ""]
@@ -219,23 +202,24 @@ def counted(listed: Sequence[Job]) -> str:
 
 def main(arguments: list[str] | None = None) -> int:
     """Write the pictures, print how many are kept, and return 1 if these are too few."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.keepers", description=__doc__)
-    parser.add_argument("--pictures", type=Path, help="folder of free photographs; default: only scikit-image's")
-    parser.add_argument("--out", type=Path, default=Path("out/keepers"), help="folder for the results")
-    parser.add_argument("--only", type=int, nargs="+", metavar="NUMBER", help="edit and count these jobs only")
-    parser.add_argument("--set", choices=("choosing", "reporting"), help="edit and count jobs of this set only")
-    parser.add_argument("--judged", action="store_true", help="the results have been judged: store their digests")
-    parser.add_argument("--count", action="store_true", help="only count the judgements")
-    options = parser.parse_args(arguments)
+    parser = options("keepers", __doc__)
+    add = parser.add_argument
+    add("--pictures", type=Path, help="folder of free photographs; default: only scikit-image's")
+    add("--out", type=Path, default=Path("out/keepers"), help="folder for the results")
+    add("--only", type=int, nargs="+", metavar="NUMBER", help="edit and count these jobs only")
+    add("--set", choices=("choosing", "reporting"), help="edit and count jobs of this set only")
+    add("--judged", action="store_true", help="the results have been judged: store their digests")
+    add("--count", action="store_true", help="only count the judgements")
+    chosen = parser.parse_args(arguments)
     listed = [
-        job for job in jobs() if (options.only is None or job.number in options.only) and options.set in (None, job.set)
+        job for job in jobs() if (chosen.only is None or job.number in chosen.only) and chosen.set in (None, job.set)
     ]
     if not listed:
         parser.error("no job has one of the numbers of --only in the set of --set; use others")
-    if not options.count:
-        pictures = results(listed, options.pictures, options.out)
+    if not chosen.count:
+        pictures = results(listed, chosen.pictures, chosen.out)
         digests = {name: digest(result) for name, result in pictures.items()}
-        compare_with_judged(digests, JUDGED, store=options.judged)
+        compare_with_judged(digests, JUDGED, store=chosen.judged)
     print(counted(listed))
     return int(sum(job.keeper is True for job in listed) < AIM * len(listed))
 

@@ -6,17 +6,15 @@ one pair needs, and that many pairs need, beyond what the process has at the sta
 cat, enlarged, and shifted for each of many pairs. Linux only.
 """
 
-import argparse
-import time
 from collections.abc import Callable, Iterator
 from functools import partial
 
 import torch
 from torch import Tensor
 
+from benchmarks.harness import options, peak, seconds
 from benchmarks.looks import EDITS, applied
-from benchmarks.memory import forget_peak, resident
-from benchmarks.whole import photograph
+from benchmarks.photographs import enlarged
 from nlfilter_torch.core.kernels import definitions_only
 from nlfilter_torch.photo import apply_look, fit_look
 from nlfilter_torch.photo.declared.steps import Step
@@ -31,35 +29,30 @@ NAMES = ("gamma (scikit-image)", "unsharp (Pillow)", "CLAHE (OpenCV)", SLIDERS)
 def edited(name: str, image: Tensor) -> Tensor:
     """A photograph (1, 3, H, W) in 8 bits under an edit."""
     if name != SLIDERS:
-        return applied(EDITS[name][1], image)
+        return applied(EDITS[name], image)
     step = Step("detail", alpha=ALPHA, limits="none", threshold=0.0)
     return (apply_step(step, image).clamp(0, 1) * 255).round() / 255
 
 
 def told(name: str, image: Tensor, repeats: int) -> str:
     """How long a look takes, the least of some times, and how exact sliders are."""
-    after, processor, wall = edited(name, image), [], []
-    for _ in range(repeats):
-        started, ran = time.perf_counter(), time.process_time()
-        look = fit_look([(image, after)])
-        processor.append(time.process_time() - ran)
-        wall.append(time.perf_counter() - started)
-    told = f"{name:26}{min(processor):6.2f} processor s {min(wall):6.2f} wall s"
+    pairs = [(image, edited(name, image))]
+    taken = [
+        (seconds(lambda: fit_look(pairs), processor=True), seconds(lambda: fit_look(pairs))) for _ in range(repeats)
+    ]
+    processor, wall = (min(times) for times in zip(*taken, strict=True))
+    line = f"{name:26}{processor:6.2f} processor s {wall:6.2f} wall s"
+    look = fit_look(pairs)
     if name != SLIDERS or isinstance(look, tuple):
-        return told
+        return line
     error = (torch.tensor(look.step["alpha"]) - torch.tensor(ALPHA)).abs().max()
-    return f"{told}, alpha off by {float(error):.1e} at most"
+    return f"{line}, alpha off by {float(error):.1e} at most"
 
 
 def least(function: Callable[[], object], repeats: int) -> float:
     """The least processor time in ms of some calls, after a first one."""
     function()
-    times = []
-    for _ in range(repeats):
-        ran = time.process_time()
-        function()
-        times.append(time.process_time() - ran)
-    return 1000 * min(times)
+    return 1000 * min(seconds(function, processor=True) for _ in range(repeats))
 
 
 def with_lattices(image: Tensor, repeats: int) -> Iterator[str]:
@@ -87,35 +80,32 @@ def shifted(image: Tensor, count: int) -> Iterator[tuple[Tensor, Tensor]]:
         yield moved, edited("gamma (scikit-image)", moved)
 
 
-def peak(image: Tensor, count: int) -> float:
-    """The most memory in MiB that the fit of so many pairs needs."""
-    forget_peak()
-    before = resident("VmRSS")
-    fit_look(shifted(image, count))
-    return resident("VmHWM") - before
+def cat(megapixels: float) -> Tensor:
+    """The cat in another size and in 8 bits, (1, 3, H, W), 3:2."""
+    height = round((megapixels * 1e6 / 1.5) ** 0.5)
+    return (enlarged("chelsea", height, round(1.5 * height)) * 255).round() / 255
 
 
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = options("look_costs", __doc__, "small pictures, and few of them")
     parser.add_argument("--megapixels", type=float, default=1.0, help="of the pair that is timed")
     parser.add_argument("--pairs", type=int, default=100, help="that memory is measured with")
     parser.add_argument("--small", type=float, default=0.1, help="megapixels of these")
     parser.add_argument("--repeats", type=int, default=3, help="of each time, of which the least is printed")
-    parser.add_argument("--quick", action="store_true", help="small pictures, and few of them")
-    options = parser.parse_args()
-    if options.quick:
-        options.megapixels, options.pairs, options.small, options.repeats = 0.005, 2, 0.005, 1
-    image = (photograph(options.megapixels) * 255).round() / 255
+    chosen = parser.parse_args()
+    if chosen.quick:
+        chosen.megapixels, chosen.pairs, chosen.small, chosen.repeats = 0.005, 2, 0.005, 1
+    image, small = cat(chosen.megapixels), cat(chosen.small)
     fit_look([(image, image**0.9)])  # loads what is loaded once
     for name in NAMES:
-        print(told(name, image, options.repeats), flush=True)
-    for line in with_lattices(image, 5 * options.repeats):
+        print(told(name, image, chosen.repeats), flush=True)
+    for line in with_lattices(image, 5 * chosen.repeats):
         print(line, flush=True)
-    small = (photograph(options.small) * 255).round() / 255
-    peak(small, 1)
-    for count in (1, options.pairs):
-        print(f"{count:4d} pairs of {options.small:g} megapixels: {peak(small, count):7.1f} MiB", flush=True)
+    fit_look(shifted(small, 1))
+    for count in (1, chosen.pairs):
+        memory = peak(lambda: fit_look(shifted(small, count)))  # noqa: B023
+        print(f"{count:4d} pairs of {chosen.small:g} megapixels: {memory:7.1f} MiB", flush=True)
 
 
 if __name__ == "__main__":

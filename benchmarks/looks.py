@@ -11,14 +11,14 @@ of the colour table were not tuned. "Best" is by held-out means as they are prin
 ``python -m benchmarks.looks_of_people`` measures edits that stand for those by people.
 """
 
-import argparse
 import io
 import shutil
 import statistics
 import subprocess
-import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -30,6 +30,7 @@ from scipy.sparse.linalg import cg
 from skimage import exposure, filters
 from torch import Tensor
 
+from benchmarks.harness import options, row
 from benchmarks.photographs import pictures
 from nlfilter_torch.photo import fit_look
 
@@ -115,28 +116,27 @@ def detailed(rgb: Bytes) -> Bytes:
     return cv2.detailEnhance(rgb[..., ::-1].copy(), sigma_s=10, sigma_r=0.15)[..., ::-1].copy()
 
 
-#: Edits by kind.
-EDITS: dict[str, tuple[str, Edit]] = {
-    "gamma (scikit-image)": ("global", floats(lambda x: exposure.adjust_gamma(x, 0.6))),
-    "S-curve (scikit-image)": ("global", floats(lambda x: exposure.adjust_sigmoid(x, 0.5, 8))),
-    "logarithm (scikit-image)": ("global", floats(lambda x: exposure.adjust_log(x, 1.0))),
-    "saturation (Pillow)": ("global", pillow(lambda x: ImageEnhance.Color(x).enhance(1.6))),
-    "saturation in HSV (OpenCV)": ("global", more_saturated),
-    "contrast (Pillow)": ("global", pillow(lambda x: ImageEnhance.Contrast(x).enhance(1.4))),
-    "automatic contrast (Pillow)": ("global", pillow(ImageOps.autocontrast)),
-    "warmth (NumPy)": ("global", warm),
-    "sepia (OpenCV)": ("global", lambda rgb: cv2.transform(rgb, SEPIA)),
-    "mixture (all three)": ("global", mixed),
-    "unsharp (Pillow)": ("detail", pillow(lambda x: x.filter(ImageFilter.UnsharpMask(2, 150, 0)))),
-    "unsharp (scikit-image)": ("detail", floats(lambda x: filters.unsharp_mask(x, radius=3, amount=1, channel_axis=2))),
-    "detailEnhance (OpenCV)": ("detail", detailed),
-    "CLAHE (OpenCV)": ("local", equalized),
-    "CLAHE (scikit-image)": ("local", floats(lambda x: exposure.equalize_adapthist(x, clip_limit=0.01))),
+EDITS: dict[str, Edit] = {
+    "gamma (scikit-image)": floats(lambda x: exposure.adjust_gamma(x, 0.6)),
+    "S-curve (scikit-image)": floats(lambda x: exposure.adjust_sigmoid(x, 0.5, 8)),
+    "logarithm (scikit-image)": floats(lambda x: exposure.adjust_log(x, 1.0)),
+    "saturation (Pillow)": pillow(lambda x: ImageEnhance.Color(x).enhance(1.6)),
+    "saturation in HSV (OpenCV)": more_saturated,
+    "contrast (Pillow)": pillow(lambda x: ImageEnhance.Contrast(x).enhance(1.4)),
+    "automatic contrast (Pillow)": pillow(ImageOps.autocontrast),
+    "warmth (NumPy)": warm,
+    "sepia (OpenCV)": lambda rgb: cv2.transform(rgb, SEPIA),
+    "mixture (all three)": mixed,
+    "unsharp (Pillow)": pillow(lambda x: x.filter(ImageFilter.UnsharpMask(2, 150, 0))),
+    "unsharp (scikit-image)": floats(lambda x: filters.unsharp_mask(x, radius=3, amount=1, channel_axis=2)),
+    "detailEnhance (OpenCV)": detailed,
+    "CLAHE (OpenCV)": equalized,
+    "CLAHE (scikit-image)": floats(lambda x: exposure.equalize_adapthist(x, clip_limit=0.01)),
 }
 MAGICK = {
-    "sigmoidal contrast (ImageMagick)": ("global", magick("-sigmoidal-contrast", "5x40%")),
-    "modulate (ImageMagick)": ("global", magick("-modulate", "105,130,100")),
-    "unsharp (ImageMagick)": ("detail", magick("-unsharp", "0x2+1.5+0")),
+    "sigmoidal contrast (ImageMagick)": magick("-sigmoidal-contrast", "5x40%"),
+    "modulate (ImageMagick)": magick("-modulate", "105,130,100"),
+    "unsharp (ImageMagick)": magick("-unsharp", "0x2+1.5+0"),
 }
 
 
@@ -146,16 +146,9 @@ def applied(edit: Edit, photograph: Tensor) -> Tensor:
     return torch.from_numpy(np.ascontiguousarray(edit(rgb))).permute(2, 0, 1)[None].float() / 255
 
 
-def look_of(pairs: Pairs) -> Predict:
-    """The look."""
-    look = fit_look(pairs)
-    assert not isinstance(look, tuple)
-    return look.apply
-
-
-def sliders_of(pairs: Pairs) -> Predict:
-    """Sliders alone."""
-    look = fit_look(pairs, parts=("alpha",))
+def look_of(pairs: Pairs, **parts: Any) -> Predict:
+    """The look, or some of its parts."""
+    look = fit_look(pairs, **parts)
     assert not isinstance(look, tuple)
     return look.apply
 
@@ -223,7 +216,7 @@ def histograms_of(pairs: Pairs) -> Predict:
 
 METHODS: dict[str, Callable[[Pairs], Predict]] = {
     "look": look_of,
-    "sliders": sliders_of,
+    "sliders": partial(look_of, parts=("alpha",)),
     "curves": curves_of,
     "17^3 table": table_of,
     "histograms": histograms_of,
@@ -265,37 +258,35 @@ def judge(
 
 def main() -> None:
     """Print the tables."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--pictures", type=Path, help="folder of photographs, in place of scikit-image's")
-    parser.add_argument("--set", choices=("choosing", "reporting"), default="reporting")
-    parser.add_argument("--side", type=int, default=SIDE, help="pixels of the short side")
-    parser.add_argument("--seed", type=int, default=0, help="of the order of the photographs")
-    parser.add_argument("--counts", type=int, nargs="+", default=[1, 3, 5], help="of pairs that are fitted at once")
-    parser.add_argument("--edits", nargs="+", default=[""], help="words of the names of the edits; all by default")
-    parser.add_argument("--methods", nargs="+", choices=METHODS, default=list(METHODS), help="all by default")
-    parser.add_argument(
-        "--quick", action="store_true", help="four small photographs that parameters were chosen on, and three edits"
-    )
-    arguments = parser.parse_args()
-    names = CHOSEN_ON if arguments.set == "choosing" or arguments.quick else REPORTED_ON
-    images = pictures(arguments.pictures, 64 if arguments.quick else arguments.side, names)
-    order = torch.randperm(len(images), generator=torch.Generator().manual_seed(arguments.seed)).tolist()
-    chosen = [list(images)[i] for i in order][: 4 if arguments.quick else 10]
+    parser = options("looks", __doc__, "four small photographs that parameters were chosen on, and three edits")
+    add = parser.add_argument
+    add("--pictures", type=Path, help="folder of photographs, in place of scikit-image's")
+    add("--set", choices=("choosing", "reporting"), default="reporting")
+    add("--side", type=int, default=SIDE, help="pixels of the short side")
+    add("--seed", type=int, default=0, help="of the order of the photographs")
+    add("--counts", type=int, nargs="+", default=[1, 3, 5], help="of pairs that are fitted at once")
+    add("--edits", nargs="+", default=[""], help="words of the names of the edits; all by default")
+    add("--methods", nargs="+", choices=METHODS, default=list(METHODS), help="all by default")
+    chosen = parser.parse_args()
+    names = CHOSEN_ON if chosen.set == "choosing" or chosen.quick else REPORTED_ON
+    images = pictures(chosen.pictures, 64 if chosen.quick else chosen.side, names)
+    order = torch.randperm(len(images), generator=torch.Generator().manual_seed(chosen.seed)).tolist()
+    used = [list(images)[i] for i in order][: 4 if chosen.quick else 10]
     edits = EDITS | (MAGICK if magick_program() else {})
-    edits = {name: edit for name, edit in edits.items() if any(word in name for word in arguments.edits)}
-    if arguments.quick:
+    edits = {name: edit for name, edit in edits.items() if any(word in name for word in chosen.edits)}
+    if chosen.quick:
         edits = dict(list(edits.items())[::5])
     magic = "installed" if magick_program() else "not installed, so that its edits are left out"
     print(f"{len(edits)} edits; ImageMagick is {magic}")
-    half = len(chosen) // 2
-    print(f"fitted: {', '.join(chosen[:half])}; held out: {', '.join(chosen[half:])}")
-    photographs = [(images[name] * 255).round() / 255 for name in chosen]
-    pairs = {name: [(image, applied(edit, image)) for image in photographs] for name, (_, edit) in edits.items()}
-    for count in [1, 2] if arguments.quick else arguments.counts:
+    half = len(used) // 2
+    print(f"fitted: {', '.join(used[:half])}; held out: {', '.join(used[half:])}")
+    photographs = [(images[name] * 255).round() / 255 for name in used]
+    pairs = {name: [(image, applied(edit, image)) for image in photographs] for name, edit in edits.items()}
+    for count in [1, 2] if chosen.quick else chosen.counts:
         if count > half:
-            print(f"\n{count} pairs are left out: of {len(chosen)} photographs, {half} are fitted")
+            print(f"\n{count} pairs are left out: of {len(used)} photographs, {half} are fitted")
             continue
-        report(pairs, {name: METHODS[name] for name in ("look", *arguments.methods)}, count)
+        report(pairs, {name: METHODS[name] for name in ("look", *chosen.methods)}, count)
 
 
 def report(
@@ -303,8 +294,8 @@ def report(
 ) -> None:
     """A table for a number of pairs that are fitted at once."""
     print(f"\nafter {count} pair{'s' * (count > 1)}: fitted mean, held out mean (lowest), in percent")
-    print(f"{'':34}" + "".join(f"{name:>21}" for name in methods))
-    best, tied, judged, ended = 0, 0, 0, time.perf_counter()
+    print(row("", methods, 21, 34))
+    best, tied, judged = 0, 0, 0
     for edit, examples in pairs.items():
         half = len(examples) // 2
         fitted, held = examples[: half if count == 1 else count], examples[half:]
@@ -320,10 +311,9 @@ def report(
         own, other = (round(value, 1) for value in (means["look"], max(others, default=-float("inf"))))
         best, tied = best + (own > other), tied + (own == other)
         verdict = "" if own > other else "  tied" if own == other else "  lost"
-        print(f"{edit:34}" + "".join(f"{cell:>21}" for cell in cells) + verdict, flush=True)
+        print(row(edit, cells, 21, 34) + verdict, flush=True)
     if len(methods) > 1:
         print(f"best of all on {best} of {judged}, held out, and tied on {tied}")
-    print(f"{time.perf_counter() - ended:.0f} s")
 
 
 if __name__ == "__main__":

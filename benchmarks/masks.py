@@ -8,14 +8,13 @@ painted. ``--set choosing`` uses the photographs and seeds that its defaults wer
 """
 
 import statistics
-import time
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable
 
 import torch
 from torch import Tensor
 
 from benchmarks.composites import Composite, composites, setup
+from benchmarks.harness import medians, row
 from benchmarks.mask_peers import PEERS
 from benchmarks.photographs import photograph
 from nlfilter_torch.core.precision import working_dtype
@@ -31,20 +30,13 @@ WON = 0.6  # required share of cases in which each peer is beaten
 MEGAPIXEL = 1024
 TRIMAP_SCALE = 3  # their composites are larger than those of scribbles
 METHODS = {OURS: region_mask, **PEERS}
-
-
-@dataclass(frozen=True)
-class Score:
-    """Mean squared error and intersection over union of one mask."""
-
-    error: float
-    overlap: float
+Score = tuple[float, float]
 
 
 def score(estimate: Tensor, wanted: Tensor) -> Score:
-    """Score a mask (1, 1, H, W) against the true one."""
+    """Mean squared error, and intersection over union, of a mask (1, 1, H, W) against the true one."""
     both, either = (estimate > 0.5) & (wanted > 0.5), (estimate > 0.5) | (wanted > 0.5)
-    return Score(float((estimate - wanted).square().mean()), float(both.sum() / either.sum()))
+    return float((estimate - wanted).square().mean()), float(both.sum() / either.sum())
 
 
 def measure(composite: Composite, count: int, seed: int) -> dict[str, Score]:
@@ -74,36 +66,24 @@ def report_trimaps(chosen: Iterable[Composite]) -> None:
 
 def report(cases: dict[str, dict[str, Score]]) -> bool:
     """Print means, wins and worst losses; return whether it is best in the mean and wins often enough."""
-    print(f"{'':14}{'MSE':>8}{'IoU':>8}{'beaten in MSE':>16}{'in IoU':>9}")
+    print(row("", ["MSE", "IoU", "beaten in MSE", "in IoU"], 15, 14))
     means, won = {}, []
     for name in ("alone", *METHODS):
-        scores = [case[name] for case in cases.values()]
-        means[name] = Score(*(statistics.mean(getattr(s, f) for s in scores) for f in ("error", "overlap")))
-        line = f"{name:14}{means[name].error:8.4f}{means[name].overlap:8.3f}"
+        means[name] = [statistics.mean(column) for column in zip(*(case[name] for case in cases.values()), strict=True)]
+        cells = [f"{means[name][0]:.4f}", f"{means[name][1]:.3f}"]
         if name in PEERS:
-            less = statistics.mean(case[OURS].error < case[name].error for case in cases.values())
-            more = statistics.mean(case[OURS].overlap > case[name].overlap for case in cases.values())
+            less = statistics.mean(case[OURS][0] < case[name][0] for case in cases.values())
+            more = statistics.mean(case[OURS][1] > case[name][1] for case in cases.values())
             won += [less, more]
-            line += f"{less:16.0%}{more:9.0%}"
-        print(line)
-    lost = [(case[OURS].error - case[name].error, key, name) for key, case in cases.items() for name in PEERS]
+            cells += [f"{less:.0%}", f"{more:.0%}"]
+        print(row(name, cells, 15, 14))
+    lost = [(case[OURS][0] - case[name][0], key, name) for key, case in cases.items() for name in PEERS]
     lost = sorted((entry for entry in lost if entry[0] > 0), reverse=True)
     print(f"lost {len(lost)} of {len(cases) * len(PEERS)} comparisons of MSE; those lost by most:")
     for lead, key, name in lost[:12]:
-        case = cases[key]
-        print(f"  {key:52} {OURS} {case[OURS].error:.4f}, {name} {case[name].error:.4f} ({lead:.4f} less)")
-    best = all(means[OURS].error < means[n].error and means[OURS].overlap > means[n].overlap for n in PEERS)
+        print(f"  {key:52} {OURS} {cases[key][OURS][0]:.4f}, {name} {cases[key][name][0]:.4f} ({lead:.4f} less)")
+    best = all(means[OURS][0] < means[name][0] and means[OURS][1] > means[name][1] for name in PEERS)
     return best and min(won) >= WON
-
-
-def timed(call: Callable[[], Tensor]) -> float:
-    """Median time of three calls, in seconds."""
-    seconds = []
-    for _ in range(3):
-        start = time.perf_counter()
-        call()
-        seconds.append(time.perf_counter() - start)
-    return statistics.median(seconds)
 
 
 def speed(side: int) -> None:
@@ -122,13 +102,14 @@ def speed(side: int) -> None:
         outside[0, 0, free[0] :, free[1] :][:10, :10] = 1  # otherwise the last mask would be returned
         return source.all(edit.fit(source, Drawn(marks)))
 
-    first, further = timed(lambda: region_mask(image, inside, outside)), timed(add_scribble)
+    calls = {"first": lambda: region_mask(image, inside, outside), "further": add_scribble}
+    first, further = medians(calls, 3).values()
     print(f"{side}x{side} on {torch.get_num_threads()} threads: {first:.2f} s, a further scribble {further:.2f} s")
 
 
 def main(arguments: list[str] | None = None) -> None:
     """Print the tables."""
-    chosen, cases = setup("Masks from scribbles, against matting and segmentation.", arguments), {}
+    chosen, cases = setup("masks", __doc__, arguments), {}
     for number, composite in enumerate(composites(chosen.count, chosen.first, chosen.images, chosen.size)):
         for scribbles in COUNTS:
             key = f"{number} {composite.name}, {scribbles} scribbles"

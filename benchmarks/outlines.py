@@ -8,14 +8,13 @@ intersection over union of the pixels above 0.5 and the object, "missed" the sha
 and "outside" what is selected beside it, as a share of the object; pixels within 1 % of the short side of an outline do
 not count.
 
-``--pictures`` is the folder of :mod:`benchmarks.denoiser_training.free_photographs`; without it only scikit-image's
+``--pictures`` is the folder of :mod:`benchmarks.free_photographs`; without it only scikit-image's
 photographs are measured. ``--peers`` adds GrabCut and closed-form matting, with the same strokes and, as they cannot do
 without a background, everything outside a rectangle around the object. Those see photographs of at most 240 pixels of
 short side, as closed-form matting takes long. ``--out FOLDER`` writes the photographs with what is selected, missed in
 red and beside the object in blue. The outlines of the choosing set may guide changes of masks.
 """
 
-import argparse
 import json
 import sys
 from collections.abc import Sequence
@@ -29,7 +28,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from benchmarks.edited_photographs import edited_photographs
+from benchmarks.free_photographs import edited_photographs
+from benchmarks.harness import options, save_picture
 from benchmarks.keepers import Job, jobs, mask_of
 from benchmarks.mask_peers import PEERS
 from benchmarks.photographs import reduced_to
@@ -38,7 +38,6 @@ from nlfilter_torch.photo.edits.applying import edit_of, scribbles_of
 from nlfilter_torch.photo.picture.drawn import Drawn
 from nlfilter_torch.photo.picture.in_memory import edit_image
 from nlfilter_torch.photo.picture.painting import TensorPainter
-from nlfilter_torch.photo.picture.photographs import Photograph, write_photograph
 from nlfilter_torch.photo.picture.resizing import resize
 from nlfilter_torch.photo.selections.mask import ObjectEdit
 
@@ -56,19 +55,12 @@ Polygon = Sequence[tuple[float, float]]
 
 @dataclass(frozen=True)
 class Outline:
-    """The outline of the object of a job.
-
-    Attributes:
-        job: the job.
-        outlines: polygons of (x, y) as fractions of width and height; the object is their union.
-        holes: likewise, not part of it.
-        either: likewise, parts that do not count.
-    """
+    """The outline of the object of a job: polygons of (x, y) as fractions of width and height."""
 
     job: Job
-    outlines: tuple[Polygon, ...]
-    holes: tuple[Polygon, ...] = ()
-    either: tuple[Polygon, ...] = ()
+    outlines: tuple[Polygon, ...]  # the object is their union
+    holes: tuple[Polygon, ...] = ()  # not part of it
+    either: tuple[Polygon, ...] = ()  # parts that do not count
 
     def object(self, size: tuple[int, int]) -> Mask:
         """The object in a picture (H, W)."""
@@ -173,9 +165,7 @@ def measure(outline: Outline, image: Tensor, peers: Sequence[str], out: Path | N
     wanted, either = outline.object(size), filled(outline.either, size)
     masks = {OURS: selected(outline.job, image)} | {name: by_peer(name, outline, image) for name in peers}
     if out is not None:
-        out.mkdir(parents=True, exist_ok=True)
-        shown = overlay(image, masks[OURS][0, 0].numpy() > 0.5, wanted)
-        write_photograph(Photograph(shown.clamp(0, 1)), out / f"{outline.job.name}.png")
+        save_picture(out / f"{outline.job.name}.png", overlay(image, masks[OURS][0, 0].numpy() > 0.5, wanted))
     return {name: score(mask[0, 0].numpy() > 0.5, wanted, either) for name, mask in masks.items()}
 
 
@@ -187,23 +177,23 @@ def line(name: str, scores: dict[str, Score]) -> str:
 
 def main(arguments: list[str] | None = None) -> int:
     """Measure and print a table."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.outlines", description=__doc__)
-    parser.add_argument("--pictures", type=Path, help="folder of free photographs; default: only scikit-image's")
-    parser.add_argument("--set", choices=("choosing", "reporting"), help="measure photographs of this set only")
-    parser.add_argument("--peers", action="store_true", help="compare with other methods")
-    parser.add_argument("--out", type=Path, help="folder for pictures")
-    parser.add_argument("--quick", action="store_true", help="one small photograph, to see that it runs")
-    options = parser.parse_args(arguments)
-    listed = [outline for outline in outlines() if options.set in (None, outline.job.set)]
-    if options.pictures is None:
+    parser = options("outlines", __doc__, "one small photograph")
+    add = parser.add_argument
+    add("--pictures", type=Path, help="folder of free photographs; default: only scikit-image's")
+    add("--set", choices=("choosing", "reporting"), help="measure photographs of this set only")
+    add("--peers", action="store_true", help="compare with other methods")
+    add("--out", type=Path, help="folder for pictures")
+    chosen = parser.parse_args(arguments)
+    listed = [outline for outline in outlines() if chosen.set in (None, outline.job.set)]
+    if chosen.pictures is None:
         listed = [outline for outline in listed if edited_photographs()[outline.job.photograph].is_shipped]
-    peers = COMPARED if options.peers else ()
+    peers = COMPARED if chosen.peers else ()
     print(f"{'':44}" + "  ".join(f"{name:>25}" for name in (OURS, *peers)))
     print(f"{'':44}" + "  ".join(["     IoU  missed  outside"] * (1 + len(peers))))
     rows = list[dict[str, Score]]()
-    for outline in listed[:1] if options.quick else listed:
-        image = outline.job.before(options.pictures)
-        rows.append(measure(outline, reduced_to(image, QUICK_SIDE) if options.quick else image, peers, options.out))
+    for outline in listed[:1] if chosen.quick else listed:
+        image = outline.job.before(chosen.pictures)
+        rows.append(measure(outline, reduced_to(image, QUICK_SIDE) if chosen.quick else image, peers, chosen.out))
         print(line(f"{outline.job.name}: {outline.job.what}"[:43], rows[-1]), flush=True)
     if rows:
         fields = ("overlap", "missed", "outside")

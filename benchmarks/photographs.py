@@ -8,17 +8,23 @@ import numpy as np
 import skimage.data
 import torch
 import torch.nn.functional as F
+from skimage.color import rgb2gray
 from skimage.transform import resize
+from torch import Tensor
 
+from nlfilter_torch.operator.features import reduce_channels
 from nlfilter_torch.photo.picture.photographs import read_photograph
 
 LOADERS = {"motorcycle": lambda: skimage.data.stereo_motorcycle()[0]}
 
-LETTERS = 27  # height of captions in pixels: phones show pictures of three columns at less than half their size
+CHOOSING = ("astronaut", "coffee", "chelsea", "motorcycle", "rocket")  # defaults of edits were chosen on these
+REPORTING = ("hubble_deep_field", "immunohistochemistry", "retina", "colorwheel")  # and not on these
+SIZE = 640  # longer side of a scene, in pixels
+Box = tuple[int, int, int, int]  # column, row, width, height, in pixels of the full-size photograph
 
 
 @cache
-def photograph(name: str, height: int | None = None, width: int | None = None) -> torch.Tensor:
+def photograph(name: str, height: int | None = None, width: int | None = None) -> Tensor:
     """A photograph (1, C, H, W) in [0, 1], float32; with a size, its middle is cropped to that shape and reduced."""
     picture = (LOADERS.get(name) or getattr(skimage.data, name))() / 255.0
     picture = picture[..., :3] if picture.ndim == 3 else picture[..., None]
@@ -32,7 +38,7 @@ def photograph(name: str, height: int | None = None, width: int | None = None) -
     return tensor.clamp(0, 1)
 
 
-def pictures(folder: Path | None, side: int, names: Sequence[str]) -> dict[str, torch.Tensor]:
+def pictures(folder: Path | None, side: int, names: Sequence[str]) -> dict[str, Tensor]:
     """Photographs (1, 3, H, W), reduced to a short side: all PNG, JPEG and TIFF files of a folder, or scikit-image's.
 
     Args:
@@ -50,12 +56,12 @@ def pictures(folder: Path | None, side: int, names: Sequence[str]) -> dict[str, 
     return {name: reduced_to(picture.expand(-1, 3, -1, -1), side) for name, picture in images.items()}
 
 
-def kodak(folder: Path, number: int) -> torch.Tensor:
+def kodak(folder: Path, number: int) -> Tensor:
     """One of Kodak's 24 photographs (1, 3, H, W), from a folder of files with their usual names (kodim07.png)."""
     return read_photograph(folder / f"kodim{number:02d}.png").pixels.float()
 
 
-def middle(picture: torch.Tensor, height: int, width: int) -> torch.Tensor:
+def middle(picture: Tensor, height: int, width: int) -> Tensor:
     """The middle of a photograph (1, C, H, W), as large as fits the shape, reduced to (height, width) by area."""
     rows, columns = picture.shape[-2:]
     scale = min(rows / height, columns / width)
@@ -65,10 +71,62 @@ def middle(picture: torch.Tensor, height: int, width: int) -> torch.Tensor:
     return F.interpolate(part, (height, width), mode="area").contiguous()
 
 
-def reduced_to(picture: torch.Tensor, side: int) -> torch.Tensor:
+def reduced_to(picture: Tensor, side: int) -> Tensor:
     """Reduce a photograph to a short side; smaller ones are not changed."""
     scale = side / min(picture.shape[-2:])
     if scale >= 1:
         return picture.float()
     size = [round(length * scale) for length in picture.shape[-2:]]
     return F.interpolate(picture.float(), size, mode="bicubic", antialias=True).clamp(0, 1)
+
+
+def enlarged(name: str, height: int, width: int) -> Tensor:
+    """A photograph (1, 3, height, width) of any size, whatever its proportions."""
+    return F.interpolate(photograph(name), (height, width), mode="bicubic", antialias=True).clamp(0, 1)
+
+
+def retina(side: int) -> Tensor:
+    """The middle of the retina in grey, (1, 1, side, side), enlarged if ``side`` exceeds its 1411 pixels."""
+    grey = rgb2gray(skimage.data.retina())
+    top, left = (max(0, length - side) // 2 for length in grey.shape)
+    grey = grey[top : top + side, left : left + side] if side <= min(grey.shape) else resize(grey, (side, side))
+    return torch.from_numpy(np.ascontiguousarray(grey, dtype=np.float32))[None, None]
+
+
+def luminance(image: Tensor) -> Tensor:
+    """Luminance of an image, (B, 1, H, W)."""
+    return reduce_channels(image, "luminance")
+
+
+def scene(name: str, size: int) -> tuple[Tensor, float]:
+    """A photograph (1, C, H, W) whose longer side is at most ``size``, and its scale relative to the original."""
+    height, width = photograph(name).shape[-2:]
+    scale = min(1.0, size / max(height, width))
+    if scale == 1.0:
+        return photograph(name), scale
+    return photograph(name, round(height * scale), round(width * scale)), scale
+
+
+def spots(image: Tensor, scale: float, *boxes: Box) -> Tensor:
+    """Mask (1, 1, H, W) that is 1 inside rectangles, each at least one pixel in size."""
+    mask = torch.zeros_like(image[:, :1])
+    for x, y, width, height in boxes:
+        left, top = round(x * scale), round(y * scale)
+        mask[..., top : top + max(1, round(height * scale)), left : left + max(1, round(width * scale))] = 1
+    return mask
+
+
+def strokes(image: Tensor, scale: float, *painted: tuple[Box, tuple[float, float, float]]) -> tuple[Tensor, Tensor]:
+    """Strokes (1, 3, H, W) and their mask (1, 1, H, W) from coloured rectangles."""
+    colours, mask = torch.zeros_like(image).expand(-1, 3, -1, -1).clone(), torch.zeros_like(image[:, :1])
+    for box, colour in painted:
+        spot = spots(image, scale, box)
+        colours = torch.where(spot > 0, torch.tensor(colour).view(1, 3, 1, 1), colours)
+        mask = torch.maximum(mask, spot)
+    return colours, mask
+
+
+def scribbled(image: Tensor, colours: Tensor, mask: Tensor) -> Tensor:
+    """An RGB image with strokes drawn on it, outlined in white."""
+    rim = F.max_pool2d(mask, 5, 1, 2)
+    return torch.where(mask > 0, colours, torch.where(rim > 0, torch.ones_like(image), image))

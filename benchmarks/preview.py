@@ -14,7 +14,6 @@ preview that it has in the editor, 1, so that small previews show what large one
 these.
 """
 
-import argparse
 import math
 import statistics
 import subprocess
@@ -30,6 +29,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from benchmarks import editors
+from benchmarks.harness import options
 from benchmarks.photographs import pictures
 from nlfilter_torch.photo.app.preview import PIXELS
 from nlfilter_torch.photo.app.session import Session
@@ -141,33 +141,33 @@ def levels(difference: Tensor) -> float:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--pictures", type=Path, help="a folder of photographs in place of scikit-image's")
-    parser.add_argument("--pixels", type=int, default=150_000, help="of the preview, at most")
-    parser.add_argument("--strides", type=int, nargs="+", default=[2, 3, 5, 8])
-    parser.add_argument("--edits", nargs="+", choices=RECIPES, default=list(RECIPES), metavar="EDIT")
-    parser.add_argument("--peers", action="store_true", help="G'MIC and darktable, too")
-    parser.add_argument("--most", type=int, default=6, help="photographs")
-    parser.add_argument("--quick", action="store_true", help="one photograph, a small preview of stride 2")
-    options = parser.parse_args(arguments)
-    if options.quick:
-        options.pixels, options.strides, options.most = 6_000, [2], 1
-    recipes = {name: RECIPES[name] for name in options.edits}
-    photographs = list(pictures(options.pictures, 1 << 20, NAMES).items())[: options.most]
+    parser = options("preview", __doc__, "one photograph, a small preview of stride 2")
+    add = parser.add_argument
+    add("--pictures", type=Path, help="a folder of photographs in place of scikit-image's")
+    add("--pixels", type=int, default=150_000, help="of the preview, at most")
+    add("--strides", type=int, nargs="+", default=[2, 3, 5, 8])
+    add("--edits", nargs="+", choices=RECIPES, default=list(RECIPES), metavar="EDIT")
+    add("--peers", action="store_true", help="G'MIC and darktable, too")
+    add("--most", type=int, default=6, help="photographs")
+    chosen = parser.parse_args(arguments)
+    if chosen.quick:
+        chosen.pixels, chosen.strides, chosen.most = 6_000, [2], 1
+    recipes = {name: RECIPES[name] for name in chosen.edits}
+    photographs = list(pictures(chosen.pictures, 1 << 20, NAMES).items())[: chosen.most]
     results: dict[str, dict[int, list[tuple[float, float]]]] = {}
-    for stride in options.strides:
+    for stride in chosen.strides:
         for title, picture in photographs:
-            peers = errors_of_peers(picture, options.pixels, stride) if options.peers else ()
-            for name, error, change in chain(errors(picture, options.pixels, stride, recipes), peers):
+            peers = errors_of_peers(picture, chosen.pixels, stride) if chosen.peers else ()
+            for name, error, change in chain(errors(picture, chosen.pixels, stride, recipes), peers):
                 results.setdefault(name, {}).setdefault(stride, []).append((error, change))
                 print(f"{title}, stride {stride}, {name}: {error:.2f} of {change:.1f}", flush=True)
-    print(f"\n{len(photographs)} photographs, previews of {options.pixels} pixels, {torch.get_num_threads()} threads")
-    strides = "".join(f"{f'stride {stride}':>10}" for stride in options.strides)
+    print(f"\n{len(photographs)} photographs, previews of {chosen.pixels} pixels, {torch.get_num_threads()} threads")
+    strides = "".join(f"{f'stride {stride}':>10}" for stride in chosen.strides)
     print(f"{'RMS difference in grey levels':<32}{'mean':>8}{'largest':>9}{strides}{'change':>9}")
     for name, by_stride in results.items():
         pairs = [pair for rows in by_stride.values() for pair in rows]
         mean, change = (statistics.mean(column) for column in zip(*pairs, strict=True))
-        cells = "".join(f"{statistics.mean(error for error, _ in by_stride[s]):>10.2f}" for s in options.strides)
+        cells = "".join(f"{statistics.mean(error for error, _ in by_stride[s]):>10.2f}" for s in chosen.strides)
         print(f"{name:<32}{mean:>8.2f}{max(error for error, _ in pairs):>9.2f}{cells}{change:>9.1f}")
 
 

@@ -1,8 +1,8 @@
 """Benchmarks on small sizes, to check that they run: ``python -m benchmarks.quick < LINES``, one benchmark a line.
 
-Each line is what follows ``python -m benchmarks.``. Each benchmark has a process of its own, as many at once as there
-are cores, forked from one that has imported torch and the library, as the imports take longer than many of them.
-Prints what each has printed once it has ended, and returns 1 if one fails.
+Each line is what follows ``python -m benchmarks.``, or begins with ``docs.``. Each benchmark has a process of its own,
+as many at once as there are cores, forked from one that has imported torch and the library, as the imports take longer
+than many of them. Prints what each has printed once it has ended, and returns 1 if one fails.
 """
 
 import multiprocessing
@@ -19,7 +19,7 @@ import skimage.measure  # noqa: F401
 import torch  # noqa: F401
 from kornia import color, filters  # noqa: F401
 
-from benchmarks.training import figures  # noqa: F401
+from benchmarks import harness  # noqa: F401
 from nlfilter_torch.photo.edits import applying  # noqa: F401
 
 
@@ -29,7 +29,7 @@ def run(line: str, output: IO[bytes]) -> None:
         os.dup2(output.fileno(), stream.fileno())
     name, *arguments = shlex.split(line)
     sys.argv = [name, *arguments]
-    runpy.run_module(f"benchmarks.{name}", run_name="__main__", alter_sys=True)
+    runpy.run_module(name if name.startswith("docs.") else f"benchmarks.{name}", run_name="__main__", alter_sys=True)
 
 
 def main(lines: list[str]) -> int:

@@ -11,20 +11,18 @@ scikit-image and OpenCV, all told the true deviation, the latter with the best o
 the estimates on pictures of a folder as taken by simulated cameras that training never draws.
 """
 
-import argparse
 import statistics
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 import torch
 import torch.nn.functional as F
-from PIL import Image
 from torch import Tensor
 
 from benchmarks.denoising.cases import Case, psnr
 from benchmarks.denoising.methods import available
+from benchmarks.harness import options, read_picture, row
 from benchmarks.photographs import pictures
 from nlfilter_torch.nn.denoiser.estimate import noise_profile
 from nlfilter_torch.nn.denoiser.profile import NoiseProfile, profile_of_difference, split_colours
@@ -72,12 +70,10 @@ def pairs_of(folder: Path, names: Sequence[str] | None) -> Iterator[tuple[str, T
         for ending, clean in ENDINGS.items():
             name = path.stem.removesuffix(ending)
             if path.stem.endswith(ending) and (names is None or name in names):
-                yield name, read(path), read(path.with_name(f"{name}{clean}{path.suffix}"))
-
-
-def read(path: Path) -> Tensor:
-    """A picture (1, 3, H, W) in [0, 1]."""
-    return torch.from_numpy(np.array(Image.open(path).convert("RGB"))).permute(2, 0, 1)[None].float() / 255
+                yield (
+                    name,
+                    *(read_picture(file)[None] for file in (path, path.with_name(f"{name}{clean}{path.suffix}"))),
+                )
 
 
 def true_levels(noisy: Tensor, clean: Tensor) -> Tensor:
@@ -122,16 +118,15 @@ def _noise(noisy: Tensor, clean: Tensor) -> Tensor:
 def show(rows: Sequence[Row]) -> None:
     """Print the table, means, the worst pair, and estimates over the truth."""
     methods = list(rows[0].psnr)
-    print("pair".ljust(38) + "".join(f"{name:>19}" for name in methods) + f"{'gain':>8}{'level':>8}{'coarse':>8}")
-    for row in rows:
-        figures = "".join(f"{row.psnr[name]:19.2f}" for name in methods)
-        print(f"{row.name:38}{figures}{row.gain:8.2f}{row.level:8.2f}{row.coarseness:8.2f}")
-    means = [statistics.mean(row.psnr[name] for row in rows) for name in methods]
-    print("mean".ljust(38) + "".join(f"{value:19.2f}" for value in means))
-    worst, weak = min(rows, key=lambda row: row.gain), [row for row in rows if row.psnr["noisy"] < 37]
-    print(f"mean gain {statistics.mean(row.gain for row in rows):.2f} dB; worst {worst.gain:.2f} dB, {worst.name}")
-    print(f"of {len(weak)} pairs below 37 dB, {sum(row.gain >= 1 for row in weak)} gain at least 1 dB")
-    show_ratios(torch.stack([row.ratios for row in rows]))
+    print(row("pair", methods, 19, 38) + row("", ("gain", "level", "coarse"), 8, 0))
+    for each in rows:
+        rest = row("", (f"{value:.2f}" for value in (each.gain, each.level, each.coarseness)), 8, 0)
+        print(row(each.name, (f"{each.psnr[name]:.2f}" for name in methods), 19, 38) + rest)
+    print(row("mean", (f"{statistics.mean(each.psnr[name] for each in rows):.2f}" for name in methods), 19, 38))
+    worst, weak = min(rows, key=lambda each: each.gain), [each for each in rows if each.psnr["noisy"] < 37]
+    print(f"mean gain {statistics.mean(each.gain for each in rows):.2f} dB; worst {worst.gain:.2f} dB, {worst.name}")
+    print(f"of {len(weak)} pairs below 37 dB, {sum(each.gain >= 1 for each in weak)} gain at least 1 dB")
+    show_ratios(torch.stack([each.ratios for each in rows]))
 
 
 def show_ratios(ratios: Tensor) -> None:
@@ -155,9 +150,10 @@ def clean_photographs(folder: Path, *, quick: bool) -> None:
 
 def simulated(folder: Path, *, count: int) -> None:
     """Print errors of the estimates on simulated cameras that training never draws."""
-    from benchmarks.denoiser_training.noise_profiles import Pairs, Random
+    from benchmarks.training.noise_profiles import Pairs
+    from benchmarks.training.pictures import Draws
 
-    pairs, random, ratios = Pairs(folder, held_out=True), Random(77), []
+    pairs, random, ratios = Pairs(folder, held_out=True), Draws(77), []
     while len(ratios) < count:
         pair = pairs.camera(random, CAMERA_SIDE)
         if pair is not None:
@@ -170,24 +166,24 @@ def simulated(folder: Path, *, count: int) -> None:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Measure."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.real_noise", description="Noise of cameras.")
-    parser.add_argument("folder", type=Path, nargs="?", help="of pairs")
-    parser.add_argument("--set", choices=("choosing", "reporting"), help="default: all pairs of the folder")
-    parser.add_argument("--peers", action="store_true", help="also measure other denoisers")
-    parser.add_argument("--clean", type=Path, help="folder of photographs without noise")
-    parser.add_argument("--cameras", type=Path, help="folder of pictures that simulated cameras take")
-    parser.add_argument("--quick", action="store_true", help="parts of the pictures, and few of them")
-    options = parser.parse_args(arguments)
-    if options.folder is not None:
+    parser = options("real_noise", __doc__, "parts of the pictures, and few of them")
+    add = parser.add_argument
+    add("folder", type=Path, nargs="?", help="of pairs")
+    add("--set", choices=("choosing", "reporting"), help="default: all pairs of the folder")
+    add("--peers", action="store_true", help="also measure other denoisers")
+    add("--clean", type=Path, help="folder of photographs without noise")
+    add("--cameras", type=Path, help="folder of pictures that simulated cameras take")
+    chosen = parser.parse_args(arguments)
+    if chosen.folder is not None:
         rows = []
-        for name, noisy, clean in pairs_of(options.folder, listed(options.set) if options.set else None):
-            part = QUICK if options.quick else ...
-            rows.append(row_of(name, noisy[part], clean[part], PEERS if options.peers else ()))
+        for name, noisy, clean in pairs_of(chosen.folder, listed(chosen.set) if chosen.set else None):
+            part = QUICK if chosen.quick else ...
+            rows.append(row_of(name, noisy[part], clean[part], PEERS if chosen.peers else ()))
         show(rows)
-    if options.clean is not None:
-        clean_photographs(options.clean, quick=options.quick)
-    if options.cameras is not None:
-        simulated(options.cameras, count=3 if options.quick else CAMERAS)
+    if chosen.clean is not None:
+        clean_photographs(chosen.clean, quick=chosen.quick)
+    if chosen.cameras is not None:
+        simulated(chosen.cameras, count=3 if chosen.quick else CAMERAS)
 
 
 if __name__ == "__main__":

@@ -242,7 +242,7 @@ def report(title: str, cases: list[dict[str, float]], limits: dict[str, str]) ->
 
 def main(arguments: list[str] | None = None) -> None:
     """Print the tables."""
-    chosen = setup("Recolouring and defocus with known object borders.", arguments)
+    chosen = setup("recolor", __doc__, arguments)
     first = chosen.first + 1000
     scenes = list(enumerate(composites(chosen.count, first, chosen.images, chosen.size)))
     print(f"{chosen.count} composites of {chosen.size[0]}x{chosen.size[1]} ({chosen.kind} set)")

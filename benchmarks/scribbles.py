@@ -5,7 +5,7 @@ that part. On composites (:mod:`benchmarks.composites`) the covered share of the
 background are known. On 30 free photographs, seven of scikit-image and the others of Debian's packages, the strokes are
 stored in ``scribbles.json`` as lists of points, the last of them on something else, and the result of the clean stroke
 is the reference: "covered" is the share of what it changes that is changed, "outside" the share of the rest that is.
-FOLDER is that of :mod:`benchmarks.denoiser_training.free_photographs`; without it only scikit-image's are measured.
+FOLDER is that of :mod:`benchmarks.free_photographs`; without it only scikit-image's are measured.
 
 Limit: each mean differs by at most 2 points with and without strays. ``--plain`` counts strays like the rest of a
 stroke. ``--out FOLDER`` writes the photographs with stroke, what is ignored of it, and both results. ``--each`` lists
@@ -13,7 +13,6 @@ the photographs with their packages. ``--set choosing`` takes the photographs an
 were chosen.
 """
 
-import argparse
 import json
 import sys
 from collections.abc import Iterator
@@ -31,13 +30,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from benchmarks.composites import FIRST_SEED, RADIUS, SIZE, composites, sources
-from benchmarks.edited_photographs import edited_photographs
+from benchmarks.free_photographs import edited_photographs
+from benchmarks.harness import Figure, options, report, save_picture
 from benchmarks.photographs import reduced_to
 from benchmarks.recolor import CHANGED, COLOURS, recoloured, tinted
-from benchmarks.training.figures import Figure, table
 from nlfilter_torch.photo import recolor
 from nlfilter_torch.photo.picture.in_memory import InMemory
-from nlfilter_torch.photo.picture.photographs import Photograph, write_photograph
 from nlfilter_torch.photo.selections.stray import stray_parts
 
 STRAY = 0.2  # of a stroke
@@ -53,23 +51,14 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class Job:
-    """A recolouring by one stroke.
+    """A recolouring by one stroke."""
 
-    Attributes:
-        name: of the picture and what is recoloured.
-        package: of the picture.
-        image: (1, 3, H, W).
-        colour: of the stroke, (1, 3, 1, 1).
-        clean: the stroke without its stray part, (1, 1, H, W).
-        whole: with it.
-    """
-
-    name: str
-    package: str
-    image: Tensor
-    colour: Tensor
-    clean: Tensor
-    whole: Tensor
+    name: str  # of the picture and what is recoloured
+    package: str  # of the picture
+    image: Tensor  # (1, 3, H, W)
+    colour: Tensor  # of the stroke, (1, 3, 1, 1)
+    clean: Tensor  # the stroke without its stray part, (1, 1, H, W)
+    whole: Tensor  # with it
 
     def result(self, mask: Tensor) -> Tensor:
         """The photograph, recoloured by a part of the stroke."""
@@ -150,41 +139,35 @@ def on_photograph(job: Job, out: Path | None) -> list[float]:
     """Covered and outside in percent, by a stroke with strays against a clean one."""
     results = [job.result(mask) for mask in (job.clean, job.whole)]
     if out is not None:
-        out.mkdir(parents=True, exist_ok=True)
         seen = torch.lerp(job.image, job.colour.expand_as(job.image), job.whole)
         seen = torch.where(stray_parts(InMemory(job.image), job.whole) > 0, IGNORED.view(1, 3, 1, 1), seen)
         name = job.name.replace(": ", "-").replace(" ", "-")
-        write_photograph(Photograph(torch.cat([seen, *results], dim=3).clamp(0, 1)), out / f"{name}.png")
+        save_picture(out / f"{name}.png", torch.cat([seen, *results], dim=3))
     before, after = ((result - job.image).abs().amax(1, keepdim=True) > 5 * CHANGED for result in results)
     return [100 * float(after[before].float().mean()), 100 * float(after[~before].float().mean())]
 
 
-def counted(drawn: object, _: object) -> object:
-    """Scribbles as they are."""
-    return drawn
-
-
 def main(arguments: list[str] | None = None) -> int:
     """Measure, print a table, and return 1 if a figure falls short of its limit."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.scribbles", description=__doc__)
-    parser.add_argument("--quick", action="store_true", help="one composite and photograph, to see that it runs")
-    parser.add_argument("--set", choices=tuple(FIRST_SEED), default="reporting", help="of photographs and composites")
-    parser.add_argument("--plain", action="store_true", help="strays count like the rest of a stroke")
-    parser.add_argument("--photographs", type=Path, help="folder of free photographs of Debian's packages")
-    parser.add_argument("--each", action="store_true", help="list the photographs")
-    parser.add_argument("--out", type=Path, help="folder for pictures")
-    options = parser.parse_args(arguments)
+    parser = options("scribbles", __doc__, "one composite and photograph")
+    add = parser.add_argument
+    add("--set", choices=tuple(FIRST_SEED), default="reporting", help="of photographs and composites")
+    add("--plain", action="store_true", help="strays count like the rest of a stroke")
+    add("--photographs", type=Path, help="folder of free photographs of Debian's packages")
+    add("--each", action="store_true", help="list the photographs")
+    add("--out", type=Path, help="folder for pictures")
+    chosen = parser.parse_args(arguments)
     with ExitStack() as stack:
-        for module in ("edits.recolor", "selections.mask") if options.plain else ():
-            stack.enter_context(mock.patch(f"nlfilter_torch.photo.{module}.without_strays", counted))
-        first = FIRST_SEED[options.set] + FIRST
-        number = 1 if options.quick else COUNT
-        rows = list(on_composites(number, first, sources(None, options.set)))
+        for module in ("edits.recolor", "selections.mask") if chosen.plain else ():
+            stack.enter_context(mock.patch(f"nlfilter_torch.photo.{module}.without_strays", lambda drawn, _: drawn))
+        first = FIRST_SEED[chosen.set] + FIRST
+        number = 1 if chosen.quick else COUNT
+        rows = list(on_composites(number, first, sources(None, chosen.set)))
         covered, outside, covered_stray, outside_stray = (mean(column) for column in zip(*rows, strict=True))
         shares = list[list[float]]()
-        for job in islice(jobs(options.set, options.photographs), 1 if options.quick else None):
-            shares.append(on_photograph(job, options.out))
-            if options.each:
+        for job in islice(jobs(chosen.set, chosen.photographs), 1 if chosen.quick else None):
+            shares.append(on_photograph(job, chosen.out))
+            if chosen.each:
                 print(f"{job.name:60}{job.package:18}covered{shares[-1][0]:6.1f} %   outside{shares[-1][1]:6.1f} %")
     figures = [
         Figure("composites: covered by clean strokes", covered, unit="%"),
@@ -197,8 +180,7 @@ def main(arguments: list[str] | None = None) -> int:
         Figure("photographs: outside with strays, worst", max(row[1] for row in shares), unit="points"),
         Figure("photographs: strokes", len(shares)),
     ]
-    print(table(figures))
-    return int(not options.quick and any(not each.holds for each in figures))
+    return report(figures, quick=chosen.quick)
 
 
 if __name__ == "__main__":

@@ -21,7 +21,6 @@ change  root mean square of the change, in grey levels;
 coarse  growth of contrast at 4 to 12 pixels.
 """
 
-import argparse
 import statistics
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -31,10 +30,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from benchmarks import unsharp
-from benchmarks.photographs import photograph, pictures
+from benchmarks.enhancers import SHARPENERS, band, gaussian
+from benchmarks.harness import options, row, strength_of
+from benchmarks.photographs import luminance, photograph, pictures
 from nlfilter_torch import detail_layers, nonlocal_operator, polynomial_filter
-from nlfilter_torch.operator.features import reduce_channels
 from nlfilter_torch.photo import sharpen
 
 PICTURES = ("astronaut", "camera", "chelsea", "coffee")
@@ -64,13 +63,13 @@ class Scene:
     @staticmethod
     def of(image: Tensor, noise: float, realisations: int = REALISATIONS) -> "Scene":
         """Create a scene from a photograph, with ``noise`` in grey levels."""
-        clean = reduce_channels(image, "luminance")
+        clean = luminance(image)
         generator = torch.Generator().manual_seed(0)
         copies = torch.randn(realisations, 1, *clean.shape[2:], generator=generator)
-        steepness = _gradient(unsharp.gaussian(clean, 1.0)).norm(dim=1, keepdim=True)
+        steepness = _gradient(gaussian(clean, 1.0)).norm(dim=1, keepdim=True)
         edges = steepness >= steepness.flatten().quantile(1 - STRONG)
         far = F.max_pool2d(edges.float(), 2 * REACH + 5, 1, REACH + 2) == 0
-        activity = unsharp.gaussian(clean.square(), 2.0) - unsharp.gaussian(clean, 2.0).square()
+        activity = gaussian(clean.square(), 2.0) - gaussian(clean, 2.0).square()
         flat = far & (activity <= activity[far].median())
         return Scene(clean, clean + noise / 255 * copies if noise else clean, edges, flat)
 
@@ -98,7 +97,7 @@ class Scene:
         if not far.any():
             return float("nan"), float("nan")
         before, after = self.noisy.mean(0, keepdim=True), result.mean(0, keepdim=True)
-        contrast = [unsharp.band(image, 4.0, 12.0)[far].square().mean().sqrt() for image in (before, after)]
+        contrast = [band(image, 4.0, 12.0)[far].square().mean().sqrt() for image in (before, after)]
         return float(255 * (after - before)[far].square().mean().sqrt()), float(contrast[1] / contrast[0])
 
     def noise_gain(self, result: Tensor) -> float:
@@ -108,7 +107,7 @@ class Scene:
     def _noise(self, images: Tensor) -> float:
         if len(images) > 1:
             return float((images - images.mean(0))[self.flat.expand_as(images)].std())
-        return float((images - unsharp.gaussian(images, 1.5))[self.flat].std())
+        return float((images - gaussian(images, 1.5))[self.flat].std())
 
 
 def _gradient(image: Tensor) -> Tensor:
@@ -131,49 +130,23 @@ def methods(scene: Scene) -> dict[str, Strength]:
         "sliders a,a,a,1": held[0],
         "the same, residual 1": held[1],
         "sliders 1,a,a,1": layers[:, 1] + layers[:, 2],
-        "unsharp, sigma 1": unsharp.unsharp(noisy, 1.0),
-        "unsharp, sigma 2": unsharp.unsharp(noisy, 2.0),
-        "unsharp, 1.2 to 3": unsharp.band(noisy, 1.2, 3.0),
-        "adaptive unsharp [12]": unsharp.adaptive(noisy),
-        "bilateral, 0.2": unsharp.bilateral(noisy, 0.2),
-        "guided, 0.01": unsharp.guided(noisy, 0.01),
+        **{name: detail(noisy) for name, detail in SHARPENERS.items()},
     }
     return {name: lambda amount, detail=detail: noisy + amount * detail for name, detail in added.items()}
 
 
-PEERS = (
-    "unsharp, sigma 1",
-    "unsharp, sigma 2",
-    "unsharp, 1.2 to 3",
-    "adaptive unsharp [12]",
-    "bilateral, 0.2",
-    "guided, 0.01",
-)
 OURS = "sharpen"
-
-
-def reach_gain(scene: Scene, strength: Strength) -> Tensor | None:
-    """Find the result with the gain on strong edges, or None if the method does not reach it."""
-    low, high = 0.0, 1.0
-    while scene.edge_gain(strength(high)) < GAIN:
-        low, high = high, 2 * high
-        if high > STRONGEST:
-            return None
-    for _ in range(16):
-        middle = (low + high) / 2
-        low, high = (middle, high) if scene.edge_gain(strength(middle)) < GAIN else (low, middle)
-    return strength(high)
 
 
 def compare_shipped(images: dict[str, Tensor]) -> None:
     """Print what the amounts as shipped do, beside an unsharp mask of the same gain; means over photographs."""
     names = ("gain, mean", "least", "largest", "change", "coarse", "overshoot", "noise")
-    print(f"\nas shipped, {len(images)} photographs".ljust(34) + "".join(f"{name:>11}" for name in names))
+    print("\n" + row(f"as shipped, {len(images)} photographs", names, 11, 33))
     for noise in SHIPPED_NOISES:
         rows: dict[str, list[tuple[float, ...]]] = {}
         for image in images.values():
             scene = Scene.of(image, noise, realisations=2)
-            detail = unsharp.unsharp(scene.noisy, 1.5)
+            detail = scene.noisy - gaussian(scene.noisy, 1.5)
             for amount in AMOUNTS:
                 sharp = sharpen(scene.noisy, amount=amount)
                 gain = scene.edge_gain(sharp)
@@ -185,25 +158,23 @@ def compare_shipped(images: dict[str, Tensor]) -> None:
                     rows.setdefault(name, []).append(
                         (scene.edge_gain(result), *scene.far(result), overshoot, scene.noise_gain(result))
                     )
-        for name, row in rows.items():
-            table = torch.tensor(row)
+        for name, values in rows.items():
+            table = torch.tensor(values)
             gains = table[:, 0]
             cells = [gains.mean(), gains.amin(), gains.amax(), *table[:, 1:].nanmean(0)]
-            label = f"noise {noise:2}: {name}"
-            print(f"{label:33}" + "".join(f"{float(cell):11.2f}" for cell in cells), flush=True)
+            print(row(f"noise {noise:2}: {name}", (f"{float(cell):.2f}" for cell in cells), 11, 33), flush=True)
 
 
 def main(arguments: list[str] | None = None) -> None:
     """Print a table for each noise level, and a summary."""
-    parser = argparse.ArgumentParser(description="Halo and noise of sharpening to one gain.")
-    parser.add_argument("--quick", action="store_true", help="two photographs at 64x64, to check that it runs")
+    parser = options("sharpening", __doc__, "two photographs at 64x64")
     parser.add_argument("--pictures", type=Path, help="folder of photographs; prints the table of amounts only")
     parser.add_argument("--side", type=int, default=SIDE, help="short side in pixels to which they are reduced")
-    options = parser.parse_args(arguments)
-    if options.pictures is not None:
-        compare_shipped(pictures(options.pictures, options.side, ()))
+    chosen = parser.parse_args(arguments)
+    if chosen.pictures is not None:
+        compare_shipped(pictures(chosen.pictures, chosen.side, ()))
         return
-    names, side = (PICTURES[:2], 64) if options.quick else (PICTURES, SIDE)
+    names, side = (PICTURES[:2], 64) if chosen.quick else (PICTURES, SIDE)
     images = {name: photograph(name, side, side) for name in names}
     print(f"gradient on strong edges times {GAIN}, {side}x{side}: halo in grey levels / noise gain")
     for noise in NOISES:
@@ -211,18 +182,17 @@ def main(arguments: list[str] | None = None) -> None:
         for image in images.values():
             scene = Scene.of(image, noise)
             for method, strength in methods(scene).items():
-                result = reach_gain(scene, strength)
+                reached = strength_of(lambda amount: scene.edge_gain(strength(amount)), GAIN, STRONGEST)  # noqa: B023
+                result = None if reached is None else strength(reached)
                 figure = None if result is None else (float(scene.overshoot(result).mean()), scene.noise_gain(result))
                 figures.setdefault(method, []).append(figure)
-        title = f"noise of {noise} levels" if noise else "as they are"
-        print(f"\n{title:26}" + "".join(f"{name:>15}" for name in names) + f"{'mean':>15}")
-        for method, row in figures.items():
-            cells = ["not reached" if cell is None else f"{cell[0]:.1f} / {cell[1]:.2f}" for cell in row]
-            known = [cell for cell in row if cell is not None]
-            means = [statistics.mean(column) for column in zip(*known, strict=True)] if len(known) == len(row) else None
-            cells.append("" if means is None else f"{means[0]:.1f} / {means[1]:.2f}")
-            print(f"{method:26}" + "".join(f"{cell:>15}" for cell in cells), flush=True)
-        if not options.quick:
+        print("\n" + row(f"noise of {noise} levels" if noise else "as they are", (*names, "mean"), 15))
+        for method, told in figures.items():
+            known = [cell for cell in told if cell is not None]
+            means = [tuple(map(statistics.mean, zip(*known, strict=True)))] if len(known) == len(told) else []
+            cells = ["not reached" if cell is None else f"{cell[0]:.1f} / {cell[1]:.2f}" for cell in (*told, *means)]
+            print(row(method, cells, 15), flush=True)
+        if not chosen.quick:
             print(verdict(figures, names))
     compare_shipped(images)
 
@@ -232,7 +202,7 @@ def verdict(figures: dict[str, list[tuple[float, float] | None]], names: tuple[s
     least, beaten = 0, []
     for i, name in enumerate(names):
         own = figures[OURS][i]
-        peers = {method: figures[method][i] for method in PEERS}
+        peers = {method: figures[method][i] for method in SHARPENERS}
         if own is None:
             beaten.append(name)
             continue

@@ -1,20 +1,30 @@
-"""Time, memory and accuracy of tiled filtering: ``python -m benchmarks.streaming``.
+"""What edits of pictures larger than memory cost, how exact they are, and what busy neighbours do to them.
+
+    python -m benchmarks.streaming [files] [--out FILE.json]    files of 4, 25 and 100 megapixels
+    python -m benchmarks.streaming strokes                      recolouring and colourising of 4 and 25 megapixels
+    python -m benchmarks.streaming memory                       processor time in tiles, compared with in memory
+    python -m benchmarks.streaming busy                         time beside busy processes, compared with alone
 
 A mosaic of photographs, each piece randomly rotated, darkened or lightened and textured, is written to a BigTIFF file;
-a fresh process filters it into another file. Time is CPU time, summed over cores, so that other programs affect it
-little. Peaks are the kernel's (VmHWM; Linux only), minus the memory that is resident after the program and its
-libraries are loaded. ``--quick`` runs everything on a fraction of a megapixel.
+a fresh process edits it into another file. Time is CPU time, summed over cores, so that other programs affect it
+little; peaks are above the memory that is resident after the program and its libraries are loaded. Then a smaller
+mosaic is edited in tiles and in memory. ``busy`` measures by the clock: a machine that is shared evenly gives a thread
+half of a core that a neighbour keeps busy, so twice the time is what a program takes that never waits for itself.
 """
 
 import argparse
 import json
+import os
 import platform
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 import numpy as np
@@ -23,18 +33,18 @@ import tifffile
 import torch
 from numpy.typing import NDArray
 
-from benchmarks.memory import MIB, forget_peak, resident
+from benchmarks.harness import MIB, forget_peak, in_fresh_process, options, resident, save_json, seconds
 from nlfilter_torch import nonlocal_operator, polynomial_filter
-from nlfilter_torch.photo import Drawn, Step, stream
+from nlfilter_torch.photo import Drawn, Step, colorize, enhance, recolor, stream
 from nlfilter_torch.photo.declared.steps import working_bytes
 from nlfilter_torch.photo.edits.applying import fit_step
 from nlfilter_torch.photo.files.rows import open_picture, write_picture
-from nlfilter_torch.photo.picture.colour import edit_luminance
-from nlfilter_torch.photo.picture.pictures import Picture
+from nlfilter_torch.photo.picture.colour import colour_guide, split_luminance
+from nlfilter_torch.photo.picture.pictures import Picture, stored_as
 from nlfilter_torch.photo.picture.tiled import Tiled
-from nlfilter_torch.photo.picture.tiles import SAMPLE, Passes, Statistics
+from nlfilter_torch.photo.picture.tiles import SAMPLE, Passes
 
-ALPHA = torch.tensor([3.0, 3.0, 4.0, 1.05])
+ALPHA = (3.0, 3.0, 4.0, 1.05)
 PLAIN: dict[str, Any] = {  # the filter without limits or threshold, in pixels of the file
     "limits": "none",
     "threshold": 0.0,
@@ -43,9 +53,16 @@ PLAIN: dict[str, Any] = {  # the filter without limits or threshold, in pixels o
     "spatial_bandwidth": "none",
     "landmarks": 100,
 }
-DETAIL = Step("detail", alpha=tuple(ALPHA.tolist()), **PLAIN)
 PIECE = 256  # side of a piece of the mosaic
 NAMES = ("astronaut", "chelsea", "coffee", "rocket", "camera", "moon", "coins", "page", "brick", "grass", "gravel")
+BOXES = (  # strokes: (top, left, height, width) as shares of the picture, and RGB
+    ((0.25, 0.25, 0.02, 0.03), (0, 0, 255)),
+    ((0.70, 0.60, 0.02, 0.02), (255, 0, 0)),
+    ((0.10, 0.80, 0.03, 0.01), (0, 180, 50)),
+    ((0.85, 0.15, 0.02, 0.04), (0, 0, 255)),
+)
+LIMIT = 800 * MIB  # of memory for files
+BUSY = "import os\nparent = os.getppid()\nwhile os.getppid() == parent: pass"  # it ends with its parent
 Array = NDArray[np.uint8]
 
 
@@ -58,40 +75,92 @@ def photographs() -> list[Array]:
     return [np.pad(p, ((0, s[0]), (0, s[1]), (0, 0)), mode="symmetric") for p, s in zip(colour, short, strict=True)]
 
 
-def mosaic(height: int, width: int) -> Iterator[Array]:
-    """Yield bands (PIECE or fewer, width, 3) of a reproducible picture of any size."""
+def bands(side: int) -> Iterator[Array]:
+    """Yield bands (PIECE or fewer, side, 3) of a reproducible square picture of any size."""
     generator, sources = np.random.default_rng(0), photographs()
-    for top in range(0, height, PIECE):
-        band = np.empty((PIECE, -(-width // PIECE) * PIECE, 3), np.uint8)
-        for left in range(0, width, PIECE):
+    for top in range(0, side, PIECE):
+        band = np.empty((PIECE, -(-side // PIECE) * PIECE, 3), np.uint8)
+        for left in range(0, side, PIECE):
             source = sources[generator.integers(len(sources))]
             y, x = (generator.integers(length - PIECE + 1) for length in source.shape[:2])
             piece = np.rot90(source[y : y + PIECE, x : x + PIECE], generator.integers(4)) / 255
             piece = piece ** generator.uniform(0.6, 1.6)
             piece = piece + generator.normal(0, generator.uniform(0, 4 / 255), piece.shape)
             band[:, left : left + PIECE] = np.rint(piece.clip(0, 1) * 255)
-        yield band[: height - top, :width]
+        yield band[: side - top, :side]
+
+
+def mosaic(side: int) -> Array:
+    """The whole picture (side, side, 3)."""
+    return np.concatenate(list(bands(side)))
 
 
 def write_mosaic(path: Path, side: int) -> None:
     """Write a tiled BigTIFF of side x side pixels."""
 
     def tiles() -> Iterator[Array]:
-        for band in mosaic(side, side):
+        for band in bands(side):
             for left in range(0, side, PIECE):
                 tile = band[:, left : left + PIECE]
                 yield np.pad(tile, ((0, PIECE - tile.shape[0]), (0, PIECE - tile.shape[1]), (0, 0)))
 
-    shape = (side, side, 3)
-    options = {"tile": (PIECE, PIECE), "compression": "zlib", "predictor": True, "maxworkers": 1}
-    tifffile.imwrite(path, tiles(), shape=shape, dtype=np.uint8, bigtiff=True, photometric="rgb", **options)
+    kind = {"tile": (PIECE, PIECE), "compression": "zlib", "predictor": True, "maxworkers": 1}
+    tifffile.imwrite(path, tiles(), shape=(side, side, 3), dtype=np.uint8, bigtiff=True, photometric="rgb", **kind)
 
 
-def work(source: Path, target: Path, statistics: Statistics, landmarks: int, memory: int) -> dict[str, object]:
-    """Filter a file in this process, and return time and memory."""
-    edit_luminance(torch.zeros(1, 3, 1, 1), lambda y: y)  # imports kornia
-    forget_peak()
-    before, started, wall = resident("VmRSS"), time.process_time(), time.perf_counter()
+@dataclass(frozen=True)
+class Boxes:
+    """Strokes (h, W, 4) with transparency; rows are drawn on request."""
+
+    shape: tuple[int, int, int]
+    dtype = np.dtype(np.uint8)
+
+    def __getitem__(self, rows: slice) -> Array:
+        """The rows from ``rows.start`` to ``rows.stop``."""
+        strokes = np.zeros((rows.stop - rows.start, *self.shape[1:]), self.dtype)
+        for place, colour in BOXES:
+            top, left, height, width = (
+                round(share * side) for share, side in zip(place, 2 * self.shape[:2], strict=True)
+            )
+            inside = slice(max(top - rows.start, 0), max(top + height - rows.start, 0))
+            strokes[inside, left : left + width] = (*colour, 255)
+        return strokes
+
+
+def drawn_on(verb: str, side: int) -> Drawn:
+    """What is drawn for an edit."""
+    return Drawn() if verb == "detail" else Drawn({}, Boxes((side, side, 4)))
+
+
+def as_image(rows: NDArray[Any]) -> torch.Tensor:
+    """Convert rows (H, W, C) of 8 bits, or of floats, to an image (1, C, H, W)."""
+    scale = np.float32(255 if rows.dtype == np.uint8 else 1)
+    return torch.from_numpy(np.ascontiguousarray(rows.transpose(2, 0, 1), np.float32) / scale)[None]
+
+
+def in_memory(verb: str, picture: NDArray[Any]) -> torch.Tensor:
+    """An edit of a whole picture (H, W, 3)."""
+    image = as_image(picture)
+    if verb == "detail":
+        return enhance(image, torch.tensor(ALPHA))
+    strokes = as_image(Boxes((*picture.shape[:2], 4))[slice(0, len(picture))])
+    if verb == "recolor":
+        return recolor(image, strokes[:, :3], strokes[:, 3:])
+    return colorize(split_luminance(image)[0], strokes[:, :3], strokes[:, 3:])
+
+
+def in_tiles(step: Step, picture: NDArray[Any], **passes: Any) -> NDArray[Any]:
+    """An edit of a picture in tiles."""
+    edited = np.empty_like(picture)
+    stream(step, picture, edited, drawn=drawn_on(step.edit, len(picture)), **passes)
+    return edited
+
+
+def work(verb: str, source: Path, target: Path, statistics: str, landmarks: int) -> dict[str, Any]:
+    """Edit a file in this process; its time by stages, and memory."""
+    colour_guide(torch.zeros(1, 3, 1, 1))  # imports kornia
+    step = Step("detail", alpha=ALPHA, **PLAIN).changed(landmarks=landmarks) if verb == "detail" else Step(verb)
+    before, started, wall = forget_peak(), time.process_time(), time.perf_counter()
     stages: dict[str, float] = {}
     stage, since = "", started
 
@@ -101,15 +170,15 @@ def work(source: Path, target: Path, statistics: Statistics, landmarks: int, mem
         stages[stage] = stages.get(stage, 0.0) + now - since
         stage, since = name, now
 
-    with open_picture(source, memory) as picture:
-        tiled = Tiled(Picture(picture.rows), Passes("uint8", statistics, memory=memory, report=report))
-        rows = tiled.rows(fit_step(DETAIL.changed(landmarks=landmarks), tiled, Drawn()))
-        write_picture(target, rows, "uint8", picture)
-        pixels = picture.shape[0] * picture.shape[1]
+    with open_picture(source, LIMIT) as picture:
+        side, width, _ = picture.shape
+        tiled = Tiled(Picture(picture.rows), Passes("uint8", statistics, memory=LIMIT, report=report))
+        write_picture(target, tiled.rows(fit_step(step, tiled, drawn_on(verb, side))), "uint8", picture)
     report("", 0, 0)
     stages.pop("")
     return {
-        "megapixels": pixels / 1e6,
+        "edit": verb,
+        "megapixels": side * width / 1e6,
         "landmarks": landmarks,
         "statistics": statistics,
         "cpu_s": time.process_time() - started,
@@ -120,84 +189,71 @@ def work(source: Path, target: Path, statistics: Statistics, landmarks: int, mem
     }
 
 
-def in_fresh_process(folder: Path, source: Path, statistics: str, landmarks: int) -> dict[str, object]:
-    """Run :func:`work` in a fresh process."""
-    arguments = [str(source), str(folder / "out.tif"), statistics, str(landmarks)]
-    command = [sys.executable, "-m", "benchmarks.streaming", "--work", *arguments]
-    done = subprocess.run(command, check=True, capture_output=True, text=True)
-    result: dict[str, object] = json.loads(done.stdout.splitlines()[-1])
-    return result
-
-
-def exactness(side: int, tiles: list[int]) -> dict[str, float]:
-    """Largest differences between tiled and in-memory results, and between tile heights, as fractions of white."""
-    picture = np.concatenate(list(mosaic(side, side))).astype(np.float32) / np.float32(255)
-    image = torch.from_numpy(picture).permute(2, 0, 1)[None]
-    luminance = 0.299 * image[:, :1] + 0.587 * image[:, 1:2] + 0.114 * image[:, 2:]
-    started = time.process_time()
-
-    def in_colour(filtered: torch.Tensor) -> NDArray[np.float32]:
-        return (image + filtered - luminance)[0].permute(1, 2, 0).numpy()
-
-    usual = in_colour(polynomial_filter(nonlocal_operator(luminance), luminance, ALPHA))
-    in_memory = time.process_time() - started
-    # A tight tolerance, since otherwise its own residual would dominate the difference from full passes.
-    whole = in_colour(polynomial_filter(nonlocal_operator(luminance, tolerance=1e-6), luminance, ALPHA))
-
-    def by_rows(**options: Any) -> NDArray[np.float32]:
-        edited = np.empty_like(picture)
-        stream(DETAIL, picture, edited, **({"sample": min(SAMPLE, side * side // 4)} | options))
-        return edited
-
-    sampled = by_rows(tile_rows=tiles[0])
-    others = [np.abs(by_rows(tile_rows=rows) - sampled).max() for rows in tiles[1:]]
-    result: dict[str, Any] = {
-        "megapixels": side * side / 1e6,
-        "memory_cpu_s": in_memory,
-        "sample_pixels": min(SAMPLE, side * side // 4),
-    }
-    result["sample_max"] = float(np.abs(sampled - whole).max())
-    result["sample_rms"] = float(np.sqrt(np.square(sampled - whole, dtype=np.float64).mean()))
-    few = by_rows(tile_rows=tiles[0], sample=result["sample_pixels"] // 4)
-    result["few_max"] = float(np.abs(few - whole).max())
-    full = by_rows(statistics="full")
-    result["full_max"] = float(np.abs(full - whole).max())
-    result["usual_max"] = float(np.abs(full - usual).max())
-    return result | {"tiles_max": float(max(others)), "smallest_tile": tiles[0], "largest_tile": tiles[-1]}
-
-
-def main() -> None:
-    """Measure, print, and write JSON if requested."""
-    parser = argparse.ArgumentParser(description="Time, memory and accuracy of tiled filtering.")
-    parser.add_argument("--quick", action="store_true", help="a fraction of a megapixel, to check that it runs")
-    parser.add_argument("--out", type=Path, help="JSON file for the figures")
-    parser.add_argument(
-        "--table", type=Path, metavar="JSON", help="print the tables of docs/scale.md from a file of --out"
-    )
-    parser.add_argument("--work", nargs=4, metavar=("IN", "OUT", "STATISTICS", "LANDMARKS"), help=argparse.SUPPRESS)
-    options = parser.parse_args()
-    if options.table:
-        table(json.loads(options.table.read_text()))
-        return
-    if options.work:
-        source, target, statistics, landmarks = options.work
-        print(json.dumps(work(Path(source), Path(target), statistics, int(landmarks), 800 * MIB)))
-        return
-
-    sides = [200] if options.quick else [2048, 5000, 10_000]
+def from_files(sides: list[int], kinds: Callable[[int], list[tuple[str, str, int]]]) -> list[dict[str, Any]]:
+    """Edit files of some sides in fresh processes, in kinds of edit, statistics and landmarks; print a line of each."""
     runs = []
     with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        for number, side in enumerate(sides):
-            source = folder / "in.tif"
+        source, target = Path(name) / "in.tif", Path(name) / "out.tif"
+        for side in sides:
             write_mosaic(source, side)
-            kinds = [("sample", 100)]
-            if number == 0:
-                kinds += [("full", 100)] if options.quick else [("full", 100), ("sample", 50), ("sample", 200)]
-            for statistics, landmarks in kinds:
-                runs.append(in_fresh_process(folder, source, statistics, landmarks))
-                show(runs[-1])
-    exact = exactness(200, [16, 64, 200]) if options.quick else exactness(2050, [64, 256, 1000, 4096])
+            for verb, statistics, landmarks in kinds(side):
+                run = in_fresh_process("streaming", "--work", verb, source, target, statistics, landmarks)
+                stages = ", ".join(f"{name} {taken:.1f}" for name, taken in run["stages_s"].items())
+                print(
+                    f"{verb}, {run['megapixels']:.2f} MP, m = {landmarks}, {statistics}: {run['cpu_s']:.1f} s of CPU "
+                    f"time, {run['cpu_s'] / run['megapixels']:.2f} s per MP, {run['peak_mib']:.0f} MiB over "
+                    f"{run['start_mib']:.0f} at the start ({stages})",
+                    flush=True,
+                )
+                runs.append(run)
+    return runs
+
+
+def exactness_of_detail(side: int, tiles: list[int]) -> dict[str, float]:
+    """Largest differences between tiled and in-memory results, and between tile heights, as fractions of white."""
+    picture = mosaic(side).astype(np.float32) / np.float32(255)
+    image, alpha, step = as_image(picture), torch.tensor(ALPHA), Step("detail", alpha=ALPHA, **PLAIN)
+    luminance = 0.299 * image[:, :1] + 0.587 * image[:, 1:2] + 0.114 * image[:, 2:]
+
+    def filtered(**more: Any) -> NDArray[np.float32]:
+        result = polynomial_filter(nonlocal_operator(luminance, **more), luminance, alpha)
+        return (image + result - luminance)[0].permute(1, 2, 0).numpy()
+
+    started = time.process_time()
+    usual, taken = filtered(), time.process_time() - started
+    # A tight tolerance, since otherwise its own residual would dominate the difference from full passes.
+    whole, sample = filtered(tolerance=1e-6), min(SAMPLE, side * side // 4)
+    sampled = in_tiles(step, picture, sample=sample, tile_rows=tiles[0])
+    few = in_tiles(step, picture, sample=sample // 4, tile_rows=tiles[0])
+    full = in_tiles(step, picture, sample=sample, statistics="full")
+    others = [np.abs(in_tiles(step, picture, sample=sample, tile_rows=rows) - sampled).max() for rows in tiles[1:]]
+    return {
+        "megapixels": side * side / 1e6,
+        "memory_cpu_s": taken,
+        "sample_pixels": sample,
+        "sample_max": float(np.abs(sampled - whole).max()),
+        "sample_rms": float(np.sqrt(np.square(sampled - whole, dtype=np.float64).mean())),
+        "few_max": float(np.abs(few - whole).max()),
+        "full_max": float(np.abs(full - whole).max()),
+        "usual_max": float(np.abs(full - usual).max()),
+        "tiles_max": float(max(others)),
+        "smallest_tile": tiles[0],
+        "largest_tile": tiles[-1],
+    }
+
+
+def files(chosen: argparse.Namespace) -> None:
+    """Detail from file to file, and its exactness."""
+
+    def kinds(side: int) -> list[tuple[str, str, int]]:
+        more = [("full", 100), ("sample", 50), ("sample", 200)] if side == 2048 else []
+        return [("detail", *kind) for kind in [("sample", 100), *more]]
+
+    if chosen.quick:
+        runs = from_files([200], lambda side: [("detail", "sample", 100), ("detail", "full", 100)])
+        exact = exactness_of_detail(200, [16, 64, 200])
+    else:
+        runs, exact = from_files([2048, 5000, 10_000], kinds), exactness_of_detail(2050, [64, 256, 1000, 4096])
     print(
         f"{exact['megapixels']:.2f} MP compared with memory, from a sample of {exact['sample_pixels']:.0f} pixels: "
         f"{exact['sample_max'] * 255:.2f} levels of 255 at most (RMS {exact['sample_rms'] * 255:.3f}), "
@@ -205,13 +261,99 @@ def main() -> None:
         f"from all pixels: {exact['full_max']:.1e} of white ({exact['usual_max']:.1e} with the usual tolerance); "
         f"tiles of {exact['smallest_tile']:.0f} to {exact['largest_tile']:.0f} rows differ by {exact['tiles_max']:.1e}"
     )
-    if options.out:
-        machine = {"machine": platform.machine(), "threads": torch.get_num_threads(), "torch": torch.__version__}
-        options.out.parent.mkdir(parents=True, exist_ok=True)
-        options.out.write_text(json.dumps({"machine": machine, "runs": runs, "exactness": exact}, indent=1) + "\n")
+    machine = {"machine": platform.machine(), "threads": torch.get_num_threads(), "torch": torch.__version__}
+    save_json(chosen.out, {"machine": machine, "runs": runs, "exactness": exact})
 
 
-def table(figures: dict[str, Any]) -> None:
+def strokes(chosen: argparse.Namespace) -> None:
+    """Recolouring and colourising from file to file, and their exactness."""
+    verbs = ("recolor", "colorize")
+    from_files([200] if chosen.quick else [2048, 5000], lambda side: [(verb, "sample", 100) for verb in verbs])
+    side = 200 if chosen.quick else 2048
+    picture, sample = mosaic(side).astype(np.float32) / np.float32(255), side * side // 4
+    for verb in verbs:
+        step, wanted = Step(verb), in_memory(verb, picture)[0].permute(1, 2, 0).numpy()
+        sampled = in_tiles(step, picture, sample=sample, tile_rows=64)
+        other = np.abs(in_tiles(step, picture, sample=sample, tile_rows=1000) - sampled).max()
+        error, full = np.abs(sampled - wanted), np.abs(in_tiles(step, picture, statistics="full") - wanted).max()
+        print(
+            f"{verb}, {side * side / 1e6:.2f} MP: a quarter as sample is off by {255 * error.max():.2f} of 255 at most "
+            f"(RMS {255 * np.sqrt(np.square(error, dtype=np.float64).mean()):.3f}), full passes by {full:.1e} of "
+            f"white; tiles of 64 and 1000 rows differ by {other:.1e}"
+        )
+
+
+def steps_of(chosen: argparse.Namespace) -> Iterator[tuple[str, float, Array, Step, int]]:
+    """Edits of mosaics of the sizes that are asked for, and how often each is repeated."""
+    for megapixels in [0.04] if chosen.quick else chosen.megapixels or [6.0]:
+        picture = mosaic(round((megapixels * 1e6) ** 0.5))
+        for verb in chosen.edits:
+            step = Step("detail", alpha=ALPHA) if verb == "detail" else Step(verb)
+            yield verb, megapixels, picture, step, 1 if chosen.quick else chosen.repeats
+
+
+def beside_memory(chosen: argparse.Namespace) -> None:
+    """CPU time per megapixel of edits in memory and in tiles, from 8 bits to 8 bits, in turn."""
+    memory, chosen.megapixels = int(chosen.memory * 1e9), chosen.megapixels or [1.4, 4.0, 12.0]
+    print(f"| edit | megapixels | threads | in memory, s per MP | tiled with {chosen.memory:g} GB, s per MP | ratio |")
+    print("|---|---|---|---|---|---|")
+    in_tiles(Step("detail", alpha=ALPHA), mosaic(100))  # lazy imports and compilation
+    for verb, megapixels, picture, step, repeats in steps_of(chosen):
+        for threads in chosen.threads[:1] if chosen.quick else chosen.threads:
+            torch.set_num_threads(threads)
+            runs = [
+                (
+                    seconds(lambda: stored_as(in_memory(verb, picture), "uint8"), processor=True),  # noqa: B023
+                    seconds(lambda: in_tiles(step, picture, memory=memory), processor=True),  # noqa: B023
+                )
+                for _ in range(repeats)
+            ]
+            whole, tiled = (median(times) * 1e6 / picture[..., 0].size for times in zip(*runs, strict=True))
+            ratio = median(run[1] / run[0] for run in runs)
+            print(f"| {verb} | {megapixels} | {threads} | {whole:.2f} | {tiled:.2f} | {ratio:.2f} |", flush=True)
+
+
+@contextmanager
+def neighbours(count: int) -> Iterator[None]:
+    """So many processes that compute without end."""
+    started = [subprocess.Popen([sys.executable, "-c", BUSY]) for _ in range(count)]
+    try:
+        time.sleep(0.5 if count else 0.0)  # they are there
+        yield
+    finally:
+        for process in started:
+            process.kill()
+            process.wait()
+
+
+def busy(chosen: argparse.Namespace) -> None:
+    """Edits in tiles, alone and beside processes that keep a core busy each, in turn."""
+    print(f"{chosen.neighbours} busy processes on {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f} before")
+    print("| edit | MP | threads | alone, s | CPU, s | beside, s | CPU, s | beside / alone | 1 thread / n |")
+    print("|---|---|---|---|---|---|---|---|---|", flush=True)
+    for verb, megapixels, picture, step, repeats in steps_of(chosen):
+        passes = {"memory": int(chosen.memory * 1e9)}
+        in_tiles(step, picture, **passes)  # what is read or compiled when it is first needed
+        runs: dict[tuple[int, int], list[tuple[float, float]]] = {}
+        for _ in range(repeats):
+            for count in (0, chosen.neighbours):
+                with neighbours(count):
+                    for threads in chosen.threads:
+                        torch.set_num_threads(threads)
+                        used = time.process_time()
+                        wall = seconds(lambda: in_tiles(step, picture, **passes))  # noqa: B023
+                        runs.setdefault((threads, count), []).append((wall, time.process_time() - used))
+        first = [wall for wall, _ in runs[chosen.threads[0], 0]]
+        for threads in chosen.threads:
+            alone, beside = runs[threads, 0], runs[threads, chosen.neighbours]
+            columns = [median(run[part] for run in times) for times in (alone, beside) for part in (0, 1)]
+            columns.append(median(b[0] / a[0] for a, b in zip(alone, beside, strict=True)))
+            columns.append(median(single / several[0] for single, several in zip(first, alone, strict=True)))
+            figures = " | ".join(f"{value:.2f}" for value in columns)
+            print(f"| {verb} | {megapixels:g} | {threads} | {figures} |", flush=True)
+
+
+def tables(figures: dict[str, Any]) -> None:
     """Print the tables of docs/scale.md from the JSON of a run."""
     print("| megapixels | m | statistics | CPU, s | s per MP | peak over start, MiB |\n|---|---|---|---|---|---|")
     for run in figures["runs"]:
@@ -221,26 +363,40 @@ def table(figures: dict[str, Any]) -> None:
     large = max(figures["runs"], key=lambda run: run["megapixels"])
     once = sum(large["stages_s"][name] for name in ("Balancing", "Summing up"))
     rate = (large["cpu_s"] - once) / large["megapixels"]
-    exact = figures["exactness"]
-    whole = exact["memory_cpu_s"] / exact["megapixels"]
+    whole = figures["exactness"]["memory_cpu_s"] / figures["exactness"]["megapixels"]
     print("\n| workers | way | time | memory of each |\n|---|---|---|---|")
     print(f"| 1 | rows | {(1000 * rate + once) / 60:.0f} min | {large['peak_mib'] / 1024:.1f} GiB |")
     for workers in (8, 64):
-        pixels = 1e9 / workers
-        memory = pixels * working_bytes(large["landmarks"], 5) / 2**30
+        memory = 1e9 / workers * working_bytes(large["landmarks"], 5) / 2**30
         print(f"| {workers} | shards | {1000 * whole / workers / 60:.1f} min | {memory:.0f} GiB |")
     print(f"\n{rate:.2f} s per MP by rows and {once:.1f} s once; {whole:.2f} s per MP in memory")
 
 
-def show(run: dict[str, object]) -> None:
-    """Print one line for a run."""
-    stages = ", ".join(f"{name} {seconds:.1f}" for name, seconds in run["stages_s"].items())  # type: ignore[attr-defined]
-    cpu, pixels = float(run["cpu_s"]), float(run["megapixels"])  # type: ignore[arg-type]
-    print(
-        f"{pixels:7.2f} MP, m = {run['landmarks']}, {run['statistics']}: {cpu:.1f} s of CPU time, {cpu / pixels:.2f} "
-        f"s per MP, {run['peak_mib']:.0f} MiB over {run['start_mib']:.0f} at the start ({stages})",
-        flush=True,
-    )
+SUITES = {"files": files, "strokes": strokes, "memory": beside_memory, "busy": busy}
+
+
+def main() -> None:
+    """Run a suite."""
+    parser = options("streaming", __doc__, "a fraction of a megapixel")
+    add = parser.add_argument
+    add("suite", nargs="?", choices=SUITES, default="files")
+    add("--out", type=Path, help="JSON file for the figures of files")
+    add("--table", type=Path, metavar="JSON", help="print the tables of docs/scale.md from a file of --out")
+    add("--megapixels", type=float, nargs="+", help="memory and busy: default 1.4 4 12, and 6")
+    add("--edits", nargs="+", choices=("detail", "recolor"), default=["detail", "recolor"], help="memory and busy")
+    add("--threads", type=int, nargs="+", default=[1, 2], help="memory and busy")
+    add("--repeats", type=int, default=3, help="memory and busy")
+    add("--memory", type=float, default=1.0, help="memory limit of tiles in gigabytes")
+    add("--neighbours", type=int, default=os.cpu_count() or 1, help="busy processes; default: one per core")
+    add("--work", nargs=5, help=argparse.SUPPRESS)
+    chosen = parser.parse_args()
+    if chosen.table:
+        tables(json.loads(chosen.table.read_text()))
+    elif chosen.work:
+        verb, source, target, statistics, landmarks = chosen.work
+        print(json.dumps(work(verb, Path(source), Path(target), statistics, int(landmarks))))
+    else:
+        SUITES[chosen.suite](chosen)
 
 
 if __name__ == "__main__":

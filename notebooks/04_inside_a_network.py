@@ -124,7 +124,7 @@ figure
 #
 # Look at the whiskers and at the skin between the eyes: noise disappears where the guide makes many pixels similar. This is the
 # result of a few seconds of training with few landmarks; more landmarks at test time help. `denoise` uses a network that was
-# trained for longer, `NonlocalDenoiser`; `python -m benchmarks.denoiser_training` trains it.
+# trained for longer, `NonlocalDenoiser`; `python -m benchmarks.training` trains it.
 
 # %%
 network.filter.affinity.num_landmarks = 300

@@ -15,7 +15,7 @@
 # # The paper's figures
 #
 # Counterparts of some figures of *Nonlocal Image Editing* on photographs that ship with scikit-image, small here, so that
-# they take seconds. `python -m benchmarks.figures` draws all of them in full size and saves their numbers. This notebook needs
+# they take seconds. `python -m docs.figures` draws all of them in full size and saves their numbers. This notebook needs
 # a checkout of the repository.
 
 # %%
@@ -25,7 +25,7 @@ import inspect
 import torch
 from IPython.display import Markdown, display
 
-from benchmarks.figures import FIGURES
+from docs.figures import FIGURES
 
 
 def draw(name: str, size: int = 128) -> None:

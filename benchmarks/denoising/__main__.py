@@ -9,67 +9,53 @@ BM3D, CBM3D      package ``bm3d``, which may be used for non-commercial purposes
 scikit-image     ``denoise_nl_means``, cycle-spun wavelets, and ``denoise_tv_chambolle`` with the best of five weights
                  for each photograph;
 OpenCV           ``fastNlMeansDenoising`` on 8 bits, with the best of four strengths for each photograph;
-plain            the network without the filter, with ``--plain FILE`` of ``benchmarks.denoiser_training --plain``.
+plain            the network without the filter, with ``--plain FILE`` of ``benchmarks.training --plain``.
 
 ``--methods``, ``--noise`` and ``--kinds`` select a part of it; results are added to the file ``--out``, from which
-``python -m benchmarks.denoising_tables`` makes tables. ``--weights FILE`` evaluates other weights than those of the
+``python -m docs.denoising_tables`` makes tables. ``--weights FILE`` evaluates other weights than those of the
 package, and may be given several times. Without ``--pictures``, the photographs are camera, coffee, chelsea and the
 left halves of retina and page. ``--wrong`` adds noise levels misstated by a fifth, noise that depends on brightness,
 and clean photographs. ``--megapixel`` measures only the CPU time and memory of ours and of BM3D at a megapixel.
 
-``--set FOLDER --published`` is for the public sets of the literature (BSD68, Set12, CBSD68, Kodak24, McMaster,
-Urban100): it prints a table with the published figures of other denoisers beside those measured here, by the protocol
-that :mod:`benchmarks.denoising.sets` states. The set is recognised by the folder's name or by the number of pictures,
-unless ``--name`` tells it.
-
-``--patterns`` compares on repeated patterns that were kept aside from training (:mod:`benchmarks.denoising.patterns`):
-what the filter adds, beside non-local means, BM3D and, with ``--plain FILE``, the network without the filter.
+``--set FOLDER`` measures on the public sets of the literature (BSD68, Set12, CBSD68, Kodak24, McMaster, Urban100), by
+the protocol that :mod:`benchmarks.denoising.sets` states; the tables of its ``--out`` are beside published figures. The
+set is recognised by the folder's name or by the number of pictures, unless ``--name`` tells it. ``--patterns`` compares
+on repeated patterns that were kept aside from training: what the filter adds, beside non-local means, BM3D and, with
+``--plain FILE``, the network without the filter.
 """
 
 import argparse
 import json
 from collections.abc import Sequence
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-from benchmarks.denoising import patterns, sets
-from benchmarks.denoising.cases import NOISE, Case, scenes, with_noise
+from benchmarks.denoising import sets
+from benchmarks.denoising.cases import NOISE, Case, Method, scenes, table, with_noise
 from benchmarks.denoising.claims import megapixel, misstated
-from benchmarks.denoising.measuring import table
-from benchmarks.denoising.methods import METHODS, Method, available, network
-from benchmarks.denoising.published import LEVELS
+from benchmarks.denoising.methods import METHODS, available, network
+from benchmarks.harness import options, save_json
 from nlfilter_torch import NonlocalDenoiser
-from nlfilter_torch.photo.files.writing import open_beside
 
 
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     """Parse the command line."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.denoising", description="Comparison of denoisers.")
-    parser.add_argument("--pictures", type=Path, help="folder of photographs; default: those of scikit-image")
-    parser.add_argument("--set", type=Path, help="folder of a public set, compared by the literature's protocol")
-    parser.add_argument("--name", choices=sets.NAMES, help="of the set, where it is not recognised")
-    parser.add_argument("--patterns", action="store_true", help="repeated patterns, drawn and of photographs")
-    parser.add_argument("--published", action="store_true", help="figures of the literature in the table of a set")
-    parser.add_argument(
-        "--noise", type=float, nargs="+", help=f"noise levels in grey levels; default: {NOISE}; for a set {LEVELS}"
-    )
-    parser.add_argument("--kinds", nargs="+", choices=("grey", "colour"), help="default: both, where there are both")
-    parser.add_argument(
-        "--weights", type=Path, action="append", default=[], help="weights of further networks to compare"
-    )
-    parser.add_argument(
-        "--plain", type=Path, action="append", default=[], help="weights of networks without the filter"
-    )
-    parser.add_argument("--methods", nargs="+", choices=METHODS, help="default: all")
-    parser.add_argument(
-        "--wrong", action="store_true", help="also test misstated and estimated noise, and clean photographs"
-    )
-    parser.add_argument(
-        "--megapixel", action="store_true", help="only CPU time and memory at a megapixel, for the first noise level"
-    )
-    parser.add_argument("--quick", action="store_true", help="small parts of two photographs, to check that it runs")
-    parser.add_argument("--out", type=Path, help="JSON file to which all measurements are added")
+    parser = options("denoising", "Comparison of denoisers.", "small parts of two photographs")
+    add = parser.add_argument
+    add("--pictures", type=Path, help="folder of photographs; default: those of scikit-image")
+    add("--set", type=Path, help="folder of a public set, compared by the literature's protocol")
+    add("--name", choices=sets.NAMES, help="of the set, where it is not recognised")
+    add("--patterns", action="store_true", help="repeated patterns, drawn and of photographs")
+    add("--noise", type=float, nargs="+", help=f"in grey levels; default: {NOISE}; for a set {sets.LEVELS}")
+    add("--kinds", nargs="+", choices=("grey", "colour"), help="default: both, where there are both")
+    add("--weights", type=Path, action="append", default=[], help="weights of further networks to compare")
+    add("--plain", type=Path, action="append", default=[], help="weights of networks without the filter")
+    add("--methods", nargs="+", choices=METHODS, help="default: all")
+    add("--wrong", action="store_true", help="also test misstated and estimated noise, and clean photographs")
+    add("--megapixel", action="store_true", help="only CPU time and memory at a megapixel, for the first noise level")
+    add("--out", type=Path, help="JSON file to which all measurements are added")
     return parser.parse_args(arguments)
 
 
@@ -81,13 +67,6 @@ def chosen(options: argparse.Namespace, default: Sequence[str]) -> dict[str, Met
         "plain" if path.parent.name == "plain" else f"plain, {path.parent.name}": network(path, plain=True)
         for path in options.plain
     }
-
-
-def save(path: Path | None, content: object) -> None:
-    """Write a JSON file, if there is to be one."""
-    if path is not None:
-        with open_beside(path) as stream:
-            stream.write(json.dumps(content, indent=1).encode())
 
 
 def compare_on_photographs(options: argparse.Namespace) -> None:
@@ -108,13 +87,13 @@ def compare_on_photographs(options: argparse.Namespace) -> None:
             figures.setdefault(f"{kind}, {level:g}", {}).update(
                 {name: {scene: asdict(result) for scene, result in row.items()} for name, row in rows.items()}
             )
-            save(options.out, figures)
+            save_json(options.out, figures)
         if options.wrong:
             misstated(network(None), clean)
 
 
 def compare_on_set(options: argparse.Namespace) -> None:
-    """Print a table for each kind of picture of a public set."""
+    """Measure on a public set, or add to what was measured on it."""
     pictures = sets.recognise(options.set, options.name, options.kinds)
     content: dict[str, Any] = {"set": pictures.name, "results": {}}
     if options.out is not None and options.out.exists():
@@ -122,22 +101,18 @@ def compare_on_set(options: argparse.Namespace) -> None:
         if content.get("set") != pictures.name:
             raise SystemExit(f"--out must have results of {pictures.name}, but {options.out} has others; name another")
     content["weights"] = sum(value.numel() for value in NonlocalDenoiser.trained().parameters())
-    methods = chosen(options, sets.COMPARED)
-    for _ in sets.measure(pictures, methods, options.noise or LEVELS, content["results"]):
-        save(options.out, content)
-    for kind in pictures.kinds:
-        print(f"\n{sets.set_table(content, kind, quoted=options.published)}")
+    methods, levels = chosen(options, sets.COMPARED), options.noise or sets.LEVELS
+    for _ in sets.measure(pictures.pictures, pictures.kinds, levels, methods, content["results"]):
+        save_json(options.out, content)
 
 
 def compare_on_patterns(options: argparse.Namespace) -> None:
-    """Print a table of repeated patterns for each kind and level."""
-    kinds, levels = options.kinds or ("grey", "colour"), options.noise or (patterns.LEVEL,)
-    methods = chosen(options, patterns.COMPARED)
-    results = patterns.compare(methods, kinds, levels, options.pictures, quick=options.quick)
-    content = {"patterns": patterns.SEED, "results": results}
-    save(options.out, content)
-    for key in results:
-        print(f"\n{patterns.pattern_table(content, key)}")
+    """Measure on repeated patterns for each kind and level."""
+    content: dict[str, Any] = {"patterns": sets.SEED, "results": {}}
+    pictures = partial(sets.patterns, folder=options.pictures, quick=options.quick)
+    kinds, levels = options.kinds or ("grey", "colour"), options.noise or (sets.PATTERN_LEVEL,)
+    for _ in sets.measure(pictures, kinds, levels, chosen(options, sets.PATTERNS_COMPARED), content["results"]):
+        save_json(options.out, content)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

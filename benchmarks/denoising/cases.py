@@ -1,15 +1,18 @@
 """Photographs with white noise, and how near a result comes to the clean photograph."""
 
 import math
+import time
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from statistics import mean
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from benchmarks.photographs import photograph, pictures
-from nlfilter_torch.operator.features import reduce_channels
+from benchmarks.harness import row
+from benchmarks.photographs import luminance, photograph, pictures
 
 HELD_OUT = ("camera", "coffee", "chelsea", "retina", "page")
 LEFT_HALVES = ("retina", "page")
@@ -38,6 +41,9 @@ class Case:
         return None if self.noisy.shape[1] == 1 else -1
 
 
+Method = Callable[[Case], Tensor]
+
+
 @dataclass(frozen=True)
 class Figures:
     """Measurements of a method on one photograph."""
@@ -62,7 +68,7 @@ def scenes(folder: Path | None, kind: str, *, quick: bool) -> dict[str, Tensor]:
         if scale < 1:
             size = [round(length * scale) for length in picture.shape[-2:]]
             picture = torch.nn.functional.interpolate(picture, size, mode="bicubic", antialias=True).clamp(0, 1)
-        picture = picture if kind == "colour" else reduce_channels(picture, "luminance")
+        picture = picture if kind == "colour" else luminance(picture)
         cut[name] = picture[QUICK] if quick else picture
     return dict(list(cut.items())[:2]) if quick else cut
 
@@ -103,3 +109,24 @@ def as_image(array: np.ndarray) -> Tensor:
     """Invert :func:`as_array`."""
     tensor = torch.from_numpy(np.ascontiguousarray(array)).float()
     return (tensor[..., None] if tensor.ndim == 2 else tensor).permute(2, 0, 1)[None]
+
+
+def judge(method: Method, case: Case) -> Figures:
+    """Run a method on a photograph and measure the result."""
+    start = time.process_time()
+    estimate = method(case)
+    seconds = time.process_time() - start
+    return Figures(psnr(estimate, case.clean), ssim(estimate.clamp(0, 1), case.clean), seconds)
+
+
+def table(methods: Mapping[str, Method], cases: Sequence[Case]) -> dict[str, dict[str, Figures]]:
+    """Print the PSNR of each photograph and the means of all measurements, one row per method."""
+    print(row("", [*(case.name[:9] for case in cases), "mean", "SSIM", "CPU s"], 10, 22))
+    rows: dict[str, dict[str, Figures]] = {}
+    for name, method in methods.items():
+        rows[name] = {case.name: judge(method, case) for case in cases}
+        figures = list(rows[name].values())
+        cells = [*(f"{each.psnr:.2f}" for each in figures), f"{mean(each.psnr for each in figures):.2f}"]
+        cells += [f"{mean(each.ssim for each in figures):.4f}", f"{mean(each.seconds for each in figures):.2f}"]
+        print(row(name, cells, 10, 22), flush=True)
+    return rows

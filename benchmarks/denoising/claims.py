@@ -5,13 +5,11 @@ from collections.abc import Mapping
 
 from torch import Tensor
 
-from benchmarks.denoising.cases import NOISE, QUICK, Case, psnr, with_noise
-from benchmarks.denoising.measuring import judge
-from benchmarks.denoising.methods import METHODS, Method
-from benchmarks.memory import forget_peak, resident
-from benchmarks.photographs import photograph
+from benchmarks.denoising.cases import NOISE, QUICK, Case, Method, judge, psnr, with_noise
+from benchmarks.denoising.methods import METHODS
+from benchmarks.harness import forget_peak, resident
+from benchmarks.photographs import luminance, photograph
 from nlfilter_torch import NonlocalDenoiser, estimate_noise
-from nlfilter_torch.operator.features import reduce_channels
 from nlfilter_torch.photo import denoise
 
 GAINS, FLOOR = (0.002, 0.01), 2 / 255  # of noise whose variance grows with brightness, as in cameras
@@ -55,14 +53,13 @@ def misstated(denoiser: Method, clean: Mapping[str, Tensor]) -> None:
 
 def megapixel(level: float, *, quick: bool) -> None:
     """Print CPU time and peak memory, above that before the call, on the left half of retina at full size, in grey."""
-    whole = reduce_channels(photograph("retina"), "luminance")
+    whole = luminance(photograph("retina"))
     clean = whole[QUICK] if quick else whole[..., : whole.shape[-1] // 2]
     case = Case("retina", clean, with_noise(clean, level / 255, 0), level / 255)
     print(f"\nretina, {clean.shape[-1]}x{clean.shape[-2]} pixels, grey, noise {level:g}")
     seconds = {}
     for name in ("ours", "BM3D"):
-        before = resident("VmRSS")
-        forget_peak()
+        before = forget_peak()
         figures = judge(METHODS[name], case)
         seconds[name] = figures.seconds
         peak = resident("VmHWM") - before

@@ -1,6 +1,6 @@
 """Denoisers: those of the package, and peers."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
@@ -9,14 +9,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from benchmarks.denoising.cases import Case, as_image, psnr
+from benchmarks.denoising.cases import Case, Method, as_image, psnr
 from nlfilter_torch import NonlocalDenoiser
 from nlfilter_torch.photo import denoise
 
 OPENCV_STRENGTHS = (0.6, 0.8, 1.0, 1.2)  # times the noise level
 TV_WEIGHTS = (0.5, 0.7, 0.9, 1.1, 1.4)  # times the noise level
-
-Method = Callable[[Case], Tensor]
 
 
 def bm3d(case: Case) -> Tensor:
@@ -74,7 +72,7 @@ def best(case: Case, results: Iterable[Tensor]) -> Tensor:
 @cache
 def network(path: Path | None, *, plain: bool = False, turns: int = 1) -> Method:
     """The trained network from a file or from the package, given the noise level."""
-    from benchmarks.denoiser_training.training import PlainDenoiser
+    from benchmarks.training.training import PlainDenoiser
 
     kind = PlainDenoiser if plain else NonlocalDenoiser
     denoiser = kind.trained() if path is None else kind.trained(path)

@@ -1,4 +1,4 @@
-"""The public sets by which denoisers are compared, and tables of results on them beside published figures.
+"""Sets of pictures by which denoisers are compared: the public ones, and repeated patterns kept aside from training.
 
 The protocol is that of the literature. Pictures keep their size and their 8 bits. White noise of 15, 25 and 50 grey
 levels is added in floating point and not clipped, and every method is told the level. Results are clipped to [0, 1];
@@ -6,32 +6,39 @@ the PSNR is that of each picture over all of its channels, and its mean over the
 becomes a grey one by its luminance (0.299, 0.587, 0.114), rounded to 8 bits. The noise of the n-th picture by name,
 counted from 0, has the seed 1000 + n in :func:`benchmarks.denoising.cases.with_noise`; the literature states none, and
 another seed changes a mean over 24 pictures by about 0.01 dB.
+
+Patterns are of the kinds :data:`benchmarks.training.patterns.APART` (herringbone, scales, hexagons, meshes, plaids,
+digits), several of each, whose n-th has the seed :data:`SEED` + n. With the folder of prepared photographs of
+:mod:`benchmarks.free_photographs`, the middles of those of its reporting set that show repeated patterns (facades,
+solar cells) are added.
 """
 
-import statistics
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from textwrap import fill
-from typing import Any
+from statistics import mean
 
 import numpy as np
 import torch
 from PIL import Image
 from torch import Tensor
 
-from benchmarks.denoising.cases import Case, Figures, with_noise
-from benchmarks.denoising.measuring import judge
-from benchmarks.denoising.methods import METHODS, Method
-from benchmarks.denoising.published import LEVELS, SOURCES, published
-from benchmarks.report import table
+from benchmarks.denoising.cases import Case, Method, judge, with_noise
+from benchmarks.denoising.methods import METHODS
+from benchmarks.free_photographs import photographs
+from benchmarks.photographs import luminance
+from benchmarks.training.patterns import APART, pattern
 
+LEVELS = (15, 25, 50)  # grey levels of noise in the tables of the literature
 FILES = (".png", ".tif", ".tiff", ".bmp", ".jpg", ".jpeg", ".pgm", ".ppm")
 COUNTS = {12: "Set12", 18: "McMaster", 24: "Kodak24", 68: "BSD68", 100: "Urban100"}  # pictures
 KINDS = {"Set12": ("grey",), "BSD68": ("grey",), "CBSD68": ("colour",)}  # of the others, grey and colour
 NAMES = (*COUNTS.values(), "CBSD68")
 COMPARED = ("noisy", "ours", "ours, 4 turns", "BM3D", *(name for name in METHODS if " " in name and "ours" not in name))
-TITLES = {("BM3D", "colour"): "CBM3D"}
+PATTERNS_COMPARED = ("noisy", "ours", "BM3D", "scikit-image NLM")
+PATTERN_LEVEL = 25.0  # grey levels of noise
+SIDE, DRAWN, SEED = 192, 3, 5000  # pixels of a pattern; patterns of each kind, and seed of the first
+PHOTOGRAPH_SIDE = 256
 #: Results of a set: by kind and level, method, and picture.
 Results = dict[str, dict[str, dict[str, dict[str, float]]]]
 
@@ -101,80 +108,66 @@ def _is_coloured(path: Path) -> bool:
     return bool((pixels != pixels[:, :1]).any())
 
 
-@dataclass(frozen=True)
-class Clipped:
-    """A method whose result is clipped to [0, 1]."""
+def patterns(kind: str, folder: Path | None, *, quick: bool = False) -> Iterator[tuple[str, Tensor]]:
+    """Names (what is shown, and a number) and pictures (1, 1 or 3, H, W) in ``"grey"`` or ``"colour"``."""
+    convert = luminance if kind == "grey" else torch.Tensor.contiguous
+    for number, drawn in enumerate(name for name in APART for _ in range(1 if quick else DRAWN)):
+        generator = torch.Generator().manual_seed(SEED + number)
+        yield f"{drawn} {number}", convert(pattern(48 if quick else SIDE, generator, kind=drawn)[None])
+    for path in photographed(folder) if folder is not None else ():
+        picture = read(path, "colour")
+        top, left = (max(0, (length - PHOTOGRAPH_SIDE) // 2) for length in picture.shape[-2:])
+        yield (
+            f"photographs {path.stem}",
+            convert(picture[..., top : top + PHOTOGRAPH_SIDE, left : left + PHOTOGRAPH_SIDE]),
+        )
 
-    method: Method
 
-    def __call__(self, case: Case) -> Tensor:
-        """Run it."""
-        return self.method(case).clamp(0, 1)
+def photographed(folder: Path) -> list[Path]:
+    """Files of the photographs of repeated patterns in a folder.
+
+    Raises:
+        SystemExit: if it has none of them.
+    """
+    wanted = [entry for entry in photographs() if entry.set == "reporting" and entry.repeated]
+    paths = [folder / entry.set / f"{entry.name}.png" for entry in wanted]
+    if not any(path.exists() for path in paths):
+        raise SystemExit(
+            f"--pictures must hold photographs such as reporting/{wanted[0].name}.png, but {folder} has none of them; "
+            "prepare them by python -m benchmarks.free_photographs --out FOLDER"
+        )
+    return [path for path in paths if path.exists()]
 
 
 def measure(
-    pictures: PublicSet, methods: Mapping[str, Method], levels: Sequence[float], results: Results
+    pictures: Callable[[str], Iterable[tuple[str, Tensor]]],
+    kinds: Sequence[str],
+    levels: Sequence[float],
+    methods: Mapping[str, Method],
+    results: Results,
 ) -> Iterator[None]:
-    """Add the measurements of methods on a set to ``results``; pause after each picture, so that they can be saved."""
-    for kind in pictures.kinds:
+    """Add the measurements of methods to ``results``, and print means; pause after each picture, to save them."""
+    for kind in kinds:
         for level in levels:
             rows = results.setdefault(f"{kind}, {level:g}", {})
-            for number, (name, clean) in enumerate(pictures.pictures(kind)):
+            for number, (name, clean) in enumerate(pictures(kind)):
                 case = Case(name, clean, with_noise(clean, level / 255, number), level / 255)
                 for method, run in methods.items():
-                    rows.setdefault(method, {})[name] = rounded(judge(run if method == "noisy" else Clipped(run), case))
+                    figures = asdict(judge(run if method == "noisy" else clipped(run), case))
+                    rows.setdefault(method, {})[name] = {
+                        figure: round(value, digits)
+                        for (figure, value), digits in zip(figures.items(), (4, 5, 3), strict=True)
+                    }
                 yield
-            line = ", ".join(f"{method} {mean(row, 'psnr'):.2f}" for method, row in rows.items())
-            print(f"{pictures.name} in {kind}, noise {level:g}: {line}", flush=True)
+            means = {method: mean(figures["psnr"] for figures in row.values()) for method, row in rows.items()}
+            ours = means.get("ours")
+            told = (
+                f"{method} {value:.2f}" + ("" if ours in (None, value) else f" (ours {ours - value:+.2f})")
+                for method, value in means.items()
+            )
+            print(f"{kind}, noise {level:g}: PSNR of {', '.join(told)}", flush=True)
 
 
-def rounded(figures: Figures) -> dict[str, float]:
-    """Measurements for a file."""
-    return {"psnr": round(figures.psnr, 4), "ssim": round(figures.ssim, 5), "seconds": round(figures.seconds, 3)}
-
-
-def mean(row: Mapping[str, Mapping[str, float]], figure: str) -> float:
-    """Mean of a measurement over pictures."""
-    return statistics.mean(measurements[figure] for measurements in row.values())
-
-
-def set_table(content: Mapping[str, Any], kind: str, *, quoted: bool) -> str:
-    """A table of a set: measured rows, and published ones if they are to be ``quoted``, with their sources below.
-
-    Args:
-        content: of the file of a set: its name as ``"set"``, the number of ``"weights"`` of the network of the
-            package, and ``"results"``.
-        kind: ``"grey"`` or ``"colour"``.
-        quoted: whether there are published figures in it.
-    """
-    name, results = content["set"], content["results"]
-    levels = [int(key.split(", ")[1]) for key in results if key.startswith(f"{kind}, ")]
-    measured = dict.fromkeys(method for level in levels for method in results[f"{kind}, {level}"])
-    order = [*(name for name in METHODS if name in measured), *(name for name in measured if name not in METHODS)]
-    rows = [_measured_row(content, kind, method, levels) for method in order]
-    entries = published(name, kind) if quoted else ()
-    for entry in entries:
-        values = dict(zip(LEVELS, entry.psnr, strict=True))
-        decibels = [_decibels(values.get(level)) for level in levels]
-        rows.append(
-            [entry.method, *decibels, "", "", "" if entry.weights is None else f"{entry.weights:,}", entry.source]
-        )
-    header = [f"{name}, {kind}, noise of", *map(str, levels), "SSIM at 25", "CPU s", "weights, thousands", "figures of"]
-    pictures = next(iter(results[f"{kind}, {levels[0]}"].values()))
-    sources = dict.fromkeys(entry.source for entry in entries)
-    notes = [f"Means over {len(pictures)} pictures.", *(f"{source}: {SOURCES[source]}." for source in sources)]
-    return f"{table(header, rows)}\n\n{fill(' '.join(notes), 120, break_on_hyphens=False)}"
-
-
-def _measured_row(content: Mapping[str, Any], kind: str, method: str, levels: Sequence[int]) -> list[str]:
-    known = {level: content["results"][f"{kind}, {level}"].get(method) for level in levels}
-    values = [None if row is None else mean(row, "psnr") for row in known.values()]
-    middle = known.get(25)
-    seconds = statistics.mean(mean(row, "seconds") for row in known.values() if row is not None)
-    ssim = "" if middle is None else f"{mean(middle, 'ssim'):.3f}"
-    weights = f"{content['weights'] / 1000:,.0f}" if method.startswith("ours") else ""
-    return [TITLES.get((method, kind), method), *map(_decibels, values), ssim, f"{seconds:.1f}", weights, "this run"]
-
-
-def _decibels(value: float | None) -> str:
-    return "" if value is None else f"{value:.2f}"
+def clipped(method: Method) -> Method:
+    """A method whose result is clipped to [0, 1]."""
+    return lambda case: method(case).clamp(0, 1)

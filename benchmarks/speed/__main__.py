@@ -1,16 +1,13 @@
 """Run the speed measurements, print each as it completes, and write all to a JSON file."""
 
-import argparse
-import json
 import os
-import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from benchmarks.harness import options, save_json
 from benchmarks.speed.machine import describe
-from benchmarks.speed.output import write
 from benchmarks.speed.plan import QUICK, Plan, Record
 from benchmarks.speed.suites import SUITES
 
@@ -76,26 +73,22 @@ def show(result: Record) -> None:
                 work=result["work"], **result["memory"]
             )
         )
-    for remedy in result.get("missing", {}).values():
-        print(f"  {remedy}")
-    sys.stdout.flush()
+    print(*(f"  {remedy}\n" for remedy in result.get("missing", {}).values()), sep="", end="", flush=True)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.speed", description=__doc__)
-    parser.add_argument("--quick", action="store_true", help="tiny sizes, to check that everything runs")
-    parser.add_argument("--only", nargs="+", choices=SUITES, metavar="SUITE", help=f"some of {', '.join(SUITES)}")
-    parser.add_argument("--out", type=Path, default=Path("out/speed.json"), help="JSON file (default: %(default)s)")
-    parser.add_argument("--device", default="cpu", help="torch device (default: %(default)s)")
-    parser.add_argument(
-        "--minutes", type=float, default=MINUTES, help="start no case later than this (default: %(default)s)"
-    )
-    options = parser.parse_args(arguments)
-    plan = QUICK if options.quick else Plan(device=options.device)
-    results = run(plan, options.only or list(SUITES), options.minutes)
-    write(options.out, (json.dumps(results, indent=1) + "\n").encode())
-    print(f"\n{results['seconds']:.0f} s; written to {options.out}")
+    parser = options("speed", __doc__, "tiny sizes")
+    add = parser.add_argument
+    add("--only", nargs="+", choices=SUITES, metavar="SUITE", help=f"some of {', '.join(SUITES)}")
+    add("--out", type=Path, default=Path("out/speed.json"), help="JSON file (default: %(default)s)")
+    add("--device", default="cpu", help="torch device (default: %(default)s)")
+    add("--minutes", type=float, default=MINUTES, help="start no case later than this (default: %(default)s)")
+    chosen = parser.parse_args(arguments)
+    plan = QUICK if chosen.quick else Plan(device=chosen.device)
+    results = run(plan, chosen.only or list(SUITES), chosen.minutes)
+    save_json(chosen.out, results)
+    print(f"\n{results['seconds']:.0f} s; written to {chosen.out}")
 
 
 if __name__ == "__main__":

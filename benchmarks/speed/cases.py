@@ -1,7 +1,7 @@
 """Images of the measurements, and options of the operator."""
 
 import functools
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -77,10 +77,6 @@ class Case:
     def operator(self, image: Tensor) -> NonlocalOperator:
         """Build the operator of an image with these options."""
         return nonlocal_operator(image, **self.options())
-
-    def to_json(self) -> dict[str, Any]:
-        """As a plain dictionary, with the number of threads used."""
-        return asdict(self) | {"threads": self.used_threads}
 
 
 @functools.cache

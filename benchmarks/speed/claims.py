@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-from benchmarks.memory import MIB
+from benchmarks.harness import MIB
 from benchmarks.speed.comparisons import CROPS, DOUBLE_PRECISION, DOUBLED, GROWTH, MANY, RESPONSE, SLIDER, SUITE
 from benchmarks.speed.plan import Plan, Record, Results, records_of
 
@@ -78,24 +78,14 @@ def claims(results: Results) -> list[Claim]:
         Claim("peak memory of the operator", True, allowed, memory, "MiB"),
         compared("time of twice the pixels, worst of 0.25 to 4 MP", 2.2, DOUBLED),
         _exponent(compared("", math.inf, GROWTH)),
-        compared(
-            "operator of {0}x{0}: m = {2} / m = {1}".format(MAIN.many_side, *MAIN.many),
-            12.0,
-            MANY,
-        ),
+        compared("operator of {0}x{0}: m = {2} / m = {1}".format(MAIN.many_side, *MAIN.many), 12.0, MANY),
         compared(f"operator of {MAIN.counts_side}x{MAIN.counts_side}: float64 / float32", 3.0, DOUBLE_PRECISION),
         compared(
             "training step on {0} crops of {1}x{1}, m = {2} / on one image of as many pixels".format(*MAIN.crops),
             1.3,
             CROPS,
         ),
-        Claim(
-            "import of the package, after that of torch",
-            True,
-            0.3,
-            _median(imported, "nlfilter_torch"),
-            "s",
-        ),
+        Claim("import of the package, after that of torch", True, 0.3, _median(imported, "nlfilter_torch"), "s"),
     ]
 
 

@@ -1,6 +1,7 @@
 """Alternating measurements, A B A B, of two sizes or variants, for the claims about ratios of times."""
 
 from collections.abc import Iterator, Mapping
+from dataclasses import asdict
 from itertools import pairwise
 
 import torch
@@ -64,7 +65,7 @@ def step_call(case: Case) -> Call:
 
 def _compared(plan: Plan, label: str, case: Case, calls: Mapping[str, Call]) -> Record:
     timings, ratio = compare(calls, threads=case.used_threads, seconds=plan.pair_seconds, least=plan.pairs)
-    return record(SUITE, case, timings, ratio=ratio.to_json()) | {"label": label}
+    return record(SUITE, case, timings, ratio=asdict(ratio)) | {"label": label}
 
 
 def _operators(plan: Plan, label: str, first: Case, second: Case) -> Record:

@@ -1,7 +1,7 @@
 """Sizes and repetitions of the measurements, and the records they produce."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import torch
@@ -21,56 +21,31 @@ Results = dict[str, Any]
 
 @dataclass(frozen=True)
 class Plan:
-    """Sizes and repetitions of the measurements.
+    """Sizes and repetitions of the measurements."""
 
-    Attributes:
-        side: of the main image.
-        landmarks: of the main operator.
-        sizes: heights and widths of the series over pixels.
-        doublings: heights and widths of images compared in pairs, each with twice the pixels of the one before.
-        counts: m of the series over landmarks.
-        counts_side: side of the image of that series, and of those over patches and data types.
-        growth: the two m compared on the main image.
-        many: the two m compared beyond the usual range.
-        many_side: side of the image of that comparison.
-        patches: patch sizes.
-        crops: number and side of the crops in a batch, and m.
-        dense_side: side of the image for the dense filter.
-        pictures: photographs that the main operator is timed on.
-        seconds: for which a group of calls takes turns, if longer than ``least`` rounds.
-        claimed_seconds: ``seconds`` of the main group, on which claims rest.
-        least: minimum number of rounds.
-        pair_seconds: for which two compared calls alternate, if longer than ``pairs`` pairs.
-        pairs: minimum number of pairs.
-        pause: idle seconds before each call in the suite ``pauses``.
-        processes: number of processes that measure the time of an import.
-        probes: number of cases whose memory is measured.
-        threads: numbers of threads; if empty, one and all.
-        device: of torch.
-    """
-
-    side: int = 1024
-    landmarks: int = 100
+    side: int = 1024  # of the main image
+    landmarks: int = 100  # of the main operator
+    # Heights and widths of the series over pixels, and of images compared in pairs, each with twice the pixels before.
     sizes: tuple[tuple[int, int], ...] = ((64, 64), (128, 128), (256, 256), (512, 512), (1024, 1024), (2048, 2048))
     doublings: tuple[tuple[int, int], ...] = ((512, 512), (512, 1024), (1024, 1024), (1024, 2048), (2048, 2048))
-    counts: tuple[int, ...] = (25, 50, 100, 200, 400)
-    counts_side: int = 384
-    growth: tuple[int, int] = (50, 200)
-    many: tuple[int, int] = (250, 1000)
-    many_side: int = 256
+    counts: tuple[int, ...] = (25, 50, 100, 200, 400)  # m of the series over landmarks
+    counts_side: int = 384  # of the image of that series, and of those over patches and data types
+    growth: tuple[int, int] = (50, 200)  # the two m compared on the main image
+    many: tuple[int, int] = (250, 1000)  # the two m compared beyond the usual range
+    many_side: int = 256  # of the image of that comparison
     patches: tuple[int, ...] = (1, 3, 5, 7, 11)
-    crops: tuple[int, int, int] = (16, 128, 64)
-    dense_side: int = 256
+    crops: tuple[int, int, int] = (16, 128, 64)  # number and side of the crops in a batch, and m
+    dense_side: int = 256  # of the image for the dense filter
     pictures: tuple[str, ...] = ("retina", "astronaut", "camera", "coffee", "hubble_deep_field")
-    seconds: float = 2.0
-    claimed_seconds: float = 20.0
+    seconds: float = 2.0  # for which a group of calls takes turns, if longer than ``least`` rounds
+    claimed_seconds: float = 20.0  # likewise for the main group, on which claims rest
     least: int = 3
-    pair_seconds: float = 5.0
+    pair_seconds: float = 5.0  # for which two compared calls alternate, if longer than ``pairs`` pairs
     pairs: int = 3
-    pause: float = 3.0
-    processes: int = 5
-    probes: int = 5
-    threads: tuple[int, ...] = ()
+    pause: float = 3.0  # idle seconds before each call in the suite ``pauses``
+    processes: int = 5  # that measure the time of an import
+    probes: int = 5  # cases whose memory is measured
+    threads: tuple[int, ...] = ()  # to measure; if empty, one and all
     device: str = "cpu"
 
     def case(self, **changes: Any) -> Case:
@@ -115,8 +90,8 @@ def record(suite: str, case: Case, timings: Mapping[str, Timing], **facts: Any) 
     return {
         "suite": suite,
         "label": case.label(),
-        "case": case.to_json(),
-        "timings": {name: timing.to_json() for name, timing in timings.items()},
+        "case": asdict(case) | {"threads": case.used_threads},
+        "timings": {name: asdict(timing) for name, timing in timings.items()},
         **floor,
         **facts,
     }

@@ -4,14 +4,13 @@
 """
 
 import json
-import subprocess
 import sys
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import torch
 from torch import Tensor
 
-from benchmarks.memory import MIB, forget_peak, resident
+from benchmarks.harness import MIB, forget_peak, in_fresh_process, resident
 from benchmarks.speed.cases import Case
 from nlfilter_torch import NonlocalFilter
 from nlfilter_torch.operator.nystrom import inverse_cholesky
@@ -23,11 +22,7 @@ ALPHA = (3.0, 3.0, 4.0, 1.05)
 
 def peak_memory(case: Case, work: str) -> dict[str, float]:
     """Peak memory in MiB that ``"operator"`` or ``"training step"`` adds to a process that holds the image."""
-    command = [sys.executable, "-m", "benchmarks.speed.probe", work, json.dumps(case.to_json())]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    if done.returncode:
-        raise RuntimeError(f"the process that measures the memory of {work}, {case.label()}, failed:\n{done.stderr}")
-    return json.loads(done.stdout.splitlines()[-1])
+    return in_fresh_process("speed.probe", work, json.dumps(asdict(case) | {"threads": case.used_threads}))
 
 
 def training_step(case: Case, image: Tensor) -> None:

@@ -2,7 +2,8 @@
 
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any
 
 import torch
 
@@ -12,15 +13,10 @@ from benchmarks.speed.comparisons import SUITE, comparisons, held_calls, power, 
 from benchmarks.speed.plan import Plan, Record, measured, record
 from benchmarks.speed.probe import ALPHA, peak_memory
 from benchmarks.speed.timing import Call, Timing, after_pauses, discard, quartiles, take_turns
-from nlfilter_torch import (
-    NonlocalFilter,
-    detail_layers,
-    estimate_bandwidth,
-    polynomial_filter,
-    spectral_filter,
-)
+from nlfilter_torch import NonlocalFilter, detail_layers, estimate_bandwidth, polynomial_filter, spectral_filter
 from nlfilter_torch.core.kernels import definitions_only
 
+Suite = Callable[[Plan], Iterator[Record]]
 COMPARED = 1 << 27  # bytes of the largest factor that is compared with float64; the main case always is
 
 
@@ -45,25 +41,21 @@ def backward_call(case: Case) -> Call:
     return lambda: torch.autograd.grad(filtered, [image, *layer.parameters()], incoming, retain_graph=True)
 
 
-def without_kernels(call: Call) -> Call:
-    """Run a call with torch alone, as without a C compiler."""
-
-    def slower() -> None:
-        with definitions_only():
-            call()
-
-    return slower
-
-
 def main_case(plan: Plan) -> Iterator[Record]:
     """The main operator, its sliders and the peers, taking turns on one image."""
     case = plan.case()
     image = case.image()
     operator = case.operator(image)
     spectrum = operator.spectrum()
+    build = discard(case.operator, image)
+
+    def slower() -> None:
+        with definitions_only():
+            build()
+
     calls: dict[str, Call] = {
-        "operator": discard(case.operator, image),
-        "operator, without the kernels in C": without_kernels(discard(case.operator, image)),
+        "operator": build,
+        "operator, without the kernels in C": slower,
         "spectrum": discard(operator.spectrum),
         "detail_layers": discard(detail_layers, operator, image),
         "new alpha, operator held": discard(polynomial_filter, operator, image, torch.tensor(ALPHA)),
@@ -147,45 +139,33 @@ def autograd(plan: Plan) -> Iterator[Record]:
     yield record("autograd", case, timings)
 
 
-def _measured(suite: str, plan: Plan, case: Case, calls: dict[str, Call]) -> Record:
-    error = case.factor_bytes <= COMPARED
-    return measured(suite, case, calls, seconds=plan.seconds, least=plan.least, error=error)
+def series(suite: str, cases: Callable[[Plan], Iterable[Case]]) -> Suite:
+    """A suite of the operator, one filtering with it and the backward pass over cases; with the error if it is small.
+
+    The backward pass of images above a megapixel is left out.
+    """
+
+    def measure(plan: Plan) -> Iterator[Record]:
+        for case in cases(plan):
+            calls = filter_calls(case, backward=case.pixels <= 1 << 20)
+            error = suite != "threads" and case.factor_bytes <= COMPARED
+            yield measured(suite, case, calls, seconds=plan.seconds, least=plan.least, error=error)
+
+    return measure
 
 
-def sizes(plan: Plan) -> Iterator[Record]:
-    """Times and error over the number of pixels."""
-    for height, width in plan.sizes:
-        case = plan.case(height=height, width=width)
-        yield _measured("sizes", plan, case, filter_calls(case, backward=case.pixels <= 1 << 20))
+def small(plan: Plan, **changes: Any) -> Case:
+    """The case of the series over landmarks, or one that differs from it."""
+    return plan.case(height=plan.counts_side, width=plan.counts_side, **changes)
 
 
-def landmarks(plan: Plan) -> Iterator[Record]:
-    """Times and error over the number of landmarks."""
-    for count in plan.counts:
-        case = plan.case(height=plan.counts_side, width=plan.counts_side, landmarks=count)
-        yield _measured("landmarks", plan, case, filter_calls(case, backward=True))
-
-
-def patches(plan: Plan) -> Iterator[Record]:
-    """Times and error over the size of the patches."""
-    for size in plan.patches:
-        case = plan.case(height=plan.counts_side, width=plan.counts_side, patch_size=size)
-        yield _measured("patches", plan, case, filter_calls(case, backward=True))
-
-
-def dtypes(plan: Plan) -> Iterator[Record]:
-    """Times and error over data types; half precision is computed in float32."""
-    for dtype in ("float32", "float64", "bfloat16"):
-        case = plan.case(height=plan.counts_side, width=plan.counts_side, dtype=dtype)
-        yield _measured("dtypes", plan, case, filter_calls(case, backward=True))
-
-
-def threads(plan: Plan) -> Iterator[Record]:
-    """The main operator, its filtering and backward pass on one thread and on all; for tiles, see streaming_busy."""
-    for count in plan.thread_counts():
-        case = plan.case(threads=count)
-        calls = filter_calls(case, backward=True)
-        yield measured("threads", case, calls, seconds=plan.seconds, least=plan.least)
+SERIES: dict[str, Callable[[Plan], Iterable[Case]]] = {
+    "sizes": lambda plan: (plan.case(height=height, width=width) for height, width in plan.sizes),
+    "landmarks": lambda plan: (small(plan, landmarks=count) for count in plan.counts),
+    "patches": lambda plan: (small(plan, patch_size=size) for size in plan.patches),
+    "dtypes": lambda plan: (small(plan, dtype=dtype) for dtype in ("float32", "float64", "bfloat16")),
+    "threads": lambda plan: (plan.case(threads=count) for count in plan.thread_counts()),
+}
 
 
 def pictures(plan: Plan) -> Iterator[Record]:
@@ -232,7 +212,7 @@ def _import_seconds() -> list[float]:
     return [float(figure) for figure in done.stdout.split()]
 
 
-SUITES: dict[str, Callable[[Plan], Iterator[Record]]] = {
+SUITES: dict[str, Suite] = {
     "main": main_case,
     SUITE: comparisons,
     "pictures": pictures,
@@ -242,9 +222,5 @@ SUITES: dict[str, Callable[[Plan], Iterator[Record]]] = {
     "slow": slow_peers,
     "dense": dense,
     "autograd": autograd,
-    "sizes": sizes,
-    "landmarks": landmarks,
-    "patches": patches,
-    "dtypes": dtypes,
-    "threads": threads,
+    **{name: series(name, cases) for name, cases in SERIES.items()},
 }

@@ -3,9 +3,10 @@
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
 from torch.utils.benchmark import Measurement, TaskSpec, set_torch_threads, timer
 
@@ -19,44 +20,22 @@ LONG = 0.5  # seconds; a longer call is warmed up by one run
 
 @dataclass(frozen=True)
 class Timing:
-    """Seconds of one call.
-
-    Attributes:
-        median: of the samples.
-        iqr: interquartile range of the samples.
-        samples: number of samples.
-        calls: number of calls per sample; a sample is their mean.
-    """
+    """Median and interquartile range of a call in seconds; each of the samples is a mean over so many calls."""
 
     median: float
     iqr: float
     samples: int
     calls: int
 
-    def to_json(self) -> dict[str, float]:
-        """As a plain dictionary."""
-        return asdict(self)
-
 
 @dataclass(frozen=True)
 class Ratio:
-    """Time of one call relative to another, from consecutive samples.
-
-    Attributes:
-        lower: lower quartile of the ratios.
-        median: median of the ratios.
-        upper: upper quartile of the ratios.
-        pairs: number of ratios.
-    """
+    """Quartiles of the time of one call relative to another, of pairs of consecutive samples."""
 
     lower: float
     median: float
     upper: float
     pairs: int
-
-    def to_json(self) -> dict[str, float]:
-        """As a plain dictionary."""
-        return asdict(self)
 
 
 def take_turns(calls: Mapping[str, Call], *, threads: int, seconds: float, least: int = 3) -> dict[str, Timing]:
@@ -65,14 +44,8 @@ def take_turns(calls: Mapping[str, Call], *, threads: int, seconds: float, least
     Each sample of a call follows an uncounted run of the same call, unless it takes seconds, so that memory and caches
     are as in a loop over pictures. :func:`after_pauses` measures the cost of a call after idle time.
 
-    Args:
-        calls: what to time, by name.
-        threads: of torch.
-        seconds: after which no further round starts, once there have been ``least``.
-        least: minimum number of rounds.
-
-    Returns:
-        A timing by name. The first call of each, which pays for imports and memory, is not counted.
+    No further round starts after ``seconds``, once there have been ``least``. The first call of each, which pays for
+    imports and memory, is not counted.
     """
     samples, repeats = _rounds(calls, threads, seconds, least)
     return {name: _summary(name, samples[name], repeats[name], threads) for name in calls}
@@ -83,12 +56,6 @@ def compare(calls: Mapping[str, Call], *, threads: int, seconds: float, least: i
 
     Other work on the machine slows both samples of a pair or, if it starts or ends between them, distorts one ratio of
     many, which changes the median little.
-
-    Args:
-        calls: A and B, by name, in this order.
-        threads: of torch.
-        seconds: after which no further pair starts, once there have been ``least``.
-        least: minimum number of pairs.
 
     Returns:
         A timing of each by name, and the ratio B / A.
@@ -102,10 +69,8 @@ def compare(calls: Mapping[str, Call], *, threads: int, seconds: float, least: i
 
 def quartiles(values: Sequence[float]) -> tuple[float, float, float]:
     """Lower quartile, median and upper quartile."""
-    lower, median, upper = torch.tensor(values, dtype=torch.float64).quantile(
-        torch.tensor([0.25, 0.5, 0.75], dtype=torch.float64)
-    )
-    return lower.item(), median.item(), upper.item()
+    lower, median, upper = np.quantile(values, (0.25, 0.5, 0.75)).tolist()
+    return lower, median, upper
 
 
 def _rounds(

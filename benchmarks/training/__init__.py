@@ -1,1 +1,1 @@
-"""Figures of the library as a layer in training, each with its limit: ``python -m benchmarks.training``."""
+"""Training of the denoiser: pictures, noise as cameras make it, the steps, and what they are judged by."""

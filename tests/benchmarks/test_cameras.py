@@ -11,13 +11,14 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from benchmarks.denoiser_training import cameras
-from benchmarks.denoiser_training.cameras import HELD_OUT_PARTS, PARTS, RANGES, Camera
-from benchmarks.denoiser_training.comparison import as_file, cut, statistics
-from benchmarks.denoiser_training.demosaicing import DEMOSAICERS, masks, mosaic
-from benchmarks.denoiser_training.development import expected, inverse_tone_curve, tone_curve
-from benchmarks.denoiser_training.jpeg import compressed, from_luminance, mean_of_rounded, to_luminance
 from benchmarks.photographs import photograph
+from benchmarks.training import cameras
+from benchmarks.training.cameras import HELD_OUT_PARTS, PARTS, RANGES, Camera
+from benchmarks.training.demosaicing import DEMOSAICERS, masks, mosaic
+from benchmarks.training.development import expected, inverse_tone_curve, tone_curve
+from benchmarks.training.jpeg import compressed, from_luminance, mean_of_rounded, to_luminance
+from benchmarks.training.simulated_pairs import as_file, cut, statistics
+from benchmarks.training.simulated_pairs import main as compare
 
 SIDE = 48
 
@@ -223,12 +224,12 @@ def test_the_command_compares_pairs_of_a_folder(tmp_path: Path, capsys: pytest.C
         Image.fromarray(levels).save(tmp_path / f"{name}.JPG", quality=80)
     written = as_file(clean, tmp_path / "a_real.JPG")
     assert 0 < float((written - clean).abs().mean()) < 0.05
-    cameras.main(["--compare", str(tmp_path), "--count", "1"])
+    compare(["--compare", str(tmp_path), "--count", "1"])
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) == 20
     assert "inside" in lines[0]
     with pytest.raises(SystemExit, match="must hold pairs"):
-        cameras.main(["--compare", str(tmp_path), "--leave-out", "a"])
+        compare(["--compare", str(tmp_path), "--leave-out", "a"])
     with pytest.raises(SystemExit):
-        cameras.main(["--compare", str(tmp_path), "--count", "0"])
+        compare(["--compare", str(tmp_path), "--count", "0"])
     assert "--count must be at least 1, got 0" in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""Photographs from Debian's packages: sets without overlap, licences, Qt's archives, and prepared pictures."""
+"""Photographs from Debian's packages: sets without overlap, Qt's archives, and prepared pictures."""
 
 import io
 import struct
@@ -8,29 +8,18 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from benchmarks.denoiser_training import free_photographs, packages
-from benchmarks.denoiser_training.free_photographs import (
+from benchmarks import free_photographs
+from benchmarks.free_photographs import (
     LARGEST_SCALE,
     PIXELS,
     SETS,
     SMALLEST_SCALE,
+    contents,
     photographs,
+    resources,
     scale_of,
+    unpacked,
 )
-from benchmarks.denoiser_training.packages import contents, licence, resources, unpacked
-
-COPYRIGHT = """Format: https://www.debian.org/doc/packaging-manuals/copyright-format/1.0/
-
-Files: *
-Copyright: 2014 somebody
-License: GPL-2+
-
-Files: nature/Dune.jpg
-       nature/Sea*.jpg
-Copyright: 2014 somebody else
-License: CC-BY-4.0
- The text of the licence.
-"""
 
 
 def archive(files: dict[str, bytes]) -> bytes:
@@ -77,13 +66,6 @@ def test_archives_of_qt_are_read(tmp_path: Path) -> None:
         resources(b"no archive")
 
 
-def test_the_licence_is_that_of_the_last_entry_that_fits() -> None:
-    assert licence(COPYRIGHT, "usr/share/nature/Dune.jpg") == "CC-BY-4.0"
-    assert licence(COPYRIGHT, "nature/Sea2.jpg") == "CC-BY-4.0"
-    assert licence(COPYRIGHT, "nature/Hill.jpg") == "GPL-2+"
-    assert licence("", "nature/Hill.jpg") == "unknown"
-
-
 def test_pictures_are_reduced_until_their_files_have_enough_bits_for_a_pixel() -> None:
     assert scale_of((1000, 1000), 187_500) == pytest.approx(0.5**0.5)
     assert scale_of((1000, 1000), 10**7) == LARGEST_SCALE
@@ -102,7 +84,7 @@ def test_packages_are_downloaded_once(tmp_path: Path, monkeypatch: pytest.Monkey
         else:
             Path(command[3]).mkdir()
 
-    monkeypatch.setattr(packages.subprocess, "run", run)
+    monkeypatch.setattr(free_photographs.subprocess, "run", run)
     assert unpacked("some", tmp_path) == unpacked("some", tmp_path) == tmp_path / "some"
     assert calls == ["apt-get", "dpkg-deb"]
 

@@ -6,8 +6,8 @@ from collections import Counter
 import pytest
 import torch
 
-from benchmarks.composites import CHOOSING
 from benchmarks.keepers import JUDGED, Job, compare_with_judged, contact_sheet, counted, digest, is_same, jobs, main
+from benchmarks.photographs import CHOOSING
 
 RECOLOURED = {
     "photograph": "coffee",

@@ -5,10 +5,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from benchmarks.denoiser_training import noise_profiles, profile_fit
-from benchmarks.denoiser_training.noise_profiles import KINDS, Pairs, main, part_of
+from benchmarks.training import noise_profiles, profile_fit
+from benchmarks.training.noise_profiles import KINDS, Pairs, main, part_of
 from nlfilter_torch.nn.denoiser.estimate import SHAPES
-from nlfilter_torch.nn.denoiser.weights import read_weights
+from nlfilter_torch.nn.denoiser.network import read_weights
 from nlfilter_torch.photo.picture.photographs import Photograph, write_photograph
 
 

@@ -1,13 +1,10 @@
 """Drawn patterns repeat, differ between generators, and fall into two families without a common kind."""
 
-from pathlib import Path
-
 import pytest
 import torch
-from PIL import Image
 from torch import Tensor
 
-from benchmarks.denoiser_training.patterns import APART, TRAINED, main, pattern
+from benchmarks.training.patterns import APART, TRAINED, pattern
 
 
 def generator(seed: int = 0) -> torch.Generator:
@@ -53,16 +50,3 @@ def test_the_families_have_no_kind_in_common() -> None:
         for held_out in (False, True)
     }
     assert not torch.equal(drawn[False], drawn[True])
-
-
-def test_the_command_writes_drawn_patterns_and_the_photographs_kept_aside(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    for name in ("solar4", "kitten"):
-        Image.new("RGB", (20, 20)).save(tmp_path / f"{name}.png")
-    main(["--out", str(tmp_path / "set"), "--photographs", str(tmp_path), "--count", "1", "--side", "32"])
-    assert {path.stem for path in (tmp_path / "set").iterdir()} == {f"{kind}_0" for kind in APART} | {"solar4"}
-    assert "7 pictures" in capsys.readouterr().out
-    with pytest.raises(SystemExit):
-        main(["--out", str(tmp_path), "--count", "0"])
-    assert "--count must be at least 1, got 0" in capsys.readouterr().err

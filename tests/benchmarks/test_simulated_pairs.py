@@ -6,10 +6,9 @@ import pytest
 import torch
 from PIL import Image
 
-from benchmarks.denoiser_training.cameras import Camera
-from benchmarks.denoiser_training.comparison import pairs as read_pairs
-from benchmarks.denoiser_training.simulated_pairs import main, pairs
 from benchmarks.photographs import photograph
+from benchmarks.training.cameras import Camera
+from benchmarks.training.simulated_pairs import main, pairs, read_pairs
 
 
 @pytest.fixture

@@ -5,12 +5,11 @@ import itertools
 import json
 import math
 import sys
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import pytest
 import torch
 
-from benchmarks import report
 from benchmarks.speed import peers
 from benchmarks.speed.__main__ import main as measure
 from benchmarks.speed.__main__ import run
@@ -31,6 +30,8 @@ from benchmarks.speed.floor import READS, floor_calls, floor_summary
 from benchmarks.speed.plan import QUICK
 from benchmarks.speed.suites import SUITES
 from benchmarks.speed.timing import Timing, compare, on_threads, take_turns
+from docs import speed
+from docs.pages import between
 
 MEASURED = ("main", "comparisons", "pictures", "pauses", "slow", "dense", "autograd", "landmarks", "dtypes")
 
@@ -63,7 +64,7 @@ def test_quick_run_measures_every_suite_it_was_asked_for(results):
 def test_report_of_a_run_has_its_tables_and_plots(results, tmp_path):
     source = tmp_path / "speed.json"
     source.write_text(json.dumps(results))
-    report.main([str(source)])
+    speed.main([str(source)])
     text = (tmp_path / "speed.md").read_text()
     for part in (
         "## Claims",
@@ -82,13 +83,13 @@ def test_report_of_a_run_has_its_tables_and_plots(results, tmp_path):
 @pytest.mark.slow
 def test_a_page_takes_full_runs_only_and_loses_nothing_around_the_markers(results, tmp_path):
     source, page = tmp_path / "speed.json", tmp_path / "page.md"
-    page.write_text(f"before\n\n{report.BEGIN}\nstale\n{report.END}\n\nafter\n")
+    page.write_text(f"before\n\n{speed.BEGIN}\nstale\n{speed.END}\n\nafter\n")
     source.write_text(json.dumps(results))
     with pytest.raises(SystemExit, match="full run"):
-        report.main([str(source), "--page", str(page)])
+        speed.main([str(source), "--page", str(page)])
     assert "stale" in page.read_text()
     source.write_text(json.dumps(copy.deepcopy(results) | {"quick": False}))
-    report.main([str(source), "--page", str(page)])
+    speed.main([str(source), "--page", str(page)])
     text = page.read_text()
     assert text.startswith("before\n")
     assert text.endswith("\n\nafter\n")
@@ -99,7 +100,7 @@ def test_a_page_takes_full_runs_only_and_loses_nothing_around_the_markers(result
 
 def test_a_page_without_markers_is_refused():
     with pytest.raises(ValueError, match="must hold the lines"):
-        report.between("a text", "a table", report.BEGIN, report.END)
+        between("a text", "a table", speed.BEGIN, speed.END)
 
 
 def test_a_missing_peer_names_its_extra_and_the_rest_goes_on(monkeypatch):
@@ -116,7 +117,7 @@ def test_suites_that_come_too_late_are_named(tmp_path):
     results = json.loads(path.read_text())
     assert results["cut"] == ["threads"]
     assert results["results"] == []
-    assert "Time was up during or before: threads" in report.report(results)
+    assert "Time was up during or before: threads" in speed.report(results)
 
 
 def test_a_suite_stops_between_two_cases_when_time_is_over(monkeypatch):
@@ -139,8 +140,8 @@ def test_claims_are_ratios_of_medians():
     record = {
         "suite": "main",
         "label": "",
-        "case": case.to_json(),
-        "timings": {name: timing.to_json() for name, timing in timings.items()},
+        "case": asdict(case),
+        "timings": {name: asdict(timing) for name, timing in timings.items()},
         "floor": floor_summary(timings),
     }
     judged = claims({"quick": False, "results": [record]})
@@ -148,7 +149,7 @@ def test_claims_are_ratios_of_medians():
     assert judged[0].holds
     assert [claim.holds for claim in judged[1:]] == [None] * (len(judged) - 1)
     timings["operator"] = Timing(1.7, 0.0, 1, 1)
-    record["timings"]["operator"] = timings["operator"].to_json()
+    record["timings"]["operator"] = asdict(timings["operator"])
     assert claims({"quick": False, "results": [record]})[0].holds is False
 
 
@@ -198,7 +199,7 @@ def test_a_claim_is_judged_by_the_median_ratio_and_shows_its_quartiles(compared,
     assert judged(1.01 * edge).holds is False
     expected = [value / math.log(4) for value in (math.log(2), math.log(5))] if label == GROWTH else [2.0, 5.0]
     assert judged(4.0).quartiles == pytest.approx(expected)
-    assert "({:.2f} to {:.2f})".format(*expected) in report.claims_table([judged(4.0)])
+    assert "({:.2f} to {:.2f})".format(*expected) in speed.claims_table([judged(4.0)])
 
 
 def test_the_worst_of_several_comparisons_counts(compared):

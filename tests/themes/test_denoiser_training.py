@@ -10,15 +10,15 @@ from PIL import Image
 from safetensors import safe_open
 from torch import Tensor
 
-from benchmarks.denoiser_training import __main__ as command
-from benchmarks.denoiser_training import examples, training
-from benchmarks.denoiser_training.__main__ import main
-from benchmarks.denoiser_training.crops import CONTRASTS, Crops
-from benchmarks.denoiser_training.draws import Draws
-from benchmarks.denoiser_training.examples import LARGEST, Examples, Source
-from benchmarks.denoiser_training.graphs import graphed_pivots
-from benchmarks.denoiser_training.pictures import LONGEST, PICTURES, RIGHT_HALVES, Pictures, read_pictures
-from benchmarks.denoiser_training.training import (
+from benchmarks.denoising.cases import HELD_OUT, LEFT_HALVES
+from benchmarks.training import __main__ as command
+from benchmarks.training import examples, training
+from benchmarks.training.__main__ import main
+from benchmarks.training.crops import CONTRASTS, Crops
+from benchmarks.training.examples import LARGEST, Examples, Source
+from benchmarks.training.graphs import graphed_pivots
+from benchmarks.training.pictures import LONGEST, PICTURES, RIGHT_HALVES, Draws, Pictures, read_pictures
+from benchmarks.training.training import (
     EXPECTED,
     PlainDenoiser,
     Plan,
@@ -28,7 +28,6 @@ from benchmarks.denoiser_training.training import (
     rate_at,
     without_rim,
 )
-from benchmarks.denoising.cases import HELD_OUT, LEFT_HALVES
 from nlfilter_torch import NonlocalDenoiser
 from nlfilter_torch.operator import landmarks
 

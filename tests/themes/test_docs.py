@@ -14,7 +14,8 @@ import torch
 from PIL import Image
 
 import nlfilter_torch
-from benchmarks import accuracy, guide_pictures, support
+from benchmarks import accuracy
+from docs import clients, guide_pictures
 from nlfilter_torch import photo
 from nlfilter_torch.photo.cli import main
 from nlfilter_torch.photo.declared.presets import PRESETS, PURPOSES
@@ -150,7 +151,7 @@ def test_every_equation_and_figure_of_the_paper_has_a_line() -> None:
     ]
     assert sorted(int(number) for number in shown) == list(range(1, 21))
     assert "| Table I |" in figures
-    from benchmarks.figures import FIGURES
+    from docs.figures import FIGURES
 
     for names in re.findall(r"--only ([\w,-]+)`", figures):
         assert set(names.split(",")) <= FIGURES.keys(), names
@@ -170,7 +171,13 @@ def test_the_tables_of_the_start_page_hold_public_names() -> None:
 
 def test_names_on_the_page_of_the_paper_exist() -> None:
     classes = [getattr(nlfilter_torch, name) for name in ("NonlocalOperator", "Spectrum")]
-    known = {*nlfilter_torch.__all__, *(name for c in classes for name in dir(c)), "plot_response", "show_layers"}
+    known = {
+        *nlfilter_torch.__all__,
+        *photo.__all__,
+        *(name for c in classes for name in dir(c)),
+        "plot_response",
+        "show_layers",
+    }
     for function in (nlfilter_torch.nonlocal_operator, nlfilter_torch.polynomial_filter):
         known.update(inspect.signature(function).parameters)
     for name in re.findall(r"`(?:\w+\.)?([A-Za-z]\w+)`", PAGES["paper"].text):
@@ -188,8 +195,8 @@ def test_the_table_of_presets_is_theirs() -> None:
 
 
 def test_the_table_of_clients_is_made_from_their_tests() -> None:
-    assert f"\n\n{support.table()}\n" in PAGES["clients"].text
-    assert len(support.table().splitlines()) > 15
+    assert f"\n\n{clients.table()}\n" in PAGES["clients"].text
+    assert len(clients.table().splitlines()) > 15
 
 
 def test_every_claim_about_training_has_its_test() -> None:

@@ -7,8 +7,8 @@ import pytest
 from PIL import Image
 
 from benchmarks import edits
-from benchmarks.figures import FIGURES
-from benchmarks.figures.__main__ import main
+from docs.figures import FIGURES
+from docs.figures.__main__ import main
 
 PAPER = {"1", "3", "6", "7", "8", "9", "10", "11", "12", "13", "14", "15", "16", "17", "18", "20", "table-1"}
 

@@ -13,7 +13,7 @@ from nbclient import NotebookClient
 from nbclient.util import run_sync
 from PIL import Image
 
-from benchmarks.notebooks import WIDEST, tidy
+from docs.notebooks import WIDEST, tidy
 
 FOLDER = Path(__file__).parents[2] / "notebooks"
 SCRIPTS = sorted(FOLDER.glob("*.py"))

@@ -1,9 +1,9 @@
-"""Table I and Fig. 20 of the paper, on reduced versions of the twelve pictures of benchmarks.tables."""
+"""Table I and Fig. 20 of the paper, on reduced versions of the twelve pictures of docs.tables."""
 
 import pytest
 
-from benchmarks import tables
-from benchmarks.tables import METHODS, PICTURES, figure_20, is_rising, table_1
+from docs import tables
+from docs.tables import METHODS, PICTURES, figure_20, is_rising, table_1
 
 PAPER, DEFAULTS = METHODS
 LONG_SIDE = 160

@@ -5,9 +5,10 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
+from benchmarks.layers import landmarks
+from benchmarks.layers.__main__ import main
 from benchmarks.photographs import photograph
-from benchmarks.training import landmarks
-from benchmarks.training.__main__ import main
+from docs.landmarks_training import draw
 
 
 @pytest.mark.slow
@@ -26,6 +27,6 @@ def test_slopes_and_recovery_with_landmarks_that_are_held() -> None:
 
 @pytest.mark.slow
 def test_curves_are_drawn(tmp_path: Path) -> None:
-    landmarks.draw(tmp_path / "curves.png", side=24)
+    draw(tmp_path / "curves.png", side=24)
     with Image.open(tmp_path / "curves.png") as picture:
         assert picture.width == 900

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 from torch.func import functional_call, grad, vmap
 
-from benchmarks import transforms
+from docs import transforms
 from nlfilter_torch import (
     NonlocalDenoiser,
     NonlocalFilter,
@@ -29,7 +29,7 @@ GUIDES, IMAGES = noise(3, 1, 6, 7), noise(3, 2, 6, 7, seed=1)
 def test_the_table_of_transforms_is_measured() -> None:
     table = transforms.table()
     assert not [cell for row in table.splitlines()[2:] for cell in row.split(" | ")[1:] if "error" in cell]
-    assert table in PAGE.read_text(encoding="utf-8"), "run python -m benchmarks.transforms docs/training.md"
+    assert table in PAGE.read_text(encoding="utf-8"), "run python -m docs.transforms docs/training.md"
 
 
 def test_gradients_per_sample_with_an_operator_for_each() -> None:

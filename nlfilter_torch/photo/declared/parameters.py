@@ -1,6 +1,6 @@
 """Declarations of all edits and their parameters, for functions, commands, files, the editor and the documentation.
 
-``docs/parameters.md`` is generated from them (``python -m benchmarks.parameters docs/parameters.md``).
+``docs/parameters.md`` is generated from them (``python -m docs.parameters docs/parameters.md``).
 """
 
 from dataclasses import replace

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from benchmarks.denoiser_training.training import PlainDenoiser
+from benchmarks.training.training import PlainDenoiser
 from nlfilter_torch import NonlocalDenoiser
 from nlfilter_torch.core.inner import EVERYWHERE
 from nlfilter_torch.nn.denoiser import network as module

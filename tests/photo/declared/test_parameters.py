@@ -9,7 +9,7 @@ from typing import get_args
 import pytest
 from torch import Tensor
 
-from benchmarks import parameters
+from docs import parameters
 from nlfilter_torch import photo
 from nlfilter_torch.operator.options import FilterOptions
 from nlfilter_torch.photo.declared.declaration import Edit

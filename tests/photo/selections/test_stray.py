@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.edited_photographs import edited_photographs
+from benchmarks.free_photographs import edited_photographs
 from benchmarks.photographs import photograph, reduced_to
 from benchmarks.recolor import CHANGED, HATS, hat_scene
 from benchmarks.scribbles import STORED, Job, as_mask, jobs, line

@@ -1,1 +1,0 @@
-"""Training of the denoiser: pictures, noise as cameras make it, the steps, and what they are judged by."""

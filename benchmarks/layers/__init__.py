@@ -1,0 +1,1 @@
+"""Figures of the library as a layer in training, each with its limit: ``python -m benchmarks.layers``."""
