@@ -4,6 +4,7 @@ import sys
 import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from mmap import mmap
 from pathlib import Path
 from typing import NamedTuple, Protocol
@@ -50,6 +51,23 @@ class Decoded(NamedTuple):
 
     channels: Stored
     orientation: int
+    metadata: Metadata
+
+
+@dataclass(frozen=True)
+class Header:
+    """What a file to write says of its picture.
+
+    Attributes:
+        shape: (H, W, S).
+        dtype: of the channels.
+        alpha: whether the last channel is transparency.
+        metadata: the rest.
+    """
+
+    shape: tuple[int, int, int]
+    dtype: np.dtype[np.generic]
+    alpha: bool
     metadata: Metadata
 
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from nlfilter_torch.photo.declared.rows import Stored
 from nlfilter_torch.photo.files import codecs, jpeg, png, tiff
 from nlfilter_torch.photo.files import exif as exif_tags
-from nlfilter_torch.photo.files.decoded import CheckSize, Decoded, decoding
+from nlfilter_torch.photo.files.decoded import CheckSize, Decoded, Header, decoding
 from nlfilter_torch.photo.files.exif_in_tiff import shortened
 from nlfilter_torch.photo.files.metadata import Metadata, UnhandledImage
 from nlfilter_torch.photo.files.writing import check_file, open_beside
@@ -133,35 +133,30 @@ def encode(
     stream: BinaryIO,
     kind: str,
     rows: Iterable[Stored],
-    shape: tuple[int, int, int],
-    dtype: np.dtype[np.generic],
-    alpha: bool,
-    metadata: Metadata,
+    header: Header,
     quality: int | None = None,
 ) -> list[str]:
-    """Write rows (h, W, S) of a picture of ``shape`` as an image file of a type in :data:`DEPTHS`.
+    """Write rows (h, W, S) of a picture as an image file of a type in :data:`DEPTHS`.
 
     ``quality`` is that of JPEG files; None is the default.
     Returns the names of metadata that are left out.
     """
-    extras = metadata.extras
+    extras = header.metadata.extras
     left_out = [*extras.left_out, *(part.name for part in extras.parts if part.kind != kind)]
     if kind == "TIFF":
-        whole = np.concatenate(list(rows))
-        whole = whole[..., 0] if shape[2] == 1 else whole
-        return left_out + tiff.write(stream, whole, whole.shape, dtype, alpha, metadata)
+        return left_out + tiff.write(stream, np.concatenate(list(rows)), header)
     left_out += extras.lacking_tags()
     if kind == "PNG":
-        png.write_png(stream, rows, shape, dtype, metadata)
+        png.write_png(stream, rows, header)
     elif kind == "JPEG":
-        metadata, lacking = fitting_jpeg(metadata)
+        metadata, lacking = fitting_jpeg(header.metadata)
         left_out += lacking
-        jpeg.write_jpeg(stream, rows, shape, metadata, quality or jpeg.USUAL_QUALITY)
+        jpeg.write_jpeg(stream, rows, replace(header, metadata=metadata), quality or jpeg.USUAL_QUALITY)
     else:
-        if extras.dpi is not None and exif_tags.resolution(metadata.exif) is None:
+        if extras.dpi is not None and exif_tags.resolution(header.metadata.exif) is None:
             left_out.append("the print resolution")
         whole = np.concatenate(list(rows))
-        codecs.write_by_pillow(stream, kind, whole[..., 0] if shape[2] == 1 else whole, metadata)
+        codecs.write_by_pillow(stream, kind, whole[..., 0] if header.shape[2] == 1 else whole, header.metadata)
     return left_out
 
 

@@ -14,7 +14,7 @@ from PIL import JpegImagePlugin
 
 from nlfilter_torch.photo.declared.rows import Stored
 from nlfilter_torch.photo.files import exif as exif_tags
-from nlfilter_torch.photo.files.decoded import bands, quiet
+from nlfilter_torch.photo.files.decoded import Header, bands, quiet
 from nlfilter_torch.photo.files.metadata import (
     FURTHER_PICTURES,
     GAIN_MAP,
@@ -218,15 +218,14 @@ def _behind(content: bytes) -> Iterator[str]:
 def write_jpeg(
     stream: BinaryIO,
     rows: Iterable[Stored],
-    shape: tuple[int, int, int],
-    metadata: Metadata,
+    header: Header,
     quality: int = USUAL_QUALITY,
 ) -> None:
-    """Write rows (h, W, S) of 8 bits of a picture of ``shape`` as they arrive, without chroma subsampling.
+    """Write rows (h, W, S) of 8 bits as they arrive, without chroma subsampling.
 
     Strips are coded alone and joined by restart markers, after which a decoder begins anew.
     """
-    height, width, _ = shape
+    height, width, _ = header.shape
     for number, strip in enumerate(bands(rows, CODED_ROWS)):
         picture = strip[..., 0] if strip.shape[2] == 1 else strip
         encoded = bytes(imagecodecs.jpeg8_encode(np.ascontiguousarray(picture), level=quality, subsampling="444"))
@@ -236,7 +235,7 @@ def write_jpeg(
             stream.write(bytes((0xFF, 0xD0 + (number - 1) % 8)))
         else:
             stream.write(bytes((0xFF, SOI)))
-            for marker, content in _written(metadata):
+            for marker, content in _written(header.metadata):
                 _write_segment(stream, marker, content)
             for part in parts:
                 content = encoded[part.start : part.stop]

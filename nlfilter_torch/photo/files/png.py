@@ -18,7 +18,7 @@ import numpy as np
 
 from nlfilter_torch.photo.declared.rows import Stored
 from nlfilter_torch.photo.files import exif as exif_tags
-from nlfilter_torch.photo.files.decoded import bands, release
+from nlfilter_torch.photo.files.decoded import Header, bands, release
 from nlfilter_torch.photo.files.metadata import (
     Extras,
     FilePart,
@@ -298,17 +298,15 @@ def write_chunk(stream: BinaryIO, name: bytes, *content: bytes) -> None:
 def write_png(
     stream: BinaryIO,
     rows: Iterable[Stored],
-    shape: tuple[int, int, int],
-    dtype: np.dtype[np.generic],
-    metadata: Metadata,
+    header: Header,
 ) -> None:
-    """Write rows (h, W, S) of a picture of ``shape`` and uint8 or uint16 as they arrive."""
-    height, width, samples = shape
+    """Write rows (h, W, S) of a picture of uint8 or uint16 as they arrive."""
+    (height, width, samples), dtype = header.shape, header.dtype
     length = 1 + width * samples * dtype.itemsize
     stream.write(SIGNATURE)
     colour = {1: 0, 2: 4, 3: 2, 4: 6}[samples]
     write_chunk(stream, b"IHDR", struct.pack(">IIBBBBB", width, height, 8 * dtype.itemsize, colour, 0, 0, 0))
-    for name, content in _written(metadata):
+    for name, content in _written(header.metadata):
         write_chunk(stream, name, content)
     packer = zlib.compressobj(6, strategy=zlib.Z_FILTERED)
     above: Stored | None = None

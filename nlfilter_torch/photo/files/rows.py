@@ -22,7 +22,7 @@ import psutil
 
 from nlfilter_torch.photo.declared.rows import NodataRows, RowSource, Stored
 from nlfilter_torch.photo.files import jpeg, png, tiff
-from nlfilter_torch.photo.files.decoded import bands, decoding
+from nlfilter_torch.photo.files.decoded import Header, bands, decoding
 from nlfilter_torch.photo.files.exif import of_part, upright
 from nlfilter_torch.photo.files.formats import (
     TooLarge,
@@ -186,10 +186,11 @@ def write_picture(
     with open_beside(path) as stream:
         values = (part for _, part in rows)
         metadata, left_out = with_thumbnail(like.metadata, None)
+        header = Header(shape, dtype, like.alpha, metadata)
         if kind == "TIFF":
-            left_out += tiff.write_rows(stream, values, shape, dtype, like.alpha, metadata)
+            left_out += tiff.write_rows(stream, values, header)
         else:
-            left_out += encode(stream, kind, values, shape, dtype, like.alpha, metadata, quality)
+            left_out += encode(stream, kind, values, header, quality)
     note_left_out(path, left_out)
 
 

@@ -1,6 +1,7 @@
 """Reading and writing of TIFF files with profile and EXIF, by tifffile; whole, or a few rows at a time."""
 
 import logging
+import math
 import os
 import struct
 from collections.abc import Iterable, Iterator
@@ -15,7 +16,7 @@ from nlfilter_torch.core.warning import warn
 from nlfilter_torch.photo.declared.rows import Stored
 from nlfilter_torch.photo.files import exif as exif_tags
 from nlfilter_torch.photo.files import exif_in_tiff
-from nlfilter_torch.photo.files.decoded import CheckSize, Decoded, bands, decoding
+from nlfilter_torch.photo.files.decoded import CheckSize, Decoded, Header, bands, decoding
 from nlfilter_torch.photo.files.metadata import (
     GROUND,
     STORAGE_TAGS,
@@ -170,22 +171,18 @@ def read_metadata(file: tifffile.TiffFile, stream: BinaryIO, depth: str) -> tupl
 def write_rows(
     stream: BinaryIO,
     rows: Iterable[Stored],
-    shape: tuple[int, int, int],
-    dtype: np.dtype[np.generic],
-    alpha: bool,
-    metadata: Metadata,
+    header: Header,
 ) -> list[str]:
-    """Write rows (h, W, S) of a picture of ``shape`` as they arrive, in tiles; large files become BigTIFF.
+    """Write rows (h, W, S) of a picture as they arrive, in tiles; large files become BigTIFF.
 
     Returns what is left out, see :func:`write`.
     """
-    height, width, samples = shape
-    plain_shape = (height, width) if samples == 1 else shape
-    big = height * width * samples * dtype.itemsize > MAX_CLASSIC_BYTES
+    _, width, samples = header.shape
+    big = math.prod(header.shape) * header.dtype.itemsize > MAX_CLASSIC_BYTES
     # Compressing ahead in threads would queue hundreds of megabytes.
-    size = TILE_SIZE * TILE_SIZE * samples * dtype.itemsize
+    size = TILE_SIZE * TILE_SIZE * samples * header.dtype.itemsize
     options = _Options(maxworkers=1, buffersize=size, tile=(TILE_SIZE, TILE_SIZE))
-    return write(stream, _tiles(rows, width), plain_shape, dtype, alpha, metadata, big, **options)
+    return write(stream, _tiles(rows, width), header, big, **options)
 
 
 def _tiles(rows: Iterable[Stored], width: int) -> Iterator[Stored]:
@@ -200,20 +197,18 @@ def _tiles(rows: Iterable[Stored], width: int) -> Iterator[Stored]:
 def write(
     stream: BinaryIO,
     data: Stored | Iterator[Stored],
-    shape: tuple[int, ...],
-    dtype: np.dtype[np.generic],
-    alpha: bool,
-    metadata: Metadata,
+    header: Header,
     big: bool = False,
     **options: Unpack[_Options],
 ) -> list[str]:
-    """Write a picture of ``shape`` (H, W) or (H, W, S), or an iterator over its tiles, compressed without loss.
+    """Write a picture (H, W, S), or an iterator over its tiles, compressed without loss.
 
-    ``alpha`` says whether the last channel is transparency; ``options`` are those of :func:`tifffile.imwrite`. Returns
-    the names of metadata that are left out.
+    ``options`` are those of :func:`tifffile.imwrite`. Returns the names of metadata that are left out.
     """
+    metadata, dtype = header.metadata, header.dtype
+    shape = header.shape[:2] if header.shape[2] == 1 else header.shape
     extras = metadata.extras
-    kept = extras.tags_for((shape[0], shape[1]), dtype.name)
+    kept = extras.tags_for(header.shape[:2], dtype.name)
     head = exif_in_tiff.opening(metadata.exif, kept[0].order if kept else "<", big)
     tags = [tag.stored(head.order) for tag in (*head.tags, *kept) if tag.code not in RESOLUTION]
     if extras.xmp is not None:
@@ -224,12 +219,12 @@ def write(
     with tifffile.TiffWriter(stream, bigtiff=big, byteorder=head.order) as file:  # type: ignore[arg-type]
         stream.write(head.body)
         file.write(
-            data,
+            data.reshape(shape) if isinstance(data, np.ndarray) else data,
             shape=shape,
             dtype=None if isinstance(data, np.ndarray) else dtype,
             photometric="rgb" if len(shape) == 3 and shape[2] >= 3 else "minisblack",
             planarconfig="contig" if len(shape) == 3 else None,
-            extrasamples=["unassalpha"] if alpha else None,
+            extrasamples=["unassalpha"] if header.alpha else None,
             compression="zlib",
             predictor=bool(np.issubdtype(dtype, np.integer)),
             iccprofile=metadata.icc,

@@ -15,6 +15,7 @@ from nlfilter_torch.core.checks import check_count
 from nlfilter_torch.operator.hidden import REACH
 from nlfilter_torch.photo.declared.development import Development, Frame
 from nlfilter_torch.photo.declared.rows import NodataRows, Stored, is_hidden, keep_apart
+from nlfilter_torch.photo.files.decoded import Header
 from nlfilter_torch.photo.files.exif import of_part
 from nlfilter_torch.photo.files.formats import Depth, check_depth, check_type, encode, read_channels, with_thumbnail
 from nlfilter_torch.photo.files.metadata import NO_EXTRAS, Extras, Metadata, note_left_out
@@ -178,7 +179,9 @@ def write_photograph(photograph: Photograph, path: str | Path, *, quality: int |
     alpha = photograph.alpha is not None
     with open_beside(path) as stream:
         metadata, left_out = with_thumbnail(photograph.metadata, None if kind == "TIFF" else channels)
-        left_out += encode(stream, kind, [channels], channels.shape, channels.dtype, alpha, metadata, quality)
+        height, width, samples = channels.shape
+        header = Header((height, width, samples), channels.dtype, alpha, metadata)
+        left_out += encode(stream, kind, [channels], header, quality)
     note_left_out(path, left_out)
 
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from nlfilter_torch.photo.files.decoded import Header
 from nlfilter_torch.photo.files.jpeg import open_jpeg, write_jpeg
 from nlfilter_torch.photo.files.metadata import Extras, Metadata
 from nlfilter_torch.photo.picture.photographs import read_photograph, write_photograph
@@ -53,7 +54,11 @@ def test_the_second_picture_of_an_mpo_is_named(tmp_path: Path) -> None:
 def test_strips_are_one_picture(height: int, channels: int) -> None:
     picture = np.tile(cat(channels=channels), (4, 1, 1))[:height]
     stream = io.BytesIO()
-    write_jpeg(stream, (picture[top : top + 37] for top in range(0, height, 37)), picture.shape, Metadata())
+    write_jpeg(
+        stream,
+        (picture[top : top + 37] for top in range(0, height, 37)),
+        Header(picture.shape, np.dtype("uint8"), False, Metadata()),
+    )
     whole = imagecodecs.jpeg8_encode(picture[..., 0] if channels == 1 else picture, level=95, subsampling="444")
     np.testing.assert_array_equal(imagecodecs.jpeg8_decode(stream.getvalue()), imagecodecs.jpeg8_decode(whole))
     assert np.asarray(Image.open(stream)).shape[0] == height
@@ -62,14 +67,14 @@ def test_strips_are_one_picture(height: int, channels: int) -> None:
 @pytest.mark.parametrize("dpi", [(72, 72), (240, 300), (299.72, 299.72)])
 def test_the_density_is_in_the_unit_that_holds_it(dpi: tuple[float, float]) -> None:
     stream = io.BytesIO()
-    write_jpeg(stream, [cat()], cat().shape, Metadata(extras=Extras(dpi=dpi)))
+    write_jpeg(stream, [cat()], Header(cat().shape, np.dtype("uint8"), False, Metadata(extras=Extras(dpi=dpi))))
     assert open_jpeg(Path(), stream.getvalue()).metadata.extras.dpi == pytest.approx(dpi, abs=0.001)
 
 
 def test_profiles_in_several_segments(tmp_path: Path) -> None:
     profile = np.random.default_rng(0).bytes(200_000)
     stream = io.BytesIO()
-    write_jpeg(stream, [cat()], cat().shape, Metadata(icc=profile))
+    write_jpeg(stream, [cat()], Header(cat().shape, np.dtype("uint8"), False, Metadata(icc=profile)))
     assert open_jpeg(Path(), stream.getvalue()).metadata.icc == profile
     assert Image.open(stream).info["icc_profile"] == profile
     with pytest.raises(EOFError):
@@ -82,5 +87,5 @@ def test_profiles_in_several_segments(tmp_path: Path) -> None:
 def test_noise_of_every_shape_is_written(shape: tuple[int, int, int]) -> None:
     values = np.random.default_rng(0).integers(0, 256, shape, dtype=np.uint8)
     stream = io.BytesIO()
-    write_jpeg(stream, [values], shape, Metadata())
+    write_jpeg(stream, [values], Header(shape, np.dtype("uint8"), False, Metadata()))
     assert np.asarray(imagecodecs.jpeg8_decode(stream.getvalue())).size == values.size

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image, PngImagePlugin
 
+from nlfilter_torch.photo.files.decoded import Header
 from nlfilter_torch.photo.files.metadata import Metadata
 from nlfilter_torch.photo.files.png import ADAM7, SAMPLES, SIGNATURE, chunks, write_chunk, write_png
 from nlfilter_torch.photo.picture.photographs import read_photograph, write_photograph
@@ -130,5 +131,7 @@ def test_noise_of_every_shape_is_written(tmp_path: Path, shape: tuple[int, int, 
     draw = np.random.default_rng(0)
     stream = io.BytesIO()
     values = draw.integers(0, np.iinfo(depth).max, shape, dtype=depth, endpoint=True)
-    write_png(stream, (values[top : top + 7] for top in range(0, shape[0], 7)), shape, values.dtype, Metadata())
+    write_png(
+        stream, (values[top : top + 7] for top in range(0, shape[0], 7)), Header(shape, values.dtype, False, Metadata())
+    )
     np.testing.assert_array_equal(np.asarray(imagecodecs.png_decode(stream.getvalue())).reshape(shape), values)
