@@ -16,7 +16,8 @@ from nlfilter_torch.photo import Recipe, Step, apply_recipe, stream
 from nlfilter_torch.photo.cli import editing, main
 from nlfilter_torch.photo.declared.rows import lacks_data
 from nlfilter_torch.photo.edits.noise import noise_of, profile_of
-from nlfilter_torch.photo.picture.in_memory import InMemory
+from nlfilter_torch.photo.picture.in_memory import InMemory, in_blocks
+from nlfilter_torch.photo.picture.measuring import mean
 from nlfilter_torch.photo.picture.photographs import read_photograph, write_photograph
 from nlfilter_torch.photo.picture.pixels import whole_image
 
@@ -221,8 +222,8 @@ def test_pixels_count_in_proportion() -> None:
     weights[..., 32:] = 0.25
     source = InMemory(picture, weights=weights)
     expected = (picture * weights).mean((2, 3)) / weights.mean()
-    torch.testing.assert_close(source.mean(whole_image)[..., 0, 0], expected)
-    blocks = source.blocks(16, 1)
+    torch.testing.assert_close(mean(source, whole_image)[..., 0, 0], expected)
+    blocks = in_blocks(source, 16, 1)
     assert blocks.weights is not None
     torch.testing.assert_close(blocks.weights[0, 0, 0], torch.tensor([1.0, 1.0, 0.25, 0.25]))
     assert InMemory(picture, weights=torch.ones(1, 1, 64, 64)).weights is None

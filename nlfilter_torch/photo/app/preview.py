@@ -30,7 +30,7 @@ from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.declared.shared_parameters import VIEWING_SIZE
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.declared.strokes import sliders_of
-from nlfilter_torch.photo.edits.applying import PreparedStep, edit_of, filter_key, over, scribbles_of
+from nlfilter_torch.photo.edits.applying import PreparedStep, edit_of, filter_key, scribbles_of
 from nlfilter_torch.photo.picture.changes import (
     activity,
     blend_changes,
@@ -41,11 +41,11 @@ from nlfilter_torch.photo.picture.changes import (
 )
 from nlfilter_torch.photo.picture.in_memory import InMemory, fit_edit
 from nlfilter_torch.photo.picture.painting import TensorPainter
-from nlfilter_torch.photo.picture.pixels import Fitted, Pixels, Planes, part_of
+from nlfilter_torch.photo.picture.pixels import Fitted, Pixels, Planes, mixed, part_of
 from nlfilter_torch.photo.picture.resizing import resize
-from nlfilter_torch.photo.picture.seen import range_of
 from nlfilter_torch.photo.picture.source import seeded
 from nlfilter_torch.photo.picture.viewing import MEGAPIXEL, viewed_size, within_limits
+from nlfilter_torch.photo.picture.working_range import range_of
 
 Key = tuple[object, ...]  # the settings on which a cached result depends
 PIXELS = round(VIEWING_SIZE.default_number * MEGAPIXEL)  # of a preview, at most
@@ -308,7 +308,7 @@ class Preview:
                 picture = next((other for other in self._pictures if other.key[-1] == whole), None)
                 if picture is not None:
                     used.append(picture)
-                    result = over(result, picture.of(result), step.opacity)
+                    result = mixed(result, picture.of(result), step.opacity)
                 continue
             picture = next((other for other in self._pictures if other.key == (*key, whole)), None)
             if picture is None:
@@ -316,7 +316,7 @@ class Preview:
                 picture = self._computed(whole, result, key, keep=not computed)
                 computed = computed or bool(key) or not self._is_of_layers(step)
             used.append(picture)
-            result, key = over(result, picture.after, step.opacity), (*key, step)
+            result, key = mixed(result, picture.after, step.opacity), (*key, step)
         self._pictures, result = used, result.clamp(0, 1)
         if moving is None:
             self.edited = result

@@ -22,11 +22,11 @@ from nlfilter_torch.photo.declared.rows import WHITE, is_hidden
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.edits.applying import edit_of
 from nlfilter_torch.photo.files.rows import StoredPicture, open_picture
-from nlfilter_torch.photo.picture.drawn import M
 from nlfilter_torch.photo.picture.edit import PhotoEdit, Rows
 from nlfilter_torch.photo.picture.in_memory import InMemory, edit_image, fit_edit
 from nlfilter_torch.photo.picture.photographs import Photograph, write_photograph
 from nlfilter_torch.photo.picture.pictures import Picture, stored_as
+from nlfilter_torch.photo.picture.pixels import M
 from nlfilter_torch.photo.picture.source import Source, seeded
 from nlfilter_torch.photo.picture.tiled import Tiled
 from nlfilter_torch.photo.picture.tiles import Tiling

@@ -20,15 +20,16 @@ from nlfilter_torch.photo.files.formats import PFM, Depth, check_depth, check_me
 from nlfilter_torch.photo.files.metadata import NO_METADATA
 from nlfilter_torch.photo.files.rows import TILED_MEMORY, StoredPicture, check_place, open_picture, write_picture
 from nlfilter_torch.photo.files.writing import check_file
-from nlfilter_torch.photo.picture.drawn import Drawn, M
+from nlfilter_torch.photo.picture.drawn import Drawn
 from nlfilter_torch.photo.picture.edit import Rows
 from nlfilter_torch.photo.picture.in_memory import InMemory
 from nlfilter_torch.photo.picture.photographs import Photograph, check_output, write_photograph
 from nlfilter_torch.photo.picture.pictures import Picture
-from nlfilter_torch.photo.picture.seen import Seen, of_picture, range_of
+from nlfilter_torch.photo.picture.pixels import M
 from nlfilter_torch.photo.picture.source import Fitted, Source, seeded
 from nlfilter_torch.photo.picture.tiled import Tiled
 from nlfilter_torch.photo.picture.tiled_scribbles import region_rows
+from nlfilter_torch.photo.picture.working_range import range_of
 from nlfilter_torch.photo.selections.mask import RegionMask
 
 PLANE_BYTES = 16  # per pixel, of a mask that is computed in tiles but written at once
@@ -161,7 +162,7 @@ class MaskJob:
     def _fitted(self, source: Source[M], drawn: Drawn[M]) -> Fitted:
         """Fit the mask, and print how much is selected."""
         working, edit = range_of(source), self._edit_at(source.size)
-        seen = source if working is None else Seen(source, working)
+        seen = source.in_range(working)
         regions = edit.select(seen, drawn)
         tell_selected(regions.selected(seen), opposed="background" in drawn.masks)
-        return Fitted(regions.masks) if working is None else of_picture(Fitted(regions.masks), working)
+        return Fitted(regions.masks, working=working, gives_picture=False)

@@ -19,12 +19,13 @@ from nlfilter_torch.photo.edits.applying import apply_recipe, edit_of, left_by_c
 from nlfilter_torch.photo.edits.recipe import edit_regions, edit_tiling
 from nlfilter_torch.photo.files.rows import StoredPicture
 from nlfilter_torch.photo.picture.changes import blend_edited
-from nlfilter_torch.photo.picture.drawn import M, Painter
+from nlfilter_torch.photo.picture.drawn import Painter
 from nlfilter_torch.photo.picture.edit import Rows
 from nlfilter_torch.photo.picture.in_memory import InMemory
 from nlfilter_torch.photo.picture.painting import TensorPainter
 from nlfilter_torch.photo.picture.photographs import Photograph
 from nlfilter_torch.photo.picture.pictures import Picture
+from nlfilter_torch.photo.picture.pixels import M
 from nlfilter_torch.photo.picture.source import Source
 from nlfilter_torch.photo.picture.tiled import Tiled
 from nlfilter_torch.photo.picture.tiled_developed import developed_rows

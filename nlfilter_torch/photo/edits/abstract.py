@@ -19,11 +19,12 @@ from nlfilter_torch.operator.features import blur, blur_margin
 from nlfilter_torch.operator.options import Completion, FilterOptions, GuideChannels, Sampling
 from nlfilter_torch.photo.declared.declaration import Edit
 from nlfilter_torch.photo.declared.parameters import ABSTRACT
+from nlfilter_torch.photo.picture import measuring
 from nlfilter_torch.photo.picture.colour import merge_luminance, split_luminance
-from nlfilter_torch.photo.picture.drawn import Drawn, M
+from nlfilter_torch.photo.picture.drawn import Drawn
 from nlfilter_torch.photo.picture.edit import PhotoEdit
 from nlfilter_torch.photo.picture.in_memory import edited
-from nlfilter_torch.photo.picture.pixels import whole_image
+from nlfilter_torch.photo.picture.pixels import M, whole_image
 from nlfilter_torch.photo.picture.source import Fitted, Guide, Pixels, Planes, Source
 from nlfilter_torch.photo.picture.viewing import fit_change, viewed_size
 
@@ -133,7 +134,7 @@ class Abstract(PhotoEdit):
         """Compute ``W^k y``; powers above 1 in several steps."""
         operator = source.operator(Guide(self.filter_options(source.size, fewer_landmarks=True)))
         # W preserves constants, but a rational function of it does so only up to rounding: filter without the mean.
-        mean, form, steps = source.mean(whole_image), POWERS(), _steps(self.power)
+        mean, form, steps = measuring.mean(source, whole_image), POWERS(), _steps(self.power)
         exponent = torch.as_tensor(self.power, dtype=torch.float64, device=mean.device).reshape(-1, 1) / steps
         weights = form.coefficients(form.nodes.to(mean.device) ** exponent).expand(source.batch, -1)
         planes: Planes = partial(_varying, mean)

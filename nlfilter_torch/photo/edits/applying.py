@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
-from functools import partial
 from importlib import import_module
 
 import torch
@@ -14,13 +13,13 @@ from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.declared.shared_parameters import FILTER
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.picture.developing import develop_image, develop_planes, limits_of
-from nlfilter_torch.photo.picture.drawn import Drawn, M, Painter, drawn_by
+from nlfilter_torch.photo.picture.drawn import Drawn, Painter, drawn_by
 from nlfilter_torch.photo.picture.edit import PhotoEdit
 from nlfilter_torch.photo.picture.in_memory import InMemory, fit_edit
 from nlfilter_torch.photo.picture.painting import TensorPainter
+from nlfilter_torch.photo.picture.pixels import M, WorkingRange
 from nlfilter_torch.photo.picture.source import Fitted, Source, seeded
 from nlfilter_torch.photo.picture.viewing import viewed_size
-from nlfilter_torch.photo.picture.working_range import WorkingRange
 
 #: The name of each edit, which is that of its module, and of its class. A new edit takes a line here.
 CLASSES = {
@@ -120,12 +119,7 @@ def fit_step(
     edit = edit_of(step, source.size, stride=stride, generator=generator)
     edit.check_channels(source.channels)
     fitted = fit_edit(edit, source, drawn, working=working)
-    return fitted if step.opacity == 1 else fitted.then(partial(over, opacity=step.opacity))
-
-
-def over(image: Tensor, edited: Tensor, opacity: float) -> Tensor:
-    """An edited image, mixed with the one before it."""
-    return edited if opacity == 1 else torch.lerp(image.to(edited.dtype), edited, opacity)
+    return replace(fitted, opacity=step.opacity)
 
 
 @full_precision

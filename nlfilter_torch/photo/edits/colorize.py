@@ -41,10 +41,11 @@ from nlfilter_torch.photo.picture.colour import (
     split_luminance,
     with_green,
 )
-from nlfilter_torch.photo.picture.drawn import Drawn, M
+from nlfilter_torch.photo.picture.drawn import Drawn
 from nlfilter_torch.photo.picture.edit import PhotoEdit, Rows
 from nlfilter_torch.photo.picture.in_memory import edited
-from nlfilter_torch.photo.picture.pixels import part_of
+from nlfilter_torch.photo.picture.measuring import check_in_memory, everywhere, reduced
+from nlfilter_torch.photo.picture.pixels import M, part_of
 from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles, scribbled_blocks
 from nlfilter_torch.photo.picture.source import (
     Fitted,
@@ -53,6 +54,7 @@ from nlfilter_torch.photo.picture.source import (
     Pixels,
     Planes,
     Source,
+    kept,
     luminance,
 )
 from nlfilter_torch.photo.picture.viewing import Coarse, viewed_size
@@ -223,9 +225,10 @@ class Colorize(PhotoEdit):
         """Raise an error for an invalid setting."""
         COLORIZE.check(method=self.method)
         if self.method == "kmeans":
-            source.check_all_in_memory(
+            check_in_memory(
+                source,
                 "method must be regression for a picture processed in tiles, got kmeans, which needs all pixels in "
-                "memory; choose regression, or allow more memory"
+                "memory; choose regression, or allow more memory",
             )
         COLORIZE.check(source.batch, strength=self.strength)
         check_positive(self.time, "time", source.batch)
@@ -240,7 +243,7 @@ class Colorize(PhotoEdit):
     def _segments(self, operators: "Operators[M]", scribbles: Scribbles, wanted: Tensor) -> Planes:
         """Chroma, red and blue, of the segment of each pixel."""
         regions, colours, valid = group_colours(wanted.unsqueeze(2), scribbles.weights.unsqueeze(2))
-        planes = operators.viewed.all(Fitted(scribbles.weighted(regions.squeeze(2)).planes))
+        planes = everywhere(operators.viewed, Fitted(scribbles.weighted(regions.squeeze(2)).planes))
         pieces = segment(cast(Spectrum, operators.of(FAR).pairs), planes, self.time, valid)
         return part_of(torch.einsum("bkhw,bkc->bchw", pieces, colours)[:, ::2])
 
@@ -341,7 +344,7 @@ class Estimates(Generic[M]):
 
     def _interpolated(self, estimate: LocalValues, pixels: Pixels, own: Tensor) -> Tensor:
         place = (estimate.links, pixels.first, pixels.image.shape)
-        return self.viewed.kept(place, [estimate.values], partial(estimate, own, pixels.first))
+        return kept(self.viewed, place, [estimate.values], partial(estimate, own, pixels.first))
 
 
 @dataclass(frozen=True, eq=False)
@@ -359,9 +362,9 @@ class Propagation(Generic[M]):
         depends on the size of the picture.
         """
         size, places, cubed = self.viewed.size, self.scribbles.places, self.scribbles.weights**3
-        guide = self.viewed.reduced(luminance, links.step(size))
+        guide = reduced(self.viewed, luminance, links.step(size))
         solve = partial(LocalValues.of, links, guide, size, places, cubed, values, self.groups, predicted)
-        return self.viewed.kept(links, [guide, places, cubed, values], solve)
+        return kept(self.viewed, links, [guide, places, cubed, values], solve)
 
 
 def usual_chroma(image: Tensor) -> Tensor:
@@ -377,7 +380,7 @@ def bandwidth_ratio(source: Source[M]) -> Tensor:
     In float64: in float32, the bandwidths of a mirrored picture would differ by rounding, and with them its landmarks.
     """
     step = max(1, min(source.size) // BLOCKS)
-    blocks = source.reduced(luminance, step).double()
+    blocks = reduced(source, luminance, step).double()
     changes = [blocks.diff(dim=dim).abs().flatten(1) for dim in (2, 3)]
     down, across = (change.sum(1) / max(1, change.shape[1]) + SAME_BRIGHTNESS for change in changes)
     return (down / across).pow(ANISOTROPY).clamp(1 / MOST_ANISOTROPY, MOST_ANISOTROPY)
@@ -494,8 +497,8 @@ def _coloured(source: Source[M], viewed: Source[M], chroma: Planes) -> Fitted:
     """
     if source is viewed:
         return Fitted(partial(_in_chroma, chroma))
-    before = viewed.all(Fitted(_luminance_twice))
-    changes = Coarse.of(before, viewed.all(Fitted(chroma)), None, "none").changes(source, _luminance_twice)
+    before = everywhere(viewed, Fitted(_luminance_twice))
+    changes = Coarse.of(before, everywhere(viewed, Fitted(chroma)), None, "none").changes(source, _luminance_twice)
     return Fitted(partial(_in_changed_chroma, changes))
 
 

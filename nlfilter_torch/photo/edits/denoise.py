@@ -28,13 +28,13 @@ from nlfilter_torch.photo.edits.hot_pixels import HotPixels, hot_pixels_of
 from nlfilter_torch.photo.edits.noise import noise_of, profile_of
 from nlfilter_torch.photo.edits.synthesis import remainder
 from nlfilter_torch.photo.picture.changes import change_in_parts
-from nlfilter_torch.photo.picture.drawn import Drawn, M
+from nlfilter_torch.photo.picture.drawn import Drawn
 from nlfilter_torch.photo.picture.edit import PhotoEdit, Rows
 from nlfilter_torch.photo.picture.in_memory import edited
-from nlfilter_torch.photo.picture.pixels import whole_image
-from nlfilter_torch.photo.picture.seen import Seen, range_of
+from nlfilter_torch.photo.picture.measuring import check_in_memory
+from nlfilter_torch.photo.picture.pixels import M, WorkingRange, whole_image
 from nlfilter_torch.photo.picture.source import Fitted, Guide, Operator, Pixels, Planes, Source
-from nlfilter_torch.photo.picture.working_range import WorkingRange
+from nlfilter_torch.photo.picture.working_range import range_of
 
 Method = Literal["network", "rule"]
 
@@ -159,8 +159,9 @@ class Denoise(PhotoEdit):
             )
         if self.method == "network":
             if is_map:
-                source.check_all_in_memory(
-                    "noise_level must be a number for a picture processed in tiles, got a map; denoise it in memory"
+                check_in_memory(
+                    source,
+                    "noise_level must be a number for a picture processed in tiles, got a map; denoise it in memory",
                 )
             denoising = NetworkDenoising(noise, self.strength, hot_pixels)
             repaired = None if hot_pixels is None else hot_pixels.repaired
@@ -189,7 +190,7 @@ class Denoise(PhotoEdit):
         working = range_of(source)
         if working is None:
             return self._measured(source)
-        return self.in_range(working)._measured(Seen(source, working))
+        return self.in_range(working)._measured(source.in_range(working))
 
     def _measured(self, source: Source[M]) -> Self:
         if self.noise_level is not None and self.hot_pixels is not None:

@@ -31,13 +31,15 @@ from nlfilter_torch.photo.picture.changes import (
     split_sliders,
     sum_of,
 )
-from nlfilter_torch.photo.picture.drawn import Drawn, M
+from nlfilter_torch.photo.picture.drawn import Drawn
 from nlfilter_torch.photo.picture.edit import PhotoEdit
 from nlfilter_torch.photo.picture.in_memory import edited
 from nlfilter_torch.photo.picture.limits import Limits
-from nlfilter_torch.photo.picture.pixels import corner, whole_image
+from nlfilter_torch.photo.picture.measuring import everywhere
+from nlfilter_torch.photo.picture.pixels import M, corner, whole_image
 from nlfilter_torch.photo.picture.resizing import enlarged
 from nlfilter_torch.photo.picture.source import Fitted, Guide, Pixels, Planes, Source, luminance
+from nlfilter_torch.photo.picture.tiled_scribbles import num_regions, resized_masks
 from nlfilter_torch.photo.picture.viewing import balance, enlarged_change, fit_change, viewed_size
 from nlfilter_torch.photo.selections.by_hand import ByHand
 from nlfilter_torch.photo.selections.connected import Extent
@@ -164,7 +166,7 @@ class Detail(PhotoEdit):
         alpha = self.alpha if drawn.sliders is None else drawn.sliders
         outside = self.outside if drawn.outside is None else drawn.outside
         masks = drawn.masks
-        counts = [source.num_regions(masks[name], name) for name in ("regions", "added") if name in masks]
+        counts = [num_regions(source, masks[name], name) for name in ("regions", "added") if name in masks]
         self._check(source.batch, masks, alpha, outside)
         if not counts:
             return self._fit_whole(source, alpha)
@@ -260,7 +262,7 @@ class Detail(PhotoEdit):
         if brighter is None:
             edited.insert(-1, whole_image)
         steps = source.size[0] / viewed.size[0], source.size[1] / viewed.size[1]
-        return Fitted(BlendedByHand(edited, viewed.all(Fitted(computed.regions.masks)), steps, by_hand))
+        return Fitted(BlendedByHand(edited, everywhere(viewed, Fitted(computed.regions.masks)), steps, by_hand))
 
     def _fitted(self, change: Planes) -> Fitted:
         """A change of detail at the viewing size."""
@@ -273,7 +275,7 @@ class Detail(PhotoEdit):
         selector = self.selection()  # takes the state of the generator before the filter draws from it
         filtered = self._filtered(viewed, sliders[0].shape[-1] - 1)
         if viewed.size != source.size:
-            masks = {name: source.resized_weights(mask, viewed.size, name) for name, mask in masks.items()}
+            masks = {name: resized_masks(source, mask, viewed.size, name) for name, mask in masks.items()}
         regions = selector.select(viewed, self.marks(Drawn(masks)))
         return RegionalChange([DetailChange(filtered, row) for row in sliders], regions)
 

@@ -27,10 +27,11 @@ from nlfilter_torch.photo.declared.steps import Step, acting_steps
 from nlfilter_torch.photo.edits.applying import fit_step
 from nlfilter_torch.photo.picture.drawn import Drawn
 from nlfilter_torch.photo.picture.pictures import Picture
+from nlfilter_torch.photo.picture.pixels import WorkingRange
 from nlfilter_torch.photo.picture.sampling import CHUNK, ColumnCache, GuidePicture, Pilot
-from nlfilter_torch.photo.picture.source import Fitted, Guide, Planes, Source, seeded
+from nlfilter_torch.photo.picture.source import Guide, Planes, Source, seeded
 from nlfilter_torch.photo.picture.statistics import Block, Sums
-from nlfilter_torch.photo.picture.tiled import Tiled
+from nlfilter_torch.photo.picture.tiled import Room, Tiled
 from nlfilter_torch.photo.picture.tiled_operator import TiledOperator, first_plane
 from nlfilter_torch.photo.picture.tiles import Passes
 
@@ -103,14 +104,26 @@ class FrameOperator(TiledOperator):
 class Frame(Tiled):
     """A frame as the source of an edit that is fitted to reference frames of the same size."""
 
-    def __init__(self, picture: Picture, passes: Passes, references: References) -> None:
-        super().__init__(picture, passes)
+    def __init__(self, picture: Picture, passes: Passes, references: References, room: Room | None = None) -> None:
+        super().__init__(picture, passes, room=room)
         self.references, self.num_requested = references, 0
 
-    def accept_any_scale(self) -> None:
-        """Do not warn of values far outside [0, 1] from now on, in this frame or the references."""
+    @property
+    def memory(self) -> float:
+        """None: means are taken over the references, not over what is kept of this frame."""
+        return 0.0
+
+    def in_range(self, working: WorkingRange | None) -> "Frame":
+        """The frame, with the references, in a range of values."""
         for picture in (self.picture, *self.references.pictures):
             picture.accept_any_scale()
+        if working is None:
+            return self
+        references = self.cached_result(partial(self._references_in_range, working))
+        return Frame(self.picture.in_range(working), self.passes, references, self.room)
+
+    def _references_in_range(self, working: WorkingRange) -> References:
+        return References([picture.in_range(working) for picture in self.references.pictures])
 
     def cached_result(self, compute: Callable[[], Cached]) -> Cached:
         """Return the next cached result for the references, or compute and cache it."""
@@ -123,9 +136,7 @@ class Frame(Tiled):
     def reference_frames(self) -> Iterator["Frame"]:
         """Yield the references, as frames that share the operators of this one."""
         for picture in self.references.pictures:
-            frame = Frame(picture, self.passes, self.references)
-            frame.operators, frame.tile_floats = self.operators, self.tile_floats
-            yield frame
+            yield Frame(picture, self.passes, self.references, self.room)
 
     @full_precision
     def operator(self, guide: Guide) -> FrameOperator:
@@ -143,8 +154,7 @@ class Frame(Tiled):
             cache=ColumnCache(1, 0),
         )
         operator.frame, operator._pixel_scaling, operator._sample = self, learnt.pixel_scaling, learnt.blocks
-        self.operators.append(operator)
-        self.tile_floats += learnt.pilot.kernel.landmarks.shape[1]
+        self.room.operators.append(operator)
         return operator
 
     def resized(self, size: tuple[int, int]) -> "Frame":
@@ -154,26 +164,6 @@ class Frame(Tiled):
 
     def _resized_references(self, size: tuple[int, int]) -> References:
         return References([Tiled.resized(frame, size).picture for frame in self.reference_frames()])
-
-    def cached(self, fitted: Fitted) -> Fitted:
-        """Return the edit unchanged: means are taken over the references, not over this frame."""
-        return fitted
-
-    def mean(self, planes: Planes) -> Tensor:
-        """Means over the references."""
-        return self.cached_result(partial(self._average, lambda frame: Tiled.mean(frame, planes)))
-
-    def mean_of(self, fitted: Fitted, function: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
-        """Means over the references."""
-        return self.cached_result(partial(self._average, lambda frame: Tiled.mean_of(frame, fitted, function)))
-
-    def ends(self, planes: Planes) -> tuple[Tensor, Tensor]:
-        """Means of the least and largest values of the references."""
-        return self.cached_result(partial(self._average_ends, planes))
-
-    def _average_ends(self, planes: Planes) -> tuple[Tensor, Tensor]:
-        least, largest = zip(*(Tiled.ends(frame, planes) for frame in self.reference_frames()), strict=True)
-        return average(least), average(largest)
 
     def measured(self, function: Callable[[Source[RowSource]], Tensor]) -> Tensor:
         """The mean of a measurement over the references."""

@@ -12,12 +12,11 @@ from functools import cache, partial
 import torch
 from torch import Tensor
 
-from nlfilter_torch.core.inner import Inner
 from nlfilter_torch.core.torch_internals import is_hidden
 from nlfilter_torch.nn.denoiser.estimate import has_few_colours
 from nlfilter_torch.operator.features import pad_border
-from nlfilter_torch.photo.picture.drawn import M
-from nlfilter_torch.photo.picture.source import Source, sampled_places
+from nlfilter_torch.photo.picture.pixels import Block, M
+from nlfilter_torch.photo.picture.source import Source, at, sampled_places
 
 MARGIN = 2  # pixels around a pixel that it is compared with
 SMALLEST = 2 * MARGIN + 1  # side of a picture in which they are looked for
@@ -183,14 +182,14 @@ def hot_pixels_of(source: Source[M]) -> HotPixels | None:
     if min(source.size) < SMALLEST:
         return None
     places = sampled_places(source.size)
-    colours, weights = source.colours(places), source.weights_at(places)
+    colours, weights = at(source, places)
     if is_hidden(colours):
         return None
     values = colours.double() if weights is None else torch.where(weights > 0, colours.double(), torch.nan)
     ends = torch.nanquantile(values.flatten(1), colours.new_tensor(RANGE).double(), dim=1)
     ends = torch.where(ends.isfinite(), ends, 0.0)
     floor = FLOOR * (ends[1] - ends[0])
-    parts = source.parts(partial(_numbers, floor=floor, width=source.size[1]), MARGIN)
+    parts = list(source.over(partial(_numbers, floor=floor), "Looking closely", margin=MARGIN))
     sums = torch.stack([part.numbers for part in parts]).sum(0)
     count, outliers, close = sums[:, :3].unbind(1)
     strong, others = sums[:, 3:].unflatten(1, (2, BINS)).unbind(1)
@@ -223,8 +222,10 @@ class Part:
     medians: Tensor
 
 
-def _numbers(image: Tensor, inner: Inner, first_row: int, floor: Tensor, width: int) -> Part:
-    """Count the outliers in rows of images (B, C, H, W), of which the first is a row of a picture of some width."""
+def _numbers(block: Block, floor: Tensor) -> Part:
+    """Count the outliers in a block of pictures."""
+    image, inner, width = block.pixels, block.inner, block.width
+    first_row = block.first // width
     total = torch.zeros(len(image), 3 + 2 * BINS, dtype=torch.float64)
     first, last, _ = inner[0].indices(image.shape[2])
     step, outliers, medians = max(1, STRIP // image.shape[3]), [], []

@@ -24,11 +24,12 @@ from nlfilter_torch.photo.looks.look_filter import (
     pointwise,
     texture_change,
 )
-from nlfilter_torch.photo.picture.drawn import Drawn, M
+from nlfilter_torch.photo.picture.drawn import Drawn
 from nlfilter_torch.photo.picture.edit import PhotoEdit, Rows
 from nlfilter_torch.photo.picture.in_memory import edit_image, edited
-from nlfilter_torch.photo.picture.pixels import corner, whole_image
-from nlfilter_torch.photo.picture.source import Fitted, Guide, Pixels, Planes, Source, luminance
+from nlfilter_torch.photo.picture.measuring import ends, mean, reduced
+from nlfilter_torch.photo.picture.pixels import M, corner, whole_image
+from nlfilter_torch.photo.picture.source import Fitted, Guide, Pixels, Planes, Source, kept, luminance
 from nlfilter_torch.photo.picture.viewing import fit_change
 
 Numbers = Tensor | Sequence[float]
@@ -190,8 +191,8 @@ class LookEdit(PhotoEdit):
             pixels = partial(_for_all_channels, partial(filtered, alpha=sliders - 1))
         if not acts(gains) and not acts(textured):
             return Fitted(pixels)
-        mean = viewed.mean(luminance) if acts(gains) else None
-        return Fitted(pixels, Bands(gains, mean, textured if acts(textured) else None), BAND_MARGIN)
+        average = mean(viewed, luminance) if acts(gains) else None
+        return Fitted(pixels, Bands(gains, average, textured if acts(textured) else None), BAND_MARGIN)
 
 
 def no_change(pixels: Pixels) -> Tensor:
@@ -270,10 +271,10 @@ def _change_of_light(source: Source[M], levels: Tensor, strengths: Tensor) -> Pl
     """The change (B, C, h, w) by automatic levels and local tone curves, or None if there is none."""
     if not acts(levels, 0.0) and not acts(strengths, 0.0):
         return None
-    stretch = source.kept("range of brightness", [], partial(_range_of, source))
+    stretch = kept(source, "range of brightness", [], partial(_range_of, source))
     curves = None
     if acts(strengths, 0.0):
-        curves = source.kept("local curves", [], partial(_curves_of, source, stretch)).weighed(strengths)
+        curves = kept(source, "local curves", [], partial(_curves_of, source, stretch)).weighed(strengths)
     return ChangeOfLight(stretch, curves, levels if curves is None or acts(levels, 0.0) else None)
 
 
@@ -282,7 +283,7 @@ def _tones(pixels: Pixels) -> Tensor:
 
 
 def _range_of(source: Source[M]) -> Stretch:
-    return Stretch.of(source.ends(_tones))
+    return Stretch.of(ends(source, _tones))
 
 
 def _ramps(stretch: Stretch, pixels: Pixels) -> Tensor:
@@ -290,7 +291,7 @@ def _ramps(stretch: Stretch, pixels: Pixels) -> Tensor:
 
 
 def _curves_of(source: Source[M], stretch: Stretch) -> LocalCurves:
-    return LocalCurves.of(source.size, stretch, partial(source.reduced, partial(_ramps, stretch)))
+    return LocalCurves.of(source.size, stretch, partial(reduced, source, partial(_ramps, stretch)))
 
 
 @dataclass(frozen=True, eq=False)

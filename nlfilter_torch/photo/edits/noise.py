@@ -10,8 +10,8 @@ from nlfilter_torch.nn.denoiser.estimate import measured_profile, profile_of_mea
 from nlfilter_torch.nn.denoiser.noise import Noise, measured_noise, window_places
 from nlfilter_torch.nn.denoiser.profile import NoiseProfile
 from nlfilter_torch.operator.options import GuideChannels
-from nlfilter_torch.photo.picture.drawn import M
-from nlfilter_torch.photo.picture.source import Source
+from nlfilter_torch.photo.picture.pixels import M
+from nlfilter_torch.photo.picture.source import Source, at
 
 Repaired = Callable[[Tensor, Tensor], Tensor]  # of places (n,) and their colours (B, C, n)
 
@@ -38,7 +38,7 @@ def _measured_profile(source: Source[M], repaired: Repaired | None) -> Tensor:
 
 def _visible(source: Source[M], places: Tensor) -> Tensor:
     """Colours of single pixels, 0 where they do not count: windows with much black are not measured."""
-    colours, weights = source.colours(places), source.weights_at(places)
+    colours, weights = at(source, places)
     return colours if weights is None else colours * (weights > 0)
 
 

@@ -20,10 +20,9 @@ from nlfilter_torch.photo.declared.steps import Step, acting_steps
 from nlfilter_torch.photo.edits.applying import fit_step, scribbles_of
 from nlfilter_torch.photo.picture.pictures import LazyRows, Picture, Tile
 from nlfilter_torch.photo.picture.resizing import resized
-from nlfilter_torch.photo.picture.sampling import ColumnCache, GuidePicture, Report, in_silence
+from nlfilter_torch.photo.picture.sampling import Report, in_silence
 from nlfilter_torch.photo.picture.source import Fitted
 from nlfilter_torch.photo.picture.tiled import Tiled
-from nlfilter_torch.photo.picture.tiled_operator import TiledOperator, TilePixels
 from nlfilter_torch.photo.picture.tiled_scribbles import RowPainter
 from nlfilter_torch.photo.picture.tiles import Passes, Statistics, intermediate
 
@@ -75,46 +74,21 @@ def select_columns(whole: RowSource, columns: range) -> LazyRows:
     return LazyRows(shape, lambda rows: np.asarray(whole[rows])[:, columns.start : columns.stop], whole.dtype)
 
 
-@dataclass(frozen=True, eq=False)
-class PartFeatures:
-    """Features of the pixels of a rectangle.
-
-    Attributes:
-        picture: the columns of the picture around the rectangle.
-        tile: the rows of the rectangle in it, with the rows around them.
-        first_column: of ``picture``, in the whole picture.
-        inside: the columns of the rectangle in ``picture``.
-    """
-
-    picture: Picture
-    tile: Tile
-    first_column: int
-    inside: slice
-
-    def __call__(self, operator: TiledOperator) -> Tensor:
-        """Features (1, D, n) for an operator of the whole picture."""
-        recipe = operator.kernel.recipe
-        guide = GuidePicture(self.picture, operator.guide.guide).seen(self.tile, recipe.patch_weights.shape[0] // 2)
-        features = recipe(guide.pixels, origin=(guide.origin[0], self.first_column), halo=guide.halo)
-        return features.unflatten(2, (len(self.tile.stored), -1))[..., self.inside].flatten(2)
-
-
-def pixels_of_part(tiled: Tiled, part: Rectangle) -> TilePixels:
-    """Read the pixels of a rectangle."""
-    margin = tiled.margin
+def tile_of_part(tiled: Tiled, part: Rectangle) -> Tile:
+    """Read the pixels of a rectangle, and those around it that its columns depend on."""
+    margin = tiled.room.margin
     around = part.grown(margin, tiled.size)
     picture = Picture(select_columns(tiled.picture.source, around.columns), tiled.picture.name)
     picture.checks_scale = tiled.picture.checks_scale
     tile = picture.tile(part.rows.start, part.rows.stop, margin)
-    columns = part.inside(around)[1]
-    features = PartFeatures(picture, tile, around.columns.start, columns)
-    first = part.rows.start * tiled.size[1] + part.columns.start
-    return TilePixels(tile.inner[..., columns], features, first, tiled.size[1])
+    return replace(tile, left=around.columns.start, inside=part.inside(around)[1], width=tiled.size[1])
 
 
 def planes_of_part(tiled: Tiled, fitted: Fitted, part: Rectangle) -> Tensor:
     """The planes (1, C, h, w) that an edit computes from a rectangle, before ``finish``."""
-    return fitted.pixels(pixels_of_part(tiled, part))
+    tile = tile_of_part(tiled, part)
+    planes = fitted.pixels(tile.in_range(fitted.working))
+    return planes if fitted.finish is not None else fitted.output(tile.image, planes)
 
 
 @torch.no_grad()
@@ -128,14 +102,14 @@ def edited_part(tiled: Tiled, fitted: Fitted, part: Rectangle) -> Tensor:
         Rectangle(range(start, min(start + step, rows.stop)), around.columns)
         for start in range(rows.start, rows.stop, step)
     ]
-    for operator in tiled.operators:
-        operator.prepare()  # before several workers need it
-    workers = tiled.passes.workers(tiled.num_landmarks)
+    tiled.room.prepare()
+    workers = tiled.passes.workers(tiled.room.num_landmarks)
     planes = torch.cat(list(in_order(partial(planes_of_part, tiled, fitted), strips, workers)), dim=2)
     if fitted.finish is None:
         return planes
-    inner = part.inside(around)
-    return fitted.finish(pixels_of_part(tiled, around).image, planes, inner)[..., *inner]
+    tile, inner = tile_of_part(tiled, around), part.inside(around)
+    result = fitted.finish(tile.in_range(fitted.working).image, planes, inner)
+    return fitted.output(tile.image, result)[..., *inner]
 
 
 class Stage:
@@ -154,8 +128,7 @@ class Stage:
             self._fitted = None
             tiled = Tiled(self.picture, passes)
             fitted = fit_step(step, tiled, scribbles_of(step, tiled.size, RowPainter()))
-            for operator in tiled.operators:
-                operator.prepare()
+            tiled.room.prepare()
             self._fitted = step, tiled, fitted
         return self._fitted[1:]
 
@@ -171,8 +144,8 @@ class Stage:
 
     def forget_columns(self) -> None:
         """Free the columns cached between passes."""
-        for operator in [] if self._fitted is None else self._fitted[1].operators:
-            operator.cache = ColumnCache(1, 0)
+        if self._fitted is not None:
+            self._fitted[1].room.forget_columns()
 
     def close(self) -> None:
         """Remove the file."""
@@ -236,7 +209,7 @@ class Parts:
         """A rectangle (1, C, h, w) of the picture, in [0, 1]."""
         picture = self._stages[0].picture
         columns = Picture(select_columns(picture.source, part.columns), picture.name)
-        return columns.tile(part.rows.start, part.rows.stop, 0).inner.clamp(0, 1)
+        return columns.tile(part.rows.start, part.rows.stop, 0).image.clamp(0, 1)
 
     def close(self) -> None:
         """Remove temporary files."""

@@ -75,8 +75,8 @@ class Blend:
 
     def __call__(self, tile: Tile) -> Tensor:
         """The blended rows (1, C, h, W) of a tile of the original picture."""
-        image, stop = tile.inner, tile.start + tile.inner.shape[2]
-        edited = [picture.tile(tile.start, stop, 0).inner.to(image) for picture in self.edited]
+        image, stop = tile.image, tile.start + len(tile.stored)
+        edited = [picture.tile(tile.start, stop, 0).image.to(image) for picture in self.edited]
         masks = [mask_of(picture.tile(tile.start, stop, 0)).to(image) for picture in self.masks]
         return blend_edited(image, edited, torch.cat(masks, dim=1))
 

@@ -15,9 +15,9 @@ from nlfilter_torch.photo.declared.declaration import Edit
 from nlfilter_torch.photo.declared.parameters import RECOLOR
 from nlfilter_torch.photo.looks.look_filter import acts
 from nlfilter_torch.photo.picture.colour import dot, merge_luminance, split_luminance
-from nlfilter_torch.photo.picture.drawn import Drawn, M
+from nlfilter_torch.photo.picture.drawn import Drawn
 from nlfilter_torch.photo.picture.in_memory import edited
-from nlfilter_torch.photo.picture.pixels import whole_image
+from nlfilter_torch.photo.picture.pixels import M, whole_image
 from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles
 from nlfilter_torch.photo.picture.source import Fitted, Pixels, Source
 from nlfilter_torch.photo.selections.border_colours import Sides, colours_beside, refine_mask

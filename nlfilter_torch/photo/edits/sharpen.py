@@ -16,11 +16,12 @@ from nlfilter_torch.photo.declared.declaration import Edit
 from nlfilter_torch.photo.declared.parameters import SHARPEN
 from nlfilter_torch.photo.edits.noise import noise_of
 from nlfilter_torch.photo.picture.changes import VARIANCE_SIGMA, activity
-from nlfilter_torch.photo.picture.drawn import Drawn, M
+from nlfilter_torch.photo.picture.drawn import Drawn
 from nlfilter_torch.photo.picture.edit import PhotoEdit
 from nlfilter_torch.photo.picture.in_memory import edited
 from nlfilter_torch.photo.picture.limits import Limits
-from nlfilter_torch.photo.picture.source import Fitted, Guide, Pixels, Planes, Source, luminance
+from nlfilter_torch.photo.picture.pixels import M
+from nlfilter_torch.photo.picture.source import Fitted, Guide, Pixels, Planes, Source, kept, luminance
 from nlfilter_torch.photo.picture.viewing import fit_change
 
 RADIUS = 1.5  # standard deviation in pixels of the blur of the unsharp mask
@@ -109,7 +110,7 @@ class Sharpen(PhotoEdit):
         """The unsharp mask of a picture at the viewing size."""
         check_reach(self.guide_blur, "guide_blur", viewed.size)
         layers = viewed.operator(self.guide(viewed.size)).layers(luminance, 1)
-        noise = viewed.kept("noise of luminance", [], partial(noise_of, viewed, "luminance"))
+        noise = kept(viewed, "noise of luminance", [], partial(noise_of, viewed, "luminance"))
         strength = (torch.as_tensor(self.amount, dtype=viewed.dtype).reshape(-1, 1, 1, 1) - 1) / UNIT
         margin = blur_margin(RADIUS) + blur_margin(VARIANCE_SIGMA)
         return Fitted(partial(_flat_layers, layers), UnsharpMask(noise, strength), margin)

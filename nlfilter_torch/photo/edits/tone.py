@@ -12,10 +12,12 @@ from nlfilter_torch.operator.options import Completion, GuideChannels, Sampling
 from nlfilter_torch.photo.declared.declaration import Edit
 from nlfilter_torch.photo.declared.parameters import TONE
 from nlfilter_torch.photo.edits.synthesis import Polynomial
-from nlfilter_torch.photo.picture.drawn import Drawn, M
+from nlfilter_torch.photo.picture.drawn import Drawn
 from nlfilter_torch.photo.picture.edit import PhotoEdit
 from nlfilter_torch.photo.picture.in_memory import edited
 from nlfilter_torch.photo.picture.limits import Limits
+from nlfilter_torch.photo.picture.measuring import mean
+from nlfilter_torch.photo.picture.pixels import M
 from nlfilter_torch.photo.picture.source import Fitted, Guide, Pixels, Source, luminance
 from nlfilter_torch.photo.picture.viewing import fit_change
 
@@ -104,8 +106,8 @@ class Tone(PhotoEdit):
 
     def _change(self, viewed: Source[M]) -> Fitted:
         """The change of luminance of a picture at the viewing size."""
-        operator, mean = viewed.operator(self.guide(viewed.size)), viewed.mean(luminance)
-        filtered = Polynomial.of(operator, partial(_without, mean), self.order, None)
+        operator, average = viewed.operator(self.guide(viewed.size)), mean(viewed, luminance)
+        filtered = Polynomial.of(operator, partial(_without, average), self.order, None)
         return Fitted(partial(filtered, alpha=self._sliders(viewed.batch, viewed.dtype)))
 
     def _sliders(self, batch: int, dtype: torch.dtype) -> Tensor:

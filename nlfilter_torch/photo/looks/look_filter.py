@@ -27,7 +27,7 @@ from nlfilter_torch.photo.looks.histogram import (
     mean_ramps,
     tones,
 )
-from nlfilter_torch.photo.picture.ends import ends_of
+from nlfilter_torch.photo.picture.pixels import ends_of
 
 BLURS = 6  # each twice as wide as the one before
 BAND_MARGIN = 2 * (2**BLURS - 1)  # pixels around a pixel that the widest depends on

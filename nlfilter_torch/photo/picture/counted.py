@@ -10,8 +10,8 @@ from torch import Tensor
 from nlfilter_torch.operator.landmarks import candidate_pixels, weighted_draws
 from nlfilter_torch.operator.options import Sampling
 from nlfilter_torch.operator.orientation import EXCHANGED
-from nlfilter_torch.photo.picture.ends import LEAST_WEIGHT
 
+LEAST_WEIGHT = 1e-6  # below which a pixel does not count
 Stored = NDArray[np.generic]  # opacity, in the dtype of the file
 
 

@@ -11,10 +11,9 @@ from torch import Tensor
 from nlfilter_torch.operator.options import FilterOptions
 from nlfilter_torch.photo.declared.declaration import Arguments, Edit
 from nlfilter_torch.photo.declared.strokes import ScribbleRole
-from nlfilter_torch.photo.picture.drawn import Drawn, M
-from nlfilter_torch.photo.picture.pixels import Fitted
+from nlfilter_torch.photo.picture.drawn import Drawn
+from nlfilter_torch.photo.picture.pixels import Fitted, M, WorkingRange
 from nlfilter_torch.photo.picture.source import Source
-from nlfilter_torch.photo.picture.working_range import WorkingRange
 
 #: Names of the scribbles of an edit that computes masks, by their roles.
 MARKS: dict[ScribbleRole, str] = {

@@ -1,6 +1,7 @@
 """An image or a batch in memory as the source of an edit, with gradients."""
 
-from collections.abc import Callable, Hashable, Sequence
+import math
+from collections.abc import Callable, Hashable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import cast
@@ -9,7 +10,7 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.core.checks import check_image, check_photograph, check_same_size, check_tensor, check_unit_range
-from nlfilter_torch.core.inner import EVERYWHERE, Inner
+from nlfilter_torch.core.inner import EVERYWHERE
 from nlfilter_torch.core.precision import full_precision, working_dtype
 from nlfilter_torch.core.rational import RationalForm
 from nlfilter_torch.filtering.filters import detail_layers
@@ -21,17 +22,27 @@ from nlfilter_torch.operator.operator import NonlocalOperator
 from nlfilter_torch.operator.pixel_matrix import Columns
 from nlfilter_torch.operator.spectrum import RitzPairs, Spectrum
 from nlfilter_torch.photo.declared.declaration import Arguments
-from nlfilter_torch.photo.picture.drawn import Drawn, M
+from nlfilter_torch.photo.picture.counted import LEAST_WEIGHT
+from nlfilter_torch.photo.picture.drawn import Drawn
 from nlfilter_torch.photo.picture.edit import PhotoEdit
-from nlfilter_torch.photo.picture.ends import ends_of, mean_of, usable
-from nlfilter_torch.photo.picture.pixels import Fitted, Planes, part_of, strips_of
-from nlfilter_torch.photo.picture.resizing import block_means, counted_means, resize, weights_of
+from nlfilter_torch.photo.picture.measuring import mean, reduced_with_weights
+from nlfilter_torch.photo.picture.pixels import Block, Fitted, M, Planes, WorkingRange, part_of, strips_of, whole_image
+from nlfilter_torch.photo.picture.resizing import resize, weights_of
 from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles
-from nlfilter_torch.photo.picture.seen import Seen, in_own_units, of_picture, range_of
-from nlfilter_torch.photo.picture.source import SAMPLE, Blocks, Guide, Kept, Source, sampled_pairs, sampled_places
-from nlfilter_torch.photo.picture.working_range import WorkingRange
-
-Cache = dict[Hashable, tuple[Sequence[Tensor], object]]  # results by their names, with the tensors they depend on
+from nlfilter_torch.photo.picture.source import (
+    SAMPLE,
+    Blocks,
+    Cache,
+    Guide,
+    Kept,
+    Source,
+    kept,
+    kept_in,
+    sampled_pairs,
+    sampled_places,
+)
+from nlfilter_torch.photo.picture.tiled_scribbles import InTiles
+from nlfilter_torch.photo.picture.working_range import range_of
 
 
 class InMemory:
@@ -41,7 +52,7 @@ class InMemory:
     (B or 1, 1, H, W) say how much pixels count, from 0 to 1; None is 1 each.
     """
 
-    first = 0
+    first, inner, memory = 0, EVERYWHERE, math.inf
 
     def __init__(self, image: Tensor, cache: Cache | None = None, weights: Tensor | None = None) -> None:
         self.image, self.cache, self.dtype = image.contiguous(), cache, image.dtype
@@ -50,8 +61,10 @@ class InMemory:
         self.batch, self.channels, *size = image.shape
         self.size, self.width = (size[0], size[1]), size[1]
 
-    def accept_any_scale(self) -> None:
-        """Such warnings are given before."""
+    @property
+    def pixels(self) -> Tensor:
+        """The image, which has no halo."""
+        return self.image
 
     def operator(self, guide: Guide) -> "InMemoryOperator":
         """Build, or take from the cache, :func:`nonlocal_operator` of the guide.
@@ -65,7 +78,7 @@ class InMemory:
             return self._build(guide)
         named = tuple((name, without_tensors(value)) for name, value in options)
         copies = [tensor.clone() for tensor in tensors]
-        return self.kept((guide.transform, guide.blur, *named), copies, partial(self._build, guide))
+        return kept(self, (guide.transform, guide.blur, *named), copies, partial(self._build, guide))
 
     def _build(self, guide: Guide) -> "InMemoryOperator":
         options = guide.options
@@ -121,102 +134,40 @@ class InMemory:
         weights = weights_of(resize(self.weights, size))
         return InMemory(fill_nearby(resize(self.image, size), weights > 0), weights=weights)
 
-    def shrunk(self, planes: Planes, size: tuple[int, int]) -> Tensor:
-        """Planes of all pixels in another size."""
-        return resize(planes(self), size)
-
-    def kept(self, name: Hashable, tensors: Sequence[Tensor], compute: Callable[[], Kept]) -> Kept:
-        """The result of a function, from the cache if it was last computed from equal tensors."""
-        return kept_in(self.cache, name, tensors, compute)
-
-    def blocks(self, step: float, floats: int) -> "InMemory":
-        """Reduce the image by :func:`block_means`."""
-        if step == 1:
+    def in_range(self, working: WorkingRange | None) -> "InMemory":
+        """The image in a range of values."""
+        if working is None:
             return self
-        cache: Cache | None = None if self.cache is None else {}
-        return self.kept(("blocks", step), [], partial(self._blocks, step, cache))
+        ends = [working.low, working.high, working.stretched]
+        return kept(self, "in range", ends, lambda: self.like(working.seen(self.image), self.weights))
 
-    def _blocks(self, step: float, cache: Cache | None) -> "InMemory":
-        weights = None if self.weights is None else weights_of(block_means(self.weights, step))
-        return InMemory(self._block_means(self.image, step), cache, weights)
-
-    def _block_means(self, planes: Tensor, step: float) -> Tensor:
-        """Means over blocks of the pixels that count; of all pixels in blocks where none does."""
-        means = block_means(planes, step)
-        if self.weights is None:
-            return means
-        return counted_means(means, block_means(planes * self.weights, step), block_means(self.weights, step))
-
-    def like(self, image: Tensor) -> "InMemory":
+    def like(self, image: Tensor, weights: Tensor | None) -> "InMemory":
         """Another image (B, C, H, W), with a cache if this one has one."""
-        return InMemory(image, None if self.cache is None else {}, self.weights)
+        return InMemory(image, None if self.cache is None else {}, weights)
 
-    def resized_weights(self, weights: Tensor, size: tuple[int, int], name: str) -> Tensor:
-        """Resize weights."""
-        check_image(weights, name, batch=self.batch)
-        check_same_size(weights, self.size, name, "image")
-        weights = weights.to(self.image)
-        ends = weights.amin((2, 3), keepdim=True), weights.amax((2, 3), keepdim=True)
-        # Undoes the overshoot of interpolation but leaves invalid weights invalid.
-        return resize(weights, size).clamp(*ends)
+    def over(
+        self,
+        function: Callable[[Block], Kept],
+        stage: str,
+        *,
+        margin: int = 0,
+        step: int = 1,
+        places: Tensor | None = None,
+    ) -> Iterator[Kept]:
+        """Apply a function to the image."""
+        yield function(self)
+
+    def emit(self, fitted: Fitted) -> Iterator[tuple[Tensor, Tensor | None]]:
+        """Yield :meth:`all`."""
+        yield self.all(fitted), self.weights
 
     def all(self, fitted: Fitted) -> Tensor:
         """Apply an edit to all pixels."""
-        parts = [fitted.pixels(part) for part in strips_of(self)]
+        seen = self.in_range(fitted.working)
+        parts = [fitted.pixels(part) for part in strips_of(seen)]
         planes = parts[0] if len(parts) == 1 else torch.cat(parts, dim=2)
-        return planes if fitted.finish is None else fitted.finish(self.image, planes, EVERYWHERE)
-
-    def cached(self, fitted: Fitted) -> Fitted:
-        """Compute the result of an edit and keep it in memory."""
-        return Fitted(part_of(self.all(fitted)))
-
-    def mean_of(self, fitted: Fitted, function: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
-        """Means of a function of the image and of the result of an edit."""
-        return mean_of(self.all(fitted.then(function)), self.weights)
-
-    def colours(self, places: Tensor) -> Tensor:
-        """Colours of single pixels."""
-        return self.image.flatten(2)[:, :, places]
-
-    def weights_at(self, places: Tensor) -> Tensor | None:
-        """The weights of single pixels."""
-        return None if self.weights is None else self.weights.flatten(2)[:, :, places]
-
-    def regions(self, masks: Tensor, name: str, *, needed: bool = True) -> list[Scribbles]:
-        """Read the scribbles of K regions from a tensor (B, K, H, W)."""
-        check_image(masks, name, batch=self.batch)
-        return [self.scribbles(mask, None, name, needed=needed) for mask in masks.split(1, dim=1)]
-
-    def weights_of(self, masks: Tensor, name: str) -> Planes:
-        """Weights of given pixels in masks (B, K, H, W) in [0, 1]."""
-        check_image(masks, name, batch=self.batch)
-        check_same_size(masks, self.size, name, "image")
-        check_unit_range(masks, name)
-        return part_of(masks.to(self.image).expand(self.batch, -1, -1, -1))
-
-    def num_regions(self, masks: Tensor, name: str) -> int:
-        """K, of masks (B, K, H, W)."""
-        check_image(masks, name, batch=self.batch)
-        return masks.shape[1]
-
-    def check_all_in_memory(self, sentence: str) -> None:
-        """All pixels are in memory."""
-
-    def mean(self, planes: Planes) -> Tensor:
-        """Means over all pixels."""
-        return mean_of(planes(self), self.weights)
-
-    def ends(self, planes: Planes) -> tuple[Tensor, Tensor]:
-        """Least and largest values over all pixels."""
-        return ends_of(planes(self), self.weights)
-
-    def reduced(self, planes: Planes, step: int) -> Tensor:
-        """Means over blocks of pixels."""
-        return self._block_means(planes(self), step)
-
-    def parts(self, function: Callable[[Tensor, Inner, int], Kept], margin: int) -> list[Kept]:
-        """The result for the image."""
-        return [function(self.image, EVERYWHERE, 0)]
+        result = planes if fitted.finish is None else fitted.finish(seen.image, planes, EVERYWHERE)
+        return fitted.output(self.image, result)
 
     def measured(self, function: Callable[[Source[Tensor]], Tensor]) -> Tensor:
         """Apply a measurement to the image."""
@@ -281,7 +232,7 @@ class InMemoryOperator:
 
     def mean(self, planes: Planes) -> Tensor:
         """Means over all pixels."""
-        return mean_of(planes(self.source), self.source.weights)[..., 0, 0]
+        return mean(self.source, planes)[..., 0, 0]
 
     def at(self, places: Tensor) -> Blocks:
         """Columns of the factor at single pixels."""
@@ -289,14 +240,35 @@ class InMemoryOperator:
         return lambda: [columns]
 
 
-def kept_in(cache: Cache | None, name: Hashable, tensors: Sequence[Tensor], compute: Callable[[], Kept]) -> Kept:
-    """The result of a function, from a cache if it was last computed from equal tensors under this name."""
-    if cache is None:
-        return compute()
-    entry = cache.get(name)
-    if entry is None or not all(torch.equal(a, b) for a, b in zip(entry[0], tensors, strict=True)):
-        entry = cache[name] = (tensors, compute())
-    return cast(Kept, entry[1])
+def in_blocks(source: Source[M], step: float, floats: int) -> InMemory:
+    """Reduce a picture, in memory, to means over blocks of ``step`` x ``step`` pixels, see :func:`reduced`.
+
+    Raises:
+        MemoryError: if there is no room for ``floats`` numbers per pixel of the reduced picture.
+    """
+    if isinstance(source, InMemory) and step == 1:
+        return source
+    needed = math.prod(math.ceil(side / step) for side in source.size) * floats * source.dtype.itemsize
+    if needed > source.memory:
+        raise MemoryError(
+            f"{cast(InTiles, source).picture.name} needs at least {needed / 1e6:.0f} MB of memory, but only "
+            f"{source.memory / 1e6:.0f} MB may be used; allow more, or use a smaller picture"
+        )
+    return kept(source, ("blocks", step), [], partial(_in_blocks, source, step))
+
+
+def _in_blocks(source: Source[M], step: float) -> InMemory:
+    image, weights = reduced_with_weights(source, whole_image, step)
+    weights = None if weights is None else weights_of(weights)
+    return source.like(image, weights) if isinstance(source, InMemory) else InMemory(image, weights=weights)
+
+
+def usable(weights: Tensor | None) -> Tensor | None:
+    """Weights (B, 1, H, W), with 0 for tiny ones; None if all are 1, or if no pixel of some image counts."""
+    if weights is None or bool((weights == 1).all()):
+        return None
+    weights = torch.where(weights < LEAST_WEIGHT, 0.0, weights)
+    return weights if bool((weights.amax((2, 3)) > 0).all()) else None
 
 
 def tensors_in(option: object) -> list[Tensor]:
@@ -322,13 +294,12 @@ def fit_edit(edit: PhotoEdit, source: Source[M], drawn: Drawn[M], *, working: Wo
         working: the range in which the edit sees the picture, if it does not depend on its pixels alone; None is the
             range that they use.
     """
-    if not edit.relative:
+    if edit.relative and working is None:
+        working = kept(source, "working range", [], partial(range_of, source))
+    if not edit.relative or working is None:
         return edit.fit(source, drawn)
-    working = range_of(source) if working is None else working
-    if working is None:
-        return edit.fit(source, drawn)
-    fitted = of_picture(edit.in_range(working).fit(Seen(source, working), drawn), working)
-    return in_own_units(fitted, working) if edit.gives_picture else fitted
+    fitted = edit.in_range(working).fit(source.in_range(working), drawn)
+    return replace(fitted, working=working, gives_picture=edit.gives_picture)
 
 
 def edited(edit: type[PhotoEdit], arguments: Arguments) -> Tensor:

@@ -1,7 +1,8 @@
 """Pictures read a few rows at a time: memory maps, zarr arrays, tifffile files, anything that can be sliced."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from copy import copy
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from typing import Protocol
 
@@ -11,9 +12,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from nlfilter_torch.core.checks import warn_of_scale
+from nlfilter_torch.core.inner import Inner
 from nlfilter_torch.operator.features import reduce_channels
 from nlfilter_torch.operator.hidden import REACH, fill_nearby
+from nlfilter_torch.operator.pixel_matrix import Columns
 from nlfilter_torch.photo.declared.rows import WHITE, RowSource, Stored, is_hidden
+from nlfilter_torch.photo.picture.pixels import Pixels, WorkingRange
 
 KINDS = ("uint8", "uint16", "float16", "float32", "float64")
 Rows = Iterator[tuple[slice, Stored]]  # with their position in the picture
@@ -63,25 +67,62 @@ class RowTarget(Protocol):
         """Store these rows."""
 
 
-@dataclass(frozen=True)
+class Opacity(Protocol):
+    """How much the pixels of a picture count."""
+
+    def rows(self, start: int, stop: int) -> Tensor:
+        """The weights (1, 1, h, W) of rows."""
+
+
+class TileFilter(Protocol):
+    """A filter that compares the pixels of tiles."""
+
+    def features(self, tile: "Tile") -> Tensor:
+        """Features (1, D, n) of the pixels of a tile."""
+
+    def columns_of(self, tile: "Tile") -> Columns:
+        """Columns of the pixels of a tile."""
+
+
+class TileLayers(Protocol):
+    """Detail layers of planes of a picture."""
+
+    def compute(self, pixels: Pixels) -> Tensor:
+        """The layers at the pixels, without a cache."""
+
+
+@dataclass(frozen=True, eq=False)
 class Tile:
-    """Some rows of a picture.
+    """A block of rows of a picture, with a halo of rows around it; or a rectangle of them.
 
     Attributes:
-        start: index of the first of them.
+        start: index of the first of the rows.
         convert: computes :attr:`pixels`, in the thread that first needs them.
         halo: number of additional rows at the top and at the bottom.
         stored: (h, W, S), the rows themselves as they are stored.
+        width: W of the picture.
+        left: column of the picture that ``stored`` begins with.
+        inside: columns of the rectangle in ``stored``; None is all.
+        counted: how much the pixels of the picture count; None is 1 each.
+        whole: the tile that this one is a part of, and its rows in that, if it is one.
     """
 
     start: int
     convert: Callable[[], Tensor]
     halo: tuple[int, int]
     stored: Stored
+    width: int
+    left: int = 0
+    inside: slice | None = None
+    counted: "Opacity | None" = None
+    whole: "tuple[Tile, slice] | None" = None
+    _features: dict[TileFilter, Tensor] = field(default_factory=dict, init=False)
+    _columns: dict[TileFilter, Columns] = field(default_factory=dict, init=False)
+    _layers: dict[TileLayers, Tensor] = field(default_factory=dict, init=False)
 
     @cached_property
     def pixels(self) -> Tensor:
-        """The pixels (1, C, h, W), C = 1 or 3, with the rows of the halo. Integers are scaled to [0, 1].
+        """The pixels (1, C, h, W), C = 1 or 3, with the halo. Integers are scaled to [0, 1].
 
         Raises:
             ValueError: if they are not finite.
@@ -91,12 +132,77 @@ class Tile:
     @property
     def origin(self) -> tuple[int, int]:
         """Row and column of the first pixel of ``pixels``."""
-        return self.start - self.halo[0], 0
+        return self.start - self.halo[0], self.left
 
     @property
-    def inner(self) -> Tensor:
+    def inner(self) -> Inner:
+        """Which of ``pixels`` are not of the halo."""
+        return slice(self.halo[0], self.pixels.shape[2] - self.halo[1]), self.inside or slice(None)
+
+    @property
+    def image(self) -> Tensor:
         """The pixels (1, C, h, W) without the halo."""
-        return self.pixels[..., self.halo[0] : self.pixels.shape[-2] - self.halo[1], :]
+        return self.pixels[..., *self.inner]
+
+    @property
+    def first(self) -> int:
+        """Row-major index in the picture of the first of these."""
+        return self.start * self.width + self.left + (0 if self.inside is None else self.inside.start)
+
+    @property
+    def weights(self) -> Tensor | None:
+        """How much these count, (1, 1, h, W); None is 1 each."""
+        if self.counted is None:
+            return None
+        return self.counted.rows(self.start, self.start + len(self.stored)).to(self.pixels.dtype)
+
+    def in_range(self, working: WorkingRange | None) -> "Tile":
+        """The tile of the same picture in a range of values."""
+        return self if working is None else replace(self, convert=partial(_seen, self, working))
+
+    def parts(self, rows: int) -> "Iterator[Tile]":
+        """Split the tile into groups of rows, whose features are computed at once."""
+        for first in range(0, len(self.stored), rows):
+            part = slice(first, min(first + rows, len(self.stored)))
+            yield replace(
+                self,
+                start=self.start + first,
+                convert=partial(_rows_of_tile, self, part),
+                halo=(0, 0),
+                stored=self.stored[part],
+                whole=(self, part),
+            )
+
+    def features(self, operator: TileFilter) -> Tensor:
+        """Features (1, D, n) of the pixels, computed once per operator."""
+        if self.whole is not None:
+            tile, rows = self.whole
+            width = self.image.shape[3]
+            return tile.features(operator)[:, :, rows.start * width : rows.stop * width]
+        if operator not in self._features:
+            self._features[operator] = operator.features(self)
+        return self._features[operator]
+
+    def columns(self, operator: TileFilter) -> Columns:
+        """Columns of the pixels, computed once per operator."""
+        if operator not in self._columns:
+            self._columns[operator] = operator.columns_of(self)
+        return self._columns[operator]
+
+    def layers(self, planes: TileLayers) -> Tensor:
+        """The detail layers of the pixels, cached until the layers of other planes are requested."""
+        if planes not in self._layers:
+            self._layers.clear()
+            self._layers[planes] = planes.compute(self)
+        return self._layers[planes]
+
+
+def _seen(tile: Tile, working: WorkingRange) -> Tensor:
+    return working.seen(tile.pixels)
+
+
+def _rows_of_tile(tile: Tile, part: slice) -> Tensor:
+    return tile.pixels[:, :, tile.halo[0] + part.start : tile.halo[0] + part.stop]
 
 
 class Picture:
@@ -109,7 +215,10 @@ class Picture:
         checks_scale: whether a warning is due if values are far outside [0, 1].
         hides: whether pixels are hidden where the transparency is 0: they have the colours of pixels nearby that are
             not, see :func:`fill_nearby`.
+        working: the range in which its values are seen, or None.
     """
+
+    working: WorkingRange | None = None
 
     def __init__(
         self,
@@ -144,6 +253,12 @@ class Picture:
         """Do not warn of values far outside [0, 1] from now on."""
         self.checks_scale = False
 
+    def in_range(self, working: WorkingRange) -> "Picture":
+        """The picture, seen in a range of values."""
+        seen = copy(self)
+        seen.working = working
+        return seen
+
     @property
     def pixels(self) -> int:
         """Number of pixels."""
@@ -162,7 +277,7 @@ class Picture:
         if self.hides and is_hidden(stored).any():
             above, below = self._read(max(first - REACH, 0), first), self._read(last, min(last + REACH, self.size[0]))
             convert = partial(self._filled, np.concatenate([above, stored, below]), len(above), last - first)
-        return Tile(start, convert, halo, stored[halo[0] : last - first - halo[1]])
+        return Tile(start, convert, halo, stored[halo[0] : last - first - halo[1]], self.size[1]).in_range(self.working)
 
     def _read(self, first: int, last: int) -> Stored:
         """The rows (h, W, S) from ``first`` to ``last``."""
@@ -252,7 +367,7 @@ def transparency(tile: Tile, kind: str) -> Stored:
 
 def mask_of(tile: Tile) -> Tensor:
     """:func:`mask_plane` of a tile."""
-    return mask_plane(tile.inner, torch.from_numpy(transparency(tile, "float32")).prod(2))
+    return mask_plane(tile.image, torch.from_numpy(transparency(tile, "float32")).prod(2))
 
 
 def mask_plane(pixels: Tensor, opacity: Tensor | None) -> Tensor:

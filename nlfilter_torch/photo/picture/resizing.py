@@ -83,6 +83,28 @@ def interpolation(places: range, length: int, wanted: int) -> tuple[slice, Tenso
     return slice(first, last), weights / weights.sum(1, keepdim=True)
 
 
+def resized_part(rows: Tensor, start: int, size: tuple[int, int], wanted: tuple[int, int]) -> tuple[int, Tensor]:
+    """What rows (B, C, h, W) of a picture (H, W), from ``start`` on, contribute to its resized rows, and the first one.
+
+    Parts of all rows are to be added up.
+    """
+    stop, scale = start + rows.shape[2], size[0] / wanted[0]
+    reach = 2 * max(scale, 1.0)
+    first = max(0, math.floor((start - reach) / scale - 0.5))
+    last = min(wanted[0], math.ceil((stop + reach) / scale + 0.5))
+    parts = []
+    for place in range(first, last, BLOCK):
+        used, weights = interpolation(range(place, min(place + BLOCK, last)), size[0], wanted[0])
+        inside = slice(max(used.start, start), min(used.stop, stop))
+        if inside.start >= inside.stop:
+            parts.append(rows.new_zeros(*rows.shape[:2], len(weights), wanted[1]))
+            continue
+        weights = weights[:, inside.start - used.start : inside.stop - used.start]
+        along = _along_rows(rows[:, :, inside.start - start : inside.stop - start], None, wanted[1])
+        parts.append(torch.einsum("rn,bcnw->bcrw", weights.to(along), along))
+    return first, torch.cat(parts, dim=2)
+
+
 def resize(planes: Tensor, size: tuple[int, int]) -> Tensor:
     """Resize planes (B, C, H, W), see :func:`resized`."""
     return resized(partial(rows_of, planes), (planes.shape[-2], planes.shape[-1]), size)
@@ -106,45 +128,30 @@ def block_counts(size: tuple[int, int], step: float) -> tuple[int, int]:
     return height, width
 
 
-def block_means(planes: Tensor, step: float) -> Tensor:
-    """Means over blocks of about ``step`` x ``step`` pixels, a whole number of which fill the picture evenly.
-
-    A pixel on the border of two blocks counts in both, weighted by the part in each. Means are computed in float64: in
-    float32 those of a mirrored picture would differ by rounding, and with them its landmarks.
-    """
-    size = (planes.shape[-2], planes.shape[-1])
-    counts = block_counts(size, step)
-    if counts == size:
-        return planes
-    if step == round(step) and all(count * step == length for count, length in zip(counts, size, strict=True)):
-        strips = planes.split(round(step) * BLOCK, dim=2)
-        return torch.cat([F.avg_pool2d(strip.double(), round(step)).to(planes) for strip in strips], dim=2)
-    return block_parts(planes, 0, size, step)[1].to(planes)
-
-
 def weights_of(planes: Tensor) -> Tensor:
     """Weights from reduced weights (B, 1, H, W): from 0 to 1, without what interpolation leaves far from any."""
     return torch.where(planes < SMALL_SHARE, 0.0, planes).clamp(max=1.0)
 
 
-def counted_means(means: Tensor, weighted: Tensor, weights: Tensor) -> Tensor:
-    """Means over the pixels of blocks that count, of all pixels where none does.
-
-    Args:
-        means: over all pixels, (B, C, n, m).
-        weighted: of the pixels times their weights.
-        weights: means of the weights, (B, 1, n, m).
-    """
-    return torch.where(weights > SMALL_SHARE, weighted / weights.clamp(min=SMALL_SHARE), means)
+def block_means(planes: Tensor, step: float) -> Tensor:
+    """Means over blocks of about ``step`` x ``step`` pixels, a whole number of which fill the picture evenly."""
+    size = (planes.shape[-2], planes.shape[-1])
+    return planes if block_counts(size, step) == size else block_parts(planes, 0, size, step)[1].to(planes)
 
 
 def block_parts(rows: Tensor, start: int, size: tuple[int, int], step: float) -> tuple[int, Tensor]:
-    """The part of :func:`block_means`, (B, C, n, m) in float64, that rows (B, C, h, W) of a picture (H, W) contribute.
+    """What rows (B, C, h, W) of a picture (H, W) contribute to its means over blocks, (B, C, n, m) in float64.
 
-    ``start`` is the first of the rows; the number of the first row of blocks comes with the result. Parts of all rows
-    are to be added up.
+    Blocks are about ``step`` x ``step`` pixels, a whole number of which fill the picture evenly. A pixel on the border
+    of two blocks counts in both, weighted by the part in each. In float32, the means of a mirrored picture would differ
+    by rounding, and with them its landmarks. ``start`` is the first of the rows; the number of the first row of blocks
+    comes with the result. Parts of all rows are to be added up.
     """
     counts, stop = block_counts(size, step), start + rows.shape[2]
+    whole = round(step)
+    if all(count * whole == length for count, length in zip(counts, size, strict=True)) and start % whole == 0:
+        strips = rows.split(whole * BLOCK, dim=2)  # float64 of a few rows at a time
+        return start // whole, torch.cat([F.avg_pool2d(strip.double(), whole) for strip in strips], dim=2)
     first, last = start * counts[0] // size[0], (stop * counts[0] - 1) // size[0]
     down = _parts(rows.double(), 2, (first, last + 1), size[0], counts[0], start)
     return first, _parts(down, 3, (0, counts[1]), size[1], counts[1], 0)

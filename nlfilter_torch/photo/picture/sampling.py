@@ -69,7 +69,7 @@ class GuidePicture(Picture):
 
     def __init__(self, picture: Picture, guide: Guide, counted: CountedPixels | None = None) -> None:
         super().__init__(picture.source, picture.name, hides=picture.hides)
-        self.checks_scale = picture.checks_scale
+        self.checks_scale, self.working = picture.checks_scale, picture.working
         self.picture, self.guide, self.counted = picture, guide, counted
         self.stored: Tensor | None = None
 
@@ -109,9 +109,10 @@ class GuidePicture(Picture):
         stop = tile.start + tile.stored.shape[0]
         halo = (min(tile.start, margin), min(self.size[0] - stop, margin))
         if self.stored is not None:
-            stored = self.stored[:, :, tile.start - halo[0] : stop + halo[1]]
-            return Tile(tile.start, partial(_unchanged, stored), halo, tile.stored)
-        return Tile(tile.start, partial(self._computed, tile, halo), halo, tile.stored)
+            columns = slice(tile.left, tile.left + tile.stored.shape[1])
+            stored = self.stored[:, :, tile.start - halo[0] : stop + halo[1], columns]
+            return replace(tile, convert=partial(_unchanged, stored), halo=halo)
+        return replace(tile, convert=partial(self._computed, tile, halo), halo=halo)
 
     def _computed(self, tile: Tile, halo: tuple[int, int]) -> Tensor:
         """The guide of a tile of the picture and of a halo of rows around it."""
@@ -185,7 +186,7 @@ class PassOverPicture:
         return self.kernel.recipe.patch_weights.shape[0] // 2
 
     def _block(self, tile: Tile) -> Block:
-        image, first = tile.inner.flatten(2), tile.start * self.picture.size[1]
+        image, first = tile.image.flatten(2), tile.first
         columns = self.cache.find(slice(first, first + image.shape[2]))
         if columns is None:
             guide = self.picture.seen(tile, self._radius)
@@ -257,7 +258,7 @@ class PatchReader:
             sums = orientation_sums(rows, tile.start, self.picture.size), rows.new_tensor([0.0, 1.0])
         else:
             sums = counted_sums(rows, tile.start, counted)
-        return patches_at(guide, seen, chosen, self.patch_size), tile.inner.flatten(2)[:, :, chosen], gradient, *sums
+        return patches_at(guide, seen, chosen, self.patch_size), tile.image.flatten(2)[:, :, chosen], gradient, *sums
 
     def _gradient(self, guide: Tensor, seen: Tile, weights: Tensor | None) -> float:
         """Sum of the gradients of a tile's guide, times the weights (1, 1, h, W) of its pixels."""

@@ -1,35 +1,48 @@
 """Access of edits to the pixels of a picture, so that every edit is written once.
 
-An edit has two parts: statistics of the whole picture (sums over all pixels), and a function of some of the pixels
-given these statistics. A :class:`Source` computes the sums: in :mod:`nlfilter_torch.photo.picture.in_memory` for an
-image or a batch in memory, with gradients; in :mod:`nlfilter_torch.photo.picture.tiled` for a picture that is read a
-few rows at a time.
+An edit has two parts: statistics of the whole picture, and a function of some of the pixels given these statistics.
+A :class:`Source` is the picture as the edit sees it. It has twelve members. Five say what it is: size, batch, channels,
+dtype, and the memory that may be used. Two read it: ``over`` applies a function to blocks of its rows, of which means,
+limits, reductions and single pixels follow (:mod:`nlfilter_torch.photo.picture.measuring`), and ``scribbles`` reads
+what is drawn on it. ``emit`` writes an edit. The others make something of the picture: its filter, the same picture in
+a smaller size or in another range of values, and measurements that films share among their frames.
+
+There are two kinds of sources: :class:`InMemory`, an image or a batch in memory, which is one block and passes
+gradients, and :class:`Tiled`, which reads a picture a few rows at a time. A source holds pixels as the edit sees them:
+the affine map from a picture that uses little of its range (:class:`WorkingRange`) is applied where pixels are read,
+and :meth:`Fitted.output` undoes it where they are written. What previews keep from one edit to the next is apart from
+sources, in :func:`kept`.
+
+Some pixels of a picture have three forms: :class:`Picture`, all of them, as they are stored; :class:`Tile`, a block of
+rows with its halo; and :class:`Tiling`, rows to write.
 """
 
-from collections.abc import Callable, Hashable, Iterable, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Protocol, TypeVar
+from functools import partial
+from typing import Protocol, TypeVar, cast, runtime_checkable
 
 import torch
 from torch import Tensor
 
 from nlfilter_torch.core.blocks import symmetric_places
-from nlfilter_torch.core.inner import Inner
 from nlfilter_torch.core.kernels.grams import compute_grams
 from nlfilter_torch.core.rational import RationalForm
 from nlfilter_torch.operator.features import blur, blur_margin, reduce_channels
 from nlfilter_torch.operator.options import FilterOptions
 from nlfilter_torch.operator.pixel_matrix import Columns
 from nlfilter_torch.operator.spectrum import RitzPairs
+from nlfilter_torch.photo.picture.pixels import Block, M, WorkingRange
 from nlfilter_torch.photo.picture.pixels import Fitted as Fitted
-from nlfilter_torch.photo.picture.pixels import M
 from nlfilter_torch.photo.picture.pixels import Pixels as Pixels
 from nlfilter_torch.photo.picture.pixels import Planes as Planes
 from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles
 
 SAMPLE = 1 << 15  # size of the sample of pixels that sums are estimated from, where an edit allows it
 
+Part = TypeVar("Part")
 Kept = TypeVar("Kept")
+Cache = dict[Hashable, tuple[Sequence[Tensor], object]]  # results by their names, with the tensors they depend on
 Blocks = Callable[[], Iterable[Tensor]]  # columns (B, M, n) of the factor, block by block
 
 
@@ -125,8 +138,33 @@ class Source(Protocol[M]):
     def dtype(self) -> torch.dtype:
         """Precision of the computation, float32 or float64."""
 
-    def accept_any_scale(self) -> None:
-        """Do not warn of values far outside [0, 1], since the edit takes them."""
+    @property
+    def memory(self) -> float:
+        """Bytes that an edit may use for what it keeps of the picture; infinity if all of the picture is in memory."""
+
+    def over(
+        self,
+        function: Callable[[Block], Part],
+        stage: str,
+        *,
+        margin: int = 0,
+        step: int = 1,
+        places: Tensor | None = None,
+    ) -> Iterator[Part]:
+        """Apply a function to blocks of rows that make up the picture, and yield the results in order.
+
+        Gradients pass if the picture is in memory, where it is one block.
+
+        Args:
+            function: of a block.
+            stage: name for the progress.
+            margin: rows of the halo of a block on both sides, except beyond the picture.
+            step: all blocks but the last have a multiple of so many rows.
+            places: row-major indices, ascending; blocks with none of these pixels may be left out.
+        """
+
+    def emit(self, fitted: "Fitted") -> Iterator[tuple[Tensor, Tensor | None]]:
+        """Yield the result of an edit, (B, C, h, W), some rows after another, and how much the pixels count."""
 
     def operator(self, guide: Guide) -> Operator:
         """Build the filter of the picture."""
@@ -147,75 +185,10 @@ class Source(Protocol[M]):
     def resized(self, size: tuple[int, int]) -> "Source[M]":
         """Reduce the picture to a smaller size (H, W)."""
 
-    def shrunk(self, planes: Planes, size: tuple[int, int]) -> Tensor:
-        """Planes (B, C, h, w) of all its pixels in a smaller size."""
+    def in_range(self, working: WorkingRange | None) -> "Source[M]":
+        """The picture as an edit sees it that takes values of any scale: None is as they are.
 
-    def resized_weights(self, weights: M, size: tuple[int, int], name: str) -> M:
-        """Reduce weights of the pixels for K regions to a smaller size (H, W).
-
-        Raises:
-            ValueError: if they do not fit the picture; ``name`` is their name in the message.
-        """
-
-    def all(self, fitted: "Fitted") -> Tensor:
-        """Result (B, C, H, W) of an edit at all pixels, for pictures that are small enough."""
-
-    def cached(self, fitted: "Fitted") -> "Fitted":
-        """Compute the result of an edit and keep it in memory, if there is room for it."""
-
-    def mean_of(self, fitted: "Fitted", function: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
-        """Means (B, S, 1, 1) of a function of the image and of an edit's result; the function returns (B, S, h, W)."""
-
-    def regions(self, masks: M, name: str, *, needed: bool = True) -> list[Scribbles]:
-        """Read the scribbles of several regions, see :meth:`scribbles`."""
-
-    def weights_of(self, masks: M, name: str) -> "Planes":
-        """Weights (B, K, h, w) of given pixels in masks of K regions, which are read as they are needed.
-
-        Raises:
-            ValueError: if they do not fit the picture; ``name`` is their name in the message.
-        """
-
-    def num_regions(self, masks: M, name: str) -> int:
-        """Number of regions that have scribbles in ``masks``, which errors call ``name``."""
-
-    def check_all_in_memory(self, sentence: str) -> None:
-        """Raise ValueError with this sentence if the picture is read in parts."""
-
-    def colours(self, places: Tensor) -> Tensor:
-        """Colours (B, C, n) of single pixels, given by ascending row-major indices."""
-
-    def weights_at(self, places: Tensor) -> Tensor | None:
-        """How much single pixels count, (B, 1, n), given by row-major indices; None is 1 each."""
-
-    def mean(self, planes: Planes) -> Tensor:
-        """Means (B, C, 1, 1) over all pixels."""
-
-    def ends(self, planes: Planes) -> tuple[Tensor, Tensor]:
-        """Least and largest values (B, C, 1, 1) over all pixels."""
-
-    def reduced(self, planes: Planes, step: int) -> Tensor:
-        """Means (B, C, H / step, W / step), sizes rounded up, over blocks of ``step`` x ``step`` pixels."""
-
-    def blocks(self, step: float, floats: int) -> "Reduced":
-        """Reduce the picture, in memory, to means over blocks of ``step`` x ``step`` pixels.
-
-        The step is an integer except for previews.
-
-        Raises:
-            MemoryError: if there is no room for ``floats`` numbers per pixel of the reduced picture.
-        """
-
-    def kept(self, name: Hashable, tensors: Sequence[Tensor], compute: Callable[[], Kept]) -> Kept:
-        """Result, called ``name``, of a function of picture and tensors; a preview keeps it for the next edit."""
-
-    def parts(self, function: Callable[[Tensor, Inner, int], Kept], margin: int) -> list[Kept]:
-        """Results of a function of parts that make up the picture, without gradients.
-
-        Args:
-            function: of some rows (B, C, h, W), of which of them are the part, and of the number of the first of these
-                in the picture. The other rows, up to ``margin`` on both sides, are there to be seen.
-            margin: in rows.
+        There is no warning of values far outside [0, 1] from now on.
         """
 
     def measured(self, function: Callable[["Source[M]"], Tensor]) -> Tensor:
@@ -225,8 +198,27 @@ class Source(Protocol[M]):
 class Reduced(Source[Tensor], Pixels, Protocol):
     """A picture in memory: a source, and the set of all its pixels."""
 
-    def like(self, image: Tensor) -> "Reduced":
-        """Another picture, of the same kind, that keeps results if this one does."""
+
+@runtime_checkable
+class Keeping(Protocol):
+    """A picture that may keep results for the next edit, in a cache if it has one."""
+
+    cache: Cache | None
+
+
+def kept(source: Source[M], name: Hashable, tensors: Sequence[Tensor], compute: Callable[[], Kept]) -> Kept:
+    """The result, called ``name``, of a function of picture and tensors; previews keep it for the next edit."""
+    return kept_in(source.cache if isinstance(source, Keeping) else None, name, tensors, compute)
+
+
+def kept_in(cache: Cache | None, name: Hashable, tensors: Sequence[Tensor], compute: Callable[[], Kept]) -> Kept:
+    """The result of a function, from a cache if it was last computed from equal tensors under this name."""
+    if cache is None:
+        return compute()
+    entry = cache.get(name)
+    if entry is None or not all(torch.equal(a, b) for a, b in zip(entry[0], tensors, strict=True)):
+        entry = cache[name] = (tensors, compute())
+    return cast(Kept, entry[1])
 
 
 def seeded(seed: int = 0) -> torch.Generator:
@@ -255,3 +247,23 @@ def sampled_pairs(blocks: Iterable[Columns], count: int, dtype: torch.dtype) -> 
 def luminance(pixels: Pixels) -> Tensor:
     """Luminance of RGB pixels; pixels with another number of channels are returned unchanged."""
     return reduce_channels(pixels.image, "luminance")
+
+
+def at(source: Source[M], places: Tensor) -> tuple[Tensor, Tensor | None]:
+    """Colours (B, C, n) of single pixels, given by ascending row-major indices, and how much they count, (B, 1, n).
+
+    None in place of the latter is 1 each.
+    """
+    parts = list(source.over(partial(_at, places), "Looking", places=places))
+    if not parts:
+        return torch.zeros(source.batch, source.channels, 0, dtype=source.dtype), None
+    colours, weights = zip(*parts, strict=True)
+    return torch.cat(colours, dim=2), None if weights[0] is None else torch.cat(weights, dim=2)
+
+
+def _at(places: Tensor, block: Block) -> tuple[Tensor, Tensor | None]:
+    """Of the pixels that lie in a block."""
+    image, weights = block.image.flatten(2), block.weights
+    first, last = torch.searchsorted(places, places.new_tensor([block.first, block.first + image.shape[2]])).tolist()
+    chosen = places[first:last] - block.first
+    return image[:, :, chosen], None if weights is None else weights.flatten(2)[:, :, chosen]

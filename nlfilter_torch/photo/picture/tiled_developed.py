@@ -114,7 +114,7 @@ class Light:
     def __call__(self, tile: Tile) -> Tensor:
         """The changed colours (1, C, h, W)."""
         least, most = map(torch.tensor, self.limits)
-        return in_light(tile.inner, self.development, (least, most))
+        return in_light(tile.image, self.development, (least, most))
 
 
 @contextmanager

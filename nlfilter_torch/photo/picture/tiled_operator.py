@@ -19,7 +19,7 @@ from nlfilter_torch.operator.pixel_matrix import Columns, capacitance_inverse, s
 from nlfilter_torch.operator.scaling import Pass, PixelScaling, summed
 from nlfilter_torch.operator.spectrum import RitzPairs
 from nlfilter_torch.photo.picture import sampling
-from nlfilter_torch.photo.picture.pictures import Tile
+from nlfilter_torch.photo.picture.pictures import Tile, TileFilter, TileLayers
 from nlfilter_torch.photo.picture.sampling import (
     ColumnCache,
     Draws,
@@ -36,42 +36,6 @@ from nlfilter_torch.photo.picture.source import SAMPLE, Blocks, Pixels, Planes, 
 from nlfilter_torch.photo.picture.statistics import CONVERGED, Block, Guess, Sums, balance_by_passes, sums_of_powers
 
 SAMPLE_BLOCKS = 8  # blocks that a sample is split into, to be shared among workers
-
-
-@dataclass(eq=False)
-class TilePixels:
-    """Pixels of a tile.
-
-    Attributes:
-        image: their colours, (1, C, h, W).
-        features: computes the features (1, D, h W) that an operator compares.
-        first: row-major index of the first pixel in the picture.
-        width: W of the picture.
-    """
-
-    image: Tensor
-    features: "Callable[[TiledOperator], Tensor]"
-    first: int
-    width: int
-    _columns: dict["TiledOperator", Columns] = field(default_factory=dict)
-    _layers: "tuple[LayerPlanes, Tensor] | None" = None
-
-    def columns(self, operator: "TiledOperator") -> Columns:
-        """Columns of the pixels, computed once per operator."""
-        if operator not in self._columns:
-            known = None
-            if self.image.shape[3] == self.width:
-                known = operator.cache.find(slice(self.first, self.first + self.image[0, 0].numel()))
-            self._columns[operator] = (
-                operator.columns(self.features(operator)) if known is None else operator.scaled(*known)
-            )
-        return self._columns[operator]
-
-    def layers(self, planes: "LayerPlanes") -> Tensor:
-        """The detail layers of the pixels, cached until the layers of other planes are requested."""
-        if self._layers is None or self._layers[0] is not planes:
-            self._layers = planes, planes.compute(self)
-        return self._layers[1]
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,22 +55,22 @@ class BlockPixels:
         """A sample of pixels has no place in the picture."""
         return self.first
 
-    def columns(self, operator: "TiledOperator") -> Columns:
+    def columns(self, operator: TileFilter) -> Columns:
         """Columns of the pixels."""
         return self.known_columns
 
-    def layers(self, planes: "LayerPlanes") -> Tensor:
+    def layers(self, planes: TileLayers) -> Tensor:
         """The detail layers of the pixels."""
         return planes.compute(self)
 
 
-def with_columns(pixels: Pixels) -> TilePixels | BlockPixels:
+def with_columns(pixels: Pixels) -> Tile | BlockPixels:
     """The pixels, with their columns.
 
     Raises:
         TypeError: if they are not of a picture that is read in tiles.
     """
-    if isinstance(pixels, TilePixels | BlockPixels):
+    if isinstance(pixels, Tile | BlockPixels):
         return pixels
     raise TypeError(
         f"pixels must be of a picture in tiles, got {type(pixels).__name__}; use the planes of its own source"
@@ -292,9 +256,19 @@ class TiledOperator:
         return self.kernel.recipe.patch_weights.shape[0] // 2 + self.guide.guide.margin
 
     def features(self, tile: Tile) -> Tensor:
-        """Features (1, D, h W) of a tile of the picture."""
+        """Features (1, D, n) of the pixels of a tile of the picture."""
         seen = self.guide.seen(tile, self.kernel.recipe.patch_weights.shape[0] // 2)
-        return self.kernel.recipe(seen.pixels, origin=seen.origin, halo=seen.halo)
+        features = self.kernel.recipe(seen.pixels, origin=seen.origin, halo=seen.halo)
+        if tile.inside is None:
+            return features
+        return features.unflatten(2, tile.stored.shape[:2])[..., tile.inside].flatten(2)
+
+    def columns_of(self, tile: Tile) -> Columns:
+        """Columns of the pixels of a tile, from the cache if they are there."""
+        known = None
+        if tile.image.shape[3] == tile.width:
+            known = self.cache.find(slice(tile.first, tile.first + tile.image[0, 0].numel()))
+        return self.columns(tile.features(self)) if known is None else self.scaled(*known)
 
     def columns(self, features: Tensor) -> Columns:
         """Columns of pixels with features (1, D, n)."""

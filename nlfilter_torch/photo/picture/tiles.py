@@ -242,7 +242,7 @@ def tile_by_tile(passes: Passes, picture: Picture, edit: TileEdit) -> Tiling:
 
 def inner(tile: Tile) -> Tensor:
     """The pixels of a tile."""
-    return tile.inner
+    return tile.image
 
 
 def factor_bytes(pixels: int, num_landmarks: int) -> int:

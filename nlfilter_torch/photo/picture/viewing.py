@@ -25,7 +25,8 @@ from torch import Tensor
 from nlfilter_torch.core.torch_internals import cached_constants
 from nlfilter_torch.operator.features import pad_border
 from nlfilter_torch.photo.picture.limits import Balance, Limits, balance_of, balanced, clamped, limit, move_luminance
-from nlfilter_torch.photo.picture.pixels import Fitted, M, Pixels, Planes, corner
+from nlfilter_torch.photo.picture.measuring import cached, everywhere, mean_of, shrunk
+from nlfilter_torch.photo.picture.pixels import Fitted, M, Pixels, Planes, corner, whole_image
 from nlfilter_torch.photo.picture.resizing import interpolation, resized, rows_of
 from nlfilter_torch.photo.picture.source import Source
 
@@ -85,8 +86,8 @@ def enlarged_change(
 ) -> Fitted:
     """The edit of a picture by a change of its reduction to a smaller size; arguments as in :func:`fit_change`."""
     fitted, balance = _limited(reduced, change, limits, brighter)
-    before, image = reduced.all(Fitted(planes)), reduced.all(Fitted(lambda pixels: pixels.image))
-    after, saturation = balanced(image, reduced.all(fitted), balance, limits)
+    before, image = everywhere(reduced, Fitted(planes)), everywhere(reduced, Fitted(whole_image))
+    after, saturation = balanced(image, everywhere(reduced, fitted), balance, limits)
     coarse = Coarse.of(before, after, saturation, limits)
     return Fitted(coarse.enlarged(source, planes).edited)
 
@@ -118,8 +119,8 @@ def _limited(
     fitted = change.then(limit)
     if brighter is None or isinstance(brighter, Balance):
         return fitted, brighter
-    cached = source.cached(fitted)
-    return cached, balance_of(partial(source.mean_of, cached), brighter)
+    kept = cached(source, fitted)
+    return kept, balance_of(partial(mean_of, source, kept), brighter)
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,7 +194,7 @@ class EnlargedChange:
         planes, count, size = self.coarse.planes, self.coarse.count, self.coarse.size
         before, change, rest = planes.split([count, count, planes.shape[1] - 2 * count], dim=1)
         stride = math.sqrt(self.size[0] * self.size[1] / (size[0] * size[1]))
-        change = _restored(change - source.shrunk(self._finer, size), stride)
+        change = _restored(change - shrunk(source, self._finer, size), stride)
         return replace(self, coarse=replace(self.coarse, planes=torch.cat([before, change, rest], dim=1)))
 
     def _finer(self, pixels: Pixels) -> Tensor:

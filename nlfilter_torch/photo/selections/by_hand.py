@@ -5,10 +5,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from nlfilter_torch.photo.picture.drawn import M
-from nlfilter_torch.photo.picture.pixels import Pixels, Planes
+from nlfilter_torch.photo.picture.pixels import M, Pixels, Planes
 from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles
-from nlfilter_torch.photo.picture.source import Source
+from nlfilter_torch.photo.picture.source import Source, at
+from nlfilter_torch.photo.picture.tiled_scribbles import num_regions, region_weights
 from nlfilter_torch.photo.selections.scribbled_colours import EPSILON
 
 
@@ -83,7 +83,7 @@ class ByHand:
 
 def _planes_of(source: Source[M], masks: M | None, name: str) -> tuple[Planes | None, int]:
     """What is painted on masks, and the number of their regions; None and 0 if there are none."""
-    return (None, 0) if masks is None else (source.weights_of(masks, name), source.num_regions(masks, name))
+    return (None, 0) if masks is None else (region_weights(source, masks, name), num_regions(source, masks, name))
 
 
 def check_drawn(scribbles: object, added: object, name: str) -> None:
@@ -94,7 +94,7 @@ def check_drawn(scribbles: object, added: object, name: str) -> None:
 
 def opaque(source: Source[M], painted: Scribbles) -> Scribbles:
     """Weights as they were painted, without the opacity of the picture under them, by which sources multiply them."""
-    opacity = source.weights_at(painted.places)
+    _, opacity = at(source, painted.places)
     if opacity is None:
         return painted
     return painted.weighted((painted.weights / opacity.to(painted.weights).clamp(min=EPSILON)).clamp(max=1.0))

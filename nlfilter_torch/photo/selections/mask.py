@@ -24,13 +24,15 @@ from nlfilter_torch.operator.options import Completion, FilterOptions, Sampling,
 from nlfilter_torch.photo.declared.declaration import Edit
 from nlfilter_torch.photo.declared.parameters import MASK
 from nlfilter_torch.photo.declared.shared_parameters import VIEWING_SIZE
-from nlfilter_torch.photo.picture.drawn import Drawn, M
+from nlfilter_torch.photo.picture.drawn import Drawn
 from nlfilter_torch.photo.picture.edit import PhotoEdit
-from nlfilter_torch.photo.picture.in_memory import edited
-from nlfilter_torch.photo.picture.pixels import Pixels, corner
+from nlfilter_torch.photo.picture.in_memory import edited, in_blocks
+from nlfilter_torch.photo.picture.measuring import shrunk
+from nlfilter_torch.photo.picture.pixels import M, Pixels, corner
 from nlfilter_torch.photo.picture.resizing import enlarged
 from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles, parts_in_blocks
-from nlfilter_torch.photo.picture.source import Fitted, Reduced, Source
+from nlfilter_torch.photo.picture.source import Fitted, Reduced, Source, at, kept
+from nlfilter_torch.photo.picture.tiled_scribbles import read_regions
 from nlfilter_torch.photo.picture.viewing import viewed_size
 from nlfilter_torch.photo.selections.by_hand import ByHand, check_drawn
 from nlfilter_torch.photo.selections.connected import Extent, connected
@@ -146,9 +148,9 @@ class RegionMask(PhotoEdit):
             raise ValueError(f"image must have 1 or 3 channels, got {source.channels}; select 1 or 3")
         scribbles, background, added = (drawn.masks.get(name) for name in ("scribbles", "background", "added"))
         check_drawn(scribbles, added, self.names[0])
-        inside = [] if scribbles is None else source.regions(scribbles, self.names[0], needed=added is None)
+        inside = [] if scribbles is None else read_regions(source, scribbles, self.names[0], needed=added is None)
         by_hand = ByHand.of(source, added, drawn.masks.get("removed"), len(inside) or None)
-        outside = [] if background is None else source.regions(background, self.names[1])
+        outside = [] if background is None else read_regions(source, background, self.names[1])
         if len(outside) not in (0, 1, len(inside)):
             raise ValueError(
                 f"{self.names[1]} must have 1 channel or one for each of the {len(inside)} regions, got "
@@ -229,7 +231,7 @@ class Regions:
         """Masks (B, K, h, w) of the picture, reduced, with what is painted on them by hand."""
         if self.by_hand is None:
             return self.reduced_masks()
-        return source.shrunk(self.masks, (self.reduced.shape[-2], self.reduced.shape[-1]))
+        return shrunk(source, self.masks, (self.reduced.shape[-2], self.reduced.shape[-1]))
 
     def reduced_masks(self) -> Tensor:
         """Computed masks (B, K, h, w) of the reduced picture."""
@@ -321,7 +323,8 @@ def _computed_regions(
         image = small.image.clamp(0.0, 1.0)  # a far brighter pixel of a float file would upset the linear functions
         masks = torch.cat([rough.mask(number, drawn) for number, drawn in enumerate(reduced)], dim=1)
         front, back = torch.stack([drawn.planes(small) for drawn in reduced], dim=2).unbind(1)
-        functions = small.kept("borders", [masks, front, back], partial(_fit_borders, small, image, masks, front, back))
+        fit = partial(_fit_borders, small, image, masks, front, back)
+        functions = kept(small, "borders", [masks, front, back], fit)
     if marked is not None:
         functions = functions * marked[:, :, None, None, None]
     regions = Regions(image, steps, functions, scribbles)
@@ -345,13 +348,13 @@ def _reduced(source: Source[M], floats: int) -> tuple[Reduced, tuple[float, floa
     size = viewed_size(source.size, VIEWED)
     viewed = source if size == source.size else source.resized(size)
     side = math.ceil(math.sqrt(size[0] * size[1] / SOLVED_PIXELS))
-    small = viewed.blocks(side, floats)
+    small = in_blocks(viewed, side, floats)
     return small, (source.size[0] / small.size[0], source.size[1] / small.size[1])
 
 
 def _fit_borders(small: Reduced, image: Tensor, rough: Tensor, front: Tensor, back: Tensor) -> Tensor:
     """:func:`fit_borders` of an image; the reduced picture that it is of keeps its models."""
-    return fit_borders(image, small.kept("models", [], partial(linear_models, image)), rough, front, back)
+    return fit_borders(image, kept(small, "models", [], partial(linear_models, image)), rough, front, back)
 
 
 def _nearness(
@@ -386,7 +389,7 @@ def blocks_of(scribbles: Scribbles, small: Source[M], size: tuple[int, int], ste
     if colours is not None:
         total = scribbles.weights.sum(1, keepdim=True)
         colours = add(colours * total) / add(total).clamp(min=EPSILON)
-    return Scribbles(places, weights.clamp(max=1.0), small.colours(places), colours)
+    return Scribbles(places, weights.clamp(max=1.0), at(small, places)[0], colours)
 
 
 def _added(blocks: Tensor, shares: Tensor, count: int, values: Tensor) -> Tensor:

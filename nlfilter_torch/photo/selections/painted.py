@@ -6,7 +6,8 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.photo.picture.colour import group_colours, region_means, split_luminance
-from nlfilter_torch.photo.picture.drawn import Drawn, M
+from nlfilter_torch.photo.picture.drawn import Drawn
+from nlfilter_torch.photo.picture.pixels import M
 from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles
 from nlfilter_torch.photo.picture.source import Source
 from nlfilter_torch.photo.selections.by_hand import ByHand, check_drawn, opaque

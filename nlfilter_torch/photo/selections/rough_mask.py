@@ -15,7 +15,7 @@ from nlfilter_torch.operator.pixel_matrix import Columns
 from nlfilter_torch.photo.picture.colour import LIGHTNESS, hundredths_of_lab
 from nlfilter_torch.photo.picture.resizing import block_means, enlarged
 from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles, scribbled_blocks
-from nlfilter_torch.photo.picture.source import Blocks, Guide, Operator, Planes, Reduced
+from nlfilter_torch.photo.picture.source import Blocks, Guide, Operator, Planes, Reduced, at, kept
 from nlfilter_torch.photo.selections.scribbled_colours import (
     EPSILON,
     by_trimap,
@@ -94,7 +94,7 @@ class Points:
     @staticmethod
     def of(picture: Reduced, operator: Operator, places: Tensor) -> "Points":
         """Read the pixels of a picture at these places."""
-        return Points(places, operator.at(places), picture.colours(places))
+        return Points(places, operator.at(places), at(picture, places)[0])
 
     def values(self, planes: Tensor) -> Tensor:
         """Values (B, C, n) of planes (B, C, H, W) at the points."""
@@ -135,7 +135,7 @@ class RoughMasks:
     @cached_property
     def evenness(self) -> Tensor:
         """:func:`evenness` of the picture."""
-        return self.picture.kept("evenness", [], partial(evenness, self.picture.image))
+        return kept(self.picture, "evenness", [], partial(evenness, self.picture.image))
 
     def mask(self, number: int, scribbles: Scribbles) -> Tensor:
         """The rough mask (B, 1, H, W) of a region with that number, from scribbles on it and on its background."""
@@ -150,7 +150,8 @@ class RoughMasks:
         likely = sharpened(self.regression(known, outside, frame_links, grid_links)(self.picture))
         likely_frame = torch.maximum(self.frame.values(likely * self.evenness), frame_links)
         compared = [unlike, likely_frame, self.grid.colours, grid_links, self.photometric_bandwidth, trimap]
-        by_colour = self.picture.kept(
+        by_colour = kept(
+            self.picture,
             ("likelihood", number),
             [colours, weights, *compared],
             partial(colour_likelihood, self.picture.image, colours, weights, self.frame.colours, *compared),

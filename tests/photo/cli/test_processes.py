@@ -123,7 +123,7 @@ class Negative:
         if tile.start >= 32 and not self.mark.exists():
             self.mark.touch()
             os.kill(os.getpid(), signal.SIGKILL)
-        return 1 - tile.inner
+        return 1 - tile.image
 
 
 def write_negative(source: Path, processes: ZarrProcesses) -> None:

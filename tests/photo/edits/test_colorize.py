@@ -19,6 +19,7 @@ from nlfilter_torch.photo.edits.colorize import (
 )
 from nlfilter_torch.photo.picture.colour import merge_luminance, split_luminance
 from nlfilter_torch.photo.picture.in_memory import InMemory
+from nlfilter_torch.photo.picture.measuring import reduced
 from nlfilter_torch.photo.picture.source import luminance as luminance_of
 from nlfilter_torch.photo.selections.local_values import RELATIVE, LocalValues
 from tests.problems import box, colour, luminance, noise, paint
@@ -210,7 +211,7 @@ def test_neither_estimate_predicts_a_stroke_from_itself() -> None:
         (far, near), residuals = extended(operators, places, sets, values, 1.0)
         whole = (far(source) + near(source))[:, :2].flatten(2)[:, :, places]
         torch.testing.assert_close(values - residuals[0], whole, rtol=1e-4, atol=1e-5)
-        guide = source.reduced(luminance_of, 1)
+        guide = reduced(source, luminance_of, 1)
         local = LocalValues.of(RELATIVE, guide, SIZE, places, weights, values, groups, values).left_out
         assert local is not None
         return values - groups.of_own(residuals[1:]), (local[:, :2] / local[:, 2:]).to(values)

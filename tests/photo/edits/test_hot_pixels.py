@@ -1,6 +1,7 @@
 """Hot and dead pixels are replaced; stars, texture, text, dithering and compression are left alone."""
 
 import io
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ import torch
 from PIL import Image, ImageDraw
 from torch import Tensor
 
+from nlfilter_torch.core.inner import Inner
 from nlfilter_torch.photo import Step, denoise, stream
 from nlfilter_torch.photo.cli import editing, main
 from nlfilter_torch.photo.edits import hot_pixels
@@ -180,17 +182,27 @@ def test_pictures_of_a_batch_and_other_ranges() -> None:
     assert torch.equal(denoise(bad, strength=0.0), bad)
 
 
+@dataclass(frozen=True)
+class Rows:
+    """A block of rows of a batch."""
+
+    pixels: torch.Tensor
+    inner: Inner
+    image: torch.Tensor
+    first: int
+    width: int
+    weights: torch.Tensor | None = None
+
+
 def test_parts_have_the_numbers_of_the_whole() -> None:
     image, floor = torch.rand(2, 3, 60, 40, generator=torch.Generator().manual_seed(0)), torch.tensor([0.01, 0.02])
     image[:, :, 17, 20] = 9.0
-    everything = (slice(None), slice(None))
-    whole = hot_pixels._numbers(image, everything, 0, floor, 40)
+    whole = hot_pixels._numbers(InMemory(image), floor)
     total, values = torch.zeros(()), []
     for start in range(0, 60, 17):
         first, stop = max(start - MARGIN, 0), min(start + 17, 60)
-        part = image[:, :, first : stop + MARGIN]
-        inner = (slice(start - first, stop - first), slice(None))
-        numbers = hot_pixels._numbers(part, inner, start, floor, 40)
+        part, inner = image[:, :, first : stop + MARGIN], (slice(start - first, stop - first), slice(None))
+        numbers = hot_pixels._numbers(Rows(part, inner, part[..., *inner], start * 40, 40), floor)
         total = total + numbers.numbers
         values.append(numbers.values)
     assert torch.equal(total, whole.numbers)

@@ -6,10 +6,19 @@ import torch
 from nlfilter_torch.filtering.filters import detail_layers
 from nlfilter_torch.operator.build import nonlocal_operator
 from nlfilter_torch.operator.options import FilterOptions
-from nlfilter_torch.photo.picture.drawn import Drawn, M
+from nlfilter_torch.photo.picture.drawn import Drawn
 from nlfilter_torch.photo.picture.edit import PhotoEdit
-from nlfilter_torch.photo.picture.in_memory import Cache, InMemory, edit_image, kept_in, tensors_in, without_tensors
-from nlfilter_torch.photo.picture.pixels import Fitted, whole_image
+from nlfilter_torch.photo.picture.in_memory import (
+    Cache,
+    InMemory,
+    edit_image,
+    in_blocks,
+    kept_in,
+    tensors_in,
+    without_tensors,
+)
+from nlfilter_torch.photo.picture.measuring import reduced
+from nlfilter_torch.photo.picture.pixels import Fitted, M, WorkingRange, whole_image
 from nlfilter_torch.photo.picture.source import Guide, Source
 from tests.problems import box, noise
 
@@ -60,36 +69,15 @@ def test_tensors_are_replaced_by_their_type_in_the_name_of_an_operator() -> None
     assert without_tensors(tensor) is torch.Tensor
 
 
-def test_statistics_are_over_all_pixels() -> None:
-    image = noise(2, 3, 12, 15)
-    source = InMemory(image)
-    assert (source.batch, source.channels, source.size, source.width) == (2, 3, (12, 15), 15)
-    torch.testing.assert_close(source.mean(whole_image), image.mean((2, 3), keepdim=True))
-    least, most = source.ends(whole_image)
-    assert torch.equal(least, image.amin((2, 3), keepdim=True))
-    assert torch.equal(most, image.amax((2, 3), keepdim=True))
-    assert source.reduced(whole_image, 4).shape == (2, 3, 3, 4)
-    torch.testing.assert_close(source.reduced(whole_image, 3)[..., 0, 0], image[..., :3, :3].mean((2, 3)))
-    assert source.measured(lambda picture: picture.mean(whole_image)).shape == (2, 3, 1, 1)
-    assert torch.equal(source.colours(torch.tensor([3, 20])), image.flatten(2)[:, :, [3, 20]])
-
-
 def test_smaller_pictures() -> None:
     image = noise(1, 3, 12, 15)
     source = InMemory(image, {})
     assert source.resized((12, 15)) is source
     assert source.resized((4, 5)).size == (4, 5)
-    assert source.blocks(1, 1) is source
-    assert source.blocks(3, 1).size == (4, 5)
-    assert source.blocks(3, 1) is source.blocks(3, 1)  # kept
-    torch.testing.assert_close(source.blocks(3, 1).image, source.reduced(whole_image, 3))
-    weights = (noise(1, 2, 12, 15) > 0.5).double()
-    resized = source.resized_weights(weights, (4, 5), "regions")
-    assert resized.shape == (1, 2, 4, 5)
-    assert resized.min() >= 0
-    assert resized.max() <= 1
-    with pytest.raises(ValueError, match="regions must have the height and width of the image"):
-        source.resized_weights(weights[..., :9], (4, 5), "regions")
+    assert in_blocks(source, 1, 1) is source
+    assert in_blocks(source, 3, 1).size == (4, 5)
+    assert in_blocks(source, 3, 1) is in_blocks(source, 3, 1)  # kept
+    torch.testing.assert_close(in_blocks(source, 3, 1).image, reduced(source, whole_image, 3))
 
 
 def test_scribbles_are_read_from_masks() -> None:
@@ -100,8 +88,6 @@ def test_scribbles_are_read_from_masks() -> None:
     assert scribbles.colours is None
     learned = (0.5 * mask).requires_grad_()
     assert len(source.scribbles(learned, None, "mask").places) == 12 * 15  # also where the weight is 0
-    assert len(source.regions(torch.cat([mask, mask], dim=1), "regions")) == 2
-    assert source.num_regions(torch.cat([mask, mask], dim=1), "regions") == 2
     assert len(source.scribbles(0 * mask, None, "mask", needed=False).places) == 0
     for wrong, kind, sentence in (
         (None, TypeError, "mask must be a torch.Tensor, got NoneType"),
@@ -140,8 +126,34 @@ class Halved(PhotoEdit):
 def test_images_are_edited_in_a_working_precision_and_keep_their_dtype() -> None:
     for dtype in (torch.float16, torch.bfloat16, torch.float32, torch.float64):
         image = noise(1, 3, 8, 9).to(dtype)
-        edited = edit_image(Halved(), image)
+        edited = edit_image(Halved(options=FilterOptions()), image)
         assert edited.dtype == dtype
         assert torch.equal(edited, image / 2)
     with pytest.raises(ValueError, match=r"grey must have 1 channel\(s\), got 3"):
-        edit_image(Halved(), noise(1, 3, 8, 9), name="grey", channels=1)
+        edit_image(Halved(options=FilterOptions()), noise(1, 3, 8, 9), name="grey", channels=1)
+
+
+def test_the_image_in_a_range_is_kept_with_its_operators() -> None:
+    image = noise(1, 3, 12, 15)
+    source, working = InMemory(image, {}), working_range(0.25, 0.5)
+    seen = source.in_range(working)
+    assert source.in_range(None) is source
+    torch.testing.assert_close(seen.image, (4 * image - 1).clamp(-1, 2))
+    assert source.in_range(working_range(0.25, 0.5)) is seen
+    assert source.in_range(working_range(0.0, 0.5)) is not seen
+
+
+def test_an_edit_in_a_range_changes_the_image_in_its_own_units() -> None:
+    image, working = noise(1, 3, 12, 15), working_range(0.25, 0.5)
+    doubled = Fitted(lambda pixels: 2 * pixels.image, working=working)
+    seen = working.seen(image)
+    torch.testing.assert_close(InMemory(image).all(doubled), image + seen / 4)
+    mixed = Fitted(lambda pixels: 2 * pixels.image, working=working, opacity=0.5)
+    torch.testing.assert_close(InMemory(image).all(mixed), image + seen / 8)
+    mask = Fitted(lambda pixels: 2 * pixels.image, working=working, gives_picture=False)
+    torch.testing.assert_close(InMemory(image).all(mask), 2 * seen)
+
+
+def working_range(low: float, high: float) -> WorkingRange:
+    low_end, high_end = (torch.tensor(end).double().view(1, 1, 1, 1) for end in (low, high))
+    return WorkingRange(low_end, high_end, torch.ones(1, 1, 1, 1, dtype=torch.bool))

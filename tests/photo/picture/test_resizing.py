@@ -10,6 +10,7 @@ from nlfilter_torch.photo.picture.in_memory import InMemory
 from nlfilter_torch.photo.picture.pictures import Picture
 from nlfilter_torch.photo.picture.resizing import block_means, enlarged, resize, resized
 from nlfilter_torch.photo.picture.tiled import Tiled
+from nlfilter_torch.photo.picture.tiled_scribbles import resized_masks
 from nlfilter_torch.photo.picture.tiles import Passes
 from tests.problems import cat, colour, noise
 
@@ -32,13 +33,13 @@ def test_weights_are_resized_by_themselves() -> None:
     mask = torch.zeros(2, 1, 40, 56)
     mask[..., 5:25, 5:30] = 1
     mask[0] *= 0.6
-    both = InMemory(torch.zeros(2, 3, 40, 56)).resized_weights(mask, (20, 28), "mask")
-    alone = InMemory(torch.zeros(1, 3, 40, 56)).resized_weights(mask[:1], (20, 28), "mask")
+    both = resized_masks(InMemory(torch.zeros(2, 3, 40, 56)), mask, (20, 28), "mask")
+    alone = resized_masks(InMemory(torch.zeros(1, 3, 40, 56)), mask[:1], (20, 28), "mask")
     assert torch.equal(both[:1], alone)
     assert both[0].max() == pytest.approx(0.6)
     rows = mask[:, 0].permute(1, 2, 0).numpy()  # the two as planes of one picture
     tiled = Tiled(Picture(np.zeros((40, 56, 3), np.float32)), Passes("float32"), "mask")
-    small = torch.from_numpy(np.asarray(tiled.resized_weights(rows, (20, 28), "mask"))).permute(2, 0, 1)
+    small = torch.from_numpy(np.asarray(resized_masks(tiled, rows, (20, 28), "mask"))).permute(2, 0, 1)
     torch.testing.assert_close(small, both[:, 0], rtol=0, atol=1e-6)
 
 

@@ -14,11 +14,21 @@ from nlfilter_torch.operator.options import FilterOptions
 from nlfilter_torch.photo import colorize, recolor
 from nlfilter_torch.photo.picture import sampling, tiles
 from nlfilter_torch.photo.picture.colour import split_luminance
+from nlfilter_torch.photo.picture.in_memory import InMemory
 from nlfilter_torch.photo.picture.painting import cover
 from nlfilter_torch.photo.picture.pictures import Picture
-from nlfilter_torch.photo.picture.tiled_scribbles import read_scribbles
+from nlfilter_torch.photo.picture.tiled import Tiled
+from nlfilter_torch.photo.picture.tiled_scribbles import (
+    num_regions,
+    read_regions,
+    read_scribbles,
+    region_weights,
+    resized_masks,
+)
+from nlfilter_torch.photo.picture.tiles import Passes
 from tests import problems
 from tests.pairwise import each_value
+from tests.problems import box, noise
 from tests.recipes import BLUE, rows_of
 from tests.streams import stream_colorize, stream_detail, stream_recolor
 from tests.strokes import mask_of, paint
@@ -329,3 +339,45 @@ def test_a_source_that_changes_its_size_is_named() -> None:
         source = Shrinking(cat(40, 30), most=100)
         with pytest.raises(ValueError, match="source must keep its size while it is read, 40 rows of 30"):
             edit(source, np.empty_like(source.picture), strokes, mask, num_landmarks=20, tile_rows=10)
+
+
+REGIONS = torch.cat([box(2, 3, size=(12, 15)), 0.5 * box(6, 8, size=(12, 15))], dim=1).float()
+REGION_ROWS = REGIONS[0].permute(1, 2, 0).numpy()
+
+
+def both() -> tuple[InMemory, Tiled]:
+    image = noise(1, 3, 12, 15).float()
+    return InMemory(image), Tiled(Picture(image[0].permute(1, 2, 0).numpy()), Passes("float32"))
+
+
+def test_masks_of_tiles_are_those_of_the_whole() -> None:
+    whole, tiled = both()
+    assert num_regions(whole, REGIONS, "regions") == num_regions(tiled, REGION_ROWS, "regions") == 2
+    assert num_regions(tiled, REGION_ROWS[..., 0], "regions") == 1
+    for one, other in zip(
+        read_regions(whole, REGIONS, "regions"), read_regions(tiled, REGION_ROWS, "regions"), strict=True
+    ):
+        assert torch.equal(one.places, other.places)
+        assert torch.equal(one.weights, other.weights)
+        torch.testing.assert_close(one.image, other.image)
+    assert len(read_regions(tiled, REGION_ROWS[..., 0], "regions")) == 1
+    assert torch.equal(region_weights(whole, REGIONS, "regions")(whole), REGIONS)
+    assert torch.equal(region_weights(tiled, REGION_ROWS, "regions")(whole), REGIONS)
+
+
+def test_smaller_masks_stay_in_their_range() -> None:
+    whole, tiled = both()
+    resized = resized_masks(whole, REGIONS, (4, 5), "regions")
+    assert resized.shape == (1, 2, 4, 5)
+    assert resized.min() >= 0
+    assert resized.max() <= 1
+    rows = np.asarray(resized_masks(tiled, REGION_ROWS, (4, 5), "regions"))
+    torch.testing.assert_close(torch.from_numpy(rows).permute(2, 0, 1)[None], resized)
+    with pytest.raises(ValueError, match="regions must have the height and width of the image"):
+        resized_masks(whole, REGIONS[..., :9], (4, 5), "regions")
+    with pytest.raises(ValueError, match="regions must have the height and width of the picture"):
+        resized_masks(tiled, REGION_ROWS[:, :9], (4, 5), "regions")
+    with pytest.raises(ValueError, match="regions must have the height and width of the image"):
+        region_weights(whole, REGIONS[..., :9], "regions")
+    with pytest.raises(ValueError, match="regions must have the height and width of source, 12x15, got 12x9"):
+        region_weights(tiled, REGION_ROWS[:, :9], "regions")

@@ -17,7 +17,7 @@ def test_memory_gives_the_size_of_tiles() -> None:
 
     def rows_within(memory: int, masked: bool = False) -> int:
         tiled = Tiled(picture, Passes("uint8", sample=1 << 16, memory=memory))
-        return tiled.fitting_rows(75 if masked else 25, num_landmarks=5)
+        return tiled.room.rows(75 if masked else 25, num_landmarks=5)
 
     rows = [rows_within(memory) for memory in (5 * 10**7, 2 * 10**8, 10**10)]
     assert 200 * 85 * 4 * rows[0] < 5 * 10**7 < 200 * 85 * 4 * 4 * rows[0]

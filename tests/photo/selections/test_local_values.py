@@ -11,6 +11,7 @@ from torch import Tensor
 from benchmarks.levin import propagate
 from nlfilter_torch.photo import colorize
 from nlfilter_torch.photo.picture.in_memory import InMemory
+from nlfilter_torch.photo.picture.measuring import reduced
 from nlfilter_torch.photo.picture.pictures import Picture
 from nlfilter_torch.photo.picture.source import luminance
 from nlfilter_torch.photo.picture.tiled import Tiled
@@ -42,7 +43,7 @@ def spread(links: Links, image: Tensor, mask: Tensor, values: Tensor) -> tuple[T
 def local(links: Links, image: Tensor, places: Tensor, weights: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
     """Return mean values and influence of scribbled pixels."""
     size = (image.shape[2], image.shape[3])
-    guide = InMemory(image).reduced(luminance, links.step(size))
+    guide = reduced(InMemory(image), luminance, links.step(size))
     solution = LocalValues.of(links, guide, size, places, weights, values)(image, 0)
     return solution[:, :-1], solution[:, -1:]
 
@@ -115,9 +116,9 @@ def test_blocks_of_tiles_are_those_of_the_whole(monkeypatch: pytest.MonkeyPatch,
     picture = np.random.default_rng(0).random((83, 61, 3), np.float32)
     tiled = Tiled(Picture(picture), Passes("float32"))
     image = torch.from_numpy(picture).permute(2, 0, 1)[None]
-    whole = InMemory(image).reduced(luminance, step)
-    torch.testing.assert_close(tiled.reduced(luminance, step), whole, atol=1e-7, rtol=0)
-    turned = InMemory(image.flip(2).mT).reduced(luminance, step)
+    whole = reduced(InMemory(image), luminance, step)
+    torch.testing.assert_close(reduced(tiled, luminance, step), whole, atol=1e-7, rtol=0)
+    turned = reduced(InMemory(image.flip(2).mT), luminance, step)
     torch.testing.assert_close(turned, whole.flip(2).mT, atol=1e-7, rtol=0)
 
 

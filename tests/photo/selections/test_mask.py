@@ -10,7 +10,7 @@ import torch
 from nlfilter_torch.photo import region_mask
 from nlfilter_torch.photo.picture import sampling
 from nlfilter_torch.photo.picture.drawn import Drawn
-from nlfilter_torch.photo.picture.in_memory import InMemory
+from nlfilter_torch.photo.picture.in_memory import InMemory, in_blocks
 from nlfilter_torch.photo.picture.pictures import Picture
 from nlfilter_torch.photo.picture.resizing import block_means
 from nlfilter_torch.photo.picture.tiled import Tiled
@@ -192,7 +192,7 @@ def test_one_scribble_selects_a_sky_whose_colour_changes(building: bool) -> None
 @pytest.mark.parametrize("step", [4, 2.5])
 def test_weights_of_blocks_are_the_means_of_their_pixels(step: float) -> None:
     source = InMemory(colour("chelsea", 41, 57))
-    small = source.blocks(step, 1)
+    small = in_blocks(source, step, 1)
     painted = torch.zeros(1, 1, 41, 57)
     painted[..., 37:, :], painted[..., 54:] = 1, 0.5
     steps = (41 / small.size[0], 57 / small.size[1])

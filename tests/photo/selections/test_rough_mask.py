@@ -6,6 +6,7 @@ import torch
 
 from nlfilter_torch import nonlocal_operator
 from nlfilter_torch.photo.picture.in_memory import InMemory, InMemoryOperator
+from nlfilter_torch.photo.picture.tiled_scribbles import read_regions
 from nlfilter_torch.photo.selections import rough_mask
 from nlfilter_torch.photo.selections.rough_mask import Points, RoughMasks, region_guide
 from nlfilter_torch.photo.selections.scribbled_colours import frame_places
@@ -23,7 +24,7 @@ def test_the_regression_is_the_best_estimate_from_scribbles_frame_and_grid(
     source = InMemory(image)
     options = {"photometric_bandwidth": 0.2, "num_landmarks": 60, "patch_size": 1, "guide_channels": "all"}
     operator = nonlocal_operator(region_guide(image), **options)
-    scribbles = source.regions(front, "a")[0].joined(source.regions(back, "b")[0])
+    scribbles = read_regions(source, front, "a")[0].joined(read_regions(source, back, "b")[0])
     held = InMemoryOperator(operator, source)
     places = frame_places((20, 24))
     grid = torch.tensor([24 * row + column for row in (7, 14) for column in (3, 8, 18)])
@@ -59,6 +60,6 @@ def test_scribbles_on_the_background_take_nothing_from_what_the_frame_says_elsew
     held = InMemoryOperator(nonlocal_operator(region_guide(image), **options), source)
     frame = Points.of(source, held, frame_places((24, 40)))
     rough = RoughMasks(source, held, frame, frame, torch.tensor(0.05), reach=0.6)
-    strokes = [source.regions(box(10, left, 3, 4, size=(24, 40)), "a")[0] for left in (14, 28)]
+    strokes = [read_regions(source, box(10, left, 3, 4, size=(24, 40)), "a")[0] for left in (14, 28)]
     outside = rough.outside(rough.scribbled(strokes[0].joined(strokes[1])), torch.ones(1, 1, len(frame.places)))
     assert outside.min() > 0.8

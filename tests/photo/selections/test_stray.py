@@ -13,6 +13,7 @@ from benchmarks.recolor import CHANGED, HATS, hat_scene
 from benchmarks.scribbles import STORED, Job, as_mask, jobs, line
 from nlfilter_torch.photo import recolor, region_mask
 from nlfilter_torch.photo.picture.in_memory import InMemory
+from nlfilter_torch.photo.picture.tiled_scribbles import read_regions
 from nlfilter_torch.photo.selections.stray import strays
 from tests.problems import box, paint
 
@@ -32,7 +33,7 @@ def scene(noise: float = 0.02) -> torch.Tensor:
 
 def ignored(image: torch.Tensor, *masks: torch.Tensor) -> torch.Tensor:
     """The plane (H, W) of the pixels of a region's scribbles that do not count."""
-    scribbles = InMemory(image).regions(sum(masks, torch.zeros(1, 1, *SIZE)).clamp(max=1), "scribbles")[0]
+    scribbles = read_regions(InMemory(image), sum(masks, torch.zeros(1, 1, *SIZE)).clamp(max=1), "scribbles")[0]
     plane = torch.zeros(SIZE[0] * SIZE[1])
     plane[scribbles.places] = strays(scribbles, SIZE)[0, 0].float()
     return plane.unflatten(0, SIZE)
@@ -83,10 +84,10 @@ def test_half_a_stroke_and_one_pixel_and_everything() -> None:
 
 def test_images_of_a_batch_are_judged_alone() -> None:
     images, masks = torch.cat([scene(), scene().flip(3)]), torch.cat([box(40, 50, 5, 49, SIZE)] * 2)
-    scribbles = InMemory(images).regions(masks, "scribbles")[0]
+    scribbles = read_regions(InMemory(images), masks, "scribbles")[0]
     both = strays(scribbles, SIZE)
     for number in range(2):
-        alone = InMemory(images[number : number + 1]).regions(masks[:1], "scribbles")[0]
+        alone = read_regions(InMemory(images[number : number + 1]), masks[:1], "scribbles")[0]
         assert torch.equal(both[number : number + 1], strays(alone, SIZE))
     assert 45 <= both[0].sum() <= 45 + 5 * BESIDE
 
