@@ -25,9 +25,7 @@ CHROMIUM = next(
 )
 SCREENS = [(390, 844), (800, 600), (1280, 800), (1920, 1080)]  # width and height
 TOUCHED, POINTED = SCREENS[::2], SCREENS[1::2]  # long tests take two of them by finger, and two by mouse
-TIMEOUT = (
-    300_000  # milliseconds, of everything that is waited for: far more than a busy machine needs, as waits end early
-)
+TIMEOUT = 300_000  # milliseconds, of everything that is waited for: far more than a busy machine needs
 OPENING = 12_000  # milliseconds in which an entry of a list is there, unless the list has been closed again
 # Colours and places are then those of a state at once, and never on the way to it. Animations stay: they show masks.
 STILL = """document.addEventListener("DOMContentLoaded", () => {

@@ -162,7 +162,10 @@ def test_the_first_five_minutes_of_a_newcomer(opened: Tab, folder: Path) -> None
     opened.wait_for_picture(before)
     expect(page.get_by_role("tab", name="Recolor, in use")).to_be_visible()
     opened.drag(opened.slider("Look: opacity"), 1.0, 0.5)
+    switches = page.get_by_role("checkbox", name=re.compile(": on$"))
+    expect(switches.first).to_have_accessible_name("Recolor: on")
     page.get_by_role("button", name="Look: up").click()
+    expect(switches.first).to_have_accessible_name("Look: on")  # the rows are those of the new order
     page.get_by_role("button", name="Recolor: remove").click()
     expect(page.get_by_role("checkbox", name="Recolor: on")).to_have_count(0)
     page.get_by_role("button", name="Undo").click()
