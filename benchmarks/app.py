@@ -28,6 +28,7 @@ from benchmarks.preview import RECIPES
 from nlfilter_torch.photo.app import drawing
 from nlfilter_torch.photo.app.closeup import Closeup
 from nlfilter_torch.photo.app.session import Session
+from nlfilter_torch.photo.app.tasks import Tasks
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.picture.photographs import Photograph, write_photograph
 
@@ -93,6 +94,17 @@ def in_the_library(path: Path, repeats: int) -> None:
         report(f"{step}, {entry} changed", times)
 
 
+class AtOnce(Tasks):
+    """The work of a page, in its own thread, and tasks in a list."""
+
+    def __init__(self, tasks: list[Awaitable[None]]) -> None:
+        self.start = tasks.append
+
+    async def run(self, doing: str, work: Callable[..., Any], *arguments: Any, progress: object = None) -> Any:
+        """Run something."""
+        return work(*arguments)
+
+
 def at_full_size(path: Path, repeats: int) -> None:
     """The part that is seen at 100 %, after pans by a third of it, and after jumps to other places."""
     session, tasks = Session(path.parent), list[Awaitable[None]]()
@@ -100,10 +112,7 @@ def at_full_size(path: Path, repeats: int) -> None:
     assert session.opened is not None
     height, width = session.opened.photograph.size
 
-    async def run(doing: str, work: Callable[[], Any], progress: object) -> Any:
-        return work()
-
-    closeup = Closeup(run, tasks.append, lambda script: None)
+    closeup = Closeup(AtOnce(tasks), lambda script: None)
 
     def look(x: float, y: float) -> float:
         """Milliseconds until what is seen at a place, in shares of the way to the lower right corner, is there."""

@@ -1,50 +1,36 @@
-"""The visible part of a photograph at full size, in pieces that the page lays over the preview."""
+"""What a page shows of the photograph at full size: the visible part, and at rest what a saved file would show."""
 
+import asyncio
 from collections.abc import Callable, Sequence
-from functools import partial
-from typing import Protocol
+from contextlib import suppress
 
 import torch
 from torch import Tensor
 
 from nlfilter_torch.core.progress import Progress
 from nlfilter_torch.photo.app import drawing
-from nlfilter_torch.photo.app.work import Interruptible, OutdatedError, Run, Start
+from nlfilter_torch.photo.app.session import Session
+from nlfilter_torch.photo.app.tasks import Interruptible, OutdatedError, Tasks
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.edits.parts import Rectangle
 from nlfilter_torch.photo.picture.sampling import Report
 
+QUIET = 1.0  # seconds without a change, after which the whole photograph is edited
 CELL = 64  # pixels; pieces consist of squares of that size
 PIECE = 1 << 19  # pixels of a piece, at most
 KEPT = 24_000_000  # pixels of all pieces, at most; invisible pieces are dropped first
 LARGEST = 40_000_000  # pixels that a page may ask for at once
 
 
-class Enlarged(Protocol):
-    """The session of an open photograph, as far as its pixels at full size are concerned."""
-
-    recipe: Recipe
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """(height, width) of the photograph."""
-
-    def original(self, place: Rectangle) -> Tensor:
-        """A part of the photograph before the edit, (1, C, h, w) in [0, 1]."""
-
-    def part(self, place: Rectangle, recipe: Recipe, report: Report) -> Tensor:
-        """A part of the photograph under an edit, (1, C, h, w) in [0, 1]."""
-
-
 class Closeup:
-    """The pieces of a photograph that a page shows at full size.
+    """The visible part of a photograph at full size, in pieces that the page lays over the preview.
 
     ``tell`` runs JavaScript in the page.
     """
 
-    def __init__(self, run: Run, start: Start, tell: Callable[[str], object]) -> None:
-        self.session: Enlarged | None = None
-        self._run, self._start, self._tell = run, start, tell
+    def __init__(self, tasks: Tasks, tell: Callable[[str], object]) -> None:
+        self.session: Session | None = None
+        self._tasks, self._tell = tasks, tell
         self._view: Rectangle | None = None
         self._recipe = Recipe()
         self._held = False  # a slider is moving: the preview alone follows
@@ -53,7 +39,7 @@ class Closeup:
         self._pieces: dict[str, tuple[Rectangle, bytes]] = {}  # in the order in which they were made
         self._covered = torch.zeros(0, 0, dtype=torch.bool)  # cells
 
-    def open(self, session: Enlarged) -> None:
+    def open(self, session: Session) -> None:
         """Show a photograph that was opened."""
         self.session, self._view = session, None
         height, width = session.size
@@ -116,7 +102,7 @@ class Closeup:
 
     def _wake(self) -> None:
         if not self._working and self._next() is not None:
-            self._start(self._work())
+            self._tasks.start(self._work())
 
     async def _work(self) -> None:
         """Make pieces until the visible part is covered."""
@@ -130,8 +116,10 @@ class Closeup:
                 self._recipe = recipe
                 try:
                     progress = Progress()
-                    work = partial(self._work_out, session, recipe, part, progress)
-                    content = await self._run("Full size", work, progress)
+                    report = Interruptible(progress, self._is_outdated, session, recipe)
+                    content = await self._tasks.run(
+                        "Full size", _piece, session, part, recipe, report, progress=progress
+                    )
                 except OutdatedError:
                     continue
                 if not self._is_outdated(session, recipe):
@@ -139,13 +127,8 @@ class Closeup:
         finally:
             self._working = False
 
-    def _is_outdated(self, session: Enlarged, recipe: Recipe) -> bool:
+    def _is_outdated(self, session: Session, recipe: Recipe) -> bool:
         return self._held or self.session is not session or session.recipe.effect != recipe.effect
-
-    def _work_out(self, session: Enlarged, recipe: Recipe, part: Rectangle, progress: Progress) -> bytes:
-        """Compute a piece, as a PNG file; runs in a thread."""
-        report = Interruptible(progress, partial(self._is_outdated, session, recipe))
-        return drawing.lossless(session.part(part, recipe, report))
 
     def _add(self, part: Rectangle, content: bytes) -> None:
         self._number += 1
@@ -169,7 +152,7 @@ class Closeup:
         rows, columns = (slice(axis.start // CELL, -(-axis.stop // CELL)) for axis in (part.rows, part.columns))
         return self._covered[rows, columns]
 
-    def _next(self) -> tuple[Enlarged, Rectangle] | None:
+    def _next(self) -> tuple[Session, Rectangle] | None:
         """The next piece that is visible but missing, with its session, or None."""
         if self.session is None or self._view is None or self._held:
             return None
@@ -183,6 +166,11 @@ class Closeup:
             range((top + rows.start) * CELL, min((top + rows.stop) * CELL, height)),
             range((left + columns.start) * CELL, min((left + columns.stop) * CELL, width)),
         )
+
+
+def _piece(session: Session, part: Rectangle, recipe: Recipe, report: Report) -> bytes:
+    """A part of the photograph under an edit, as a PNG file."""
+    return drawing.lossless(session.part(part, recipe, report))
 
 
 def first_block(missing: Tensor, most: int) -> tuple[range, range] | None:
@@ -204,3 +192,45 @@ def first_block(missing: Tensor, most: int) -> tuple[range, range] | None:
             break
         bottom += 1
     return range(top, bottom), range(left, left + width)
+
+
+class AtRest:
+    """Replaces the preview by the photograph under the edit, reduced, once nothing has changed for a second.
+
+    ``wanted`` says whether a session and its current edit are what the page shows as a preview, ``show`` shows the
+    result.
+    """
+
+    def __init__(self, tasks: Tasks, wanted: Callable[[Session], bool], show: Callable[[Tensor], None]) -> None:
+        self._tasks, self._wanted, self._show = tasks, wanted, show
+        self._working = False
+        self._again: Session | None = None
+
+    def drawn(self, session: Session) -> None:
+        """Start over, since the preview of a session has been drawn."""
+        if session.is_reduced and session.recipe.acting:
+            self._again = session
+            if not self._working:
+                self._tasks.start(self._work())
+
+    async def _work(self) -> None:
+        self._working = True
+        try:
+            while self._again is not None:
+                session, self._again = self._again, None
+                await asyncio.sleep(QUIET)
+                with suppress(OutdatedError):
+                    await self._edit(session, session.recipe)
+        finally:
+            self._working = False
+
+    def _is_outdated(self, session: Session, recipe: Recipe) -> bool:
+        return self._again is not None or session.recipe.effect != recipe.effect or not self._wanted(session)
+
+    async def _edit(self, session: Session, recipe: Recipe) -> None:
+        progress = Progress()
+        report = Interruptible(progress, self._is_outdated, session, recipe)
+        report("Full size", 0, 1)
+        picture = await self._tasks.run("Full size", session.at_rest, recipe, report, progress=progress)
+        report("Full size", 1, 1)
+        self._show(picture)

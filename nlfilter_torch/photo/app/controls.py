@@ -14,7 +14,8 @@ from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.declared.steps import Step
 
 Change = Callable[[str, Mapping[str, Value], bool], None]  # step, values, whether the change is complete
-UNITS = {"gain": "\u00d7", "%": "%"}
+Replace = Callable[[Recipe, int | None], None]  # a new edit, and the place of the step whose slider moves, or None
+SYMBOLS = {"gain": "\u00d7", "%": "%"}
 
 
 @dataclass(frozen=True)
@@ -84,7 +85,7 @@ class Control:
         if value == self.slider.none:
             return "all"
         places = len(f"{self.slider.step:g}".partition(".")[2])
-        return f"{value:.{places}f} {UNITS.get(self.parameter.unit, '')}".rstrip()
+        return f"{value:.{places}f} {SYMBOLS.get(self.parameter.unit, '')}".rstrip()
 
 
 LAYERS = (

@@ -4,11 +4,10 @@ import secrets
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
-from typing import Protocol
 from urllib.parse import quote
 
+from fastapi import Response
 from nicegui import events, ui
 from nicegui.elements.upload_files import FileUpload
 from torch import Tensor
@@ -16,28 +15,28 @@ from torch import Tensor
 from nlfilter_torch.core.progress import Progress
 from nlfilter_torch.photo.app import drawing
 from nlfilter_torch.photo.app.access import LARGEST
-from nlfilter_torch.photo.app.assets import SCRIPTS, STATIC
-from nlfilter_torch.photo.app.at_rest import AtRest
 from nlfilter_torch.photo.app.brush import Brush
 from nlfilter_torch.photo.app.canvas import Canvas
-from nlfilter_torch.photo.app.closeup import Closeup
+from nlfilter_torch.photo.app.closeup import AtRest, Closeup
 from nlfilter_torch.photo.app.crop_tool import FREE, Proportions
 from nlfilter_torch.photo.app.developed import DEVELOPING, Developed
-from nlfilter_torch.photo.app.dialogs import NameDialog, Question, SaveDialog
-from nlfilter_torch.photo.app.look_tab import thumbnails
+from nlfilter_torch.photo.app.dialogs import NameDialog, Question, SaveDialog, Upload
+from nlfilter_torch.photo.app.library import Library
 from nlfilter_torch.photo.app.panel import Panel
 from nlfilter_torch.photo.app.session import Session
-from nlfilter_torch.photo.app.tabs import Link, PhotoLink
-from nlfilter_torch.photo.app.tasks import EXPECTED, Tasks
-from nlfilter_torch.photo.app.uploads import Upload
+from nlfilter_torch.photo.app.tabs import Link, PhotoLink, thumbnails
+from nlfilter_torch.photo.app.tasks import EXPECTED, Arguments, Tasks
 from nlfilter_torch.photo.declared.development import Development
 from nlfilter_torch.photo.declared.json_values import Value
 from nlfilter_torch.photo.declared.parameters import DETAIL, EDITS
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.declared.strokes import sliders_of
-from nlfilter_torch.photo.picture.sampling import Report
 
-Save = Callable[[str, Report], Path]  # name and progress
+STATIC = Path(__file__).with_name("static")  # the scripts and the style sheet of the page
+STATIC_ADDRESS = "/static"  # at which the server offers them
+SCRIPTS = "".join(
+    f'<script type="module" src="{STATIC_ADDRESS}/{name}"></script>\n' for name in ("page.js", "closeup.js", "crop.js")
+)
 LARGEST_PRESET = 20_000_000  # bytes
 PRESET_KINDS = ".json,.cube,.png,.tif,.tiff,.jpg,.jpeg,application/json"
 REPLACING = (
@@ -48,26 +47,10 @@ INSIDE, OUTSIDE = "#4ade80", "#60a5fa"  # colours of the sliders' response in th
 EDITORS: dict[str, "Editor"] = {}  # open pages by the token in the addresses of their pictures
 
 
-class Photographs(Protocol):
-    """Where the sessions of photographs come from; all raise ValueError, OSError or MemoryError if there is none."""
-
-    def new(self) -> Session:
-        """A session without a photograph."""
-
-    def open(self, path: Path) -> Session:
-        """The session of a file."""
-
-    def open_upload(self, copy: Path, name: str) -> Session:
-        """The session of a file that the browser sent."""
-
-    def reopen(self, address: str) -> Session:
-        """The session of an address that a page had."""
-
-
 class Editor:
     """One tab of the browser, and the session of the photograph that it shows."""
 
-    def __init__(self, photographs: Photographs) -> None:
+    def __init__(self, photographs: Library) -> None:
         self._photographs = photographs
         self.session = photographs.new()
         self._told: str | None = None  # the last trouble of the session that was shown
@@ -88,8 +71,8 @@ class Editor:
         ui.add_css(STATIC / "page.css")
         ui.add_head_html(SCRIPTS)
         self._build_header()
-        self._closeup = Closeup(self._tasks.run, self._tasks.start, self._tell)
-        self._at_rest = AtRest(self._tasks.run, self._tasks.start, self._is_preview, self._take)
+        self._closeup = Closeup(self._tasks, self._tell)
+        self._at_rest = AtRest(self._tasks, self._is_preview, self._take)
         brush = Brush()
         with ui.element("div").classes("editor"):
             with ui.element("div").classes("viewer"):
@@ -380,7 +363,7 @@ class Editor:
                     await self._show_crop()
                     if moving == DEVELOPING:
                         continue
-                await self._tasks.run("Working", partial(self._canvas.draw, moving))
+                await self._tasks.run("Working", self._canvas.draw, moving)
                 if moving is None:
                     self._frame()
                 self._show()
@@ -398,7 +381,7 @@ class Editor:
     async def _draw_looks(self) -> None:
         """Draw thumbnails of the photograph, as it is developed, under each look."""
         developed = self.session.developed
-        pictures = await self._tasks.run("Working", partial(thumbnails, developed.preview.pixels))
+        pictures = await self._tasks.run("Working", thumbnails, developed.preview.pixels)
         if self.session.opened is not None and self.session.developed is developed:  # still
             self._pictured = developed
             self._picturing += 1
@@ -450,7 +433,7 @@ class Editor:
             (OUTSIDE, detail["alpha"]),
             *((INSIDE, row) for row in sliders_of(detail.strokes, detail.sliders_inside)),
         ]
-        eigenvalues = await self._tasks.run("Working", partial(self.session.eigenvalues, detail))
+        eigenvalues = await self._tasks.run("Working", self.session.eigenvalues, detail)
         self._panel.draw_response(drawing.response_svg(eigenvalues, curves))
 
     def _switch(self, tab: str) -> None:
@@ -471,9 +454,9 @@ class Editor:
         if self.session.opened is not None:  # a browser that reconnects keeps its edit
             return
         if address and (image is None or address != image.name):
-            self._tasks.start(self._open(partial(self._photographs.reopen, address)))
+            self._tasks.start(self._open(self._photographs.reopen, address))
         elif image is not None:
-            self._tasks.start(self._open(partial(self._photographs.open, image)))
+            self._tasks.start(self._open(self._photographs.open, image))
 
     async def _take_photograph(self, event: events.UploadEventArguments) -> None:
         event.sender.run_method("reset")
@@ -483,10 +466,10 @@ class Editor:
         with tempfile.TemporaryDirectory(prefix="nlfilter-torch-") as folder:
             copy = Path(folder) / "photograph"
             await file.save(copy)
-            await self._open(partial(self._photographs.open_upload, copy, file.name))
+            await self._open(self._photographs.open_upload, copy, file.name)
 
-    async def _open(self, find: Callable[[], Session]) -> None:
-        self.session = await self._tasks.run("Opening", find)
+    async def _open(self, find: Callable[[*Arguments], Session], *place: *Arguments) -> None:
+        self.session = await self._tasks.run("Opening", find, *place)
         opened = self.session.opened
         if opened is None or self._client.is_deleted:
             return
@@ -530,7 +513,8 @@ class Editor:
             dialog = SaveDialog("Save the photograph", name, session.folder, session.check_photograph, side)
         chosen = await dialog.answer()
         if chosen is not None:
-            self._tasks.start(self._save(partial(session.save, options=dialog.options), chosen, Progress()))
+            progress = Progress()
+            self._tasks.start(self._save(progress, session.save, chosen, progress, dialog.options))
 
     async def _ask_edit_name(self) -> None:
         name = "edit" if self.session.opened is None else Path(self.session.opened.name).stem
@@ -538,10 +522,10 @@ class Editor:
             dialog = NameDialog("Save the edit", f"{name}.json", self.session.folder, self.session.check_preset)
         chosen = await dialog.answer()
         if chosen is not None:
-            self._tasks.start(self._save(self.session.save_preset, chosen, Progress()))
+            self._tasks.start(self._save(Progress(), self.session.save_preset, chosen))
 
-    async def _save(self, save: Save, name: str, progress: Progress) -> None:
-        path = await self._tasks.run("Saving", partial(save, name, progress), progress)
+    async def _save(self, progress: Progress, save: Callable[[*Arguments], Path], *arguments: *Arguments) -> None:
+        path = await self._tasks.run("Saving", save, *arguments, progress=progress)
         self._tasks.clear_error()
         if self._client.is_deleted:
             return
@@ -559,17 +543,24 @@ def framed(session: Session, development: Development) -> object:
 class Pages:
     """The pages of the editor, which begin with an image, if there is one."""
 
-    photographs: Photographs
+    photographs: Library
     image: Path | None
 
     def build(self, photo: str = "") -> None:
         """Build a page, for the photograph of an address that a page had before, if there is one."""
         Editor(self.photographs).build(self.image, photo)
 
-    def picture(self, token: str, kind: str, place: str) -> bytes | None:
-        """A picture of the page with a token, by its kind; of the original at a place."""
+    def picture(self, token: str, kind: str, at: str = "") -> Response:
+        """A picture of the page with a token, by its kind, of the original at a place; or status 404.
+
+        The whole photograph is a JPEG file, and all else PNG files.
+        """
         editor = EDITORS.get(token)
-        return None if editor is None else editor.picture(kind, place)
+        content = None if editor is None else editor.picture(kind, at)
+        if not content:
+            return Response(status_code=404)
+        media_type = "image/jpeg" if kind in ("before", "after") else "image/png"
+        return Response(content, media_type=media_type, headers={"Cache-Control": "no-store"})
 
 
 def _button(

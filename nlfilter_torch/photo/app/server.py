@@ -11,13 +11,11 @@ import sys
 import threading
 import time
 from functools import partial
-from typing import Protocol
 
-from fastapi import Response
 from nicegui import app, binding, ui
 
 from nlfilter_torch.photo.app.access import TOKEN, Guard, forget_token, token_in
-from nlfilter_torch.photo.app.assets import STATIC, STATIC_ADDRESS
+from nlfilter_torch.photo.app.page import STATIC, STATIC_ADDRESS, Pages
 from nlfilter_torch.photo.app.sidecar import state_folder
 
 TITLE = "nlfilter-torch"
@@ -25,31 +23,6 @@ STARTING, PAUSE = 30.0, 0.05  # seconds for the server to accept connections, an
 #: Objects, and multiples, after which Python looks for circles among the youngest, the younger and all: as Python 3.11
 #: does by itself.
 COLLECTED = (700, 10, 10)
-
-
-class Pages(Protocol):
-    """The pages that the server offers."""
-
-    def build(self, photo: str = "") -> None:
-        """Build a page, for the photograph of an address that a page had before, if there is one."""
-
-    def picture(self, token: str, kind: str, place: str) -> bytes | None:
-        """A picture of the page with a token, by its kind; of the original at a place."""
-
-
-class Pictures:
-    """Answers requests for the pictures of pages: JPEG files of the whole photograph, PNG files of all else."""
-
-    def __init__(self, pages: Pages) -> None:
-        self._pages = pages
-
-    def answer(self, token: str, kind: str, at: str = "") -> Response:
-        """The picture, or status 404."""
-        content = self._pages.picture(token, kind, at)
-        if not content:
-            return Response(status_code=404)
-        media_type = "image/jpeg" if kind in ("before", "after") else "image/png"
-        return Response(content, media_type=media_type, headers={"Cache-Control": "no-store"})
 
 
 def serve(pages: Pages, *, host: str, port: int, open_page: bool) -> None:
@@ -66,7 +39,7 @@ def serve(pages: Pages, *, host: str, port: int, open_page: bool) -> None:
     app.add_middleware(Guard, host=host, token=token, name=f"nlfilter-torch-{port}")
     app.config.quasar_config["loadingBar"] = {"skipHijack": True}  # the page shows what it is doing itself
     app.add_static_files(STATIC_ADDRESS, STATIC, max_cache_age=0)  # another version must not find old files
-    app.get("/picture/{token}/{kind}")(Pictures(pages).answer)
+    app.get("/picture/{token}/{kind}")(pages.picture)
     ui.page("/", title=TITLE, language="en-US")(pages.build)
     free_closed_pages()
     app.on_startup(threading.Thread(target=_tell_when_ready, args=(host, port, token), daemon=True).start)

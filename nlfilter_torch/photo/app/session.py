@@ -489,10 +489,8 @@ class Session:
         self.saved = recipe
         return target
 
-    def save_preset(self, name: str, report: Report = in_silence) -> Path:
+    def save_preset(self, name: str) -> Path:
         """Write the edit as a file for :meth:`load_preset` and the command line.
-
-        This is quick; ``report`` is not called.
 
         Raises:
             ValueError, OSError: if it cannot be written.

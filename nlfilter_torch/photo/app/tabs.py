@@ -1,20 +1,29 @@
-"""The tab of an edit: its sliders, and the settings of the brush that draws strokes for it."""
+"""The tabs of edits: sliders, the settings of the brush, and what photographs, details and looks have beside these."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 
 from nicegui import ui
+from torch import Tensor
 
-from nlfilter_torch.photo.app import controls
+from nlfilter_torch.photo.app import controls, drawing
 from nlfilter_torch.photo.app.brush import BRUSHES, COLOURS, RADIUS, Brush
-from nlfilter_torch.photo.app.controls import Change, Choice, Control, Slider, SteadySlider
-from nlfilter_torch.photo.app.step_list import Replace
+from nlfilter_torch.photo.app.controls import Change, Choice, Control, Replace, Slider, SteadySlider, show_pressed
+from nlfilter_torch.photo.app.crop_tool import FREE, PROPORTIONS
+from nlfilter_torch.photo.declared.development import DEVELOP, WHOLE
 from nlfilter_torch.photo.declared.json_values import Value
 from nlfilter_torch.photo.declared.parameters import EDITS
-from nlfilter_torch.photo.declared.presets import Recipe
+from nlfilter_torch.photo.declared.presets import LOOKS, PRESETS, PURPOSES, Recipe
+from nlfilter_torch.photo.declared.steps import NONE, Step
 from nlfilter_torch.photo.declared.strokes import ScribbleRole
+from nlfilter_torch.photo.edits.applying import apply_step
+from nlfilter_torch.photo.picture.resizing import resize
 
+BANDWIDTH = 20.0  # grey levels, the start when the bandwidth is not automatic
+THUMBNAIL = 160  # pixels of the longest side, twice as many as on the page
+AMOUNT = "amount"
+UNITS_OF_DEVELOPMENT = {"exposure": " stops", "straighten": "\u00b0"}
 BY_HAND = "Brush (B) and Eraser (E) paint on the mask itself; S is the first tool again."
 
 
@@ -110,8 +119,7 @@ class EditTab:
         with ui.row().classes("w-full items-center no-wrap"):
             ui.label("Tools").classes("group")
             ui.space()
-            clear = ui.button("Clear strokes", on_click=partial(self._link.clear, edit))
-            clear.props("flat dense no-caps")
+            ui.button("Clear strokes", on_click=self._clear).props("flat dense no-caps")
         if hint:
             ui.label(hint).classes("hint")
         self._tools = ui.toggle(BRUSHES[edit], value=brush.word[edit])
@@ -128,6 +136,9 @@ class EditTab:
             size.on_value_change(lambda event: brush.radius.update({edit: event.value / 100}))
             size.on_reset(lambda: size.set_value(100 * RADIUS))
 
+    def _clear(self) -> None:
+        self._link.clear(self._edit)
+
     def _build_colours(self) -> None:
         """Build a field for the colour that the brush paints, the same in all tabs, and buttons for some colours."""
         brush = self._link.brush
@@ -139,3 +150,224 @@ class EditTab:
         field = ui.color_input("Colour", value=brush.colour, on_change=lambda event: brush.choose_colour(event.value))
         field.props("dense outlined").classes("w-full q-mt-xs")
         brush.shown.append(field.set_value)
+
+
+@dataclass(frozen=True)
+class DevelopControl(Control):
+    """A slider for a value of how the photograph is developed."""
+
+    def read(self, recipe: Recipe) -> float:
+        """The slider's value for an edit."""
+        return float(getattr(recipe.develop, self.parameter.name))
+
+    def usual(self, recipe: Recipe) -> float:
+        """The slider's value at the start."""
+        return self.parameter.default_number
+
+    def show(self, value: float) -> str:
+        """The value as text."""
+        return super().show(value) + UNITS_OF_DEVELOPMENT.get(self.parameter.name, "")
+
+
+DEVELOP_CONTROLS = tuple(DevelopControl(DEVELOP.name, p, p.slider, p.help) for p in DEVELOP if p.slider is not None)
+
+
+class DevelopTab(EditTab):
+    """The tab, built into the open element."""
+
+    def follow(self) -> None:
+        """Show the current edit."""
+        super().follow()
+        photo = self._link.photo
+        for button, is_on in ((self._crop, photo.is_cropping()), (self._pick, photo.is_picking())):
+            show_pressed(button, is_on)
+        self._whole.set_enabled(self._link.recipe().develop.crop != WHOLE)
+        self._proportions.set_value(photo.held())
+
+    def _build(self) -> None:
+        ui.label(DEVELOP.hint).classes("hint")
+        self._sliders = [Slider(control, self._link.recipe, self._develop) for control in DEVELOP_CONTROLS]
+        photo = self._link.photo
+        self._pick = ui.button("Grey point", icon="colorize", on_click=photo.pick).props("flat dense no-caps")
+        self._pick.tooltip("Click on something that is grey or white: the white balance makes it so")
+        ui.label("Crop").classes("group")
+        with ui.row().classes("w-full items-center no-wrap gap-2 q-mt-xs"):
+            self._crop = ui.button("Crop", icon="crop", on_click=photo.crop).props("flat dense no-caps")
+            self._crop.tooltip("Drag a frame over the whole photograph; Escape ends it")
+            self._proportions = ui.select(list(PROPORTIONS), value=photo.held(), label="Proportions")
+            self._proportions.props("dense outlined options-dense").classes("grow")
+            self._proportions.tooltip("Width to height of the crop, which it keeps while its frame is dragged")
+            self._proportions.on_value_change(lambda event: self._hold(event.value))
+            self._whole = ui.button("Whole picture", on_click=self._uncrop).props("flat dense no-caps")
+
+    def _develop(self, _: str, values: Mapping[str, Value], complete: bool) -> None:
+        """Change some values."""
+        self._link.photo.develop(values, complete)
+
+    def _hold(self, name: str) -> None:
+        """Let the crop keep proportions, if these are not those that it keeps already."""
+        if name != self._link.photo.held():
+            self._link.photo.hold(name)
+
+    def _uncrop(self) -> None:
+        self._link.photo.hold(FREE)
+        self._link.photo.develop({"crop": WHOLE}, True)
+
+
+class DetailTab(EditTab):
+    """The tab of an edit with sliders for layers, built into the open element."""
+
+    def __init__(self, edit: str, link: Link) -> None:
+        self._following = False
+        self._layout: tuple[int, bool] = (0, False)  # number of layers, and whether a region has its own sliders
+        self._started: str | None = None  # the preset that was chosen last
+        super().__init__(edit, link)
+
+    def follow(self) -> None:
+        """Show the current edit."""
+        detail = self._step
+        self._following = True
+        if self._layout != (len(detail["alpha"]), detail.has_region()):
+            self._layout = (len(detail["alpha"]), detail.has_region())
+            self._build_sliders(detail)
+        super().follow()
+        automatic = isinstance(detail["bandwidth"], str)
+        self._automatic.set_value(automatic)
+        self._by_hand.set_visibility(not automatic)
+        if not automatic:
+            self._bandwidth.set_value(detail["bandwidth"])
+        self._name_preset(detail)
+        self._following = False
+
+    def draw_response(self, svg: str) -> None:
+        """Show the response of the sliders."""
+        self._response.set_content(svg)
+
+    @property
+    def _step(self) -> Step:
+        """The current step of the edit."""
+        return self._link.recipe().current(self._edit)
+
+    def _build(self) -> None:
+        names = {name: f"{name}: {PURPOSES[name]}" for name in PRESETS}
+        self._presets = ui.select(names, label="Start from", on_change=lambda event: self._choose(event.value))
+        self._presets.props("dense outlined options-dense").classes("w-full")
+        self._box = ui.column().classes("w-full gap-1")
+        self._response = ui.html("", sanitize=False).classes("w-full q-mt-sm")
+        self._response.tooltip("What the sliders do to each eigenvalue of the filter; each dot is one of them.")
+        self._build_bandwidth()
+        self._build_brush(EDITS[self._edit].hint)
+
+    def _build_bandwidth(self) -> None:
+        self._automatic = ui.checkbox("What counts as detail: automatic", value=True)
+        self._automatic.props("dense").classes("q-mt-xs")
+        self._automatic.on_value_change(lambda event: self._set_bandwidth("auto" if event.value else BANDWIDTH))
+        with ui.column().classes("control gap-0") as self._by_hand:
+            ui.label("Largest difference that counts as detail").tooltip(
+                "How different two places may be and still count as alike, in grey levels of 255. Small values affect "
+                "only fine texture, large ones treat much as detail."
+            )
+            self._bandwidth = SteadySlider(min=2, max=80, step=1, value=BANDWIDTH)
+            self._bandwidth.props('dense label aria-label="Bandwidth"')
+            self._bandwidth.on("change", lambda event: self._set_bandwidth(float(event.args)))
+            self._bandwidth.on_reset(lambda: self._set_bandwidth(BANDWIDTH))
+
+    def _build_sliders(self, detail: Step) -> None:
+        self._box.clear()
+        sliders: list[Slider] = []
+        self._choices = []
+        with self._box:
+            if detail.has_region():
+                ui.label("In the region").classes("group")
+                ui.label("They start at the values of the sliders below, and change the region only.").classes("hint")
+                inside = controls.detail_sliders("inside", len(detail.sliders_inside))
+                sliders += [self._slider(control, " in the region") for control in inside]
+                sliders += [self._slider(control) for control in controls.OF_EDIT[self._edit]]
+                self._choices = controls.choices(self._edit, self._link.recipe, self._link.change)
+                ui.label("Elsewhere").classes("group")
+            outside = controls.detail_sliders("alpha", len(detail["alpha"]))
+            sliders += [self._slider(control) for control in outside]
+        self._sliders = sliders
+
+    def _choose(self, name: str | None) -> None:
+        """Set the sliders to a preset; those of a region stay if there are as many."""
+        if name is None or self._following:
+            return
+        self._started = name
+        inside = self._step["inside"]
+        fits = inside is not None and len(inside) == len(PRESETS[name].steps[0]["alpha"])
+        self._link.change(self._edit, {**preset_entries(name), "inside": inside if fits else None}, True)
+
+    def _name_preset(self, detail: Step) -> None:
+        """Show the preset that the sliders equal, or else the one they started from, which can be chosen again."""
+        same = [name for name in PRESETS if all(detail[k] == v for k, v in preset_entries(name).items())]
+        if same and self._started not in same:
+            self._started = same[0]
+        if detail["alpha"] == NONE:
+            self._started = None
+        self._presets.set_value(self._started if self._started in same else None)
+        changed = self._started is not None and self._started not in same
+        self._presets.props(f'label="{f"Started from {self._started}, then changed" if changed else "Start from"}"')
+
+    def _set_bandwidth(self, value: float | str) -> None:
+        if not self._following:
+            self._link.change(self._edit, {"bandwidth": value}, True)
+
+
+def preset_entries(name: str) -> dict[str, Value]:
+    """The values that a preset sets."""
+    detail = PRESETS[name].steps[0]
+    return {entry: detail[entry] for entry in ("alpha", "bandwidth", "spatial_bandwidth", "landmarks")}
+
+
+def thumbnails(picture: Tensor) -> dict[str, bytes]:
+    """A picture (1, C, H, W) in [0, 1] under each look, small, as PNG files."""
+    scale = min(1.0, THUMBNAIL / max(picture.shape[-2:]))
+    size = (max(1, round(picture.shape[-2] * scale)), max(1, round(picture.shape[-1] * scale)))
+    small = resize(picture, size).clamp(0, 1)
+    return {name: drawing.lossless(apply_step(look, small).clamp(0, 1)) for name, look in LOOKS.items()}
+
+
+def look_entries(look: Step) -> dict[str, Value]:
+    """All values of a look but its amount, which a person has chosen."""
+    return {p.name: look[p.name] for p in look.declared if p.name != AMOUNT}
+
+
+class LookTab(EditTab):
+    """The tab of looks, built into the open element."""
+
+    def __init__(self, edit: str, link: Link) -> None:
+        self._buttons: dict[str, ui.button] = {}
+        self._pictures: dict[str, ui.element] = {}
+        super().__init__(edit, link)
+
+    def follow(self) -> None:
+        """Show the current edit."""
+        super().follow()
+        look = self._link.recipe().current(self._edit)
+        has_look = look.changed(amount=1.0).would_change()
+        for slider in self._sliders:
+            slider.set_enabled(has_look)
+        for name, button in self._buttons.items():
+            address = self._link.thumbnail(name)
+            button.set_enabled(bool(address))
+            if address:
+                self._pictures[name].props(f'src="{address}"')
+            self._pictures[name].set_visibility(bool(address))
+            show_pressed(button, has_look and look_entries(look) == look_entries(LOOKS[name]))
+
+    def _build(self) -> None:
+        with ui.element("div").classes("looks w-full").props('role="group" aria-label="Looks"'):
+            for name in LOOKS:
+                button = ui.button(on_click=partial(self._choose, name)).props(f'flat no-caps aria-label="{name}"')
+                with button, ui.element("div"):
+                    self._pictures[name] = ui.element("img").classes("thumbnail").props('alt=""')
+                    ui.label(name.capitalize())
+                self._buttons[name] = button
+        super()._build()
+
+    def _choose(self, name: str) -> None:
+        entries = look_entries(LOOKS[name])
+        if self._link.recipe().current(self._edit)[AMOUNT] == 0:
+            entries[AMOUNT] = 1.0  # a look that is chosen is to be seen
+        self._link.change(self._edit, entries, True)

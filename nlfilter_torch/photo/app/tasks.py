@@ -2,13 +2,17 @@
 
 import asyncio
 from collections.abc import Awaitable, Callable
-from typing import TypeVar
+from dataclasses import dataclass
+from typing import TypeVar, TypeVarTuple
 
 from nicegui import background_tasks, ui
 
 from nlfilter_torch.core.progress import Progress
+from nlfilter_torch.photo.app.session import Session
+from nlfilter_torch.photo.declared.presets import Recipe
 
-T = TypeVar("T")
+Result = TypeVar("Result")
+Arguments = TypeVarTuple("Arguments")
 EXPECTED = (ValueError, OSError, MemoryError)  # for unusable files and values; the message says why
 PATIENCE = 0.3  # seconds until the page shows that it is working
 SHOWN = 0.5  # seconds between two texts of the progress
@@ -39,9 +43,15 @@ class Tasks:
             self.show_error("this failed, and it is not your fault; the terminal that runs the editor shows more")
             raise  # for the log
 
-    async def run(self, doing: str, work: Callable[[], T], progress: Progress | None = None) -> T:
+    async def run(
+        self,
+        doing: str,
+        work: Callable[[*Arguments], Result],
+        *arguments: *Arguments,
+        progress: Progress | None = None,
+    ) -> Result:
         """Run something in a thread; the page shows ``doing`` if it takes long, and its progress."""
-        task = asyncio.ensure_future(asyncio.to_thread(work))
+        task = asyncio.ensure_future(asyncio.to_thread(work, *arguments))
         done, _ = await asyncio.wait({task}, timeout=PATIENCE)
         if not done:
             self._doing.set_text(f"{doing}\u2026")
@@ -67,3 +77,30 @@ class Tasks:
         error, self._error = self._error, None
         if error is not None and not error.is_deleted:
             error.dismiss()
+
+
+class OutdatedError(Exception):
+    """The edit has changed meanwhile."""
+
+
+@dataclass(frozen=True)
+class Interruptible:
+    """Passes reports of progress on, and raises OutdatedError at the first one after an edit is outdated.
+
+    Attributes:
+        progress: takes the reports.
+        is_outdated: returns whether the edit of a session is no longer wanted.
+        session: of the photograph that is edited.
+        recipe: the edit.
+    """
+
+    progress: Progress
+    is_outdated: Callable[[Session, Recipe], bool]
+    session: Session
+    recipe: Recipe
+
+    def __call__(self, stage: str, done: int, total: int) -> None:
+        """Report that ``done`` of ``total`` parts of a stage are done."""
+        if self.is_outdated(self.session, self.recipe):
+            raise OutdatedError
+        self.progress(stage, done, total)

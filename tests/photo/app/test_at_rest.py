@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from nlfilter_torch.core.progress import Progress
-from nlfilter_torch.photo.app import at_rest
-from nlfilter_torch.photo.app.at_rest import AtRest
+from nlfilter_torch.photo.app import closeup
+from nlfilter_torch.photo.app.closeup import AtRest
 from nlfilter_torch.photo.app.session import Session
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.declared.steps import Step
@@ -50,11 +50,14 @@ class Page:
         self.works: list[Awaitable[None]] = []
         self.session: Session | None = session
         self.before_work: Callable[[], None] = lambda: None
-        self.at_rest = AtRest(self.run, self.works.append, lambda session: session is self.session, self.shown.append)
+        self.at_rest = AtRest(self, lambda session: session is self.session, self.shown.append)
 
-    async def run(self, doing: str, work: Callable[[], Any], progress: Progress) -> Any:
+    def start(self, work: Awaitable[None]) -> None:
+        self.works.append(work)
+
+    async def run(self, doing: str, work: Callable[..., Any], *arguments: object, progress: Progress) -> Any:
         self.before_work()
-        return work()
+        return work(*arguments)
 
     def draw(self, session: Session) -> None:
         self.at_rest.drawn(session)
@@ -64,7 +67,7 @@ class Page:
 
 @pytest.fixture
 def page(large: Session, monkeypatch: pytest.MonkeyPatch) -> Page:
-    monkeypatch.setattr(at_rest, "QUIET", 0.0)
+    monkeypatch.setattr(closeup, "QUIET", 0.0)
     return Page(large)
 
 

@@ -63,12 +63,15 @@ class Page:
         self.works: list[Awaitable[None]] = []
         self.parts: list[Rectangle] = []
         self.before_work: Callable[[], None] = lambda: None
-        self.closeup = Closeup(self.run, self.works.append, self.told.append)
+        self.closeup = Closeup(self, self.told.append)
         self.closeup.open(session)
 
-    async def run(self, doing: str, work: Callable[[], Any], progress: Progress) -> Any:
+    def start(self, work: Awaitable[None]) -> None:
+        self.works.append(work)
+
+    async def run(self, doing: str, work: Callable[..., Any], *arguments: object, progress: Progress) -> Any:
         self.before_work()
-        return work()
+        return work(*arguments)
 
     def finish(self) -> None:
         async def all_of_it() -> None:

@@ -3,7 +3,7 @@
 import pytest
 from nicegui import Client
 
-from nlfilter_torch.photo.app.detail_tab import DetailTab, entries_of
+from nlfilter_torch.photo.app.tabs import DetailTab, preset_entries
 from nlfilter_torch.photo.declared.presets import PRESETS, Recipe
 from nlfilter_torch.photo.declared.steps import Step
 from tests.photo.app.page_controls import IN, Controls
@@ -23,7 +23,7 @@ def tab(shown: Controls) -> DetailTab:
 
 def test_presets_are_those_of_the_command() -> None:
     for name in PRESETS:
-        assert Recipe((Step("detail", **entries_of(name)),)) == PRESETS[name]
+        assert Recipe((Step("detail", **preset_entries(name)),)) == PRESETS[name]
 
 
 def test_a_region_has_sliders_of_its_own(shown: Controls, tab: DetailTab) -> None:
@@ -39,7 +39,7 @@ def test_a_region_has_sliders_of_its_own(shown: Controls, tab: DetailTab) -> Non
 def test_a_preset_is_chosen_and_named(shown: Controls, tab: DetailTab) -> None:
     tab._choose("crisp")
     (change,) = shown.changes
-    assert change == ("detail", {**entries_of("crisp"), "inside": None}, True)
+    assert change == ("detail", {**preset_entries("crisp"), "inside": None}, True)
     shown.show(tab, PRESETS["crisp"])
     assert tab._presets.value == "crisp"
     assert tab._presets.props["label"] == "Start from"

@@ -3,7 +3,7 @@
 import pytest
 from nicegui import Client, ui
 
-from nlfilter_torch.photo.app.develop_tab import CONTROLS, DevelopTab
+from nlfilter_torch.photo.app.tabs import DEVELOP_CONTROLS, DevelopTab
 from nlfilter_torch.photo.declared.development import WHOLE, Development
 from nlfilter_torch.photo.declared.presets import Recipe
 from tests.photo.app.page_controls import Controls
@@ -20,7 +20,7 @@ def test_sliders_show_and_change_the_development(client: Client) -> None:
         if listener.type == "dblclick":
             listener.handler(None)
     assert shown.developed == [({"exposure": 0.0}, True)]
-    assert [control.usual(Recipe()) for control in CONTROLS] == [0, 0, 0, 0]
+    assert [control.usual(Recipe()) for control in DEVELOP_CONTROLS] == [0, 0, 0, 0]
 
 
 def test_the_crop_is_shown_and_reset(client: Client) -> None:
@@ -51,5 +51,5 @@ def test_the_crop_is_shown_and_reset(client: Client) -> None:
 
 @pytest.mark.parametrize("name", ["exposure", "straighten"])
 def test_values_of_sliders_are_rounded(name: str) -> None:
-    control = next(control for control in CONTROLS if control.parameter.name == name)
+    control = next(control for control in DEVELOP_CONTROLS if control.parameter.name == name)
     assert control.entries(Recipe(), 0.123456) == {name: 0.1235}

@@ -8,7 +8,7 @@ import torch
 from nicegui import Client, ui
 from PIL import Image
 
-from nlfilter_torch.photo.app.look_tab import SIDE, LookTab, entries_of, thumbnails
+from nlfilter_torch.photo.app.tabs import THUMBNAIL, LookTab, look_entries, thumbnails
 from nlfilter_torch.photo.declared.presets import LOOKS, Recipe
 from nlfilter_torch.photo.edits.applying import apply_step
 from tests.photo.app.page_controls import Controls
@@ -33,19 +33,19 @@ def test_a_look_is_chosen(client: Client) -> None:
     shown.click("faded")
     ((edit, values, is_complete),) = shown.changes
     assert (edit, is_complete) == ("look", True)
-    assert values == entries_of(LOOKS["faded"])
+    assert values == look_entries(LOOKS["faded"])
     shown.show(tab, Recipe((LOOKS["faded"].changed(amount=0.4),)))
     assert [n for n, button in buttons(shown).items() if button.props["aria-pressed"] == "true"] == ["faded"]
     assert shown.of(ui.slider)[0].enabled
     shown.show(tab, Recipe((LOOKS["faded"].changed(amount=0.0),)))
     shown.click("warm")
-    assert shown.changes.pop()[1] == {**entries_of(LOOKS["warm"]), "amount": 1.0}
+    assert shown.changes.pop()[1] == {**look_entries(LOOKS["warm"]), "amount": 1.0}
 
 
 def test_pictures_show_the_looks() -> None:
     large = torch.nn.functional.interpolate(cat(), scale_factor=3)
     pictures = {name: np.asarray(Image.open(io.BytesIO(content))) for name, content in thumbnails(large).items()}
-    assert {picture.shape for picture in pictures.values()} == {(107, SIDE, 3)}
+    assert {picture.shape for picture in pictures.values()} == {(107, THUMBNAIL, 3)}
     assert np.ptp(pictures["mono"].astype(int), axis=2).max() <= 1
     assert pictures["warm"][..., 2].mean() < pictures["cool"][..., 2].mean()
     assert thumbnails(cat()[:, :1]).keys() == LOOKS.keys()
@@ -59,4 +59,4 @@ def test_looks_are_gentle(name: str) -> None:
     assert (edited.mean() - cat().mean()).abs() < 0.06
     recipe = Recipe((LOOKS[name],))
     assert Recipe.from_json(recipe.to_json(), "look.json") == recipe
-    assert entries_of(LOOKS[name]).keys() == {p.name for p in LOOKS[name].declared} - {"amount"}
+    assert look_entries(LOOKS[name]).keys() == {p.name for p in LOOKS[name].declared} - {"amount"}

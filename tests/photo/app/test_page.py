@@ -12,11 +12,10 @@ from nicegui import Client, background_tasks, ui
 
 from nlfilter_torch.core.progress import Progress
 from nlfilter_torch.photo.app import drawing
-from nlfilter_torch.photo.app.assets import SCRIPTS, STATIC, STATIC_ADDRESS
 from nlfilter_torch.photo.app.crop_tool import Proportions
 from nlfilter_torch.photo.app.dialogs import Question
 from nlfilter_torch.photo.app.library import Library
-from nlfilter_torch.photo.app.page import EDITORS, Editor
+from nlfilter_torch.photo.app.page import EDITORS, SCRIPTS, STATIC, STATIC_ADDRESS, Editor
 from nlfilter_torch.photo.declared.development import WHOLE, Development
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.picture.photographs import Photograph, write_photograph
@@ -53,7 +52,7 @@ class Page:
 def works(monkeypatch: pytest.MonkeyPatch) -> list[Awaitable[None]]:
     works: list[Awaitable[None]] = []
     monkeypatch.setattr(background_tasks, "create", lambda work, **options: works.append(work))
-    monkeypatch.setattr("nlfilter_torch.photo.app.at_rest.QUIET", 0.0)
+    monkeypatch.setattr("nlfilter_torch.photo.app.closeup.QUIET", 0.0)
     return works
 
 
@@ -304,9 +303,9 @@ def test_saving(opened: Page, photo: Path) -> None:
     editor = opened.editor
     editor._change("detail", {"alpha": ALPHA}, True)
     opened.finish()
-    asyncio.run(editor._save(editor.session.save, "out.png", Progress()))
+    asyncio.run(editor._save(Progress(), editor.session.save, "out.png"))
     assert photo.with_name("out.png").is_file()
-    asyncio.run(editor._save(editor.session.save_preset, "edit.json", Progress()))
+    asyncio.run(editor._save(Progress(), editor.session.save_preset, "edit.json"))
     assert Recipe.from_json(photo.with_name("edit.json").read_bytes(), "") == editor.session.recipe
     assert not editor.session.unsaved
 

@@ -13,7 +13,6 @@ from nlfilter_torch.__main__ import main
 from nlfilter_torch.photo.app import server
 from nlfilter_torch.photo.app.library import Library
 from nlfilter_torch.photo.app.page import EDITORS, Pages
-from nlfilter_torch.photo.app.server import Pictures
 
 
 @pytest.fixture
@@ -24,7 +23,7 @@ def pages(client: Client, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Pa
 
 def test_pictures_are_for_those_who_know_their_address(pages: Pages) -> None:
     pages.build()
-    answer_of = Pictures(pages).answer
+    answer_of = pages.picture
     ((token, editor),) = EDITORS.items()
     try:
         assert answer_of(token, "after").status_code == 404  # there is none

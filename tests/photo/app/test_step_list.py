@@ -3,7 +3,7 @@
 import pytest
 from nicegui import Client, ui
 
-from nlfilter_torch.photo.app.step_list import StepList, listed
+from nlfilter_torch.photo.app.panel import StepList, listed
 from nlfilter_torch.photo.declared.development import Development
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.declared.steps import Step
@@ -58,7 +58,7 @@ def test_a_step_is_switched_mixed_moved_and_removed(shown: Controls, steps: Step
     slider = shown.of(ui.slider)[1]
     slider.set_value(25.0)
     assert shown.replaced.pop() == (Recipe((TONE, IDLE, SHARPEN.mixed(opacity=0.25))), 2)  # while it moves
-    steps._mix(2, 25.0, None)
+    steps.rows[1].mix(25.0, None)
     assert shown.replaced.pop()[1] is None
     assert "25 %" in shown.texts()
     shown.click("Tone: down")

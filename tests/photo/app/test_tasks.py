@@ -54,7 +54,7 @@ def test_work_that_takes_long_is_shown_with_its_progress(
         return work
 
     assert asyncio.run(tasks.run("Working", wait_for("Working\u2026"))) == "Working\u2026"
-    assert asyncio.run(tasks.run("Saving", wait_for("Saving: "), progress)).startswith("Saving: Averaging, ")
+    assert asyncio.run(tasks.run("Saving", wait_for("Saving: "), progress=progress)).startswith("Saving: Averaging, ")
     (sign,) = [element for element in client.elements.values() if "working" in element.classes]
     assert not sign.visible
 

@@ -2,7 +2,7 @@
 
 from nicegui import Client
 
-from nlfilter_torch.photo.app.uploads import Upload
+from nlfilter_torch.photo.app.dialogs import Upload
 
 REFUSED = [
     (
