@@ -3,6 +3,7 @@
 import asyncio
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -10,7 +11,7 @@ from torch import Tensor
 from nlfilter_torch.core.progress import Progress
 from nlfilter_torch.photo.app import drawing
 from nlfilter_torch.photo.app.session import Session
-from nlfilter_torch.photo.app.tasks import Interruptible, OutdatedError, Tasks
+from nlfilter_torch.photo.app.tasks import Tasks
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.edits.parts import Rectangle
 from nlfilter_torch.photo.picture.sampling import Report
@@ -20,6 +21,33 @@ CELL = 64  # pixels; pieces consist of squares of that size
 PIECE = 1 << 19  # pixels of a piece, at most
 KEPT = 24_000_000  # pixels of all pieces, at most; invisible pieces are dropped first
 LARGEST = 40_000_000  # pixels that a page may ask for at once
+
+
+class OutdatedError(Exception):
+    """The edit has changed meanwhile."""
+
+
+@dataclass(frozen=True)
+class Interruptible:
+    """Passes reports of progress on, and raises OutdatedError at the first one after an edit is outdated.
+
+    Attributes:
+        progress: takes the reports.
+        is_outdated: returns whether the edit of a session is no longer wanted.
+        session: of the photograph that is edited.
+        recipe: the edit.
+    """
+
+    progress: Progress
+    is_outdated: Callable[[Session, Recipe], bool]
+    session: Session
+    recipe: Recipe
+
+    def __call__(self, stage: str, done: int, total: int) -> None:
+        """Report that ``done`` of ``total`` parts of a stage are done."""
+        if self.is_outdated(self.session, self.recipe):
+            raise OutdatedError
+        self.progress(stage, done, total)
 
 
 class Closeup:

@@ -55,4 +55,4 @@ def app(image: Image = None, out: Out = None, host: Host = "127.0.0.1", port: Po
             f"the editor needs {error.name}, which is not installed; install it with: pip install 'nlfilter-torch[app]'"
         ) from error
     pages = Pages(Library(folder, None if image is None else image.parent), image)
-    serve(pages, host=host, port=port, open_page=open)
+    serve(pages.build, pages.picture, host=host, port=port, open_page=open)

@@ -23,6 +23,7 @@ from nlfilter_torch.photo.app.developed import DEVELOPING, Developed
 from nlfilter_torch.photo.app.dialogs import NameDialog, Question, SaveDialog, Upload
 from nlfilter_torch.photo.app.library import Library
 from nlfilter_torch.photo.app.panel import Panel
+from nlfilter_torch.photo.app.server import SCRIPTS, STATIC
 from nlfilter_torch.photo.app.session import Session
 from nlfilter_torch.photo.app.tabs import Link, PhotoLink, thumbnails
 from nlfilter_torch.photo.app.tasks import EXPECTED, Arguments, Tasks
@@ -32,11 +33,6 @@ from nlfilter_torch.photo.declared.parameters import DETAIL, EDITS
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.declared.strokes import sliders_of
 
-STATIC = Path(__file__).with_name("static")  # the scripts and the style sheet of the page
-STATIC_ADDRESS = "/static"  # at which the server offers them
-SCRIPTS = "".join(
-    f'<script type="module" src="{STATIC_ADDRESS}/{name}"></script>\n' for name in ("page.js", "closeup.js", "crop.js")
-)
 LARGEST_PRESET = 20_000_000  # bytes
 PRESET_KINDS = ".json,.cube,.png,.tif,.tiff,.jpg,.jpeg,application/json"
 REPLACING = (

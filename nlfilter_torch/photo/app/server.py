@@ -10,14 +10,21 @@ import socket
 import sys
 import threading
 import time
+from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 
+from fastapi import Response
 from nicegui import app, binding, ui
 
 from nlfilter_torch.photo.app.access import TOKEN, Guard, forget_token, token_in
-from nlfilter_torch.photo.app.page import STATIC, STATIC_ADDRESS, Pages
 from nlfilter_torch.photo.app.sidecar import state_folder
 
+STATIC = Path(__file__).with_name("static")  # the scripts and the style sheet of the page
+STATIC_ADDRESS = "/static"  # at which the server offers them
+SCRIPTS = "".join(
+    f'<script type="module" src="{STATIC_ADDRESS}/{name}"></script>\n' for name in ("page.js", "closeup.js", "crop.js")
+)
 TITLE = "nlfilter-torch"
 STARTING, PAUSE = 30.0, 0.05  # seconds for the server to accept connections, and between two attempts
 #: Objects, and multiples, after which Python looks for circles among the youngest, the younger and all: as Python 3.11
@@ -25,8 +32,12 @@ STARTING, PAUSE = 30.0, 0.05  # seconds for the server to accept connections, an
 COLLECTED = (700, 10, 10)
 
 
-def serve(pages: Pages, *, host: str, port: int, open_page: bool) -> None:
+def serve(
+    build: Callable[[str], None], picture: Callable[[str, str, str], Response], *, host: str, port: int, open_page: bool
+) -> None:
     """Run the editor until it is interrupted.
+
+    ``build`` builds a page, and ``picture`` answers requests for its pictures: see :class:`Pages`.
 
     Raises:
         ValueError: if it cannot listen on that address; port 0 is a free one.
@@ -39,8 +50,8 @@ def serve(pages: Pages, *, host: str, port: int, open_page: bool) -> None:
     app.add_middleware(Guard, host=host, token=token, name=f"nlfilter-torch-{port}")
     app.config.quasar_config["loadingBar"] = {"skipHijack": True}  # the page shows what it is doing itself
     app.add_static_files(STATIC_ADDRESS, STATIC, max_cache_age=0)  # another version must not find old files
-    app.get("/picture/{token}/{kind}")(pages.picture)
-    ui.page("/", title=TITLE, language="en-US")(pages.build)
+    app.get("/picture/{token}/{kind}")(picture)
+    ui.page("/", title=TITLE, language="en-US")(build)
     free_closed_pages()
     app.on_startup(threading.Thread(target=_tell_when_ready, args=(host, port, token), daemon=True).start)
     ui.run(

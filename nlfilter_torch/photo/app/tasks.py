@@ -2,14 +2,11 @@
 
 import asyncio
 from collections.abc import Awaitable, Callable
-from dataclasses import dataclass
 from typing import TypeVar, TypeVarTuple
 
 from nicegui import background_tasks, ui
 
 from nlfilter_torch.core.progress import Progress
-from nlfilter_torch.photo.app.session import Session
-from nlfilter_torch.photo.declared.presets import Recipe
 
 Result = TypeVar("Result")
 Arguments = TypeVarTuple("Arguments")
@@ -77,30 +74,3 @@ class Tasks:
         error, self._error = self._error, None
         if error is not None and not error.is_deleted:
             error.dismiss()
-
-
-class OutdatedError(Exception):
-    """The edit has changed meanwhile."""
-
-
-@dataclass(frozen=True)
-class Interruptible:
-    """Passes reports of progress on, and raises OutdatedError at the first one after an edit is outdated.
-
-    Attributes:
-        progress: takes the reports.
-        is_outdated: returns whether the edit of a session is no longer wanted.
-        session: of the photograph that is edited.
-        recipe: the edit.
-    """
-
-    progress: Progress
-    is_outdated: Callable[[Session, Recipe], bool]
-    session: Session
-    recipe: Recipe
-
-    def __call__(self, stage: str, done: int, total: int) -> None:
-        """Report that ``done`` of ``total`` parts of a stage are done."""
-        if self.is_outdated(self.session, self.recipe):
-            raise OutdatedError
-        self.progress(stage, done, total)

@@ -125,10 +125,9 @@ def fit_look(
     _check_regions(regions)
     looks = []
     for region in regions:
-        chosen = region.chosen(choices)
-        look = chosen.look
+        look, explained, added = region.chosen(choices)
         changed = _step_of(look, layout, step)
-        looks.append(FittedLook(changed, look.parts, look.fitted, look.left_out, chosen.explained, chosen.added))
+        looks.append(FittedLook(changed, look.parts, look.fitted, look.left_out, explained, added))
     return looks[0] if len(looks) == 1 else tuple(looks)
 
 

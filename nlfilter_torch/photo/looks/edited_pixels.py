@@ -126,7 +126,7 @@ class EditedPhotograph:
         for shown in self._shown():
             places = sample(shown, most)
             share = int((shown > 0).sum()) / max(len(places), 1)
-            samples.append(self._sampled(places, shown * self.free, shown, share, {}))
+            samples.append(self._sampled(places, shown * self.free, shown, share, shown.new_zeros(3, 0, len(places))))
         return samples
 
     def _shown(self) -> list[Tensor]:
@@ -150,23 +150,24 @@ class EditedPhotograph:
         share = float((weights.amax(0) > 0).sum()) / max(int((weights[:, places].amax(0) > 0).sum()), 1)
         rows, columns = places // self.size[1], places % self.size[1]
         before = self.before[:, places]
-        weighed = {
-            "bands": torch.stack([band[:, places] for band in self.bands], dim=1),
-            "texture": torch.stack([texture[places] for texture in self.texture]),
-            "stretch": self.stretch.changes(before[None, :, None])[0, :, :, 0].transpose(0, 1),
-            "local": self.local.at(before[None], rows, columns)[0].transpose(0, 1),
-            "alpha": layers,
-        }
-        return self._sampled(places, weights, shown, share, weighed)
+        parts = (  # in the order of their columns
+            torch.stack([band[:, places] for band in self.bands], dim=1),
+            torch.stack([texture[places] for texture in self.texture]),
+            self.stretch.changes(before[None, :, None])[0, :, :, 0].transpose(0, 1),
+            self.local.at(before[None], rows, columns)[0].transpose(0, 1),
+            layers,
+        )
+        surroundings = torch.cat([part.expand(3, -1, -1) for part in parts], dim=1)
+        return self._sampled(places, weights, shown, share, surroundings)
 
     def _sampled(
-        self, places: Tensor, weights: Tensor, shown: Tensor, share: float, weighed: dict[str, Tensor]
+        self, places: Tensor, weights: Tensor, shown: Tensor, share: float, surroundings: Tensor
     ) -> PixelSample:
         """The pixels at places (P,) with so many times their weights."""
         return PixelSample(
             self.before[:, places],
             self.after[:, places],
-            weighed,
+            surroundings,
             weights[:, places] * share,
             shown[places] * share,
             squares(places, self.size[1]),

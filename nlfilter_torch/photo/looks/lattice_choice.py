@@ -109,7 +109,7 @@ class LatticeChoice:
             coefficients=strength * look.coefficients,
             fitted=lattice.fitted,
             left_out=lattice.left_out,
-            lattice=strength * rising(lattice.changes, look.coefficients, self.layout, lattice.density),
+            lattice=strength * rising(lattice.changes[1], look.coefficients, self.layout, colours),
         )
 
     def _fitted(self, basis: Candidate) -> tuple[Candidate, ColourChange, FittedLattice]:
@@ -132,7 +132,7 @@ class LatticeChoice:
             more = _change(self.colours, predicted, self._groups(self.colours)).followed_by([hues[0], hues[-1]])
         lattice = refined(more, lattice)
         if bool(hues[-1].any()):
-            lattice = replace(lattice.with_more(hues[-1]), without=plain.explained())
+            lattice = replace(lattice.with_more(torch.stack([hues[0], hues[-1]])), without=plain.explained())
         return replace(basis, coefficients=looks[-1]), plain, lattice
 
     def _groups(self, pixels: PixelSample) -> Tensor:
@@ -176,20 +176,20 @@ def coloured(colours: Tensor, coefficients: Tensor, layout: PartLayout) -> Tenso
     return pointwise(colours[None, :, None], straight + curves, identity + matrix, 1 + saturation[0])[0, :, 0]
 
 
-def rising(lattice: Tensor, coefficients: Tensor, layout: PartLayout, density: Tensor) -> Tensor:
+def rising(lattice: Tensor, coefficients: Tensor, layout: PartLayout, pixels: ColourChange) -> Tensor:
     """A lattice (3, n, n, n) with which no grey gets darker from one to the next, unless it does without the lattice.
 
-    The least changes of the greys, weighed by their density (n^3,), are passed on to colours near them.
+    The least changes of the greys, weighed by the pixels near them, are passed on to colours near them.
     """
-    if lattice.shape[1] < layout.knots:  # greys between the nodes count as well
-        shares = resampled(density.view(1, *lattice.shape[1:]).expand(3, -1, -1, -1), layout.knots)[0].flatten()
-        finer = resampled(lattice, layout.knots)
-        risen = rising(finer, coefficients, layout, shares)
-        return lattice if risen is finer else risen
     nodes = lattice.shape[1]
+    if nodes < layout.knots:  # greys between the nodes count as well
+        finer = resampled(lattice, layout.knots)
+        risen = rising(finer, coefficients, layout, pixels)
+        return lattice if risen is finer else risen
     plain = coloured(torch.linspace(0, 1, nodes, dtype=torch.float64).expand(3, -1), coefficients, layout)
     diagonal = torch.arange(nodes) * (nodes * nodes + nodes + 1)
     greys = plain + lattice.flatten(1)[:, diagonal]
+    density = pixels.density(nodes)
     weights = density[diagonal] + 1e-6 * density.sum()
     moved = torch.stack([
         torch.from_numpy(isotonic_regression(values.numpy(), weights=weights.numpy()).x)

@@ -5,7 +5,7 @@ lattice follows the pixels, see :mod:`nlfilter_torch.photo.looks.lattice_problem
 at all nodes, and weak: they follow the colours that many pixels have, and change nothing elsewhere.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -76,7 +76,7 @@ class ColourChange:
         before, after, *predicted = (values[:, ::step] for values in (self.before, self.after, *self.predicted))
         return ColourChange(before, after, predicted, self.weights[::step], self.folds[::step])
 
-    def followed_by(self, lattices: Sequence[Tensor]) -> "ColourChange":
+    def followed_by(self, lattices: Iterable[Tensor]) -> "ColourChange":
         """The pixels, each of whose looks is followed by a lattice (3, n, n, n)."""
         colours = self.before[None, :, None]
         predicted = [
@@ -85,10 +85,18 @@ class ColourChange:
         ]
         return replace(self, predicted=predicted)
 
-    def energy(self, rest: Tensor, fold: int | None = None) -> float:
-        """Weighted sum of squares of values (3, P), of all or of a fold."""
-        weights = self.weights if fold is None else self.weights * (self.folds == fold)
+    def energy(self, rest: Tensor, look: int | None = None) -> float:
+        """Weighted sum of squares of values (3, P), of the fold that a look was fitted without, or of all."""
+        of_all = look is None or look == len(self.predicted) - 1
+        weights = self.weights if of_all else self.weights * (self.folds == look)
         return float((weights * rest.square()).sum())
+
+    def density(self, nodes: int) -> Tensor:
+        """Weights (n^3,) of the pixels at the nodes of a lattice."""
+        places, shares = corners(self.before, nodes)
+        return torch.zeros(nodes**3, dtype=shares.dtype).index_add_(
+            0, places.flatten(), (shares * self.weights).flatten()
+        )
 
 
 @dataclass(frozen=True)
@@ -96,30 +104,26 @@ class FittedLattice:
     """The lattice that explains most of what is left out.
 
     Attributes:
-        changes: (3, n, n, n).
+        changes: (2, 3, n, n, n), fitted without the first fold, and to all pixels.
         fitted: share of the change that the look explains with it.
         left_out: the same for pixels left out of the fit.
         without: share of the change of these that the look explains without it.
-        density: weights of the pixels at the nodes, (n^3,).
-        first: changes (3, n, n, n) fitted without the first fold.
     """
 
     changes: Tensor
     fitted: float
     left_out: float
     without: float
-    density: Tensor
-    first: Tensor
+
+    @property
+    def nodes(self) -> int:
+        """Number n of nodes along each axis."""
+        return self.changes.shape[-1]
 
     def with_more(self, changes: Tensor) -> "FittedLattice":
-        """The lattice and another one (3, m, m, m) of what comes before it, with as many nodes as the larger one."""
-        nodes = max(self.changes.shape[1], changes.shape[1])
-        density = self.density.view(1, *self.changes.shape[1:]).expand(3, -1, -1, -1)
-        return replace(
-            self,
-            changes=resampled(self.changes, nodes) + resampled(changes, nodes),
-            density=resampled(density, nodes)[0].flatten(),
-        )
+        """The lattice and another one (2, 3, m, m, m), with as many nodes as the larger one."""
+        nodes = max(self.nodes, changes.shape[-1])
+        return replace(self, changes=resampled(self.changes, nodes) + resampled(changes, nodes))
 
 
 def fit_lattice(pixels: ColourChange) -> FittedLattice:
@@ -127,25 +131,28 @@ def fit_lattice(pixels: ColourChange) -> FittedLattice:
 
     The smoothness is chosen with few nodes; one fold tells whether more nodes explain more.
     """
-    number = len(pixels.predicted) - 1
+    last = len(pixels.predicted) - 1
     power, without = pixels.power, pixels.left_of_folds
     problem, fine = (Problem.of(pixels, nodes) for nodes in GRIDS[:2])
     smooth, folds, first = problem.smoothest(without)
     left = sum(folds)
-    cross = fine.cross(0)
-    start = fine.solve([0], smooth, cross, torch.zeros_like(cross))
-    finer = fine.left_of(0, start[0])
+    start = torch.zeros_like(first)
+    finest = fine.solve([0], smooth, fine.cross([0]))
+    finer = fine.left_of(0, finest[0])
     if finer < FINER * folds[0]:
-        problem, left, first = fine, left * finer / folds[0], start[0]
-    changes = problem.solve_all(smooth, start if problem is fine else None)
-    fitted = 1 - pixels.energy(pixels.left(problem.at_pixels(changes), number)) / power
-    changes, first = (values.view(3, *[problem.sums.nodes] * 3) for values in (changes, first))
-    return FittedLattice(changes, fitted, 1 - left / power, 1 - without / power, problem.sums.all().density[0], first)
+        problem, left, first = fine, left * finer / folds[0], finest[0]
+        start = first
+    changes = problem.solve([last], smooth, problem.cross([last]), start.unsqueeze(0))[0]
+    fitted = 1 - problem.left_of(last, changes) / power
+    both = torch.stack([first, changes]).unflatten(2, (problem.sums.nodes,) * 3)
+    return FittedLattice(both, fitted, 1 - left / power, 1 - without / power)
 
 
 @dataclass(frozen=True)
 class Problem:
     """Lattices of some number of nodes that explain what is left of pixels.
+
+    Each look has one: those fitted without a fold, by the numbers of the folds, and the last one, fitted to all pixels.
 
     Attributes:
         pixels: the pixels.
@@ -163,64 +170,46 @@ class Problem:
     def of(pixels: ColourChange, nodes: int) -> "Problem":
         """The problem for that many nodes along each axis."""
         places, shares = corners(pixels.before, nodes)
-        counts = (nodes, len(pixels.predicted) - 1)
+        counts = (nodes, len(pixels.predicted))
         return Problem(pixels, places, shares, CellSums.of(places, shares, pixels.weights, pixels.folds, counts))
 
-    @property
-    def folds(self) -> list[int]:
-        """Numbers of the folds."""
-        return list(range(self.sums.bands.shape[1]))
-
-    def products(self, number: int, fold: int | None = None) -> Tensor:
-        """Products (3, n^3) of the nodes and what the look of that number leaves of pixels, but for a fold."""
-        weights = self.pixels.weights if fold is None else self.pixels.weights * (self.pixels.folds != fold)
-        rest = weights * self.pixels.left(0.0, number)
-        products = torch.zeros(3, self.sums.nodes**3, dtype=torch.float64)
-        for place, share in zip(self.places, self.shares, strict=True):
-            for channel in range(3):
-                products[channel].index_add_(0, place, share * rest[channel])
+    def cross(self, looks: Sequence[int]) -> Tensor:
+        """Products (looks, 3, n^3) of the nodes and what looks leave of the pixels that they are fitted to."""
+        products = torch.zeros(len(looks), 3, self.sums.nodes**3, dtype=torch.float64)
+        for own, look in zip(products, looks, strict=True):
+            rest = self.pixels.weights * (self.pixels.folds != look) * self.pixels.left(0.0, look)
+            for place, share in zip(self.places, self.shares, strict=True):
+                own.index_add_(1, place, share * rest)
         return products
-
-    def cross(self, *folds: int) -> Tensor:
-        """For each fold, products (folds, 3, n^3) of the nodes and what is left of the pixels of the others."""
-        return torch.stack([self.products(fold, fold) for fold in folds])
 
     def smoothest(self, most: float) -> tuple[float, list[float], Tensor]:
         """The smoothness that leaves least of the folds that are left out, and what it leaves of each.
 
         Also the changes (3, n^3) fitted without the first fold. ``most`` is left without a lattice.
         """
-        cross = self.cross(*self.folds)
+        folds = range(len(self.pixels.predicted) - 1)
+        cross = self.cross(folds)
         changes = torch.zeros_like(cross)
-        best = (SMOOTH[0], [most / len(self.folds)] * len(self.folds), changes[0])
+        best = (SMOOTH[0], [most / len(folds)] * len(folds), changes[0])
         for smooth in SMOOTH:
-            changes = self.solve(self.folds, smooth, cross, changes)
-            left = [self.left_of(fold, changes[fold]) for fold in self.folds]
+            changes = self.solve(folds, smooth, cross, changes)
+            left = [self.left_of(fold, changes[fold]) for fold in folds]
             if sum(left) > LOOSER * sum(best[1]):
                 break
             best = smooth, left, changes[0]
         return best
 
-    def solve(self, folds: list[int], smooth: float, cross: Tensor, start: Tensor) -> Tensor:
-        """For each fold, the changes (folds, 3, n^3) fitted to the others."""
-        return solve_lattices(Penalised(self.sums.without(*folds), smooth), cross, start)
-
-    def solve_all(self, smooth: float, start: Tensor | None = None) -> Tensor:
-        """Changes (3, n^3) fitted to all pixels."""
-        cross = self.products(len(self.folds)).unsqueeze(0)
+    def solve(self, looks: Sequence[int], smooth: float, cross: Tensor, start: Tensor | None = None) -> Tensor:
+        """Smooth changes (looks, 3, n^3), from :meth:`cross`."""
         start = torch.zeros_like(cross) if start is None else start
-        return solve_lattices(Penalised(self.sums.all(), smooth), cross, start)[0]
+        return solve_lattices(Penalised(self.sums.without(*looks), smooth), cross, start)
 
-    def left_of(self, fold: int, changes: Tensor) -> float:
-        """Energy of what is left of a fold by changes (3, n^3) that were fitted without it."""
-        return self.pixels.energy(self.pixels.left(self.at_pixels(changes), fold), fold)
-
-    def at_pixels(self, changes: Tensor) -> Tensor:
-        """Changes (3, P) of the pixels by those of the nodes, (3, n^3)."""
+    def left_of(self, look: int, changes: Tensor) -> float:
+        """Energy of what a look leaves of its fold, the last one of all, with changes (3, n^3) at the nodes."""
         change = torch.zeros_like(self.pixels.before)
         for place, share in zip(self.places, self.shares, strict=True):
             change.addcmul_(share, changes[:, place])
-        return change
+        return self.pixels.energy(self.pixels.left(change, look), look)
 
 
 def refined(pixels: ColourChange, lattice: FittedLattice) -> FittedLattice:
@@ -231,46 +220,34 @@ def refined(pixels: ColourChange, lattice: FittedLattice) -> FittedLattice:
     for nodes in GRIDS[1:]:
         lattice = _with_details(pixels, lattice, nodes)
     for _ in range(AGAIN if bool(((pixels.after <= 0) | (pixels.after >= 1)).any()) else 0):
-        lattice = _with_details(pixels, lattice, lattice.changes.shape[1])
+        lattice = _with_details(pixels, lattice, lattice.nodes)
     return lattice
 
 
 def _with_details(pixels: ColourChange, lattice: FittedLattice, nodes: int) -> FittedLattice:
-    """Add a lattice with that many nodes along each axis, or none."""
-    problem = _rest(pixels, lattice, nodes)
-    rest, count = problem.pixels, len(pixels.weights)
+    """Add a lattice with that many nodes along each axis to what it leaves of the pixels, or none."""
+    ends = replace(pixels, predicted=[pixels.predicted[0], pixels.predicted[-1]])
+    first, last = ends.followed_by(lattice.changes).predicted
+    rest = replace(pixels, predicted=[first, first, last], folds=pixels.folds.clamp(max=1))  # all but the first are one
+    problem, count = Problem.of(rest, nodes), len(pixels.weights)
     before = rest.energy(rest.left(0.0, 0), 0)
-    cross, best = problem.cross(0), (before, 0.0, torch.zeros(3, nodes**3, dtype=torch.float64))
+    cross, best = problem.cross([0]), (before, 0.0, torch.zeros(1, 3, nodes**3, dtype=torch.float64))
     changes = torch.zeros_like(cross)
     for ridge in FINE_RIDGES:
         changes = solve_lattices(Ridged(problem.sums.without(0), ridge / count), cross, changes)
         left = problem.left_of(0, changes[0])
         if left > best[0]:
             break
-        best = left, ridge, changes[0]
-    left, ridge, first = best
-    if left >= before * (FINER if nodes > lattice.changes.shape[1] else 1):
+        best = left, ridge, changes
+    left, ridge, start = best
+    if left >= before * (FINER if nodes > lattice.nodes else 1):
         return lattice
-    cross = problem.products(2).unsqueeze(0)
-    change = solve_lattices(Ridged(problem.sums.all(), ridge / count), cross, first.unsqueeze(0))[0]
+    change = solve_lattices(Ridged(problem.sums.without(2), ridge / count), problem.cross([2]), start)
     return replace(
-        lattice,
-        changes=resampled(lattice.changes, nodes) + change.view(3, nodes, nodes, nodes),
-        first=resampled(lattice.first, nodes) + first.view(3, nodes, nodes, nodes),
-        fitted=1 - rest.energy(rest.left(problem.at_pixels(change), 2)) / pixels.power,
+        lattice.with_more(torch.cat([start, change]).unflatten(2, (nodes,) * 3)),
+        fitted=1 - problem.left_of(2, change[0]) / pixels.power,
         left_out=1 - (1 - lattice.left_out) * left / before,
-        density=problem.sums.all().density[0],
     )
-
-
-def _rest(pixels: ColourChange, lattice: FittedLattice, nodes: int) -> Problem:
-    """The problem of explaining with that many nodes what is left of pixels.
-
-    Of its three predictions, the first is by looks without the first fold, and the last by those of all.
-    """
-    ends = replace(pixels, predicted=[pixels.predicted[0], pixels.predicted[-1]])
-    first, all_of = ends.followed_by([lattice.first, lattice.changes]).predicted
-    return Problem.of(replace(pixels, predicted=[first, first, all_of], folds=pixels.folds.clamp(max=1)), nodes)
 
 
 def hue_columns(colours: Tensor) -> Tensor:

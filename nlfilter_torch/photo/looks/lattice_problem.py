@@ -48,10 +48,6 @@ class CellSums:
         """For each of some folds, the sums over the others."""
         return CellSums(self.nodes, self.bands.sum(1, keepdim=True) - self.bands[:, list(folds)])
 
-    def all(self) -> "CellSums":
-        """The sums over all folds."""
-        return CellSums(self.nodes, self.bands.sum(1, keepdim=True))
-
     @cached_property
     def density(self) -> Tensor:
         """Sums of the weights at each node, (folds, n^3)."""

@@ -223,6 +223,7 @@ def colours_of_nodes(nodes: int) -> Tensor:
 
 
 def resampled(lattice: Tensor, nodes: int) -> Tensor:
-    """A lattice (3, n, n, n) with another number of nodes, (3, m, m, m)."""
-    flat = colours_of_nodes(nodes).flatten(1)[None, :, None]
-    return lattice_change(flat, lattice.double())[0, :, 0].view(3, nodes, nodes, nodes)
+    """A lattice (..., 3, n, n, n) with another number of nodes, (..., 3, m, m, m)."""
+    lattices = lattice.double().view(-1, *lattice.shape[-4:])
+    colours = colours_of_nodes(nodes).flatten(1)[None, :, None].expand(len(lattices), -1, -1, -1)
+    return lattice_change(colours, lattices).view(*lattice.shape[:-3], nodes, nodes, nodes)

@@ -6,8 +6,9 @@ each saturation, the bands of blurs, the changes by automatic levels and by loca
 filter. See :mod:`nlfilter_torch.photo.looks.look_filter`.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -111,15 +112,14 @@ class LookSums:
         return 1.0 - self.left(coefficients) / max(float(self.power.sum()), 1e-30)
 
 
-@dataclass(frozen=True)
-class PixelSample:
+class PixelSample(NamedTuple):
     """Pixels of photographs before and after an edit.
 
     Attributes:
         before: (3, P).
         after: (3, P).
-        weighed: columns of the parts of a look that depend on the surroundings of a pixel, as for :func:`columns_of`;
-            empty for pixels that only colours are fitted to.
+        surroundings: columns of the parts of a look that depend on the surroundings of a pixel, (3, F', P), as for
+            :func:`columns_of`; F' is 0 for pixels that only colours are fitted to.
         weights: (3, P); 0 for values that are clipped after the edit.
         shown: weights (P,) of the pixels regardless of clipping.
         square: number of the part of the picture that a pixel is in, (P,), see :func:`squares`.
@@ -128,37 +128,29 @@ class PixelSample:
 
     before: Tensor
     after: Tensor
-    weighed: dict[str, Tensor]
+    surroundings: Tensor
     weights: Tensor
     shown: Tensor
     square: Tensor
     fold: Tensor
 
+    @staticmethod
+    def joined(samples: Iterable["PixelSample"]) -> "PixelSample":
+        """The pixels of several samples."""
+        return PixelSample(*(torch.cat(values, dim=-1) for values in zip(*samples, strict=True)))
+
     def at(self, places: Tensor | slice) -> "PixelSample":
         """Some of the pixels."""
-        weighed = {name: columns[..., places] for name, columns in self.weighed.items()}
-        planes = {own.name: getattr(self, own.name)[..., places] for own in fields(self) if own.name != "weighed"}
-        return PixelSample(weighed=weighed, **planes)
-
-    @staticmethod
-    def joined(samples: Sequence["PixelSample"]) -> "PixelSample":
-        """The pixels of several samples with columns of the same parts."""
-        weighed = {name: torch.cat([sample.weighed[name] for sample in samples], dim=-1) for name in samples[0].weighed}
-        planes = {
-            own.name: torch.cat([getattr(sample, own.name) for sample in samples], dim=-1)
-            for own in fields(PixelSample)
-            if own.name != "weighed"
-        }
-        return PixelSample(weighed=weighed, **planes)
+        return PixelSample(*(values[..., places] for values in self))
 
     def every(self, step: int) -> "PixelSample":
         """Each ``step``-th of the pixels, with ``step`` times their weights."""
         few = self.at(slice(None, None, step))
-        return replace(few, weights=few.weights * step, shown=few.shown * step)
+        return few._replace(weights=few.weights * step, shown=few.shown * step)
 
     def columns(self, layout: PartLayout) -> Tensor:
         """See :func:`columns_of`."""
-        return columns_of(self.before, self.weighed, layout)
+        return columns_of(self.before, self.surroundings, layout)
 
     def sums(self, layout: PartLayout) -> list[LookSums]:
         """Sums over the pixels of each square, one after the other to save memory."""
@@ -191,13 +183,12 @@ def squares(places: Tensor, width: int) -> Tensor:
     return rows * SQUARES + columns
 
 
-def columns_of(image: Tensor, weighed: Mapping[str, Tensor], layout: PartLayout) -> Tensor:
+def columns_of(image: Tensor, surroundings: Tensor, layout: PartLayout) -> Tensor:
     """Columns (3, F, P), in float64: what a unit of each parameter changes at some pixels.
 
     Args:
         image: pixels (3, P) before the edit.
-        weighed: columns of the parts that depend on the surroundings of a pixel: ``bands`` (3, 7, P), ``texture``
-            (6, P), ``stretch`` (3, 3, P), ``local`` (3, 8, P), and ``alpha``, the layers of luminance, (k+1, P).
+        surroundings: columns (3, F', P) of the parts that depend on the surroundings of a pixel: all from ``bands`` on.
         layout: of the columns.
     """
     colours = image.double()  # the columns nearly depend on each other
@@ -205,8 +196,7 @@ def columns_of(image: Tensor, weighed: Mapping[str, Tensor], layout: PartLayout)
     hats = (1 - (colours.clamp(0, 1).unsqueeze(1) * (layout.knots - 1) - knots).abs()).clamp(min=0)
     steps = saturation_hats(colours[None, :, None], layout.factors)[0, :, 0]
     below = below_largest(colours[None])[0].unsqueeze(1) * steps
-    columns = {"curves": hats, "matrix": colours, "saturation": below, **weighed}
-    return torch.cat([columns[part].double().expand(3, -1, -1) for part in layout.lengths], dim=1)
+    return torch.cat([hats, colours.expand(3, -1, -1), below, surroundings.double()], dim=1)
 
 
 def sums_of(columns: Tensor, change: Tensor, weights: Tensor) -> LookSums:

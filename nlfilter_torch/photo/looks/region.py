@@ -1,7 +1,7 @@
 """The look of a region of photographs, or of all of them, from the pixels of all pairs."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import reduce
 
 import torch
@@ -26,21 +26,6 @@ FOLDS = 5  # of cross-validation, among which the pairs are divided
 SLIDERS_ONLY = 0.98  # share of the change from which on an edit counts as one by sliders alone
 LIKELY = 0.95  # share that the layers of a sample of the pixels explain of such an edit
 Shares = tuple[float, float]  # of the change that is explained: of fitted data, and of data left out of the fit
-
-
-@dataclass(frozen=True)
-class ChosenLook:
-    """The look of a region.
-
-    Attributes:
-        look: the one that was chosen.
-        explained: shares for every choice of parts that was tried.
-        added: what each part adds to these, the most first; the lattice, fitted to what the others leave, is last.
-    """
-
-    look: Candidate
-    explained: dict[Parts, Shares]
-    added: dict[str, Shares]
 
 
 class Region:
@@ -86,9 +71,9 @@ class Region:
         else:
             self.folds[fold] = self.folds[fold] + whole
         if self.has_lattice:
-            more = replace(pixels, weighed={}) if colours is None else colours
+            more = pixels._replace(surroundings=pixels.surroundings[:, :0]) if colours is None else colours
             for kept, sample in ((self._pixels, pixels), (self._colours, more)):
-                kept.add(replace(sample, fold=torch.full_like(sample.fold, fold)))
+                kept.add(sample._replace(fold=torch.full_like(sample.fold, fold)))
         self._add_sliders(pixels, whole, rounding)
 
     def _add_sliders(self, pixels: PixelSample, sums: LookSums, rounding: float) -> None:
@@ -99,7 +84,7 @@ class Region:
             self._sliders = None
             return
         # Sliders add the same to every channel, each of which is rounded by itself.
-        layers = pixels.weighed["alpha"].repeat(1, 3)
+        layers = pixels.surroundings[0, -self.layout.sliders :].repeat(1, 3)
         before, after, weights = (planes.flatten() for planes in (pixels.before, pixels.after, pixels.weights))
         alpha = fit_layers(layers, before, after, weights, rounding)
         place = self.layout.place("alpha")
@@ -113,8 +98,12 @@ class Region:
         """Sums of what is left out in turn: of pairs, or of the squares of a single one."""
         return self.folds if len(self.folds) > 1 else self._squares
 
-    def chosen(self, choices: Sequence[Parts]) -> ChosenLook:
-        """The look that suits the pairs best, of one of these choices of parts."""
+    def chosen(self, choices: Sequence[Parts]) -> tuple[Candidate, dict[Parts, Shares], dict[str, Shares]]:
+        """The look that suits the pairs best, of one of these choices of parts.
+
+        Also the shares that every choice explains, and what each part of the look adds to these, the most first; the
+        lattice, fitted to what the others leave, is last.
+        """
         alone = len(self.folds) == 1
         if alone:
             best, candidates = choose_from_one(self._groups, self.layout, choices)
@@ -128,12 +117,12 @@ class Region:
         if more is not None:
             explained[more.parts] = more.fitted, more.left_out
             added["lattice"] = more.fitted - basis.fitted, more.left_out - basis.left_out
-            return ChosenLook(more, explained, added)
+            return more, explained, added
         if best.parts == SLIDERS and self._sliders is not None:
             coefficients = torch.zeros_like(best.coefficients)
             coefficients[:, self.layout.place("alpha")] = torch.linalg.solve(*self._sliders) - 1
             best = replace(best, coefficients=coefficients)
-        return ChosenLook(best, explained, added)
+        return best, explained, added
 
     def _with_lattice(self, candidates: dict[Parts, Candidate]) -> Candidate | None:
         """A look with a lattice for what one of the candidates leaves; None if that explains hardly more."""

@@ -15,7 +15,8 @@ from nlfilter_torch.photo.app import drawing
 from nlfilter_torch.photo.app.crop_tool import Proportions
 from nlfilter_torch.photo.app.dialogs import Question
 from nlfilter_torch.photo.app.library import Library
-from nlfilter_torch.photo.app.page import EDITORS, SCRIPTS, STATIC, STATIC_ADDRESS, Editor
+from nlfilter_torch.photo.app.page import EDITORS, Editor
+from nlfilter_torch.photo.app.server import SCRIPTS, STATIC, STATIC_ADDRESS
 from nlfilter_torch.photo.declared.development import WHOLE, Development
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.picture.photographs import Photograph, write_photograph

@@ -18,11 +18,11 @@ def test_layers_of_a_sample_are_nearly_those_of_all_pixels(monkeypatch: pytest.M
     regions = photograph.regions_of_sample()
     assert regions is not None
     (sample,) = regions
-    assert sample.weighed["alpha"].shape == (4, 2000)
+    assert sample.surroundings[0, -4:].shape == (4, 2000)
     assert float(sample.weights[0].sum()) == pytest.approx(float(photograph.free[0].sum()), rel=0.02)
     exact = photograph.layers[:, sample_of(torch.ones(CAT.shape[-2:]))]
-    assert torch.allclose(sample.weighed["alpha"].sum(0), exact.sum(0), atol=1e-5)
-    assert bool(((sample.weighed["alpha"] - exact).square().mean(1) < 0.04 * exact.square().mean(1)).all())
+    assert torch.allclose(sample.surroundings[0, -4:].sum(0), exact.sum(0), atol=1e-5)
+    assert bool(((sample.surroundings[0, -4:] - exact).square().mean(1) < 0.04 * exact.square().mean(1)).all())
     masks = torch.ones(1, *CAT.shape[-2:])
     assert EditedPhotograph(CAT[0], CAT[0] ** 0.7, masks, FEW, 3, None).regions_of_sample() is None
 

@@ -1,7 +1,5 @@
 """Pixels kept for the lattice, and lattices of looks."""
 
-from dataclasses import replace
-
 import pytest
 import torch
 from torch import Tensor
@@ -90,7 +88,7 @@ def test_never_more_pixels_than_enough_are_kept(monkeypatch: pytest.MonkeyPatch)
     for number, image in enumerate((CAT, CUP, SUIT, CAT, CUP)):
         photograph = EditedPhotograph(image[0], image[0] ** 0.7, None, FEW, 3, None)
         (pixels,) = photograph.regions()
-        kept.add(replace(pixels, fold=torch.full_like(pixels.fold, number)))
+        kept.add(pixels._replace(fold=torch.full_like(pixels.fold, number)))
         total = float(kept.all().shown.sum())
         assert total == pytest.approx(8000 * (number + 1), rel=0.01)
         assert len(kept.all().shown) <= 15_000

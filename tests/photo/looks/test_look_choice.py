@@ -16,8 +16,7 @@ from tests.looks import CAT, FEW, in_bytes, single_look
 def test_no_curve_that_does_not_fall_explains_more(parts: Parts) -> None:
     layout = PartLayout(knots=6, factors=2, sliders=2)
     image = torch.rand(3, 500, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    lengths = {"bands": (3, 7), "texture": (6,), "stretch": (3, 3), "local": (3, 8), "alpha": (2,)}
-    columns = columns_of(image, {part: torch.zeros(*shape, 500) for part, shape in lengths.items()}, layout)
+    columns = columns_of(image, torch.zeros(3, 7 + 6 + 3 + 8 + 2, 500), layout)
     sums = sums_of(columns, 0.4 * torch.sin(9 * image), torch.ones_like(image))
     place = layout.place("curves")
     changes = fit_parts(sums, parts, layout, 0.0)[:, place]

@@ -24,9 +24,7 @@ def test_sums_of_samples_are_those_of_all_pixels() -> None:
 def test_columns_and_parameters_are_the_change_of_a_look() -> None:
     image = CAT[0, :, 10:30, 10:30].double().flatten(1)
     layout = PartLayout(knots=17, factors=5, sliders=4)
-    lengths = {"bands": (3, 7), "texture": (6,), "stretch": (3, 3), "local": (3, 8), "alpha": (4,)}
-    others = {part: torch.zeros(*shape, 400) for part, shape in lengths.items()}
-    columns = columns_of(image, others, layout)
+    columns = columns_of(image, torch.zeros(3, 7 + 6 + 3 + 8 + 4, 400), layout)
     assert columns.shape == (3, layout.columns, 400)
     coefficients = torch.zeros(3, layout.columns, dtype=torch.float64)
     straight = torch.linspace(0, 1, 17, dtype=torch.float64)
