@@ -1,4 +1,4 @@
-"""Error of the approximate filter relative to the dense one: ``python -m benchmarks.accuracy``.
+"""How far results of the approximate filter are from those of the dense one: ``python -m benchmarks.accuracy``.
 
 RMS difference of W y in grey levels between the library in float64 and :mod:`tests.reference`, on photographs reduced
 to 72x72, 5x5 patches, m = 100. The paper's own method appears twice: as implemented in the reference, and as the

@@ -1,4 +1,4 @@
-"""Time of the editor from a pointer movement to the picture: python -m benchmarks.app [--side 1000] [--browser].
+"""How long the editor takes from a movement of the pointer to the picture: ``python -m benchmarks.app [--browser]``.
 
 Prints medians and quartiles of ``--repeats``, in milliseconds, on a square preview. Then, for a photograph of
 ``--megapixels``, the same; with ``--browser`` from the pointer's move to the picture in a headless Chromium as well,

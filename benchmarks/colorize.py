@@ -1,4 +1,4 @@
-"""Colourisation against optimisation: ``python -m benchmarks.colorize [--pictures FOLDER] [--set choosing]``.
+"""How near colours from a few strokes are to the true ones, beside optimisation: ``python -m benchmarks.colorize``.
 
 Grey versions of photographs are colourised from 6, 20 and 60 random 5x5 strokes of their true chroma, with three seeds
 each. Prints the PSNR of the RGB result against the photograph, and CPU time, for the regression mixed with values of

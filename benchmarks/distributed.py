@@ -1,4 +1,4 @@
-"""Communication between ranks that share one image: ``python -m benchmarks.distributed [--ranks 3]``.
+"""What ranks that share one image send to each other: ``python -m benchmarks.distributed [--ranks 3]``.
 
 Counts the bytes of every tensor that a rank passes to ``torch.distributed`` in one forward and one backward pass, for
 images of several heights. A ring all-reduce over n ranks sends each such byte 2 (n - 1) / n times; protocol overhead is

@@ -1,13 +1,12 @@
-"""Claims about masks and edits, and whether they hold: ``python -m benchmarks.edits [--out FILE]``.
+"""Whether what is claimed of masks and edits holds: ``python -m benchmarks.edits [--out FILE]``.
 
 Prints one line per claim, with its limit and the measured value, on photographs that ship with scikit-image. Larger
 comparisons have their own modules: ``benchmarks.colorize``, ``benchmarks.sharpening``, ``docs.figures``.
 """
 
-import argparse
-import json
+import sys
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from itertools import pairwise
 from pathlib import Path
 
@@ -18,29 +17,19 @@ import torch.nn.functional as F
 from skimage.color import rgb2hsv
 from torch import Tensor
 
+from benchmarks.harness import Figure, options, report, save_json
 from benchmarks.photographs import luminance, scene, spots, strokes
 from nlfilter_torch import Spectrum, diffusion_mask, nonlocal_operator
 from nlfilter_torch.photo import abstract, adjust_tone, defocus, filter_frames, recolor
-from nlfilter_torch.photo.files.writing import open_beside
 
 SUIT = (60, 300, 20, 20)  # column, row, width, height on the astronaut's suit
 TIMES = (0.5, 1.0, 2.0, 5.0)
 STEP = 7  # pixels that the camera moves from frame to frame
 
 
-@dataclass(frozen=True)
-class Claim:
-    """A claim that a measured value is at least, or at most, its limit."""
-
-    what: str
-    limit: float
-    measured: float
-    at_least: bool = False
-
-    @property
-    def holds(self) -> bool:
-        """Whether the measured value is within the limit."""
-        return self.measured >= self.limit if self.at_least else self.measured <= self.limit
+def claim(what: str, limit: float, measured: float, *, at_least: bool = False) -> Figure:
+    """A measured value with its limit."""
+    return Figure(what, measured, limit, at_most=not at_least)
 
 
 def _astronaut(side: int) -> tuple[Tensor, Tensor, Spectrum]:
@@ -50,7 +39,7 @@ def _astronaut(side: int) -> tuple[Tensor, Tensor, Spectrum]:
     return image, spots(image, scale, SUIT), operator.spectrum()
 
 
-def masks() -> Iterator[Claim]:
+def masks() -> Iterator[Figure]:
     """Masks of a scribble on the astronaut's suit, with RGB guide and h = 25/255."""
     _, spot, whole = _astronaut(512)
     _, small_spot, preview = _astronaut(256)
@@ -59,40 +48,40 @@ def masks() -> Iterator[Claim]:
     below_collar = np.arange(512)[:, None] > 200
     suit = torch.from_numpy((hue > 0.01) & (hue < 0.08) & (saturation > 0.6) & (value > 0.35) & below_collar)
     ratio = float(mask[0, 0][suit].mean() / mask[0, 0][~suit].mean())
-    yield Claim("mask at t = 1: mean on the suit / mean elsewhere", 3.0, ratio, at_least=True)
+    yield claim("mask at t = 1: mean on the suit / mean elsewhere", 3.0, ratio, at_least=True)
     levels = torch.linspace(0, 1, 21)
     quantiles = torch.stack([diffusion_mask(preview, small_spot, time=t).flatten().quantile(levels) for t in TIMES])
-    yield Claim(
+    yield claim(
         f"smallest growth of its 5 to 95 % quantiles, t = {TIMES}",
         0.0,
         float(quantiles.diff(dim=0)[:, 1:-1].min()),
         at_least=True,
     )
-    yield Claim("smallest value of the mask", 1e-30, float(mask.min()), at_least=True)
-    yield Claim("largest value of the mask", 1.0, float(mask.max()))
+    yield claim("smallest value of the mask", 1e-30, float(mask.min()), at_least=True)
+    yield claim("largest value of the mask", 1.0, float(mask.max()))
     apart = F.avg_pool2d(mask, 2) - diffusion_mask(preview, small_spot)
-    yield Claim("mean difference between masks at 256 and 512 pixels", 0.05, float(apart.abs().mean()))
+    yield claim("mean difference between masks at 256 and 512 pixels", 0.05, float(apart.abs().mean()))
 
 
-def recolouring() -> Iterator[Claim]:
+def recolouring() -> Iterator[Figure]:
     """Recolouring from one blue stroke on the suit."""
     image, scale = scene("astronaut", 256)
     colours, painted = strokes(image, scale, (SUIT, (0.1, 0.3, 0.9)))
     edited = recolor(image, colours, painted)
     change = float(255 * (luminance(edited) - luminance(image)).abs().max())
-    yield Claim("recolor: largest change of luminance, grey levels", 1.0, change)
+    yield claim("recolor: largest change of luminance, grey levels", 1.0, change)
     outside = spots(image, scale, (300, 20, 100, 120)).expand_as(image) > 0  # backdrop
-    yield Claim("recolor: largest change of the backdrop, grey levels", 2.0, _levels(edited - image, outside))
+    yield claim("recolor: largest change of the backdrop, grey levels", 2.0, _levels(edited - image, outside))
     kept = spots(image, scale, (200, 90, 50, 60))  # face
     edited = recolor(image, colours, painted, keep=kept)
-    yield Claim(
+    yield claim(
         "recolor: largest change of the area to keep, grey levels",
         2.0,
         _levels(edited - image, kept.expand_as(image) > 0),
     )
 
 
-def focusing() -> Iterator[Claim]:
+def focusing() -> Iterator[Figure]:
     """Defocus that keeps the astronaut sharp, but not the shuttle behind her."""
     image, scale = scene("astronaut", 256)
     region = spots(image, scale, (188, 60, 60, 60), (40, 260, 32, 160))
@@ -100,29 +89,29 @@ def focusing() -> Iterator[Claim]:
     for aperture in ("disc", "gaussian"):
         blurred = defocus(image, region, radius=4.0, aperture=aperture)
         kept = _energy(blurred, face) / _energy(image, face)
-        yield Claim(f"defocus, {aperture}: remaining gradient energy of the face", 0.95, kept, at_least=True)
+        yield claim(f"defocus, {aperture}: remaining gradient energy of the face", 0.95, kept, at_least=True)
         left = _energy(blurred, shuttle) / _energy(image, shuttle)
-        yield Claim(f"defocus, {aperture}: remaining gradient energy behind it", 0.3, left)
+        yield claim(f"defocus, {aperture}: remaining gradient energy behind it", 0.3, left)
 
 
-def abstraction() -> Iterator[Claim]:
+def abstraction() -> Iterator[Figure]:
     """Abstraction for k near 0, and the change of the mean under contrast."""
     image = scene("chelsea", 256)[0]
     for power, limit in ((0.0, 0.01), (1e-5, 0.1)):
         change = float(255 * (abstract(image, power=power) - image).square().mean().sqrt())
-        yield Claim(f"abstract, k = {power:g}: RMS change, grey levels", limit, change)
+        yield claim(f"abstract, k = {power:g}: RMS change, grey levels", limit, change)
     drift = adjust_tone(image, contrast=1.4, clarity=3.0, limits="none").mean((2, 3)) - image.mean((2, 3))
-    yield Claim("tone, contrast 1.4: drift of the mean, grey levels", 0.1, float(255 * drift.abs().max()))
+    yield claim("tone, contrast 1.4: drift of the mean, grey levels", 0.1, float(255 * drift.abs().max()))
 
 
-def pan() -> Iterator[Claim]:
+def pan() -> Iterator[Figure]:
     """Flicker in ten frames of a pan over the astronaut, edited together and each alone."""
     whole = scene("astronaut", 512)[0]
     film = [whole[..., 60 + STEP * i : 160 + STEP * i, 130 + STEP * i : 250 + STEP * i] for i in range(10)]
     alpha = torch.tensor([3.0, 3.0, 4.0, 1.05])
     together = list(filter_frames(film, alpha, references=[film[0], film[5], film[9]]))
     singles = [next(filter_frames([frame], alpha, references=[frame])) for frame in film]
-    yield Claim(
+    yield claim(
         "flicker of a ten-frame pan / flicker of frames edited alone", 0.25, _flicker(together) / _flicker(singles)
     )
 
@@ -141,27 +130,18 @@ def _flicker(edited: list[Tensor]) -> float:
     return float(torch.stack(pairs).mean())
 
 
-TOPICS: tuple[Callable[[], Iterator[Claim]], ...] = (masks, recolouring, focusing, abstraction, pan)
+TOPICS: tuple[Callable[[], Iterator[Figure]], ...] = (masks, recolouring, focusing, abstraction, pan)
 
 
-def main(arguments: list[str] | None = None) -> None:
-    """Print a line per claim; exit with status 1 if one does not hold."""
-    parser = argparse.ArgumentParser(description="Claims about masks and edits, and whether they hold.")
+def main(arguments: list[str] | None = None) -> int:
+    """Print a line per claim; return 1 if one does not hold."""
+    parser = options("edits", __doc__)
     parser.add_argument("--out", type=Path, help="also write the results to this JSON file")
-    options = parser.parse_args(arguments)
-    kept = []
-    print(f"{'':66}{'limit':>12}{'measured':>12}")
-    for topic in TOPICS:
-        for claim in topic():
-            kept.append(asdict(claim) | {"holds": claim.holds})
-            sign = ">=" if claim.at_least else "<="
-            verdict = "" if claim.holds else "  FALLS SHORT"
-            print(f"{claim.what:66}{sign + f' {claim.limit:g}':>12}{claim.measured:12.4g}{verdict}", flush=True)
-    if options.out is not None:
-        with open_beside(options.out) as stream:
-            stream.write((json.dumps(kept, indent=1) + "\n").encode())
-    raise SystemExit(not all(claim["holds"] for claim in kept))
+    chosen = parser.parse_args(arguments)
+    figures = [figure for topic in TOPICS for figure in topic()]
+    save_json(chosen.out, [asdict(figure) | {"holds": figure.holds} for figure in figures])
+    return report(figures)
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

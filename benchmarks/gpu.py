@@ -1,11 +1,10 @@
-"""Results, times and memory on a GPU: ``python -m benchmarks.gpu [--quick]``.
+"""What a GPU changes in results, times and memory: ``python -m benchmarks.gpu [--quick]``.
 
 Every result is compared with that of the CPU in float64. Times of building an operator and of filtering one channel are
 printed beside the time that their matrix products and their reads of the factor take at rates measured on this GPU.
 Without a GPU the program prints an error and exits with status 2.
 """
 
-import argparse
 import statistics
 import sys
 import time
@@ -15,6 +14,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from benchmarks.harness import options
 from nlfilter_torch import (
     NonlocalFilter,
     captured_energy,
@@ -197,16 +197,14 @@ def report(device: str, sizes: Iterable[float], rate_size: int, *, side: int = 9
 
 def main(arguments: list[str] | None = None) -> int:
     """Measure on the GPU, if there is one."""
-    parser = argparse.ArgumentParser(description="Results, times and memory on a GPU.")
-    parser.add_argument("--quick", action="store_true", help="small sizes")
-    options = parser.parse_args(arguments)
+    chosen = options("gpu", __doc__, "small sizes").parse_args(arguments)
     if not torch.cuda.is_available():
         print(
             "this benchmark needs a GPU that torch can use, found none; run it on a machine with CUDA", file=sys.stderr
         )
         return 2
     print(torch.cuda.get_device_name(), torch.__version__)
-    if options.quick:
+    if chosen.quick:
         report("cuda", MEGAPIXELS[:1], 1024, crop=32)
     else:
         report("cuda", MEGAPIXELS, 8192)

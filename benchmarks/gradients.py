@@ -1,4 +1,4 @@
-"""Time and memory of a training step, compared with plain autograd: ``python -m benchmarks.gradients [--quick]``.
+"""What a training step takes in time and memory, compared with plain autograd: ``python -m benchmarks.gradients``.
 
 The gradient of a weighted sum of the filtered image with respect to guide, alpha and bandwidth, on one grey picture in
 float32. The comparison is with :mod:`tests.plain_autograd`, the same filter in plain tensor operations, differentiated

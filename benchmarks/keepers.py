@@ -1,4 +1,4 @@
-"""Forty jobs of a retoucher on free photographs, and how many results are kept: ``python -m benchmarks.keepers``.
+"""How many results of a retoucher's forty jobs on free photographs are kept: ``python -m benchmarks.keepers``.
 
 Recolouring by the first strokes that come to mind, masks, defocus, presets, colours for grey photographs, noise and
 abstraction. The strokes of ``keepers.json`` were drawn once, with the editor's brush, and never adapted to results.

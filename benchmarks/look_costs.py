@@ -1,4 +1,4 @@
-"""Time and memory of fitting looks: ``python -m benchmarks.look_costs [--megapixels 1] [--pairs 100]``.
+"""What fitting and applying looks takes: ``python -m benchmarks.look_costs [--megapixels 1] [--pairs 100]``.
 
 Processor and wall seconds of one pair edited by Pillow, and by sliders of this library, which are to be found to 1e-3
 through 8 bits; then processor time of applying looks with and without lattices of colours; then the most memory that

@@ -1,4 +1,4 @@
-"""Looks from edits of other programs: ``python -m benchmarks.looks [--pictures FOLDER] [--quick] [--set choosing]``.
+"""How much of other programs' edits a fitted look repeats, beside other ways: ``python -m benchmarks.looks``.
 
 Edits by OpenCV, scikit-image and Pillow (and ImageMagick where it is installed) on ten photographs: looks are fitted to
 one, three and five of the first five, and judged on the other five. Figures are shares of the energy of the change that

@@ -1,4 +1,4 @@
-"""Looks from edits as people make them: ``python -m benchmarks.looks_of_people --pictures FOLDER [--quick]``.
+"""How near fitted looks come to edits as people make them: ``python -m benchmarks.looks_of_people``.
 
 Twelve chains of white balance, curves, hue-wise shifts, split toning and vibrance by RawTherapee's command line
 (``rawtherapee/*.pp3``) and two by ImageMagick on photographs of a folder. Every pair is fitted, and judged on itself;

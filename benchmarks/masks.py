@@ -1,4 +1,4 @@
-"""Masks from scribbles against matting and segmentation: ``python -m benchmarks.masks [--pictures FOLDER] [--quick]``.
+"""How exact masks from scribbles are, beside matting and segmentation: ``python -m benchmarks.masks``.
 
 Composites with known opacity (:mod:`benchmarks.composites`), with 1, 2 and 4 scribbles on each side, and on the object
 alone. Reports the mean squared error of the mask, and the intersection over union of its values above 0.5, for

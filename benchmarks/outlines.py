@@ -1,4 +1,4 @@
-"""Objects selected on photographs, against outlines drawn by hand: ``python -m benchmarks.outlines [--quick]``.
+"""How well selections follow outlines of objects drawn by hand on photographs: ``python -m benchmarks.outlines``.
 
 The outlines of ``outlines.json`` are of objects in :mod:`benchmarks.keepers`, as polygons whose points are fractions of
 width and height, with holes; they were drawn without looking at results. Parts that may or may not be meant, such as

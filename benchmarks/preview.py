@@ -1,4 +1,4 @@
-"""What the editor shows, against what it saves: ``python -m benchmarks.preview [--pictures FOLDER]``.
+"""How far what the editor shows is from what it saves: ``python -m benchmarks.preview [--pictures FOLDER]``.
 
 Each photograph is opened in a session of the editor, edited, and saved. Printed is the root mean square difference in
 grey levels between the picture on the screen, before it becomes a JPEG, and the saved file resized to its size: for

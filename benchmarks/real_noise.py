@@ -1,4 +1,4 @@
-"""Denoising of photographs with the noise of cameras: ``python -m benchmarks.real_noise FOLDER [--set reporting]``.
+"""What denoising gains on photographs with the noise of cameras: ``python -m benchmarks.real_noise FOLDER``.
 
 The folder holds pairs of one shot and the mean of many, ``NAME_real.*`` and ``NAME_mean.*`` (or ``_noisy`` and
 ``_clean``). The table shows, for each pair, PSNR of the shot, of ``denoise`` without being told anything, told the true

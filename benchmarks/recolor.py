@@ -1,4 +1,4 @@
-"""Recolouring and defocus with known object borders: ``python -m benchmarks.recolor [--pictures FOLDER] [--quick]``.
+"""How much of an object recolouring and defocus reach, and what beside it: ``python -m benchmarks.recolor``.
 
 Measured on composites (:mod:`benchmarks.composites`). For recolouring, the object has one strong colour: it is the
 texture of its photograph, tinted. The expected result is the composite of the recoloured object. "Covered" is the share

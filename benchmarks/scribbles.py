@@ -1,4 +1,4 @@
-"""Strokes with strays beside clean ones: ``python -m benchmarks.scribbles [--quick] [--photographs FOLDER]``.
+"""What strokes that stray from their object change, beside clean ones: ``python -m benchmarks.scribbles``.
 
 Recolouring by one natural stroke, a bent line, of which a fifth lies on something else, against the same stroke without
 that part. On composites (:mod:`benchmarks.composites`) the covered share of the object and the changed share of the

@@ -1,4 +1,4 @@
-"""Halo and noise of sharpening: ``python -m benchmarks.sharpening [--pictures FOLDER] [--side N] [--quick]``.
+"""What sharpening costs in halos and noise, beside other methods: ``python -m benchmarks.sharpening``.
 
 Four photographs in grey at 256x256, without noise and with white noise of 10 and 20 grey levels. The strength of every
 method is set so that the gradient on strong edges (the steepest 4 % of pixels, measured along the clean photograph's

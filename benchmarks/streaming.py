@@ -36,7 +36,6 @@ from numpy.typing import NDArray
 from benchmarks.harness import MIB, forget_peak, in_fresh_process, options, resident, save_json, seconds
 from nlfilter_torch import nonlocal_operator, polynomial_filter
 from nlfilter_torch.photo import Drawn, Step, colorize, enhance, recolor, stream
-from nlfilter_torch.photo.declared.steps import working_bytes
 from nlfilter_torch.photo.edits.applying import fit_step
 from nlfilter_torch.photo.files.rows import open_picture, write_picture
 from nlfilter_torch.photo.picture.colour import colour_guide, split_luminance
@@ -353,25 +352,6 @@ def busy(chosen: argparse.Namespace) -> None:
             print(f"| {verb} | {megapixels:g} | {threads} | {figures} |", flush=True)
 
 
-def tables(figures: dict[str, Any]) -> None:
-    """Print the tables of docs/scale.md from the JSON of a run."""
-    print("| megapixels | m | statistics | CPU, s | s per MP | peak over start, MiB |\n|---|---|---|---|---|---|")
-    for run in figures["runs"]:
-        cpu, pixels = run["cpu_s"], run["megapixels"]
-        kinds = f"{pixels:.1f} | {run['landmarks']} | {run['statistics']}"
-        print(f"| {kinds} | {cpu:.1f} | {cpu / pixels:.2f} | {run['peak_mib']:.0f} |")
-    large = max(figures["runs"], key=lambda run: run["megapixels"])
-    once = sum(large["stages_s"][name] for name in ("Balancing", "Summing up"))
-    rate = (large["cpu_s"] - once) / large["megapixels"]
-    whole = figures["exactness"]["memory_cpu_s"] / figures["exactness"]["megapixels"]
-    print("\n| workers | way | time | memory of each |\n|---|---|---|---|")
-    print(f"| 1 | rows | {(1000 * rate + once) / 60:.0f} min | {large['peak_mib'] / 1024:.1f} GiB |")
-    for workers in (8, 64):
-        memory = 1e9 / workers * working_bytes(large["landmarks"], 5) / 2**30
-        print(f"| {workers} | shards | {1000 * whole / workers / 60:.1f} min | {memory:.0f} GiB |")
-    print(f"\n{rate:.2f} s per MP by rows and {once:.1f} s once; {whole:.2f} s per MP in memory")
-
-
 SUITES = {"files": files, "strokes": strokes, "memory": beside_memory, "busy": busy}
 
 
@@ -381,7 +361,6 @@ def main() -> None:
     add = parser.add_argument
     add("suite", nargs="?", choices=SUITES, default="files")
     add("--out", type=Path, help="JSON file for the figures of files")
-    add("--table", type=Path, metavar="JSON", help="print the tables of docs/scale.md from a file of --out")
     add("--megapixels", type=float, nargs="+", help="memory and busy: default 1.4 4 12, and 6")
     add("--edits", nargs="+", choices=("detail", "recolor"), default=["detail", "recolor"], help="memory and busy")
     add("--threads", type=int, nargs="+", default=[1, 2], help="memory and busy")
@@ -390,9 +369,7 @@ def main() -> None:
     add("--neighbours", type=int, default=os.cpu_count() or 1, help="busy processes; default: one per core")
     add("--work", nargs=5, help=argparse.SUPPRESS)
     chosen = parser.parse_args()
-    if chosen.table:
-        tables(json.loads(chosen.table.read_text()))
-    elif chosen.work:
+    if chosen.work:
         verb, source, target, statistics, landmarks = chosen.work
         print(json.dumps(work(verb, Path(source), Path(target), statistics, int(landmarks))))
     else:

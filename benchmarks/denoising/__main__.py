@@ -1,4 +1,4 @@
-"""Comparison of denoisers: ``python -m benchmarks.denoising [--pictures FOLDER] [--methods NAMES] [--out FILE]``.
+"""How well denoisers work and what they take, ours beside others: ``python -m benchmarks.denoising``.
 
 On photographs that were not used in training, with white noise of 5, 15, 25 and 50 grey levels, in grey and in colour:
 PSNR, SSIM and CPU seconds of

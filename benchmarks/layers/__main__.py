@@ -1,4 +1,4 @@
-"""Figures of the library as a layer in training: ``python -m benchmarks.layers [TOPIC ...] [--out FILE.json]``."""
+"""What the library gives as a layer in training: ``python -m benchmarks.layers [TOPIC ...] [--out FILE.json]``."""
 
 import importlib
 import sys
