@@ -36,7 +36,7 @@ from torch.nn.functional import avg_pool2d
 from benchmarks.composites import Composite, composites, draw_strokes, setup
 from benchmarks.photographs import photograph
 from nlfilter_torch.photo import defocus, recolor
-from nlfilter_torch.photo.edits.defocus import blur_kernel, convolve
+from nlfilter_torch.photo.edits.defocus import Lens, convolve
 from nlfilter_torch.photo.edits.recolor import Recoloring, with_room
 from nlfilter_torch.photo.picture.colour import hundredths_of_lab, merge_luminance, split_luminance
 from nlfilter_torch.photo.picture.resizing import resize
@@ -162,7 +162,7 @@ def measure_defocus(composite: Composite, count: int, seed: int) -> dict[str, fl
     radius = RADIUS * min(composite.image.shape[-2:])
     probe = torch.cat([composite.image, composite.alpha], dim=1)
     result = defocus(composite.image, inside, radius=radius)
-    kernel = blur_kernel(radius, "disc").float()
+    kernel = Lens(radius, "disc").kernel().float()
     ones = convolve(torch.ones_like(composite.alpha), kernel)
     behind = convolve(composite.background, kernel) / ones
     wanted = composite.alpha * composite.object + (1 - composite.alpha) * behind

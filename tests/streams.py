@@ -30,8 +30,10 @@ FUNCTIONS: dict[type[PhotoEdit], Callable[..., Tensor]] = {
 
 def settings_of(edit: type[PhotoEdit], **settings: Any) -> Any:
     """The edit with the defaults of its function where no other settings are named."""
-    parameters = inspect.signature(FUNCTIONS[edit]).parameters.values()
-    defaults = {p.name: p.default for p in parameters if p.default is not inspect.Parameter.empty}
+    parameters = inspect.signature(FUNCTIONS[edit]).parameters
+    if unknown := settings.keys() - parameters.keys():
+        raise TypeError(f"{FUNCTIONS[edit].__name__} has no arguments {', '.join(sorted(unknown))}")
+    defaults = {p.name: p.default for p in parameters.values() if p.default is not inspect.Parameter.empty}
     return edit.of(defaults | settings)
 
 

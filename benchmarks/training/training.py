@@ -20,7 +20,8 @@ from torch.utils.data import DataLoader
 from benchmarks.training.examples import SHARES, Batches, Examples, Source
 from benchmarks.training.graphs import graphed_pivots
 from benchmarks.training.pictures import Pictures
-from nlfilter_torch.nn.denoiser.network import PLANES, SLOPE, WIDTH, Layer, NonlocalDenoiser, read_weights, shapes_of
+from nlfilter_torch.nn.denoiser.network import PLANES, SLOPE, WIDTH, Layer, NonlocalDenoiser, shapes_of
+from nlfilter_torch.nn.denoiser.weights import read_weights
 from nlfilter_torch.photo.files.writing import open_beside
 from nlfilter_torch.photo.plotting import save_figure
 

@@ -10,7 +10,7 @@ from benchmarks.photographs import SIZE, Box, scene, spots
 from docs.scenes import SIDE, Numbers, marked, rounded
 from nlfilter_torch.photo import defocus, region_mask
 from nlfilter_torch.photo.declared.parameters import DEFOCUS
-from nlfilter_torch.photo.edits.defocus import blur_behind, focus_of
+from nlfilter_torch.photo.edits.defocus import Lens, focus_of
 from nlfilter_torch.photo.plotting import show_images
 
 PORTRAIT: tuple[Box, ...] = (
@@ -57,7 +57,7 @@ def figure_17(size: int = SIZE) -> tuple[Figure, Numbers]:
     distance = (disparity - disparity[region > 0].median()).abs()
     lens = defocus(image, region)
     blur = ((distance - NEAR) / (FAR - NEAR)).clamp(0, 1)
-    true = blur_behind(image, 1 - blur, DEFOCUS["radius"].pixels(None, image.shape[-2:]), "disc")
+    true = Lens(DEFOCUS["radius"].pixels(None, image.shape[-2:]), "disc").blur_behind(image, 1 - blur)
     panels |= {
         "(e) photograph and spots": marked(image, region),
         "(f) focus map": default_map(image, region),

@@ -16,9 +16,9 @@ from .edits.fit_look import FittedLook as FittedLook
 from .edits.fit_look import fit_look as fit_look
 from .edits.frames import filter_frames as filter_frames
 from .edits.look import apply_look as apply_look
+from .edits.recipe import stream as stream
 from .edits.recolor import recolor as recolor
 from .edits.sharpen import sharpen as sharpen
-from .edits.streaming import stream as stream
 from .edits.tone import adjust_tone as adjust_tone
 from .looks.look_module import Look as Look
 from .picture.drawn import Drawn as Drawn

@@ -18,8 +18,8 @@ from nlfilter_torch.photo.cli.progress import steps
 from nlfilter_torch.photo.declared.colour_tables import CUBE_NODES, HALD_LEVEL, cube_of, hald_of
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.edits.applying import apply_step
-from nlfilter_torch.photo.edits.colour_part import colour_part, colour_table, table_error
 from nlfilter_torch.photo.edits.fit_look import FittedLook, fit_look
+from nlfilter_torch.photo.edits.look import colour_part, colour_table, table_error
 from nlfilter_torch.photo.files.formats import check_type
 from nlfilter_torch.photo.files.writing import check_file, open_beside
 from nlfilter_torch.photo.looks.alignment import align, explained_share, inside_frame

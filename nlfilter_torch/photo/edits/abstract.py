@@ -5,7 +5,6 @@ Edges and tones after Winnemoeller, Olsen and Gooch, "Real-Time Video Abstractio
 
 import math
 from dataclasses import dataclass
-from functools import partial
 from typing import ClassVar
 
 import torch
@@ -24,13 +23,10 @@ from nlfilter_torch.photo.picture.colour import merge_luminance, split_luminance
 from nlfilter_torch.photo.picture.drawn import Drawn
 from nlfilter_torch.photo.picture.edit import PhotoEdit
 from nlfilter_torch.photo.picture.in_memory import edited
-from nlfilter_torch.photo.picture.pixels import M, whole_image
+from nlfilter_torch.photo.picture.pixels import LessMean, M, whole_image
 from nlfilter_torch.photo.picture.source import Fitted, Guide, Pixels, Planes, Source
 from nlfilter_torch.photo.picture.viewing import fit_change, viewed_size
 
-# W^k for k up to 1 by four poles alone, which cost about as much as a spectrum: the gains of eigenvalues from 1e-4 to 1
-# are right to 7e-3, those of smaller ones are nearly that of 1e-4, and pixels of photographs to a grey level (RMS 0.1).
-POWERS = partial(rational_form, decades=4, degree=0, poles=4, first=2.0, last=8.0)
 # Difference of Gaussians on luminance from 0 to 100: scale and weight of the wider one, and steepness.
 WIDER, SENSITIVITY, FALLOFF = 1.6, 0.98, 1.0
 SOFT, CRISP = 5.0, 25.0  # steepness of the steps between tones in flat areas and at edges
@@ -123,8 +119,8 @@ class Abstract(PhotoEdit):
         if self.edges == 0 and self.tones is None:
             return fitted
         scale = source.size[0] / viewed_size(source.size, self.viewing_size)[0]
-        drawing = partial(_drawn, edges=self.edges, width=width, tones=self.tones, scale=scale)
-        return Fitted(fitted.pixels, drawing, margin=blur_margin(WIDER * width) + 1)
+        drawing = Drawing(self.edges, width, self.tones, scale)
+        return Fitted(fitted.pixels, drawing.finish, margin=blur_margin(WIDER * width) + 1)
 
     def _change(self, viewed: Source[M]) -> Fitted:
         """The change of a picture at the viewing size."""
@@ -133,11 +129,14 @@ class Abstract(PhotoEdit):
     def flattened(self, source: Source[M]) -> "Flattened":
         """Compute ``W^k y``; powers above 1 in several steps."""
         operator = source.operator(Guide(self.filter_options(source.size, fewer_landmarks=True)))
+        # W^k for k up to 1 by four poles alone, which cost about as much as a spectrum: the gains of eigenvalues from
+        # 1e-4 to 1 are right to 7e-3, those of smaller ones nearly that of 1e-4, and pixels to a grey level (RMS 0.1).
+        form, steps = rational_form(decades=4, degree=0, poles=4, first=2.0, last=8.0), _steps(self.power)
         # W preserves constants, but a rational function of it does so only up to rounding: filter without the mean.
-        mean, form, steps = measuring.mean(source, whole_image), POWERS(), _steps(self.power)
+        mean = measuring.mean(source, whole_image)
         exponent = torch.as_tensor(self.power, dtype=torch.float64, device=mean.device).reshape(-1, 1) / steps
         weights = form.coefficients(form.nodes.to(mean.device) ** exponent).expand(source.batch, -1)
-        planes: Planes = partial(_varying, mean)
+        planes: Planes = LessMean(whole_image, mean)
         for _ in range(steps):
             planes = operator.rational(planes, form, weights)
         return Flattened(mean, planes)
@@ -148,16 +147,6 @@ def _steps(power: float | Tensor) -> int:
     if isinstance(power, Tensor):
         power = ABSTRACT["power"].high if is_unreadable(power) else float(power.detach().max())
     return max(1, math.ceil(power))
-
-
-def _drawn(
-    _: Tensor, planes: Tensor, __: Inner, *, edges: float, width: float, tones: int | None, scale: float
-) -> Tensor:
-    return draw(planes, edges, width, tones, scale)
-
-
-def _varying(mean: Tensor, pixels: Pixels) -> Tensor:
-    return pixels.image - mean
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,33 +170,43 @@ class Flattened:
         return self(pixels) - pixels.image
 
 
-def draw(flat: Tensor, edges: float, width: float, tones: int | None, scale: float = 1.0) -> Tensor:
-    """Quantize the luminance of an image (B, C, H, W), see :func:`quantize`, and draw lines along its edges."""
-    luminance, chroma = split_luminance(flat) if flat.shape[1] == 3 else (flat, torch.zeros_like(flat))
-    toned = luminance if tones is None else quantize(luminance, tones, scale)
-    toned = toned * (1 - edges * (1 - edge_lines(luminance, width)))
-    return merge_luminance(toned, chroma) if flat.shape[1] == 3 else toned
+@dataclass(frozen=True)
+class Drawing:
+    """Lines along the edges of a flattened picture, and few tones.
 
-
-def edge_lines(luminance: Tensor, width: float) -> Tensor:
-    """Compute lines (B, 1, H, W) from a difference of Gaussians: 1 off the lines, towards 0 in their middle."""
-    near, far = blur(luminance, width), blur(luminance, WIDER * width)
-    difference = 100 * (near - SENSITIVITY * far)
-    return 1 + torch.tanh(FALLOFF * difference.clamp(max=0.0))
-
-
-def quantize(luminance: Tensor, tones: int, scale: float = 1.0) -> Tensor:
-    """Quantize luminance (B, 1, H, W) to ``tones`` levels, with soft steps in flat areas and steep ones at edges.
-
-    Gradients are those of a picture with pixels ``scale`` times as large.
+    Attributes:
+        edges: darkness of the lines.
+        width: of the lines, in pixels.
+        tones: number of levels of luminance; None does not quantize.
+        scale: gradients are those of a picture with pixels so many times as large.
     """
-    from kornia.filters import spatial_gradient  # kornia takes half a second to import
 
-    step = 1 / (tones - 1)
-    nearest = (luminance / step).round() * step
-    gradient = (
-        100 * scale * spatial_gradient(luminance, mode="diff").square().sum(2).clamp(min=MIN_SQUARED_GRADIENT).sqrt()
-    )
-    steepness = SOFT + (CRISP - SOFT) * (gradient / EDGE_GRADIENT).clamp(max=1.0)
-    # Steepness is relative to a step, so that transitions look alike for any number of tones.
-    return nearest + step / 2 * torch.tanh(steepness * (luminance - nearest) / step)
+    edges: float
+    width: float
+    tones: int | None
+    scale: float = 1.0
+
+    def finish(self, _: Tensor, flat: Tensor, __: Inner) -> Tensor:
+        """Quantize the luminance of a flattened image (B, C, H, W), and draw lines along its edges."""
+        luminance, chroma = split_luminance(flat) if flat.shape[1] == 3 else (flat, torch.zeros_like(flat))
+        toned = luminance if self.tones is None else self.quantized(luminance, self.tones)
+        toned = toned * (1 - self.edges * (1 - self.lines(luminance)))
+        return merge_luminance(toned, chroma) if flat.shape[1] == 3 else toned
+
+    def lines(self, luminance: Tensor) -> Tensor:
+        """Compute lines (B, 1, H, W) from a difference of Gaussians: 1 off the lines, towards 0 in their middle."""
+        near, far = blur(luminance, self.width), blur(luminance, WIDER * self.width)
+        difference = 100 * (near - SENSITIVITY * far)
+        return 1 + torch.tanh(FALLOFF * difference.clamp(max=0.0))
+
+    def quantized(self, luminance: Tensor, tones: int) -> Tensor:
+        """Quantize luminance (B, 1, H, W), with soft steps in flat areas and steep ones at edges."""
+        from kornia.filters import spatial_gradient  # kornia takes half a second to import
+
+        step = 1 / (tones - 1)
+        nearest = (luminance / step).round() * step
+        squared = spatial_gradient(luminance, mode="diff").square().sum(2)
+        gradient = 100 * self.scale * squared.clamp(min=MIN_SQUARED_GRADIENT).sqrt()
+        steepness = SOFT + (CRISP - SOFT) * (gradient / EDGE_GRADIENT).clamp(max=1.0)
+        # Steepness is relative to a step, so that transitions look alike for any number of tones.
+        return nearest + step / 2 * torch.tanh(steepness * (luminance - nearest) / step)

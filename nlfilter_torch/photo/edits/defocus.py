@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import dataclass
-from functools import partial
 from typing import ClassVar, Literal
 
 import torch
@@ -111,8 +110,8 @@ class Defocus(ObjectEdit):
         if source.channels not in (1, 3):
             raise ValueError(f"image must have 1 or 3 channels, got {source.channels}; select 1 or 3")
         DEFOCUS.check(aperture=self.aperture, radius=self.radius)
-        radius = float(DEFOCUS["radius"].pixels(self.radius, source.size))
-        check_reach(radius, "radius", source.size)
+        lens = Lens(float(DEFOCUS["radius"].pixels(self.radius, source.size)), self.aperture)
+        check_reach(lens.radius, "radius", source.size)
         region, added = drawn.masks.get("focus_region"), drawn.masks.get("added")
         check_drawn(region, added, "focus_region")
         by_hand = ByHand.of(source, added, drawn.masks.get("removed"), 1)
@@ -121,12 +120,7 @@ class Defocus(ObjectEdit):
             inside = [source.scribbles(region, None, "focus_region", needed=added is None)]
             background = background_of(source, drawn.masks.get("background"), inside[0], "background")
         subject = fit_regions(source, inside, background, self.selection_in(source.size), by_hand)
-        finish = partial(_blurred, radius=radius, aperture=self.aperture)
-        return Fitted(subject.masks, finish, _kernel_radius(radius, self.aperture))
-
-
-def _blurred(image: Tensor, masks: Tensor, _: Inner, *, radius: float, aperture: Aperture) -> Tensor:
-    return blur_behind(image, focus_of(masks), radius, aperture)
+        return Fitted(subject.masks, lens.finish, lens.reach)
 
 
 def focus_of(mask: Tensor) -> Tensor:
@@ -134,29 +128,38 @@ def focus_of(mask: Tensor) -> Tensor:
     return ((mask - BLURRED) / (SHARP - BLURRED)).clamp(0.0, 1.0)
 
 
-def blur_behind(image: Tensor, focus: Tensor, radius: float, aperture: Aperture) -> Tensor:
-    """Blur the background of an image by itself, and blend it by the fraction of each pixel that is in focus."""
-    behind = (1 - focus).square() + SUBJECT_WEIGHT  # SUBJECT_WEIGHT matters only where there is no background nearby
-    sums = convolve(torch.cat([image * behind, behind], dim=1), blur_kernel(radius, aperture).to(image))
-    blurred = torch.lerp(sums[:, :-1] / sums[:, -1:], image, focus)
-    return torch.where(focus == 1, image, blurred)
+@dataclass(frozen=True)
+class Lens:
+    """What blurs the background: a radius in pixels, and the shape of the aperture."""
 
+    radius: float
+    aperture: Aperture
 
-def _kernel_radius(radius: float, aperture: Aperture) -> int:
-    """Radius of the kernel in pixels; for a Gaussian, three standard deviations."""
-    return math.ceil(radius + 0.5) if aperture == "disc" else math.ceil(1.5 * radius)
+    @property
+    def reach(self) -> int:
+        """Radius of the kernel in pixels; for a Gaussian, three standard deviations."""
+        return math.ceil(self.radius + 0.5) if self.aperture == "disc" else math.ceil(1.5 * self.radius)
 
+    def kernel(self) -> Tensor:
+        """Compute a square kernel of unit sum: a disc with a soft rim, or a Gaussian of the same variance."""
+        axis = torch.arange(-self.reach, self.reach + 1, dtype=torch.float64)
+        squared = axis.square().unsqueeze(0) + axis.square().unsqueeze(1)
+        if self.aperture == "disc":
+            kernel = (self.radius + 0.5 - squared.sqrt()).clamp(0.0, 1.0)
+        else:
+            kernel = torch.exp(-squared / (2 * (self.radius / 2) ** 2))
+        return kernel / kernel.sum()
 
-def blur_kernel(radius: float, aperture: Aperture) -> Tensor:
-    """Compute a square kernel of unit sum: a disc with a soft rim, or a Gaussian of the same variance."""
-    half_width = _kernel_radius(radius, aperture)
-    axis = torch.arange(-half_width, half_width + 1, dtype=torch.float64)
-    squared = axis.square().unsqueeze(0) + axis.square().unsqueeze(1)
-    if aperture == "disc":
-        kernel = (radius + 0.5 - squared.sqrt()).clamp(0.0, 1.0)
-    else:
-        kernel = torch.exp(-squared / (2 * (radius / 2) ** 2))
-    return kernel / kernel.sum()
+    def finish(self, image: Tensor, masks: Tensor, _: Inner) -> Tensor:
+        """Blur an image behind the subject that masks (B, 1, H, W) show."""
+        return self.blur_behind(image, focus_of(masks))
+
+    def blur_behind(self, image: Tensor, focus: Tensor) -> Tensor:
+        """Blur the background of an image by itself, and blend it by the fraction of each pixel that is in focus."""
+        behind = (1 - focus).square() + SUBJECT_WEIGHT  # which matters only where there is no background nearby
+        sums = convolve(torch.cat([image * behind, behind], dim=1), self.kernel().to(image))
+        blurred = torch.lerp(sums[:, :-1] / sums[:, -1:], image, focus)
+        return torch.where(focus == 1, image, blurred)
 
 
 def convolve(planes: Tensor, kernel: Tensor) -> Tensor:

@@ -3,7 +3,7 @@
 Paper: Sec. III, Fig. 6(c), (d); Sec. V.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import ClassVar, Literal, Self
@@ -24,10 +24,8 @@ from nlfilter_torch.nn.denoiser.tiles import STEP
 from nlfilter_torch.operator.options import Completion, FilterOptions, GuideChannels, Sampling
 from nlfilter_torch.photo.declared.declaration import Edit
 from nlfilter_torch.photo.declared.parameters import DENOISE
-from nlfilter_torch.photo.edits.hot_pixels import HotPixels, hot_pixels_of
-from nlfilter_torch.photo.edits.noise import noise_of, profile_of
-from nlfilter_torch.photo.edits.synthesis import remainder
-from nlfilter_torch.photo.picture.changes import change_in_parts
+from nlfilter_torch.photo.edits.noise import HotPixels, hot_pixels_of, noise_of, profile_of
+from nlfilter_torch.photo.picture.changes import change_in_parts, remainder
 from nlfilter_torch.photo.picture.drawn import Drawn
 from nlfilter_torch.photo.picture.edit import PhotoEdit, Rows
 from nlfilter_torch.photo.picture.in_memory import edited
@@ -140,11 +138,11 @@ class Denoise(PhotoEdit):
         DENOISE.check(source.batch, strength=self.strength, brightness=self.brightness, colour=self.colour)
         DENOISE.check(method=self.method)
         fitted = self._fit(source)
-        if _are(1, self.brightness, self.colour):
-            return fitted
-        in_parts = partial(change_in_parts, brightness=self.brightness, colour=self.colour)
-        repaired = None if fitted.repaired is None else partial(_repaired_in_parts, fitted.repaired, in_parts)
-        return replace(fitted.then(in_parts), repaired=repaired)
+        return fitted if _are(1, self.brightness, self.colour) else fitted.then(self.in_parts)
+
+    def in_parts(self, image: Tensor, edited: Tensor) -> Tensor:
+        """The image with the shares of its change that are made."""
+        return change_in_parts(image, edited, brightness=self.brightness, colour=self.colour)
 
     def _fit(self, source: Source[M]) -> Fitted:
         check_count(self.options.num_landmarks, "num_landmarks")
@@ -163,9 +161,9 @@ class Denoise(PhotoEdit):
                     source,
                     "noise_level must be a number for a picture processed in tiles, got a map; denoise it in memory",
                 )
-            denoising = NetworkDenoising(noise, self.strength, hot_pixels)
-            repaired = None if hot_pixels is None else hot_pixels.repaired
-            return Fitted(first_channel, denoising, margin=2 * STEP, step=STEP, repaired=repaired)
+            denoising = NetworkDenoising(replace(self, hot_pixels=hot_pixels), noise)
+            repaired = None if hot_pixels is None else denoising.repaired
+            return Fitted(first_channel, denoising.finish, margin=2 * STEP, step=STEP, repaired=repaired)
         if is_map:
             raise ValueError(
                 "noise_level must be a number or have shape (B,) for method rule, got a map; use method network"
@@ -263,16 +261,6 @@ def _are(number: float, *values: object) -> bool:
     return all(not isinstance(value, Tensor) and value == number for value in values)
 
 
-def _repaired_in_parts(
-    repaired: Callable[[Tensor, Tensor], Tensor],
-    in_parts: Callable[[Tensor, Tensor], Tensor],
-    image: Tensor,
-    span: Tensor,
-) -> Tensor:
-    """Images whose defects are replaced in part, see :attr:`Fitted.repaired`."""
-    return in_parts(image, repaired(image, span))
-
-
 def _in_range(level: object, working: WorkingRange) -> float | Tensor | Noise | NoiseProfile | None:
     """A noise level, in units of pictures, as they are seen in their working range."""
     black, span = working.black.flatten(), working.span.flatten()
@@ -311,16 +299,21 @@ def first_channel(pixels: Pixels) -> Tensor:
 class NetworkDenoising:
     """Denoising by the network, with tiles at the same positions in memory and for a picture read by rows."""
 
+    edit: Denoise
     noise: float | Tensor | Noise | NoiseProfile
-    strength: float | Tensor
-    hot_pixels: HotPixels | None = None
 
-    def __call__(self, image: Tensor, _: Tensor, inner: Inner) -> Tensor:
+    def repaired(self, image: Tensor, span: Tensor) -> Tensor:
+        """Images whose hot pixels are replaced, as far as the edit changes them, see :attr:`Fitted.repaired`."""
+        hot_pixels = self.edit.hot_pixels
+        whole = image if hot_pixels is None else hot_pixels.repaired(image, span)
+        return whole if _are(1, self.edit.brightness, self.edit.colour) else self.edit.in_parts(image, whole)
+
+    def finish(self, image: Tensor, _: Tensor, inner: Inner) -> Tensor:
         """Denoise an image."""
-        image = image if self.hot_pixels is None else self.hot_pixels.removed(image)
+        image = image if self.edit.hot_pixels is None else self.edit.hot_pixels.removed(image)
         noise = self.noise.at(image) if isinstance(self.noise, Noise) else self.noise
         levels = level_planes(noise, image, "noise_level")
-        strength = per_image(self.strength, levels, 4).expand(len(image), -1, -1, -1)
+        strength = per_image(self.edit.strength, levels, 4).expand(len(image), -1, -1, -1)
         levels = levels * strength.repeat_interleave(len(levels) // len(image), dim=0)
         levels = torch.where(deviation_of(levels) < NEGLIGIBLE_NOISE, torch.zeros_like(levels), levels)
         return image - _network(image.device, image.dtype).estimate_in_tiles(image, levels, turns=1, inner=inner)

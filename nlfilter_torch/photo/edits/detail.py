@@ -21,15 +21,13 @@ from nlfilter_torch.operator.features import blur_margin
 from nlfilter_torch.operator.options import Completion, GuideChannels, Sampling
 from nlfilter_torch.photo.declared.declaration import Arguments, Edit
 from nlfilter_torch.photo.declared.parameters import DETAIL, MASK
-from nlfilter_torch.photo.edits.synthesis import Polynomial
 from nlfilter_torch.photo.picture.changes import (
     VARIANCE_SIGMA,
+    DetailChange,
     activity,
     blend_changes,
     change_of_mean,
     limit_by_activity,
-    split_sliders,
-    sum_of,
 )
 from nlfilter_torch.photo.picture.drawn import Drawn
 from nlfilter_torch.photo.picture.edit import PhotoEdit
@@ -165,15 +163,19 @@ class Detail(PhotoEdit):
         """Fit the change of detail of a picture, or of its regions."""
         alpha = self.alpha if drawn.sliders is None else drawn.sliders
         outside = self.outside if drawn.outside is None else drawn.outside
-        masks = drawn.masks
-        counts = [num_regions(source, masks[name], name) for name in ("regions", "added") if name in masks]
-        self._check(source.batch, masks, alpha, outside)
-        if not counts:
-            return self._fit_whole(source, alpha)
-        return self._fit_regions(source, masks, region_sliders(alpha, counts[0]), outside)
+        return replace(self, alpha=alpha, outside=outside)._fit(source, drawn.masks)
 
-    def _check(self, batch: int, masks: Mapping[str, object], alpha: Tensor, outside: Tensor | None) -> None:
+    def _fit(self, source: Source[M], masks: Mapping[str, M]) -> Fitted:
+        """:meth:`fit` with the sliders of the edit."""
+        counts = [num_regions(source, masks[name], name) for name in ("regions", "added") if name in masks]
+        self._check(source.batch, masks)
+        if not counts:
+            return self._fit_whole(source)
+        return self._fit_regions(source, masks, region_sliders(self.alpha, counts[0]))
+
+    def _check(self, batch: int, masks: Mapping[str, object]) -> None:
         """Raise an error for an invalid setting."""
+        alpha, outside = self.alpha, self.outside
         check_alpha(alpha)
         check_count(self.options.num_landmarks, "num_landmarks")
         DETAIL.check(batch, channels=self.channels, limits=self.limits, viewing_size=self.viewing_size)
@@ -198,34 +200,30 @@ class Detail(PhotoEdit):
         """The guide of a picture (H, W) at the viewing size, and the options of the filter."""
         return Guide(self.filter_options(size, fewer_landmarks=True), exact=self.residual is not None)
 
-    def _filtered(self, viewed: Source[M], order: int) -> Polynomial:
-        """The filter of a picture, which gives changes by sliders less 1."""
+    def _detail(self, viewed: Source[M], sliders: Tensor) -> DetailChange:
+        """The change of all of a picture by sliders less 1."""
         residual = None if self.residual is None else self.residual - 1
-        operator = viewed.operator(self.guide(viewed.size))
-        return Polynomial.of(operator, self.planes, order, residual)
+        return DetailChange.of(viewed.operator(self.guide(viewed.size)), self.planes, sliders, residual)
 
-    def _fit_whole(self, source: Source[M], alpha: Tensor) -> Fitted:
+    def _fit_whole(self, source: Source[M]) -> Fitted:
+        alpha = self.alpha
         if alpha.ndim == 2 and len(alpha) not in (1, source.batch):
             raise ValueError(
                 f"alpha must have shape (k+1,), or ({source.batch}, k+1) for a row per image, got "
                 f"{tuple(alpha.shape)}; select the rows"
             )
-        sliders = alpha - 1  # so that sliders of 1 change nothing, bit for bit
-        brighter = None if alpha.ndim == 4 else sliders[..., -1].reshape(-1, 1, 1, 1).to(source.dtype)
-        change = partial(self._change, sliders)
-        return fit_change(source, change, self.planes, self.viewing_size, self.limits, brighter=brighter)
+        brighter = None if alpha.ndim == 4 else (alpha - 1)[..., -1].reshape(-1, 1, 1, 1).to(source.dtype)
+        return fit_change(source, self._change, self.planes, self.viewing_size, self.limits, brighter=brighter)
 
-    def _change(self, sliders: Tensor, viewed: Source[M]) -> Fitted:
+    def _change(self, viewed: Source[M]) -> Fitted:
         """The change of a picture at the viewing size."""
-        order = (sliders.shape[1] if sliders.ndim == 4 else sliders.shape[-1]) - 1
-        change = DetailChange(self._filtered(viewed, order), sliders)
+        change = self._detail(viewed, self.alpha - 1)
         if not isinstance(self.threshold, Tensor) and self.threshold == 0:
-            return Fitted(change.total)
+            return Fitted(change.whole)
         return self._fitted(change)
 
-    def _fit_regions(
-        self, source: Source[M], masks: Mapping[str, M], sliders: Tensor, outside: Tensor | None
-    ) -> Fitted:
+    def _fit_regions(self, source: Source[M], masks: Mapping[str, M], sliders: Tensor) -> Fitted:
+        outside = self.outside
         elsewhere = torch.zeros_like(sliders[0]) if outside is None else outside - 1
         brighter = None if outside is None else change_of_mean(torch.cat([sliders, outside[None] - 1]))
         brighter = None if brighter is None else brighter.to(source.dtype)
@@ -273,11 +271,11 @@ class Detail(PhotoEdit):
     ) -> "RegionalChange":
         """The change of the regions of a picture at the viewing size, by a row of sliders for each and for the rest."""
         selector = self.selection()  # takes the state of the generator before the filter draws from it
-        filtered = self._filtered(viewed, sliders[0].shape[-1] - 1)
+        first = self._detail(viewed, sliders[0])
         if viewed.size != source.size:
             masks = {name: resized_masks(source, mask, viewed.size, name) for name, mask in masks.items()}
         regions = selector.select(viewed, self.marks(Drawn(masks)))
-        return RegionalChange([DetailChange(filtered, row) for row in sliders], regions)
+        return RegionalChange([replace(first, sliders=row) for row in sliders], regions)
 
     def _limited(self, image: Tensor, changes: Tensor, _: Inner) -> Tensor:
         return limit_by_activity(changes, activity(image), self.threshold)
@@ -297,23 +295,6 @@ def region_sliders(alpha: Tensor, count: int) -> Tensor:
             f"{tuple(alpha.shape)}; reshape it"
         )
     return alpha - 1
-
-
-@dataclass(frozen=True, eq=False)
-class DetailChange:
-    """The change of detail by sliders less 1, as added detail and the rest, (B, 2 C, h, w)."""
-
-    filtered: Polynomial
-    sliders: Tensor
-
-    def __call__(self, pixels: Pixels) -> Tensor:
-        """Added detail and the rest of the change at the given pixels."""
-        halves = zip(split_sliders(self.sliders), (0.0, None), strict=True)
-        return torch.cat([self.filtered(pixels, half, weight) for half, weight in halves], dim=1)
-
-    def total(self, pixels: Pixels) -> Tensor:
-        """The change at the given pixels, (B, C, h, w)."""
-        return sum_of(self(pixels))
 
 
 @dataclass(frozen=True, eq=False)

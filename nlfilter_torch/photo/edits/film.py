@@ -7,8 +7,7 @@ again for every other frame, so that equal patches are edited equally in all fra
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
-from typing import TypeVar, cast
+from typing import Concatenate, ParamSpec, TypeVar, cast
 
 import numpy as np
 import torch
@@ -39,6 +38,7 @@ from nlfilter_torch.photo.picture.tiles import Passes
 REFERENCE_PIXELS = 1 << 16
 UNLIMITED_BANDWIDTH = 1e6  # spatial bandwidth in pixels at which distance has no effect
 Cached = TypeVar("Cached")
+P = ParamSpec("P")
 FrameArray = NDArray[np.float32]
 
 
@@ -84,21 +84,21 @@ class FrameOperator(TiledOperator):
 
     def sums(self, planes: Planes, order: int) -> Sums:
         """The sums over the references for the first ``order`` powers of W."""
-        return self.frame.cached_result(partial(self._sums_of_references, planes, order))
+        return self.frame.cached_result(self._sums_of_references, planes, order)
 
     def _sums_of_references(self, planes: Planes, order: int) -> Sums:
         return self._summed_up(planes, order, self.over("Summing up"))
 
     def shifted_inner(self, planes: Planes, shifts: Tensor) -> Tensor:
         """The sums over the references for shifted systems."""
-        return self.frame.cached_result(partial(self._shifted_of_references, planes, shifts))
+        return self.frame.cached_result(self._shifted_of_references, planes, shifts)
 
     def _shifted_of_references(self, planes: Planes, shifts: Tensor) -> Tensor:
         return self._shifted(planes, shifts, self.over("Summing up"))
 
     def mean(self, planes: Planes) -> Tensor:
         """Means over the references."""
-        return self.frame.cached_result(partial(super().mean, planes))
+        return self.frame.cached_result(super().mean, planes)
 
 
 class Frame(Tiled):
@@ -119,17 +119,17 @@ class Frame(Tiled):
             picture.accept_any_scale()
         if working is None:
             return self
-        references = self.cached_result(partial(self._references_in_range, working))
+        references = self.cached_result(self._references_in_range, working)
         return Frame(self.picture.in_range(working), self.passes, references, self.room)
 
     def _references_in_range(self, working: WorkingRange) -> References:
         return References([picture.in_range(working) for picture in self.references.pictures])
 
-    def cached_result(self, compute: Callable[[], Cached]) -> Cached:
-        """Return the next cached result for the references, or compute and cache it."""
+    def cached_result(self, function: Callable[P, Cached], *args: P.args, **kwargs: P.kwargs) -> Cached:
+        """Return the next cached result for the references, or compute it by a function of these, and cache it."""
         if self.num_requested == len(self.references.results):
             with torch.no_grad():
-                self.references.results.append(compute())
+                self.references.results.append(function(*args, **kwargs))
         self.num_requested += 1
         return cast(Cached, self.references.results[self.num_requested - 1])
 
@@ -141,7 +141,7 @@ class Frame(Tiled):
     @full_precision
     def operator(self, guide: Guide) -> FrameOperator:
         """The filter of the references."""
-        learnt = self.cached_result(partial(learn_filter, self.references.pictures, guide))
+        learnt = self.cached_result(learn_filter, self.references.pictures, guide)
         operator = FrameOperator(
             GuidePicture(self.picture, guide),
             learnt.pilot,
@@ -159,7 +159,7 @@ class Frame(Tiled):
 
     def resized(self, size: tuple[int, int]) -> "Frame":
         """The frame, with the references, in a smaller size."""
-        references = self.cached_result(partial(self._resized_references, size))
+        references = self.cached_result(self._resized_references, size)
         return Frame(super().resized(size).picture, replace(self.plain, tile_rows=None), references)
 
     def _resized_references(self, size: tuple[int, int]) -> References:
@@ -167,11 +167,13 @@ class Frame(Tiled):
 
     def measured(self, function: Callable[[Source[RowSource]], Tensor]) -> Tensor:
         """The mean of a measurement over the references."""
-        return self.cached_result(partial(self._average, function))
+        return self.cached_result(self._average, function)
 
-    def _average(self, function: "Callable[[Frame], Tensor]") -> Tensor:
+    def _average(
+        self, function: "Callable[Concatenate[Frame, P], Tensor]", *args: P.args, **kwargs: P.kwargs
+    ) -> Tensor:
         """The mean of a function over the references."""
-        return average([function(frame) for frame in self.reference_frames()])
+        return average([function(frame, *args, **kwargs) for frame in self.reference_frames()])
 
 
 def average(values: Sequence[Tensor]) -> Tensor:

@@ -13,17 +13,19 @@ from nlfilter_torch.operator.features import reduce_channels
 from nlfilter_torch.operator.options import Completion, GuideChannels, Sampling
 from nlfilter_torch.photo.declared.declaration import Edit
 from nlfilter_torch.photo.declared.shared_parameters import LOOK
-from nlfilter_torch.photo.edits.synthesis import Polynomial
+from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.looks.histogram import LocalCurves, Stretch, ramps, tones
 from nlfilter_torch.photo.looks.look_filter import (
     BAND_MARGIN,
     acts,
     band_change,
     check_part,
+    colours_of_nodes,
     lattice_of,
     pointwise,
     texture_change,
 )
+from nlfilter_torch.photo.picture.changes import DetailChange
 from nlfilter_torch.photo.picture.drawn import Drawn
 from nlfilter_torch.photo.picture.edit import PhotoEdit, Rows
 from nlfilter_torch.photo.picture.in_memory import edit_image, edited
@@ -34,6 +36,9 @@ from nlfilter_torch.photo.picture.viewing import fit_change
 
 Numbers = Tensor | Sequence[float]
 TINT = 1 / 255  # difference of channels of a grey pixel that a look colours
+
+#: The parameters of a look that are a function of the colour alone, for programs that take colour tables.
+COLOURS = ("red", "green", "blue", "matrix", "saturation", "lattice", "amount")
 
 
 def apply_look(
@@ -187,8 +192,7 @@ class LookEdit(PhotoEdit):
         pixels: Planes = no_change
         if acts(sliders):
             operator = viewed.operator(Guide(self.filter_options(viewed.size)))
-            filtered = Polynomial.of(operator, luminance, sliders.shape[-1] - 1, None)
-            pixels = partial(_for_all_channels, partial(filtered, alpha=sliders - 1))
+            pixels = partial(_for_all_channels, DetailChange.of(operator, luminance, sliders - 1, None).whole)
         if not acts(gains) and not acts(textured):
             return Fitted(pixels)
         average = mean(viewed, luminance) if acts(gains) else None
@@ -330,3 +334,35 @@ def _numbers(value: Numbers, name: str, dtype: torch.dtype) -> Tensor:
     if numbers.is_complex():
         raise TypeError(f"{name} must be real numbers, got {numbers.dtype}; pass their real part")
     return numbers.to(dtype)
+
+
+def colour_part(step: Step) -> Step:
+    """A look without all that depends on the picture or the surroundings of a pixel; steps of detail have none."""
+    if step.edit != LOOK.name:
+        return Step(LOOK.name)
+    return Step(LOOK.name, **{name: step[name] for name in COLOURS})
+
+
+def colour_table(step: Step, nodes: int) -> Tensor:
+    """Colours (3, n, n, n), in float64, under the :func:`colour_part` of a look, by their red, green and blue before.
+
+    They may leave [0, 1].
+    """
+    colours = colours_of_nodes(nodes).view(1, 3, nodes, nodes * nodes)
+    return _coloured(colour_part(step), colours).view(3, nodes, nodes, nodes)
+
+
+def table_error(step: Step, nodes: int, colours: Tensor) -> float:
+    """Root mean squared error in levels of 255 of a table with that many nodes, at colours (B, 3, H, W)."""
+    table = colour_table(step, nodes) - colours_of_nodes(nodes)
+    shown, exact = (_coloured(part, colours) for part in (Step(LOOK.name, lattice=_flat(table)), colour_part(step)))
+    return 255 * float((shown.clamp(0, 1) - exact.clamp(0, 1)).square().mean().sqrt())
+
+
+def _flat(table: Tensor) -> tuple[float, ...]:
+    return tuple(table.flatten().tolist())
+
+
+def _coloured(look: Step, colours: Tensor) -> Tensor:
+    """Colours (B, 3, H, W) under a look that depends on nothing else."""
+    return edit_image(LookEdit.of(look.arguments((colours.shape[-2], colours.shape[-1]))), colours)

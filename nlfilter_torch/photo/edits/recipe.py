@@ -1,9 +1,10 @@
-"""A whole edit, as saved by the editor, on a picture larger than memory: one step after another, in tiles of rows."""
+"""Edits of pictures larger than memory, in tiles of rows: one step, or a whole edit as saved by the editor."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -12,10 +13,22 @@ from nlfilter_torch.photo.declared.rows import RowSource
 from nlfilter_torch.photo.declared.steps import Step, acting_steps
 from nlfilter_torch.photo.edits.applying import fit_step, scribbles_of
 from nlfilter_torch.photo.picture.changes import blend_edited
-from nlfilter_torch.photo.picture.pictures import Picture, Rows, Tile, mask_of
+from nlfilter_torch.photo.picture.drawn import Drawn
+from nlfilter_torch.photo.picture.pictures import Picture, Rows, RowTarget, Tile, mask_of
+from nlfilter_torch.photo.picture.sampling import Report, in_silence
 from nlfilter_torch.photo.picture.tiled import Tiled
 from nlfilter_torch.photo.picture.tiled_scribbles import RowPainter
-from nlfilter_torch.photo.picture.tiles import Passes, Tiling, between_steps, inner, tile_by_tile
+from nlfilter_torch.photo.picture.tiles import (
+    SAMPLE,
+    Passes,
+    Statistics,
+    Tiling,
+    between_steps,
+    check_target,
+    fill,
+    inner,
+    tile_by_tile,
+)
 
 
 def edit_rows(passes: Passes, source: RowSource, steps: Sequence[Step], name: str) -> Rows:
@@ -94,3 +107,62 @@ def step_tiling(step: Step, passes: Passes, source: RowSource, name: str) -> Ite
 def clipped(tiling: Tiling, limits: tuple[float, float]) -> Tiling:
     """The same rows, with values in a range."""
     return replace(tiling, edit=lambda tile: tiling.edit(tile).clamp(*limits))
+
+
+def stream(
+    step: Step,
+    source: RowSource,
+    target: RowTarget,
+    *,
+    drawn: Drawn[RowSource] | None = None,
+    statistics: Statistics = "sample",
+    sample: int = SAMPLE,
+    tile_rows: int | None = None,
+    memory: int = 1 << 30,
+    report: Report | None = None,
+    generator: torch.Generator | None = None,
+) -> None:
+    """Apply a step of any edit to a picture of any size, with only some of its rows in memory at once.
+
+    The whole picture shares landmarks, balancing and coefficients. Given these, the result at a pixel depends only on
+    its surroundings, so tiles are exact: there are no seams, and the size of the tiles does not matter.
+
+    Args:
+        step: the edit, with its parameters and strokes.
+        source: rows (H, W) or (H, W, S) of 8 or 16 bits or floats: a numpy array or memory map, an array of zarr,
+            anything that returns rows for a slice. One or three channels are colours; one more is transparency, which
+            is copied. Integers are scaled to [0, 1].
+        target: receives the rows in order, by assignment to a slice; of the source's shape and any dtype. For edits
+            that add colours to a grey picture it has three colours, and transparency if the source has it.
+        drawn: scribbles in place of the step's strokes: masks are rows (H, W), (H, W, 1) or, of K regions, (H, W, K)
+            in [0, 1]; colours are rows (H, W, 3) in RGB, read under their mask only, or (H, W, 4) with the mask as last
+            channel, as is what :func:`recolor` adds by hand.
+        statistics: ``"sample"`` balances the filter and computes its coefficients on a sample of the pixels that
+            favours rare patches, and reads the source twice; ``"full"`` continues from there with all pixels, in three
+            or four passes that each cost more than the output.
+        sample: approximate number of pixels of that sample; with as many as the picture has, statistics are full.
+        tile_rows: rows of a tile; None is as many as fit in ``memory``. With 256 MB or more, it is rounded to a
+            multiple of the rows that make 16,384 pixels.
+        memory: bytes that may be used, besides those of source and target.
+        report: called with the name of a stage, the part done and the total.
+        generator: source of randomness for the landmarks; None draws the same for every call.
+
+    Raises:
+        TypeError, ValueError: if an argument or the scribbles do not fit, or the source changes its size while it is
+            read.
+        MemoryError: if the samples, the scribbled pixels or a single row take more than ``memory``.
+
+    Example:
+        >>> picture = np.random.default_rng(0).integers(0, 256, (60, 40, 3), np.uint8)
+        >>> edited = np.empty_like(picture)
+        >>> stream(Step("detail", alpha=(1.0, 1.0), landmarks=20), picture, edited, tile_rows=16)
+        >>> np.array_equal(edited, picture)
+        True
+    """
+    check_target(target, source, coloured=step.declared.coloured)
+    passes = Passes(np.dtype(target.dtype).name, statistics, sample, tile_rows, memory, report or in_silence)
+    tiled = Tiled(Picture(source), passes)
+    drawn = scribbles_of(step, tiled.size, RowPainter()) if drawn is None else drawn
+    with single_threaded(tiled.passes.workers(1)):
+        fitted = fit_step(step, tiled, drawn, generator=generator)
+    fill(target, tiled.rows(fitted))

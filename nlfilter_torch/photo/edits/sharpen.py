@@ -113,21 +113,23 @@ class Sharpen(PhotoEdit):
         noise = kept(viewed, "noise of luminance", [], partial(noise_of, viewed, "luminance"))
         strength = (torch.as_tensor(self.amount, dtype=viewed.dtype).reshape(-1, 1, 1, 1) - 1) / UNIT
         margin = blur_margin(RADIUS) + blur_margin(VARIANCE_SIGMA)
-        return Fitted(partial(_flat_layers, layers), UnsharpMask(noise, strength), margin)
-
-
-def _flat_layers(layers: Planes, pixels: Pixels) -> Tensor:
-    return layers(pixels).flatten(1, 2)
+        mask = UnsharpMask(layers, noise, strength)
+        return Fitted(mask.planes, mask.finish, margin)
 
 
 @dataclass(frozen=True, eq=False)
 class UnsharpMask:
-    """An unsharp mask of luminance without its noise, times a strength (B or 1, 1, 1, 1)."""
+    """An unsharp mask of luminance without its noise, times a strength (B or 1, 1, 1, 1), from its detail layers."""
 
+    layers: Planes
     noise: Noise
     strength: Tensor
 
-    def __call__(self, image: Tensor, planes: Tensor, _: Inner) -> Tensor:
+    def planes(self, pixels: Pixels) -> Tensor:
+        """The layers, (B, 2, h, w)."""
+        return self.layers(pixels).flatten(1, 2)
+
+    def finish(self, image: Tensor, planes: Tensor, _: Inner) -> Tensor:
         """The mask (B, 1, H, W) of an image, from the fine and the smooth layer of its luminance."""
         fine, smooth = planes.chunk(2, dim=1)
         variance = self.noise.at(_grey(image)).square()

@@ -1,7 +1,6 @@
 """Contrast and local contrast around the mean by the last two sliders. Paper: Figs. 6(a), 7(b) to 10(b)."""
 
 from dataclasses import dataclass
-from functools import partial
 from typing import ClassVar
 
 import torch
@@ -11,14 +10,14 @@ from nlfilter_torch.core.checks import check_count, check_order
 from nlfilter_torch.operator.options import Completion, GuideChannels, Sampling
 from nlfilter_torch.photo.declared.declaration import Edit
 from nlfilter_torch.photo.declared.parameters import TONE
-from nlfilter_torch.photo.edits.synthesis import Polynomial
+from nlfilter_torch.photo.picture.changes import DetailChange
 from nlfilter_torch.photo.picture.drawn import Drawn
 from nlfilter_torch.photo.picture.edit import PhotoEdit
 from nlfilter_torch.photo.picture.in_memory import edited
 from nlfilter_torch.photo.picture.limits import Limits
 from nlfilter_torch.photo.picture.measuring import mean
-from nlfilter_torch.photo.picture.pixels import M
-from nlfilter_torch.photo.picture.source import Fitted, Guide, Pixels, Source, luminance
+from nlfilter_torch.photo.picture.pixels import LessMean, M
+from nlfilter_torch.photo.picture.source import Fitted, Guide, Source, luminance
 from nlfilter_torch.photo.picture.viewing import fit_change
 
 
@@ -106,9 +105,8 @@ class Tone(PhotoEdit):
 
     def _change(self, viewed: Source[M]) -> Fitted:
         """The change of luminance of a picture at the viewing size."""
-        operator, average = viewed.operator(self.guide(viewed.size)), mean(viewed, luminance)
-        filtered = Polynomial.of(operator, partial(_without, average), self.order, None)
-        return Fitted(partial(filtered, alpha=self._sliders(viewed.batch, viewed.dtype)))
+        operator, planes = viewed.operator(self.guide(viewed.size)), LessMean(luminance, mean(viewed, luminance))
+        return Fitted(DetailChange.of(operator, planes, self._sliders(viewed.batch, viewed.dtype), None).whole)
 
     def _sliders(self, batch: int, dtype: torch.dtype) -> Tensor:
         """Sliders less 1, (B, k+1), with which the filter gives the change."""
@@ -117,8 +115,3 @@ class Tone(PhotoEdit):
         )
         fine = [torch.zeros(batch, dtype=contrast.dtype, device=contrast.device)] * (self.order - 1)
         return torch.stack([*fine, clarity, contrast], dim=1)
-
-
-def _without(mean: Tensor, pixels: Pixels) -> Tensor:
-    """Luminance of pixels less the mean."""
-    return luminance(pixels) - mean

@@ -1,12 +1,19 @@
 """Changes of detail: added detail and the rest, less of it in flat areas, and the changes of several regions."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
 
 import torch
 from torch import Tensor
 
+from nlfilter_torch.core.kernels.tall_skinny import spread
 from nlfilter_torch.core.precision import per_image, squarable
+from nlfilter_torch.filtering.filters import residual_change, weigh_layers
 from nlfilter_torch.operator.features import blur, reduce_channels
+from nlfilter_torch.operator.pixel_matrix import Columns
+from nlfilter_torch.operator.spectrum import Response
+from nlfilter_torch.photo.picture.source import Operator, Pixels, Planes
 
 VARIANCE_SIGMA = 2.0  # standard deviation in pixels of the Gaussian window for the local variance
 EPSILON = 1e-12
@@ -87,3 +94,66 @@ def blend_edited(image: Tensor, edited: Sequence[Tensor], masks: Tensor) -> Tens
     before = image.expand(-1, max(version.shape[1] for version in edited), -1, -1)
     changes = [version - before for version in edited]
     return before + blend_changes(torch.cat([*changes, torch.zeros_like(before)], dim=1), masks)
+
+
+@dataclass(frozen=True, eq=False)
+class DetailChange:
+    """A change of planes of a picture by sliders less 1, with :func:`polynomial_filter`.
+
+    Attributes:
+        planes: what is changed.
+        layers: its detail layers.
+        sliders: less 1, so that sliders of 1 change nothing, bit for bit.
+        residual: weight of the residual, less 1; None is that of eq. 12.
+        captured: the planes, projected on the eigenvectors; None if ``residual`` is.
+        share: remainder r of the diagonal of W; None if ``residual`` is.
+    """
+
+    planes: Planes
+    layers: Planes
+    sliders: Tensor
+    residual: float | Tensor | None = None
+    captured: Planes | None = None
+    share: Planes | None = None
+
+    @staticmethod
+    def of(operator: Operator, planes: Planes, sliders: Tensor, residual: float | Tensor | None) -> "DetailChange":
+        """Prepare the change of planes of a picture."""
+        order = (sliders.shape[1] if sliders.ndim == 4 else sliders.shape[-1]) - 1
+        layers = operator.layers(planes, order)
+        if residual is None:
+            return DetailChange(planes, layers, sliders)
+        captured = synthesize(operator, torch.ones_like, operator.coefficients(planes))
+        return DetailChange(planes, layers, sliders, residual, captured, operator.of_columns(remainder))
+
+    def __call__(self, pixels: Pixels) -> Tensor:
+        """Added detail and the rest of the change at the given pixels, (B, 2 C, h, w)."""
+        halves = zip(split_sliders(self.sliders), (0.0, self.residual), strict=True)
+        return torch.cat([self._by(pixels, half, weight) for half, weight in halves], dim=1)
+
+    def whole(self, pixels: Pixels) -> Tensor:
+        """The change at the given pixels, (B, C, h, w)."""
+        return self._by(pixels, self.sliders, self.residual)
+
+    def _by(self, pixels: Pixels, sliders: Tensor, weight: float | Tensor | None) -> Tensor:
+        """The change by these sliders, and with this weight of the residual if there is one."""
+        filtered = weigh_layers(self.layers(pixels), sliders)
+        if weight is None or self.captured is None or self.share is None:
+            return filtered
+        residual = self.planes(pixels) - self.captured(pixels)
+        return filtered + residual_change(sliders, weight, residual, self.share(pixels))
+
+
+def synthesize(operator: Operator, response: Response, coefficients: Tensor) -> Planes:
+    """Compute ``V f(S) V^T y`` for a response f and coefficients (B, C, M) of y."""
+    total = coefficients @ operator.pairs.gain(response).mT
+    return operator.of_columns(partial(_spread, total))
+
+
+def _spread(total: Tensor, columns: Columns) -> Tensor:
+    return spread(total.to(columns.factor), columns.factor, columns.scaling)
+
+
+def remainder(columns: Columns) -> Tensor:
+    """Part r of the diagonal of W that the factor lacks, (B, 1, n)."""
+    return columns.remainder.unsqueeze(1)

@@ -59,6 +59,18 @@ def whole_image(pixels: Pixels) -> Tensor:
     return pixels.image
 
 
+@dataclass(frozen=True, eq=False)
+class LessMean:
+    """Planes of a picture less their means (B, C, 1, 1)."""
+
+    planes: Planes
+    mean: Tensor
+
+    def __call__(self, pixels: Pixels) -> Tensor:
+        """The planes at given pixels."""
+        return self.planes(pixels) - self.mean
+
+
 def part_of(planes: Tensor) -> Planes:
     """Function that returns the part of planes (B, ..., H, W) of a picture at given pixels."""
 

@@ -1,6 +1,7 @@
 """The trained denoiser: no change without noise, no seams between tiles, precisions, gradients and what it refuses."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -14,8 +15,9 @@ from nlfilter_torch.nn.denoiser import tiles
 from nlfilter_torch.nn.denoiser.network import NOISIEST, PIXELS, TRAINED, WIDTH, level_planes
 from nlfilter_torch.nn.denoiser.profile import KNOTS, NoiseProfile, join_colours, split_colours, split_noise
 from nlfilter_torch.nn.denoiser.tiles import SIDE, STEP, in_tiles
+from nlfilter_torch.operator.options import FilterOptions
 from nlfilter_torch.photo import denoise
-from nlfilter_torch.photo.edits.denoise import NetworkDenoising
+from nlfilter_torch.photo.edits.denoise import Denoise, NetworkDenoising
 from tests.pairwise import each_value
 from tests.problems import colour, decibels, noisy, seeded
 from tests.rounding import denoiser_rounding
@@ -194,13 +196,14 @@ def test_levels_above_those_of_training_keep_their_ratios() -> None:
 
 def test_the_edit_takes_profiles_with_a_strength_for_each_image() -> None:
     images, profile = torch.cat([noisy(CAT, 0.1), CAT])[..., :64, :64], coarse_profile(0.1)
-    run = NetworkDenoising(profile, torch.tensor([1.0, 0.5]))
-    result = run(images, images[:, :1], EVERYWHERE)
+    edit = Denoise(noise_level=None, strength=torch.tensor([1.0, 0.5]), method="network", options=FilterOptions())
+    result = NetworkDenoising(edit, profile).finish(images, images[:, :1], EVERYWHERE)
     with torch.no_grad():
         for number, strength in enumerate((1.0, 0.5)):
             wanted = TRAINED_ONE(images[number], profile.scaled(strength))
             torch.testing.assert_close(result[number], wanted, rtol=0, atol=1e-3)
-    assert torch.equal(NetworkDenoising(profile.scaled(1e-3), 1.0)(images, images[:, :1], EVERYWHERE), images)
+    weak = NetworkDenoising(replace(edit, strength=1.0), profile.scaled(1e-3))
+    assert torch.equal(weak.finish(images, images[:, :1], EVERYWHERE), images)
 
 
 @pytest.mark.parametrize("channels", [2, 4])

@@ -9,7 +9,9 @@ from torch import Tensor
 from nlfilter_torch.photo import Look, apply_look
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.edits.applying import apply_step
+from nlfilter_torch.photo.edits.look import colour_part, colour_table, table_error
 from nlfilter_torch.photo.edits.recipe import edit_rows
+from nlfilter_torch.photo.looks.look_filter import colours_of_nodes
 from nlfilter_torch.photo.picture.in_memory import InMemory
 from nlfilter_torch.photo.picture.tiles import Passes
 from tests.looks import ALPHA, BANDS, BENT, CAT, CUP, LOCAL, SEPIA, STRETCH, TEXTURE, VIVID
@@ -96,3 +98,26 @@ def test_looks_of_colours_need_no_smaller_picture(monkeypatch: pytest.MonkeyPatc
     assert torch.equal(apply_look(image, red=curve, viewing_size=0.001), whole)
     with pytest.raises(AttributeError, match="resized"):
         apply_look(image, alpha=(2.0, 1.0, 1.0, 1.0), red=curve, viewing_size=0.001)
+
+
+LOOK = Step("look", red=BENT, matrix=SEPIA, saturation=VIVID, amount=0.8)
+
+
+def test_only_what_depends_on_the_colour_alone_is_in_the_table() -> None:
+    whole = LOOK.changed(alpha=ALPHA, bands=BANDS, local=LOCAL, stretch=STRETCH)
+    assert colour_part(whole) == LOOK
+    assert colour_part(Step("detail")) == Step("look")
+    assert torch.equal(colour_table(whole, 5), colour_table(LOOK, 5))
+
+
+def test_the_table_holds_the_colours_of_its_nodes() -> None:
+    nodes = colours_of_nodes(4).view(1, 3, 8, 8)
+    torch.testing.assert_close(colour_table(LOOK, 4), apply_step(LOOK, nodes).view(3, 4, 4, 4))
+
+
+def test_finer_tables_are_more_exact_and_exact_for_curves() -> None:
+    curve = Step("look", red=BENT, green=BENT, blue=BENT)
+    assert table_error(curve, 33, CAT) < 1e-3
+    errors = [table_error(LOOK, nodes, CAT) for nodes in (5, 9, 33)]
+    assert errors[0] > errors[1] > errors[2]
+    assert errors[2] < 0.5

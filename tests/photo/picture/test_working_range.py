@@ -24,7 +24,7 @@ from nlfilter_torch.photo import (
 from nlfilter_torch.photo.app.preview import Preview
 from nlfilter_torch.photo.edits.film import FilmEdit
 from nlfilter_torch.photo.edits.parts import Parts, Rectangle
-from nlfilter_torch.photo.edits.streaming import stream
+from nlfilter_torch.photo.edits.recipe import stream
 from nlfilter_torch.photo.picture.in_memory import InMemory
 from nlfilter_torch.photo.picture.tiles import Passes
 from nlfilter_torch.photo.picture.working_range import LEAST_STEPS, range_of

@@ -14,8 +14,8 @@ from torch import Tensor
 from nlfilter_torch.core.inner import Inner
 from nlfilter_torch.photo import Step, denoise, stream
 from nlfilter_torch.photo.cli import editing, main
-from nlfilter_torch.photo.edits import hot_pixels
-from nlfilter_torch.photo.edits.hot_pixels import MARGIN, hot_pixels_of, in_order
+from nlfilter_torch.photo.edits import noise as module
+from nlfilter_torch.photo.edits.noise import MARGIN, hot_pixels_of, in_order
 from nlfilter_torch.photo.picture.in_memory import InMemory
 from tests.pairwise import each_value
 from tests.problems import colour, luminance
@@ -197,12 +197,12 @@ class Rows:
 def test_parts_have_the_numbers_of_the_whole() -> None:
     image, floor = torch.rand(2, 3, 60, 40, generator=torch.Generator().manual_seed(0)), torch.tensor([0.01, 0.02])
     image[:, :, 17, 20] = 9.0
-    whole = hot_pixels._numbers(InMemory(image), floor)
+    whole = module._numbers(InMemory(image), floor)
     total, values = torch.zeros(()), []
     for start in range(0, 60, 17):
         first, stop = max(start - MARGIN, 0), min(start + 17, 60)
         part, inner = image[:, :, first : stop + MARGIN], (slice(start - first, stop - first), slice(None))
-        numbers = hot_pixels._numbers(Rows(part, inner, part[..., *inner], start * 40, 40), floor)
+        numbers = module._numbers(Rows(part, inner, part[..., *inner], start * 40, 40), floor)
         total = total + numbers.numbers
         values.append(numbers.values)
     assert torch.equal(total, whole.numbers)
