@@ -32,10 +32,10 @@ from .nn.sliders import PolynomialSliders as PolynomialSliders
 from .operator.build import nonlocal_operator as nonlocal_operator
 from .operator.build import operator_from_features as operator_from_features
 from .operator.features import estimate_bandwidth as estimate_bandwidth
+from .operator.hidden import pad_images as pad_images
 from .operator.operator import Certificate as Certificate
 from .operator.operator import Diagnostics as Diagnostics
 from .operator.operator import NonlocalOperator as NonlocalOperator
-from .operator.padding import pad_images as pad_images
 from .operator.spectrum import Spectrum as Spectrum
 
 __version__: str

@@ -16,7 +16,7 @@ from torch import Tensor
 from benchmarks.harness import Figure
 from benchmarks.layers.point_sets import ISSUE, MORE, POINTS, PointSet
 from nlfilter_torch import NonlocalOperator, nonlocal_operator, operator_from_features
-from nlfilter_torch.operator.coverage import LARGEST_SHARE
+from nlfilter_torch.operator.traps import LARGEST_SHARE
 
 SEED = 40
 DRAWS = 3  # choices of landmarks, whose errors are averaged

@@ -28,7 +28,7 @@ from nlfilter_torch import (
 )
 from nlfilter_torch.core.rational import interval_nodes, rational_form
 from nlfilter_torch.filtering.lanczos import Lanczos, gains_of
-from nlfilter_torch.filtering.rational_product import rational_product
+from nlfilter_torch.filtering.matrix_function import rational_product
 
 LEVELS = 255
 Response = Callable[[Tensor], Tensor]

@@ -1,4 +1,4 @@
-"""Planes of pixels: blocks that fit the cache, batches folded into channels, weights, and a stratified sample."""
+"""Planes of pixels: blocks that fit the cache, inner parts, batches folded into channels, and a sample."""
 
 from collections.abc import Iterator
 
@@ -152,3 +152,12 @@ def stratified(pixels: int, count: int, generator: torch.Generator) -> Tensor:
     device = generator.device
     offsets = torch.rand(count, generator=generator, device=device, dtype=torch.float64)
     return ((torch.arange(count, device=device) + offsets) * (pixels / count)).long().clamp_(max=pixels - 1)
+
+
+Inner = tuple[slice, slice]  # rows and columns
+EVERYWHERE: Inner = (slice(None), slice(None))
+
+
+def shaped_as(image: Tensor, planes: Tensor) -> Tensor:
+    """View planes (B, C, ...) with the size of an image of as many pixels, (B', C', ...)."""
+    return planes.flatten(2).unflatten(2, image.shape[2:])

@@ -4,10 +4,10 @@ Other modules use only public parts of torch. A new version of torch may rename 
 ``make test-oldest`` runs the tests with the oldest supported version, ``make test`` with that of ``constraints.txt``.
 
 Built on them are the tests whether values of tensors can be read, the refusal of transforms under which no operator
-can be built, and the registration of operators. Reading a value (``float(tensor)``, ``if tensor``) makes the CPU wait
-for an accelerator, and is impossible for tensors without data: on the device "meta", as fake tensors, under
-``torch.compile`` and ``torch.export``. In these cases checks of values are skipped, and iterations run a fixed number
-of steps.
+can be built, the registration of operators, gradients of low rank, and the memory format of results. Reading a value
+(``float(tensor)``, ``if tensor``) makes the CPU wait for an accelerator, and is impossible for tensors without data: on
+the device "meta", as fake tensors, under ``torch.compile`` and ``torch.export``. In these cases checks of values are
+skipped, and iterations run a fixed number of steps.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -334,3 +334,66 @@ def are_derived(arguments: Sequence[Any]) -> bool:
     if not in_forward_mode():
         return False
     return any(isinstance(t, Tensor) and forward_ad.unpack_dual(t).tangent is not None for t in arguments)
+
+
+class OuterProduct(Tensor):
+    """A low-rank gradient ``left @ right`` of the factor, evaluated only when needed.
+
+    The gradients of products with W and of balancing are low-rank matrices (B, M, N). When autograd adds them, their
+    factors are concatenated, and the backward pass of the Nystrom factor evaluates the sum block by block. This saves
+    three copies of the factor. Any other operation sees an ordinary tensor.
+
+    Attributes:
+        left: (B, M, r).
+        right: (B, r, N).
+    """
+
+    left: Tensor
+    right: Tensor
+
+    @staticmethod
+    def __new__(cls, left: Tensor, right: Tensor) -> "OuterProduct":
+        """Create a tensor that has the shape of the product but owns no memory."""
+        shape = (left.shape[0], left.shape[1], right.shape[2])
+        product = cast(OuterProduct, without_memory(cls, shape, left))
+        product.left, product.right = left, right
+        return product
+
+    def formed(self) -> Tensor:
+        """The product as an ordinary tensor, (B, M, N)."""
+        return torch.bmm(self.left, self.right)
+
+    @classmethod
+    def __torch_dispatch__(cls, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:  # type: ignore[override]
+        if func is torch.ops.aten.detach.default:
+            return args[0]
+        if func is torch.ops.aten.add.Tensor and not kwargs and all(isinstance(a, OuterProduct) for a in args):
+            left = torch.cat([a.left for a in args], dim=2)
+            return OuterProduct(left, torch.cat([a.right for a in args], dim=1))
+        args, kwargs = replace_instances(OuterProduct, OuterProduct.formed, (args, kwargs or {}))
+        return func(*args, **kwargs)
+
+
+def outer_product(left: Tensor, right: Tensor) -> Tensor:
+    """``left @ right``, stored as its two factors if they are smaller than the product."""
+    if left.shape[2] >= left.shape[1] or torch.compiler.is_compiling():
+        return torch.bmm(left, right)
+    return OuterProduct(left, right)
+
+
+def factors_of(gradient: Tensor) -> tuple[Tensor, ...]:
+    """Factors (B, M, r) and (B, r, N) of a low-rank gradient, or the gradient itself as a tuple of one."""
+    return (gradient.left, gradient.right) if isinstance(gradient, OuterProduct) else (gradient,)
+
+
+def in_format_of(result: Tensor, image: Tensor) -> Tensor:
+    """Convert a result (B, C, *size) to the dtype of ``image``, and to channels-last if ``image`` is."""
+    result = result.to(image.dtype)
+    channels_last = {4: torch.channels_last, 5: torch.channels_last_3d}.get(image.ndim)
+    if image.is_contiguous() or channels_last is None:
+        return result
+    # Dynamo cannot trace this, and has no such tensors.
+    if not torch.compiler.is_compiling() and any(map(is_transformed, (image, result))):
+        return result
+    is_last = image.is_contiguous(memory_format=channels_last)
+    return result.contiguous(memory_format=channels_last) if is_last else result

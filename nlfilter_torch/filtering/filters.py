@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from nlfilter_torch.core.blocks import for_planes
+from nlfilter_torch.core.blocks import for_planes, shaped_as
 from nlfilter_torch.core.checks import (
     check_alpha,
     check_dtype,
@@ -18,8 +18,8 @@ from nlfilter_torch.core.checks import (
     check_unit_range,
     check_values,
 )
-from nlfilter_torch.core.layouts import in_format_of, shaped_as
 from nlfilter_torch.core.precision import full_precision, per_image
+from nlfilter_torch.core.torch_internals import in_format_of
 from nlfilter_torch.operator.operator import NonlocalOperator
 from nlfilter_torch.operator.pixel_matrix import Columns
 

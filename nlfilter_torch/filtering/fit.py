@@ -23,8 +23,8 @@ from nlfilter_torch.core.checks import (
     check_values,
 )
 from nlfilter_torch.core.communicator import ALONE, Communicator
-from nlfilter_torch.core.matrix_function import SymmetricMatrix
 from nlfilter_torch.core.precision import full_precision
+from nlfilter_torch.core.symmetric_matrix import SymmetricMatrix
 from nlfilter_torch.core.torch_internals import is_hidden
 from nlfilter_torch.filtering.filters import detail_layers
 from nlfilter_torch.operator.operator import NonlocalOperator

@@ -17,8 +17,8 @@ from torch import Tensor
 from nlfilter_torch.core.blocks import weighted
 from nlfilter_torch.core.checks import Response
 from nlfilter_torch.core.communicator import Communicator
-from nlfilter_torch.core.matrix_function import MEETING, divided_differences
 from nlfilter_torch.core.precision import once_differentiable
+from nlfilter_torch.core.symmetric_matrix import MEETING, divided_differences
 from nlfilter_torch.core.torch_internals import for_each_gradient
 from nlfilter_torch.operator.pixel_matrix import PixelMatrix
 

@@ -24,9 +24,8 @@ from nlfilter_torch.core.checks import (
     described,
 )
 from nlfilter_torch.core.communicator import ALONE, Communicator
-from nlfilter_torch.core.layouts import in_format_of
 from nlfilter_torch.core.precision import full_precision, per_image, working_dtype
-from nlfilter_torch.core.torch_internals import is_hidden
+from nlfilter_torch.core.torch_internals import in_format_of, is_hidden
 from nlfilter_torch.operator.build import checked_operator
 from nlfilter_torch.operator.features import estimate_bandwidth
 from nlfilter_torch.operator.operator import NonlocalOperator

@@ -5,7 +5,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from nlfilter_torch.core.blocks import fold_batch, weighted
+from nlfilter_torch.core.blocks import fold_batch, shaped_as, weighted
 from nlfilter_torch.core.checks import (
     check_finite,
     check_fits,
@@ -15,8 +15,8 @@ from nlfilter_torch.core.checks import (
     check_values,
     checked_response,
 )
-from nlfilter_torch.core.layouts import in_format_of, shaped_as
 from nlfilter_torch.core.precision import full_precision, per_image, working_dtype
+from nlfilter_torch.core.torch_internals import in_format_of
 from nlfilter_torch.filtering.matrix_function import TOLERANCE, apply_function
 from nlfilter_torch.operator.operator import NonlocalOperator
 from nlfilter_torch.operator.spectrum import Response, Spectrum

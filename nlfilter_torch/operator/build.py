@@ -23,15 +23,6 @@ from nlfilter_torch.core.torch_internals import is_hidden, outside_transforms, r
 from nlfilter_torch.core.warning import warn
 from nlfilter_torch.operator.assignment import Assignment, Layout
 from nlfilter_torch.operator.counting import assign_among_counted, extended, hidden_points
-from nlfilter_torch.operator.coverage import (
-    FEW,
-    HALF,
-    LARGEST_SHARE,
-    LEAST_POINTS,
-    SAMPLED,
-    sampled_points,
-    share_above,
-)
 from nlfilter_torch.operator.eigenvalue_bound import exceeds, is_bounded, limiter, slack
 from nlfilter_torch.operator.features import (
     GuideFeatures,
@@ -41,7 +32,7 @@ from nlfilter_torch.operator.features import (
     reduce_channels,
     unit_window,
 )
-from nlfilter_torch.operator.held import landmarks_by
+from nlfilter_torch.operator.landmarks import landmarks_by
 from nlfilter_torch.operator.nystrom import inverse_cholesky
 from nlfilter_torch.operator.operator import Kernel, NonlocalOperator
 from nlfilter_torch.operator.option_checks import check_bandwidths, check_options, landmark_count
@@ -60,7 +51,17 @@ from nlfilter_torch.operator.sinkhorn import (
     sinkhorn_balance,
     warn_of_residual,
 )
-from nlfilter_torch.operator.traps import warn_of_scale_of_features, warn_of_units
+from nlfilter_torch.operator.traps import (
+    FEW,
+    HALF,
+    LARGEST_SHARE,
+    LEAST_POINTS,
+    SAMPLED,
+    sampled_points,
+    share_above,
+    warn_of_scale_of_features,
+    warn_of_units,
+)
 
 
 def _is_small(bandwidth: float | Tensor | str) -> bool:

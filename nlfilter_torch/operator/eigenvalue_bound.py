@@ -13,7 +13,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from nlfilter_torch.core.matrix_function import SymmetricMatrix
+from nlfilter_torch.core.symmetric_matrix import SymmetricMatrix
 from nlfilter_torch.operator.options import Landmarks
 
 # Amount by which eigenvalues may exceed 1 through rounding and inexact row sums; r exceeds 1 by less.

@@ -15,9 +15,8 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.core.kernels.columns import columns, columns_backward
-from nlfilter_torch.core.low_rank import factors_of
 from nlfilter_torch.core.precision import once_differentiable
-from nlfilter_torch.core.torch_internals import for_each_gradient, is_hidden, register
+from nlfilter_torch.core.torch_internals import factors_of, for_each_gradient, is_hidden, register
 from nlfilter_torch.operator.options import Completion
 
 CANCELLATION = 1e-7  # error of a squared distance above which distances are not computed from matrix products

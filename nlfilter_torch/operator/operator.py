@@ -18,11 +18,9 @@ from nlfilter_torch.core.checks import (
 from nlfilter_torch.core.communicator import ALONE, Communicator
 from nlfilter_torch.core.containers import Batch, loadable
 from nlfilter_torch.core.kernels.tall_skinny import moment, spread
-from nlfilter_torch.core.layouts import in_format_of
 from nlfilter_torch.core.precision import full_precision, trainable, uncompiled
-from nlfilter_torch.core.torch_internals import outside_transforms, refuse_transforms
+from nlfilter_torch.core.torch_internals import in_format_of, outside_transforms, refuse_transforms
 from nlfilter_torch.operator.assignment import Assignment
-from nlfilter_torch.operator.coverage import SAMPLED, SampledRows, sampled_points
 from nlfilter_torch.operator.eigenvalue_bound import largest_eigenvalue
 from nlfilter_torch.operator.features import GuideFeatures
 from nlfilter_torch.operator.nystrom import nystrom_factor
@@ -30,6 +28,7 @@ from nlfilter_torch.operator.options import Completion
 from nlfilter_torch.operator.pixel_matrix import Columns, PixelMatrix
 from nlfilter_torch.operator.scaling import KernelMatrix, PixelScaling
 from nlfilter_torch.operator.spectrum import Spectrum, compute_spectrum
+from nlfilter_torch.operator.traps import SAMPLED, SampledRows, sampled_points
 
 DENSE_LIMIT = 1 << 14  # pixels; the dense matrix of a 128x128 image takes 1 GB in float32
 

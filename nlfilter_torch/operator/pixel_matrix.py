@@ -17,11 +17,9 @@ from torch import Tensor
 
 from nlfilter_torch.core.blocks import root_weighted, weighted
 from nlfilter_torch.core.communicator import ALONE, Communicator
-from nlfilter_torch.core.kernels.grams import compute_grams, sum_grams
-from nlfilter_torch.core.kernels.tall_skinny import moment, spread
-from nlfilter_torch.core.low_rank import outer_product
+from nlfilter_torch.core.kernels.tall_skinny import compute_grams, moment, spread, sum_grams
 from nlfilter_torch.core.precision import once_differentiable
-from nlfilter_torch.core.torch_internals import for_each_gradient, in_transform, is_hidden
+from nlfilter_torch.core.torch_internals import for_each_gradient, in_transform, is_hidden, outer_product
 
 SMALL = 1 << 17  # pixels up to which Gram matrices are summed in float64 throughout
 LEAST_APART = 1e-9  # of the smallest difference from r

@@ -32,8 +32,7 @@ from torch import Tensor
 
 from nlfilter_torch.core.blocks import stratified, weighted
 from nlfilter_torch.core.communicator import ALONE, Communicator
-from nlfilter_torch.core.kernels.grams import sum_grams
-from nlfilter_torch.core.kernels.tall_skinny import moment, positive_root, spread, sweep, weigh
+from nlfilter_torch.core.kernels.tall_skinny import moment, positive_root, spread, sum_grams, sweep, weigh
 from nlfilter_torch.core.torch_internals import is_hidden
 from nlfilter_torch.core.warning import warn
 

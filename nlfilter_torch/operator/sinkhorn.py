@@ -30,9 +30,8 @@ from torch import Tensor
 from nlfilter_torch.core.blocks import SWEPT, pixel_blocks, weighted
 from nlfilter_torch.core.communicator import Communicator
 from nlfilter_torch.core.kernels.tall_skinny import gather, spread
-from nlfilter_torch.core.low_rank import outer_product
 from nlfilter_torch.core.precision import once_differentiable
-from nlfilter_torch.core.torch_internals import for_each_gradient, is_hidden, register
+from nlfilter_torch.core.torch_internals import for_each_gradient, is_hidden, outer_product, register
 from nlfilter_torch.core.warning import warn
 from nlfilter_torch.operator.eigenvalue_bound import ALWAYS, exceeds, slack
 from nlfilter_torch.operator.pixel_matrix import PixelMatrix

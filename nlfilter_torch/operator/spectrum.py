@@ -18,10 +18,9 @@ from nlfilter_torch.core.blocks import fold_batch, root_weighted, unfold_batch, 
 from nlfilter_torch.core.checks import check_coefficients, check_fits, check_instance, checked_response
 from nlfilter_torch.core.communicator import ALONE, Communicator
 from nlfilter_torch.core.containers import Batch, loadable
-from nlfilter_torch.core.kernels.grams import compute_grams
-from nlfilter_torch.core.kernels.tall_skinny import moment, spread
-from nlfilter_torch.core.matrix_function import SymmetricMatrix
+from nlfilter_torch.core.kernels.tall_skinny import compute_grams, moment, spread
 from nlfilter_torch.core.precision import full_precision, trainable
+from nlfilter_torch.core.symmetric_matrix import SymmetricMatrix
 from nlfilter_torch.core.torch_internals import is_hidden
 from nlfilter_torch.operator.pixel_matrix import Columns
 

@@ -1,7 +1,17 @@
-"""Warnings of mistakes that give no error: wrong units, wrong order of dimensions, guides of another scale."""
+"""Mistakes that give no error: wrong units, wrong order of dimensions, guides of another scale, too few landmarks.
 
+How well landmarks cover points is measured on rows of W beside those of the exact filter, for a sample of the points.
+The diagonal correction does not tell. It is large at a point that resembles no other, whose row of W is right, and in
+many dimensions at most points of a cluster around a landmark, whose rows are right too, since what the correction
+replaces is shared with no other point. So affinities to other points have to be computed.
+"""
+
+from dataclasses import dataclass
+
+import torch
 from torch import Tensor
 
+from nlfilter_torch.core.blocks import weighted
 from nlfilter_torch.core.torch_internals import is_hidden
 from nlfilter_torch.core.warning import warn
 
@@ -59,3 +69,91 @@ def warn_of_scale_of_features(scaling: Tensor, guide: Tensor, bandwidth: float |
             "guide must have differences near photometric_bandwidth, got so small ones that all pixels are alike; "
             "lower photometric_bandwidth, or divide the guide by its standard deviation"
         )
+
+
+SAMPLED = 1024  # points whose rows are compared; all, if there are at most twice as many
+FEW = 256  # points of a first look, in about 2 ms on one core
+LARGEST_SHARE = 0.15  # of badly covered points, above which there is a warning
+LEAST_POINTS = 1024  # below which there is none, since as many landmarks as points can be afforded
+SWEEPS = 20  # of balancing the exact filter of the sample
+GOLDEN = 0.6180339887498949  # whose multiples, without their whole parts, spread evenly over the interval from 0 to 1
+HALF = 0.5  # share of its weight by which the row of a badly covered point is off
+
+
+def sampled_points(points: int) -> Tensor:
+    """Numbers (S,) of the points whose features are kept, spread over all ``points``; always the same."""
+    if points <= 2 * SAMPLED:
+        return torch.arange(points)
+    starts = torch.arange(SAMPLED + 1) * points // SAMPLED
+    return starts[:-1] + (torch.arange(SAMPLED).double() * GOLDEN % 1 * starts.diff()).long()
+
+
+def share_above(values: Tensor, limit: float, weights: Tensor | None) -> Tensor:
+    """Share (B,) of the points, by weights (B, N), whose values (B, N) are above a limit."""
+    above = weighted((values > limit).double(), weights).sum(1)
+    return above / (values.shape[1] if weights is None else weights.double().sum(1))
+
+
+@dataclass(frozen=True, eq=False)
+class SampledRows:
+    """Rows of W at a sample of the points.
+
+    Attributes:
+        features: (B, D, S).
+        factor: columns of U, (B, M, S).
+        scaling: d, (B, S).
+        remainder: r, (B, S).
+        weights: number of pixels that each point represents, (B, S).
+        every: number of points of the image for each of the sample.
+    """
+
+    features: Tensor
+    factor: Tensor
+    scaling: Tensor
+    remainder: Tensor
+    weights: Tensor
+    every: float
+
+    def thinned(self, count: int) -> "SampledRows":
+        """The rows of about ``count`` of the points, or of all if there are fewer."""
+        step = max(1, self.scaling.shape[1] // count)
+        return SampledRows(
+            features=self.features[..., ::step],
+            factor=self.factor[..., ::step],
+            scaling=self.scaling[..., ::step],
+            remainder=self.remainder[..., ::step],
+            weights=self.weights[..., ::step],
+            every=self.every * step,
+        )
+
+    def badly_covered(self) -> Tensor:
+        """Share (B,) of the points, by weight, whose rows are off by more than half."""
+        return share_above(self.errors(), HALF, self.weights)
+
+    def errors(self) -> Tensor:
+        """Share (B, S) of the weight of each row that lies at other points than in the exact filter of the sample.
+
+        Half of the sum of the differences of a row, 1 at most if no weight is negative. Of a point that stands for
+        others of the image, only its own value counts as its own.
+        """
+        return torch.stack([self._errors_of(image) for image in range(len(self.scaling))])
+
+    def _errors_of(self, image: int) -> Tensor:
+        """Errors (S,) of the rows of one image, in float64."""
+        features, factor = self.features[image].double(), self.factor[image].double()
+        scaling, own = self.scaling[image].double(), self.weights[image].double()
+        features = features - features.mean(1, keepdim=True)
+        norms = features.square().sum(0)
+        squared = norms.unsqueeze(1) + norms - 2 * features.mT @ features
+        exact = torch.exp(-squared.clamp(min=0.0)) * (own * self.every)
+        exact.diagonal().copy_(own)
+        rows = scaling.unsqueeze(1) * (factor.mT @ factor) * scaling
+        itself = rows.diagonal() * own + self.remainder[image]
+        rows = rows * (own * self.every)
+        rows.diagonal().copy_(itself)
+        least = torch.finfo(exact.dtype).tiny  # row sums of points that do not count
+        balanced = exact.sum(1).clamp(min=least).rsqrt()
+        for _ in range(SWEEPS):
+            balanced = (balanced / (exact @ balanced).clamp(min=least)).sqrt()
+        exact = balanced.unsqueeze(1) * exact * balanced
+        return ((rows - exact).abs().sum(1) / 2).nan_to_num(nan=torch.inf)

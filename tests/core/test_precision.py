@@ -14,8 +14,8 @@ from nlfilter_torch import (
     nonlocal_operator,
     spectral_filter,
 )
-from nlfilter_torch.core.low_rank import OuterProduct
 from nlfilter_torch.core.precision import WITHOUT_TF32, full_precision
+from nlfilter_torch.core.torch_internals import OuterProduct
 from tests.problems import noise, seeded
 
 SIZE = (5, 4)

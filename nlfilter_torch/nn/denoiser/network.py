@@ -8,16 +8,15 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from nlfilter_torch.core.blocks import EVERYWHERE, Inner
 from nlfilter_torch.core.checks import (
     check_count,
     check_photograph,
     described,
 )
-from nlfilter_torch.core.inner import EVERYWHERE, Inner
 from nlfilter_torch.core.kernels.convolution import SLOPE, channels_last, convolve
-from nlfilter_torch.core.layouts import in_format_of
 from nlfilter_torch.core.precision import full_precision
-from nlfilter_torch.core.torch_internals import outside_transforms, refuse_transforms
+from nlfilter_torch.core.torch_internals import in_format_of, outside_transforms, refuse_transforms
 from nlfilter_torch.core.workers import threads_for
 from nlfilter_torch.filtering.filters import detail_layers
 from nlfilter_torch.nn.denoiser.noise import noise_map

@@ -7,8 +7,7 @@ from itertools import groupby, product
 import torch
 from torch import Tensor
 
-from nlfilter_torch.core.blocks import reflected
-from nlfilter_torch.core.inner import EVERYWHERE, Inner
+from nlfilter_torch.core.blocks import EVERYWHERE, Inner, reflected
 from nlfilter_torch.core.workers import divided_among
 
 SIDE, STEP = 96, 80  # size and spacing of tiles, in pixels

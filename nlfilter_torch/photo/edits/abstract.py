@@ -10,8 +10,8 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
+from nlfilter_torch.core.blocks import Inner
 from nlfilter_torch.core.checks import check_count, check_reach
-from nlfilter_torch.core.inner import Inner
 from nlfilter_torch.core.rational import rational_form
 from nlfilter_torch.core.torch_internals import is_unreadable
 from nlfilter_torch.operator.features import blur, blur_margin

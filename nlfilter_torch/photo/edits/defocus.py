@@ -7,8 +7,8 @@ from typing import ClassVar, Literal
 import torch
 from torch import Tensor
 
+from nlfilter_torch.core.blocks import Inner
 from nlfilter_torch.core.checks import check_reach
-from nlfilter_torch.core.inner import Inner
 from nlfilter_torch.operator.options import Completion, Sampling
 from nlfilter_torch.photo.declared.declaration import Edit
 from nlfilter_torch.photo.declared.parameters import DEFOCUS

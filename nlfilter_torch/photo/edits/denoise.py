@@ -11,8 +11,8 @@ from typing import ClassVar, Literal, Self
 import torch
 from torch import Tensor
 
+from nlfilter_torch.core.blocks import Inner
 from nlfilter_torch.core.checks import check_count
-from nlfilter_torch.core.inner import Inner
 from nlfilter_torch.core.precision import per_image
 from nlfilter_torch.core.torch_internals import cached_constants
 from nlfilter_torch.filtering.filters import weigh_layers

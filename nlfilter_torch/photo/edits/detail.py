@@ -8,6 +8,7 @@ from typing import ClassVar, Literal, Self
 import torch
 from torch import Tensor
 
+from nlfilter_torch.core.blocks import Inner
 from nlfilter_torch.core.checks import (
     check_alpha,
     check_count,
@@ -16,7 +17,6 @@ from nlfilter_torch.core.checks import (
     check_positive,
     check_shape,
 )
-from nlfilter_torch.core.inner import Inner
 from nlfilter_torch.operator.features import blur_margin
 from nlfilter_torch.operator.options import Completion, GuideChannels, Sampling
 from nlfilter_torch.photo.declared.declaration import Arguments, Edit

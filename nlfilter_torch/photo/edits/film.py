@@ -18,7 +18,7 @@ from nlfilter_torch.core.blocks import stratified
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.operator.build import operator_from_points
 from nlfilter_torch.operator.features import GuideFeatures, estimate_bandwidth, reduce_channels
-from nlfilter_torch.operator.held import landmarks_by
+from nlfilter_torch.operator.landmarks import landmarks_by
 from nlfilter_torch.operator.scaling import PixelScaling
 from nlfilter_torch.operator.spectrum import RitzPairs
 from nlfilter_torch.photo.declared.rows import RowSource

@@ -7,8 +7,8 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from nlfilter_torch.core.blocks import Inner
 from nlfilter_torch.core.checks import check_alpha, check_image, check_same_size, check_values
-from nlfilter_torch.core.inner import Inner
 from nlfilter_torch.core.precision import working_dtype
 from nlfilter_torch.filtering.fitted import FittedFilter, fit_filter
 from nlfilter_torch.operator.build import operator_from_guide

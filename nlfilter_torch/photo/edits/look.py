@@ -8,7 +8,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from nlfilter_torch.core.inner import EVERYWHERE, Inner
+from nlfilter_torch.core.blocks import EVERYWHERE, Inner
 from nlfilter_torch.operator.features import reduce_channels
 from nlfilter_torch.operator.options import Completion, GuideChannels, Sampling
 from nlfilter_torch.photo.declared.declaration import Edit

@@ -7,8 +7,8 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
+from nlfilter_torch.core.blocks import Inner
 from nlfilter_torch.core.checks import check_reach
-from nlfilter_torch.core.inner import Inner
 from nlfilter_torch.nn.denoiser.noise import Noise
 from nlfilter_torch.operator.features import blur, blur_margin, reduce_channels
 from nlfilter_torch.operator.options import Completion, Sampling

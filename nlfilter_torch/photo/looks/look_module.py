@@ -9,8 +9,8 @@ import torch
 from torch import Tensor, nn
 
 from nlfilter_torch.core.checks import check_choice, check_count, check_image
-from nlfilter_torch.core.layouts import in_format_of
 from nlfilter_torch.core.precision import working_dtype
+from nlfilter_torch.core.torch_internals import in_format_of
 from nlfilter_torch.filtering.filters import polynomial_filter
 from nlfilter_torch.nn.parameters import check_learn
 from nlfilter_torch.operator.build import operator_from_guide

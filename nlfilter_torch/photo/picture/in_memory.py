@@ -9,12 +9,12 @@ from typing import cast
 import torch
 from torch import Tensor
 
+from nlfilter_torch.core.blocks import EVERYWHERE
 from nlfilter_torch.core.checks import check_image, check_photograph, check_same_size, check_tensor, check_unit_range
-from nlfilter_torch.core.inner import EVERYWHERE
 from nlfilter_torch.core.precision import full_precision, working_dtype
 from nlfilter_torch.core.rational import RationalForm
 from nlfilter_torch.filtering.filters import detail_layers
-from nlfilter_torch.filtering.rational_product import pole_terms, rational_product, weigh_poles
+from nlfilter_torch.filtering.matrix_function import pole_terms, rational_product, weigh_poles
 from nlfilter_torch.filtering.scribbles import check_painted
 from nlfilter_torch.operator.build import operator_from_guide
 from nlfilter_torch.operator.hidden import fill_nearby

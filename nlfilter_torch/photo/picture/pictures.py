@@ -11,8 +11,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from nlfilter_torch.core.blocks import Inner
 from nlfilter_torch.core.checks import warn_of_scale
-from nlfilter_torch.core.inner import Inner
 from nlfilter_torch.operator.features import reduce_channels
 from nlfilter_torch.operator.hidden import REACH, fill_nearby
 from nlfilter_torch.operator.pixel_matrix import Columns

@@ -7,8 +7,7 @@ from typing import Protocol, TypeVar
 import torch
 from torch import Tensor
 
-from nlfilter_torch.core.blocks import block_length
-from nlfilter_torch.core.inner import Inner
+from nlfilter_torch.core.blocks import Inner, block_length
 
 STRIP = 1 << 18  # pixels that a core computes at a time; with fewer, cores wait for each other if other programs run
 M = TypeVar("M")  # masks and colours of pixels as a source takes them: tensors in memory, rows in tiles

@@ -26,7 +26,7 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.core.blocks import symmetric_places
-from nlfilter_torch.core.kernels.grams import compute_grams
+from nlfilter_torch.core.kernels.tall_skinny import compute_grams
 from nlfilter_torch.core.rational import RationalForm
 from nlfilter_torch.operator.features import blur, blur_margin, reduce_channels
 from nlfilter_torch.operator.options import FilterOptions

@@ -11,7 +11,7 @@ from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.core.rational import RationalForm
 from nlfilter_torch.core.workers import in_order
 from nlfilter_torch.filtering.filters import layers_of_columns
-from nlfilter_torch.filtering.rational_product import weigh_poles
+from nlfilter_torch.filtering.matrix_function import weigh_poles
 from nlfilter_torch.operator.eigenvalue_bound import exceeds, limiter, slack
 from nlfilter_torch.operator.features import reduce_channels
 from nlfilter_torch.operator.operator import Kernel

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from nlfilter_torch.core.low_rank import OuterProduct
+from nlfilter_torch.core.torch_internals import OuterProduct
 from nlfilter_torch.operator.nystrom import inverse_cholesky, nystrom_factor
 from tests.native import LEVELS, by_torch, random
 from tests.pairwise import pairwise

@@ -14,8 +14,7 @@ from torch import Tensor
 from nlfilter_torch import nonlocal_operator
 from nlfilter_torch.core.kernels import columns, convolution, definitions_only, lattice, library, stencil  # noqa: F401, register
 from nlfilter_torch.core.kernels.clusters import TRIALS, lloyd, pivots  # noqa: F401, registers both
-from nlfilter_torch.core.kernels.grams import sum_grams
-from nlfilter_torch.core.kernels.tall_skinny import moment, spread
+from nlfilter_torch.core.kernels.tall_skinny import moment, spread, sum_grams
 from nlfilter_torch.operator import build  # noqa: F401, registers two
 from nlfilter_torch.operator.nystrom import inverse_cholesky, nystrom_factor
 from nlfilter_torch.operator.scaling import KernelMatrix

@@ -9,7 +9,7 @@ import torch
 
 from benchmarks.training.training import PlainDenoiser
 from nlfilter_torch import NonlocalDenoiser
-from nlfilter_torch.core.inner import EVERYWHERE
+from nlfilter_torch.core.blocks import EVERYWHERE
 from nlfilter_torch.nn.denoiser import network as module
 from nlfilter_torch.nn.denoiser import tiles
 from nlfilter_torch.nn.denoiser.network import NOISIEST, PIXELS, TRAINED, WIDTH, level_planes

@@ -50,7 +50,8 @@ def test_distance_does_not_count_unless_asked_for() -> None:
 def test_equal_frames_count_as_one(monkeypatch: pytest.MonkeyPatch) -> None:
     """Several equal references give the same result as one: balancing, means and noise are averages."""
     monkeypatch.setattr(
-        "nlfilter_torch.operator.held.assign_landmarks", lambda features, *_, **__: (features[:, :, :1900:48], None)
+        "nlfilter_torch.operator.landmarks.assign_landmarks",
+        lambda features, *_, **__: (features[:, :, :1900:48], None),
     )
     frame = crop(90, 190)
     for step in STEPS:

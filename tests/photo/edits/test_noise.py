@@ -11,7 +11,7 @@ import torch
 from PIL import Image, ImageDraw
 from torch import Tensor
 
-from nlfilter_torch.core.inner import Inner
+from nlfilter_torch.core.blocks import Inner
 from nlfilter_torch.photo import Step, denoise, stream
 from nlfilter_torch.photo.cli import editing, main
 from nlfilter_torch.photo.edits import noise as module

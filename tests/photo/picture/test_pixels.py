@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from nlfilter_torch.core.inner import Inner
+from nlfilter_torch.core.blocks import Inner
 from nlfilter_torch.photo.picture.in_memory import InMemory
 from nlfilter_torch.photo.picture.measuring import mean_of
 from nlfilter_torch.photo.picture.pixels import Fitted, Pixels, Strip, corner, part_of, strips_of, whole_image

@@ -9,7 +9,7 @@ from torch import Tensor
 from nlfilter_torch import (
     nonlocal_operator,
 )
-from nlfilter_torch.core.matrix_function import SymmetricMatrix
+from nlfilter_torch.core.symmetric_matrix import SymmetricMatrix
 from tests.images import hard_images
 from tests.problems import noise, seeded
 
