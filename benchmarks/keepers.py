@@ -29,7 +29,7 @@ from benchmarks.free_photographs import edited_photographs
 from benchmarks.harness import options, save_picture
 from benchmarks.photographs import luminance, reduced_to, scribbled
 from nlfilter_torch.photo import region_mask
-from nlfilter_torch.photo.app.brush import RADIUS
+from nlfilter_torch.photo.app.brush import BRUSH_RADIUS
 from nlfilter_torch.photo.declared.parameters import EDITS, MASK
 from nlfilter_torch.photo.declared.presets import Recipe, find_recipe
 from nlfilter_torch.photo.declared.steps import Step
@@ -67,7 +67,7 @@ class Job:
     def of(number: int, entry: dict[str, Any]) -> "Job":
         """The job of an entry of the file."""
         edit, what = entry["edit"], entry["what"]
-        drawn = [{"radius": RADIUS} | stroke for stroke in entry.get("strokes", ())]
+        drawn = [{"radius": BRUSH_RADIUS} | stroke for stroke in entry.get("strokes", ())]
         strokes = tuple(EDITS.get(edit, MASK).mark_of(stroke, what) for stroke in drawn)
         recipe = find_recipe(entry["preset"]) if edit == "preset" else Recipe()
         if edit in EDITS:

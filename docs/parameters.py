@@ -11,10 +11,10 @@ from functools import cache
 from pathlib import Path
 
 import nlfilter_torch
-from nlfilter_torch.photo.declared.declaration import UNITS, Edit, Parameter
+from nlfilter_torch.photo.declared.declaration import UNIT_NAMES, Edit, Parameter
 from nlfilter_torch.photo.declared.development import DEVELOP
 from nlfilter_torch.photo.declared.parameters import EDITS
-from nlfilter_torch.photo.declared.shared_parameters import FILTER
+from nlfilter_torch.photo.declared.shared_parameters import FILTER_ARGUMENTS
 
 PACKAGE = Path(nlfilter_torch.__file__).parent
 INTERFACES = ("cli", "app")  # folders whose files could declare parameters of any edit
@@ -56,7 +56,7 @@ def cells(edit: Edit, parameter: Parameter) -> tuple[str, ...]:
     each = f"{parameter.low:g} to {parameter.high:g}, each"
     spans = {"choice": ", ".join(parameter.choices), "sliders": each, "lattice": each}
     span = spans.get(parameter.kind, f"{parameter.low:g} to {parameter.high:g}")
-    unit = UNITS[parameter.unit][0] or {"gain": "times"}.get(parameter.unit, "")
+    unit = UNIT_NAMES[parameter.unit][0] or {"gain": "times"}.get(parameter.unit, "")
     words = " or ".join(parameter.words)
     name = f"`{parameter.keyword}`" if parameter.is_argument else "`alpha` of a region"
     return f"`{parameter.name}`", shown, f"{span}{', or ' + words if words else ''}", unit, name, parameter.help
@@ -145,7 +145,7 @@ def main(arguments: list[str] | None = None) -> int:
     worst = 0
     for edit in EDITS.values():
         for parameter in edit:
-            if parameter.keyword in FILTER and parameter.name != "tolerance":
+            if parameter.keyword in FILTER_ARGUMENTS and parameter.name != "tolerance":
                 continue  # declared once for all edits, in filter_parameters, with the edit's defaults
             where = places(edit, parameter)
             worst = max(worst, len(where))

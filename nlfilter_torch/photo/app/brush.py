@@ -5,8 +5,8 @@ from dataclasses import dataclass, field
 
 from nlfilter_torch.photo.declared.parameters import EDITS
 
-COLOURS = ("#2f6fde", "#12a15f", "#e0b321", "#dd5c21", "#c8283c", "#8a46c8", "#8b5e3c", "#808080")
-RADIUS = 0.02  # of the brush at the start
+PALETTE = ("#2f6fde", "#12a15f", "#e0b321", "#dd5c21", "#c8283c", "#8a46c8", "#8b5e3c", "#808080")
+BRUSH_RADIUS = 0.02  # of the brush at the start
 BRUSHES: dict[str, dict[str, str]] = {
     edit.name: {scribble.word: scribble.label for scribble in edit.scribbles}
     for edit in EDITS.values()
@@ -26,8 +26,8 @@ class Brush:
     """
 
     word: dict[str, str] = field(default_factory=lambda: {step: next(iter(words)) for step, words in BRUSHES.items()})
-    radius: dict[str, float] = field(default_factory=lambda: dict.fromkeys(BRUSHES, RADIUS))
-    colour: str = COLOURS[0]
+    radius: dict[str, float] = field(default_factory=lambda: dict.fromkeys(BRUSHES, BRUSH_RADIUS))
+    colour: str = PALETTE[0]
     shown: list[Callable[[str], object]] = field(default_factory=list)
 
     def paint(self, step: str) -> str:

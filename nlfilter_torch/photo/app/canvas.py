@@ -17,7 +17,7 @@ from nlfilter_torch.photo.declared.strokes import Mark, Stroke
 Draw = Callable[[str, Callable[[], None]], None]  # adds a stroke to a step
 
 
-class Painted(Protocol):
+class PaintedSession(Protocol):
     """The session of an open photograph, as far as its preview and its strokes are concerned."""
 
     @property
@@ -64,7 +64,7 @@ class Canvas:
         self.histogram = ""
         self.clipped = self.clipped_before = (0.0, 0.0)  # shares of white and of black, after and before the edit
         self.pick: Callable[[float, float], None] | None = None
-        self._session: Painted | None = None
+        self._session: PaintedSession | None = None
         self._preview_size = self._whole_size = (1, 1)
         self._brush, self._token, self._draw, self._lay = brush, token, draw, lay
         self._frame = 0
@@ -123,7 +123,7 @@ class Canvas:
             ui.space()
             self._size = ui.label("").classes("hint wide")
 
-    def open(self, session: Painted, preview: Tensor, size: tuple[int, int]) -> None:
+    def open(self, session: PaintedSession, preview: Tensor, size: tuple[int, int]) -> None:
         """Show a photograph of ``size`` (height, width) that was opened, first its preview (1, C, h, w)."""
         self._session = session
         self._edited = preview.clamp(0, 1)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from nicegui import ui
 
-from nlfilter_torch.photo.declared.development import WHOLE, Crop
+from nlfilter_torch.photo.declared.development import WHOLE_CROP, Crop
 
 FREE, ORIGINAL = "Free", "Original"
 #: Width and height of the crops that a person may choose.
@@ -31,7 +31,7 @@ class Proportions:
 
     name: str = FREE
     cut: Crop | None = None
-    base: Crop = WHOLE
+    base: Crop = WHOLE_CROP
     kept: frozenset[Crop] = frozenset()
 
     def aspect(self, size: tuple[int, int]) -> float | None:

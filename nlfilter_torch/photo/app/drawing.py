@@ -14,12 +14,12 @@ from nlfilter_torch.photo.declared.parameters import EDITS
 from nlfilter_torch.photo.declared.strokes import Mark, Region, ScribbleRole, Stroke
 from nlfilter_torch.photo.picture.colour import hundredths_of_lab
 
-QUALITY = 95
+JPEG_QUALITY = 95
 #: Colours of the mask, of which the one that differs most from the picture under it is shown.
 TINTS = ((255, 40, 80), (0, 190, 255), (255, 220, 0))
 OPACITY = 120  # of the mask, of 255
 COMPARED = 4096  # pixels, about, with which these are compared
-HATCHING = 8  # pixels of a preview from one line to the next
+HATCH_PERIOD = 8  # pixels of a preview from one line to the next
 #: Colours of strokes by their roles.
 ROLES: dict[ScribbleRole, str] = {
     "object": "#22c55e",
@@ -27,7 +27,7 @@ ROLES: dict[ScribbleRole, str] = {
     "added": "#38bdf8",
     "removed": "#a855f7",
 }
-KEPT = "#9ca3af"  # colour of strokes on what keeps its colour
+KEPT_STROKE = "#9ca3af"  # colour of strokes on what keeps its colour
 OUTLINE = 2  # width in pixels of a preview of the border of a region
 WHITE_TINT, BLACK_TINT = (255, 60, 60, 255), (60, 120, 255, 255)  # where a picture is clipped
 BINS = 64  # of a histogram
@@ -47,7 +47,7 @@ def _grey_or_rgb(image: Tensor) -> Image.Image:
 
 def picture(image: Tensor) -> bytes:
     """An image (1, 1 or 3, H, W) in [0, 1] as a JPEG."""
-    return _encode(_grey_or_rgb(image), "JPEG", quality=QUALITY, subsampling=0)
+    return _encode(_grey_or_rgb(image), "JPEG", quality=JPEG_QUALITY, subsampling=0)
 
 
 def lossless(image: Tensor) -> bytes:
@@ -80,8 +80,8 @@ def contrasting_tint(image: Tensor, mask: Tensor) -> tuple[int, int, int]:
 def hatching(places: Tensor) -> bytes:
     """Black and white lines on some pixels (1, 1, H, W), as a transparent PNG."""
     height, width = places.shape[-2:]
-    phase = (torch.arange(height).unsqueeze(1) + torch.arange(width)) % HATCHING
-    lines, values = (places[0, 0] > 0) & (phase < HATCHING // 2), torch.where(phase < HATCHING // 4, 255, 0)
+    phase = (torch.arange(height).unsqueeze(1) + torch.arange(width)) % HATCH_PERIOD
+    lines, values = (places[0, 0] > 0) & (phase < HATCH_PERIOD // 2), torch.where(phase < HATCH_PERIOD // 4, 255, 0)
     layer = torch.where(lines, values, 0).unsqueeze(2).repeat(1, 1, 4)
     layer[..., 3] = torch.where(lines, 255, 0)
     return _encode(Image.fromarray(layer.to(torch.uint8).numpy()), "PNG", compress_level=1)
@@ -150,7 +150,7 @@ def strokes_svg(marks: Iterable[Mark], size: tuple[int, int], *, keeps: bool = F
             points = points if len(points) > 1 else points * 2  # a dot is a line of no length
             end, thickness = "", 2 * mark.radius * min(size)
         line = "L".join(f"{x * width:.1f} {y * height:.1f}" for x, y in points)
-        colour = mark.colour or (KEPT if keeps and mark.role == "background" else ROLES[mark.role])
+        colour = mark.colour or (KEPT_STROKE if keeps and mark.role == "background" else ROLES[mark.role])
         paths.append(f'<path d="M{line}{end}" stroke="{colour}" stroke-width="{thickness:.1f}" class="stroke" />')
     return "".join(paths)
 

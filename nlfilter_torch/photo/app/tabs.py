@@ -8,10 +8,10 @@ from nicegui import ui
 from torch import Tensor
 
 from nlfilter_torch.photo.app import controls, drawing
-from nlfilter_torch.photo.app.brush import BRUSHES, COLOURS, RADIUS, Brush
+from nlfilter_torch.photo.app.brush import BRUSH_RADIUS, BRUSHES, PALETTE, Brush
 from nlfilter_torch.photo.app.controls import Change, Choice, Control, Replace, Slider, SteadySlider, show_pressed
 from nlfilter_torch.photo.app.crop_tool import FREE, PROPORTIONS
-from nlfilter_torch.photo.declared.development import DEVELOP, WHOLE
+from nlfilter_torch.photo.declared.development import DEVELOP, WHOLE_CROP
 from nlfilter_torch.photo.declared.json_values import Value
 from nlfilter_torch.photo.declared.parameters import EDITS
 from nlfilter_torch.photo.declared.presets import LOOKS, PRESETS, PURPOSES, Recipe
@@ -134,7 +134,7 @@ class EditTab:
             size = SteadySlider(min=0.5, max=10, step=0.5, value=100 * brush.radius[edit])
             size.props('dense label aria-label="Brush size"')
             size.on_value_change(lambda event: brush.radius.update({edit: event.value / 100}))
-            size.on_reset(lambda: size.set_value(100 * RADIUS))
+            size.on_reset(lambda: size.set_value(100 * BRUSH_RADIUS))
 
     def _clear(self) -> None:
         self._link.clear(self._edit)
@@ -143,7 +143,7 @@ class EditTab:
         """Build a field for the colour that the brush paints, the same in all tabs, and buttons for some colours."""
         brush = self._link.brush
         with ui.row().classes("gap-2 q-mt-xs"):
-            for colour in COLOURS:
+            for colour in PALETTE:
                 ui.button(on_click=partial(brush.choose_colour, colour)).props(
                     f'round dense unelevated size=sm aria-label="{colour}"'
                 ).style(f"background: {colour} !important")
@@ -181,7 +181,7 @@ class DevelopTab(EditTab):
         photo = self._link.photo
         for button, is_on in ((self._crop, photo.is_cropping()), (self._pick, photo.is_picking())):
             show_pressed(button, is_on)
-        self._whole.set_enabled(self._link.recipe().develop.crop != WHOLE)
+        self._whole.set_enabled(self._link.recipe().develop.crop != WHOLE_CROP)
         self._proportions.set_value(photo.held())
 
     def _build(self) -> None:
@@ -211,7 +211,7 @@ class DevelopTab(EditTab):
 
     def _uncrop(self) -> None:
         self._link.photo.hold(FREE)
-        self._link.photo.develop({"crop": WHOLE}, True)
+        self._link.photo.develop({"crop": WHOLE_CROP}, True)
 
 
 class DetailTab(EditTab):

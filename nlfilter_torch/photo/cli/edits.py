@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 import typer
 
 from nlfilter_torch.photo.cli import options
-from nlfilter_torch.photo.declared.declaration import FILTER_PANEL, UNITS, Edit, Kind, Parameter, ScribbleKind
+from nlfilter_torch.photo.declared.declaration import FILTER_PANEL, UNIT_NAMES, Edit, Kind, Parameter, ScribbleKind
 from nlfilter_torch.photo.declared.json_values import Value
 from nlfilter_torch.photo.declared.parameters import DETAIL, EDITS
 from nlfilter_torch.photo.declared.presets import LOOKS, PRESETS, Recipe, find_recipe
@@ -140,7 +140,7 @@ def option(parameter: Parameter, panel: str | None = None) -> object:
         kind = Literal[parameter.choices]
     decorated = typer.Option(
         f"--{parameter.name.replace('_', '-')}",
-        metavar=None if parameter.choices else parameter.metavar or UNITS[parameter.unit][1],
+        metavar=None if parameter.choices else parameter.metavar or UNIT_NAMES[parameter.unit][1],
         help=parameter.help,
         rich_help_panel=panel or parameter.panel,
         min=low,

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from nlfilter_torch.photo.declared.declaration import FILTER_PANEL, GAINS, MAX_SLIDERS, UNITS, Parameter
+from nlfilter_torch.photo.declared.declaration import FILTER_PANEL, GAINS, MAX_SLIDERS, UNIT_NAMES, Parameter
 from nlfilter_torch.photo.declared.development import Crop, check_value
 from nlfilter_torch.photo.declared.strokes import Shape
 
@@ -115,7 +115,7 @@ def parse_number(text: str, parameter: Parameter) -> float | str:
         value = float(text)
     except ValueError:
         value = math.nan
-    name, unit = f"--{parameter.name.replace('_', '-')}", UNITS[parameter.unit][0]
+    name, unit = f"--{parameter.name.replace('_', '-')}", UNIT_NAMES[parameter.unit][0]
     words = "".join(f", or {word}" for word in parameter.words)
     if not 0 < value < math.inf:
         raise ValueError(f"{name} must be a positive number of {unit}, such as 20{words}, got {text!r}")

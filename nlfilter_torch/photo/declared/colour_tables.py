@@ -43,7 +43,7 @@ def lattice_of_cube(text: str, name: str) -> Lattice:
         raise ValueError(f"{name} must hold {size}^3 = {size**3} colours, got {len(rows)}; export it again")
     import numpy as np
 
-    return lattice_of(np.array(rows))
+    return lattice_of_table(np.array(rows))
 
 
 def lattice_of_hald(picture: "Values", name: str) -> Lattice:
@@ -64,10 +64,10 @@ def lattice_of_hald(picture: "Values", name: str) -> Lattice:
     if level > MOST_HALD_LEVEL:
         raise ValueError(f"{name} must be a Hald of level {MOST_HALD_LEVEL} at most, got {level}; make a smaller one")
     white = {"uint8": 255, "uint16": WHITE_16}.get(picture.dtype.name, 1)
-    return lattice_of(np.asarray(picture[..., :3], dtype=np.float64).reshape(-1, 3) / white)
+    return lattice_of_table(np.asarray(picture[..., :3], dtype=np.float64).reshape(-1, 3) / white)
 
 
-def lattice_of(colours: "NDArray[np.floating]") -> Lattice:
+def lattice_of_table(colours: "NDArray[np.floating]") -> Lattice:
     """The lattice of a table (n^3, 3) of colours, in the order of files."""
     import numpy as np
 

@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 # Values outside these ranges give no useful result, and numbers overflow.
 GAINS = (-1e6, 1e6)  # sliders
 USUAL_GAINS = (0.0, 10.0)  # beyond these, the command wants the user to insist
-BANDWIDTHS = (0.01, 1e6)  # photometric bandwidths, in grey levels from 0 to 255
-DISTANCES = (0.01, 1e6)  # spatial bandwidths, in pixels
+PHOTOMETRIC_RANGE = (0.01, 1e6)  # photometric bandwidths, in grey levels from 0 to 255
+SPATIAL_RANGE = (0.01, 1e6)  # spatial bandwidths, in pixels
 MAX_SLIDERS = 100
 MAX_PATCH = 99  # pixels
 MAX_LANDMARKS = 10_000
@@ -35,7 +35,7 @@ Domain = Literal["positive", "not negative", "share", "up to 10", "below 1", "fi
 #: Section in the help of a command for settings of the filter, which few users need.
 FILTER_PANEL = "Filter"
 #: For each unit: its name in errors, and the placeholder of a value in the help of a command.
-UNITS: dict[Unit, tuple[str, str | None]] = {
+UNIT_NAMES: dict[Unit, tuple[str, str | None]] = {
     "": ("", None),
     "levels": ("grey levels", "LEVELS"),
     "lab": ("units of CIE Lab", "LAB"),
@@ -155,7 +155,7 @@ class Parameter:
         >>> Parameter("tones", "count", None, "", 2, 64, optional=True).wanted
         'a whole number from 2 to 64, or null'
         """
-        unit = UNITS[self.unit][0]
+        unit = UNIT_NAMES[self.unit][0]
         number = f"a {'positive ' if self.low > 0 else ''}number of {unit}," if unit else "a number"
         ends = [f"{end:.0f}" if abs(end) >= 1e5 else f"{end:g}" for end in (self.low, self.high)]
         span = f"from {ends[0]} to {ends[1]}"

@@ -14,8 +14,8 @@ from nlfilter_torch.photo.declared.json_values import is_within, shown
 from nlfilter_torch.photo.declared.strokes import Mark, Point
 
 Crop = tuple[float, float, float, float]
-WHOLE: Crop = (0.0, 0.0, 1.0, 1.0)
-EXACT = 1e-9  # pixels, within which an edge is that of a pixel
+WHOLE_CROP: Crop = (0.0, 0.0, 1.0, 1.0)
+ROUNDING = 1e-9  # pixels, within which an edge is that of a pixel
 SAME = 0.01  # pixels, by which the sides of a crop that was moved may differ
 
 #: Declared as an edit is, though it is no step: it comes first, and once.
@@ -64,7 +64,7 @@ DEVELOP = Edit(
             "straighten",
             "number",
             0.0,
-            "Degrees by which the photograph is turned, clockwise above 0, counter-clockwise below. Empty corners are "
+            "Degrees by which the photograph is rotated, clockwise above 0, counter-clockwise below. Empty corners are "
             "cut off, and the proportions kept.",
             -45,
             45,
@@ -75,12 +75,12 @@ DEVELOP = Edit(
         Parameter(
             "crop",
             "sliders",
-            WHOLE,
+            WHOLE_CROP,
             "What is kept of the straightened photograph: left, top, right and bottom edge, as shares of its width and "
             "height from 0 to 1. It shrinks about its middle if it has empty corners.",
             0,
             1,
-            idle=WHOLE,
+            idle=WHOLE_CROP,
             length=4,
             metavar="L,T,R,B",
         ),
@@ -115,8 +115,8 @@ class Development:
         exposure: stops, -5 to 5; 1 doubles the light.
         temperature: -1 (blue) to 1 (amber).
         tint: -1 (green) to 1 (magenta).
-        straighten: degrees, -45 to 45, by which the picture is turned clockwise about its middle.
-        crop: left, top, right and bottom edge as shares of the turned picture, which keeps its size. A crop with empty
+        straighten: degrees, -45 to 45, by which the picture is rotated clockwise about its middle.
+        crop: left, top, right and bottom edge as shares of the rotated picture, which keeps its size. A crop with empty
             corners is shrunk about its middle until it has none.
 
     Raises:
@@ -131,7 +131,7 @@ class Development:
     temperature: float = DEVELOP["temperature"].default_number
     tint: float = DEVELOP["tint"].default_number
     straighten: float = DEVELOP["straighten"].default_number
-    crop: Crop = WHOLE
+    crop: Crop = WHOLE_CROP
 
     def __post_init__(self) -> None:
         """Check all values, and make them numbers of the declared type."""
@@ -163,7 +163,7 @@ class Development:
         """Where the developed picture lies in a picture (H, W).
 
         Raises:
-            ValueError: if the middle of the crop is outside the turned picture.
+            ValueError: if the middle of the crop is outside the rotated picture.
         """
         height, width = size
         left, top, right, bottom = self.crop
@@ -177,7 +177,7 @@ class Development:
         share = min(1.0, *(_reach(middle, (x * half[0], y * half[1]), angle, size) for x in (-1, 1) for y in (-1, 1)))
         if share <= 0:
             raise ValueError(
-                f"crop must have its middle within the photograph turned by {self.straighten:g} degrees, got "
+                f"crop must have its middle within the photograph rotated by {self.straighten:g} degrees, got "
                 f"{', '.join(f'{edge:g}' for edge in self.crop)}; move it inwards"
             )
         columns, rows = (_inside(m + n / 2, share * h) for m, n, h in zip(middle, (width, height), half, strict=True))
@@ -215,7 +215,7 @@ AS_IT_IS = Development()
 
 @dataclass(frozen=True)
 class Frame:
-    """Where a developed picture lies in its original: a rectangle of the original turned about its middle.
+    """Where a developed picture lies in its original: a rectangle of the original rotated about its middle.
 
     Attributes:
         original: (H, W) of the original.
@@ -297,7 +297,7 @@ class Frame:
         if self.is_whole:
             return x, y
         height, width = self.original
-        column, row = turned((x - 0.5) * width, (y - 0.5) * height, self.angle)
+        column, row = rotated((x - 0.5) * width, (y - 0.5) * height, self.angle)
         return (column + width / 2 - self.left) / self.width, (row + height / 2 - self.top) / self.height
 
     def outward(self, x: float, y: float) -> tuple[float, float]:
@@ -306,7 +306,7 @@ class Frame:
             return x, y
         height, width = self.original
         column, row = self.left + x * self.width - width / 2, self.top + y * self.height - height / 2
-        column, row = turned(column, row, -self.angle)
+        column, row = rotated(column, row, -self.angle)
         return column / width + 0.5, row / height + 0.5
 
     def mark_inward(self, mark: Mark) -> Mark:
@@ -318,18 +318,18 @@ class Frame:
         return mark.mapped(self.outward, 1 / self.scale)
 
 
-def turned(x: float, y: float, angle: float) -> tuple[float, float]:
-    """A point, y downwards, turned clockwise about the origin by an angle in radians."""
+def rotated(x: float, y: float, angle: float) -> tuple[float, float]:
+    """A point, y downwards, rotated clockwise about the origin by an angle in radians."""
     return x * math.cos(angle) - y * math.sin(angle), x * math.sin(angle) + y * math.cos(angle)
 
 
 def _reach(middle: tuple[float, float], corner: tuple[float, float], angle: float, size: tuple[int, int]) -> float:
-    """The share of the way from the middle of a crop to its corner that is within the turned picture (H, W).
+    """The share of the way from the middle of a crop to its corner that is within the rotated picture (H, W).
 
     Both are (x, y), ``middle`` from that of the picture and ``corner`` from that of the crop. Not positive if the
     middle is outside.
     """
-    starts, ways = turned(*middle, -angle), turned(*corner, -angle)
+    starts, ways = rotated(*middle, -angle), rotated(*corner, -angle)
     shares = []
     for start, way, length in zip(starts, ways, (size[1], size[0]), strict=True):
         room = length / 2 - (start if way > 0 else -start)
@@ -339,13 +339,13 @@ def _reach(middle: tuple[float, float], corner: tuple[float, float], angle: floa
 
 def _inside(middle: float, half: float) -> range:
     """The whole pixels between the ends of an interval."""
-    return range(math.ceil(middle - half - EXACT), math.floor(middle + half + EXACT))
+    return range(math.ceil(middle - half - ROUNDING), math.floor(middle + half + ROUNDING))
 
 
 def _thin(columns: range, rows: range, middle: Point, angle: float, size: tuple[int, int]) -> tuple[range, range]:
     """Columns and rows of a crop that holds no whole pixel on one axis or on both, but has one there.
 
-    It has no empty corners, or is a single pixel whose centre is within the turned picture (H, W). ``middle`` is that
+    It has no empty corners, or is a single pixel whose centre is within the rotated picture (H, W). ``middle`` is that
     of the crop, from that of the picture.
     """
     height, width = size
@@ -364,8 +364,8 @@ def _thin(columns: range, rows: range, middle: Point, angle: float, size: tuple[
     for step in range(steps + 1):  # to the middle of the picture, around which all pixels are within
         share = 1 - step / steps
         column, row = math.floor(share * x + width / 2), math.floor(share * y + height / 2)
-        across, down = turned(column + 0.5 - width / 2, row + 0.5 - height / 2, -angle)
-        if abs(across) < width / 2 - EXACT and abs(down) < height / 2 - EXACT:
+        across, down = rotated(column + 0.5 - width / 2, row + 0.5 - height / 2, -angle)
+        if abs(across) < width / 2 - ROUNDING and abs(down) < height / 2 - ROUNDING:
             break
     return range(column, column + 1), range(row, row + 1)
 
@@ -373,16 +373,16 @@ def _thin(columns: range, rows: range, middle: Point, angle: float, size: tuple[
 def _kept(
     pixels: range, first: float, length: int, axes: tuple[Point, Point], angle: float, size: tuple[int, int]
 ) -> range:
-    """The pixels of a line, one pixel wide and ``first`` its border, that are within the turned picture (H, W).
+    """The pixels of a line, one pixel wide and ``first`` its border, that are within the rotated picture (H, W).
 
     ``axes`` are the direction across the line and that along it, ``length`` that of the picture along it.
     """
-    across, along = (turned(*axis, -angle) for axis in axes)
+    across, along = (rotated(*axis, -angle) for axis in axes)
     low, high = -math.inf, math.inf
     for border in (first, first + 1):
         for a, b, side in zip(across, along, size[::-1], strict=True):
             ends = sorted((sign * side / 2 - a * border) / b for sign in (-1, 1))
             low, high = max(low, ends[0]), min(high, ends[1])
-    start = max(pixels.start, math.ceil(low + length / 2 + EXACT)) if low < length else pixels.stop
-    stop = min(pixels.stop, math.floor(high + length / 2 - EXACT)) if high > -length else pixels.start
+    start = max(pixels.start, math.ceil(low + length / 2 + ROUNDING)) if low < length else pixels.stop
+    stop = min(pixels.stop, math.floor(high + length / 2 - ROUNDING)) if high > -length else pixels.start
     return range(start, max(start, stop))

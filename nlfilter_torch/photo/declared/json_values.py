@@ -60,11 +60,11 @@ class SupportsItem(Protocol):
         """The number of Python that equals it."""
 
 
-def plain(value: Value) -> Value:
+def without_numpy(value: Value) -> Value:
     """The value with numbers of Python in place of those of numpy, which JSON does not take.
 
     >>> from numpy import float32, int64
-    >>> plain(float32(0.5)), plain((int64(2), 1.0)), plain("auto")
+    >>> without_numpy(float32(0.5)), without_numpy((int64(2), 1.0)), without_numpy("auto")
     (0.5, (2, 1.0), 'auto')
     """
     if isinstance(value, tuple):

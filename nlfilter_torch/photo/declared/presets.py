@@ -33,7 +33,7 @@ from nlfilter_torch.photo.declared.strokes import Region
 if TYPE_CHECKING:
     from nlfilter_torch.photo.declared.colour_tables import Values
 
-ORDER = tuple(EDITS)  # order in which the editor adds steps
+EDIT_ORDER = tuple(EDITS)  # order in which the editor adds steps
 JPEG_START = b"\xff\xd8\xff"
 PICTURE_STARTS = (b"\x89PNG", b"II*\0", b"MM\0*", JPEG_START)  # how files of pictures start
 OTHER_PICTURES = (b"BM", b"RIFF", b"GIF8", b"P6", b"\0\0\0")  # of kinds that are not read here
@@ -117,8 +117,8 @@ class Recipe:
         place = self.place_of(step.edit)
         if place is not None:
             return self.replaced(place, step)
-        rank = ORDER.index(step.edit)
-        place = max((i + 1 for i, other in enumerate(self.steps) if ORDER.index(other.edit) < rank), default=0)
+        rank = EDIT_ORDER.index(step.edit)
+        place = max((i + 1 for i, other in enumerate(self.steps) if EDIT_ORDER.index(other.edit) < rank), default=0)
         return self._of((*self.steps[:place], step, *self.steps[place:]), self._after(place, 1))
 
     def place_of(self, edit: str) -> int | None:
@@ -282,9 +282,9 @@ def _read_steps(entries: dict[str, object], name: str) -> list[Step]:
         raise ValueError(f"steps in {name} must be a list, got {shown(entries['steps'])}; correct it")
     steps = []
     for number, step in enumerate(entries["steps"], 1):
-        if not isinstance(step, dict) or step.get("edit") not in ORDER:
+        if not isinstance(step, dict) or step.get("edit") not in EDIT_ORDER:
             raise ValueError(
-                f"step {number} in {name} must have an entry edit, one of {', '.join(ORDER)}, got {shown(step)}; "
+                f"step {number} in {name} must have an entry edit, one of {', '.join(EDIT_ORDER)}, got {shown(step)}; "
                 "correct it"
             )
         rest = {entry: value for entry, value in step.items() if entry != "edit"}

@@ -3,12 +3,12 @@
 from typing import TypedDict, Unpack
 
 from nlfilter_torch.photo.declared.declaration import (
-    BANDWIDTHS,
-    DISTANCES,
     FILTER_PANEL,
     GAINS,
     MAX_LANDMARKS,
     MAX_PATCH,
+    PHOTOMETRIC_RANGE,
+    SPATIAL_RANGE,
     USUAL_GAINS,
     Domain,
     Edit,
@@ -48,7 +48,7 @@ class Further(Presentation, total=False):
 
 ALIKE = "How much two places may differ and still count as similar"
 #: Arguments of the filter of an edit.
-FILTER = ("photometric_bandwidth", "spatial_bandwidth", "patch_size", "num_landmarks", "landmarks")
+FILTER_ARGUMENTS = ("photometric_bandwidth", "spatial_bandwidth", "patch_size", "num_landmarks", "landmarks")
 
 
 def number(
@@ -96,7 +96,7 @@ def filter_parameters(
         "bandwidth",
         bandwidth,
         levels + ("much as detail. `auto` estimates it from the picture." if auto else "wide areas as one."),
-        BANDWIDTHS,
+        PHOTOMETRIC_RANGE,
         "levels",
         words=("auto",) if auto else (),
         optional=bandwidth is None,
@@ -112,7 +112,7 @@ def filter_parameters(
             "spatial_bandwidth",
             None,
             f"How far apart two places may be and still count as similar. Default: {reach}.",
-            DISTANCES,
+            SPATIAL_RANGE,
             "px",
             words=("none",) if far else (),
             optional=True,
@@ -180,7 +180,7 @@ VIEWING_SIZE = number(
     panel=FILTER_PANEL,
 )
 #: For all edits that select objects.
-TOLERANCE = number(
+COLOUR_TOLERANCE = number(
     "tolerance",
     8.0,
     "How much two colours may differ and still count as similar, in units of CIE Lab.",
@@ -190,7 +190,7 @@ TOLERANCE = number(
     panel=FILTER_PANEL,
 )
 #: For all edits that select regions.
-REACH = number(
+REGION_REACH = number(
     "reach",
     0.65,
     "How far a region spreads to less similar areas. 0 stays close, 0.95 goes far.",
@@ -211,12 +211,12 @@ EXTENT = Parameter(
     choices=("near", "object", "everywhere"),
     labels=("What is like it nearby", "This object", "Everywhere"),
 )
-REACH_SLIDER = Slider("Reach of the region", 0, 0.95, 0.05)
+REGION_REACH_SLIDER = Slider("Reach of the region", 0, 0.95, 0.05)
 
 
-KNOTS = 17  # of a tone curve
+CURVE_KNOTS = 17  # of a tone curve
 SATURATIONS = 5  # that have a factor of their own
-STRAIGHT = tuple(i / (KNOTS - 1) for i in range(KNOTS))
+STRAIGHT = tuple(i / (CURVE_KNOTS - 1) for i in range(CURVE_KNOTS))
 
 
 def _curve(channel: str) -> Parameter:

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from nlfilter_torch.photo.declared.declaration import Arguments, Edit
-from nlfilter_torch.photo.declared.json_values import Value, is_within, plain, shown
+from nlfilter_torch.photo.declared.json_values import Value, is_within, shown, without_numpy
 from nlfilter_torch.photo.declared.parameters import EDITS
-from nlfilter_torch.photo.declared.shared_parameters import FILTER
+from nlfilter_torch.photo.declared.shared_parameters import FILTER_ARGUMENTS
 from nlfilter_torch.photo.declared.strokes import Mark, ScribbleRole, sliders_of
 
 VERSION = 1  # of files of steps
@@ -53,7 +53,7 @@ class Step:
             raise TypeError(
                 f"{edit} has no parameter {min(unknown)}; its parameters are {', '.join(p.name for p in declared)}"
             )
-        values = {name: plain(value) for name, value in values.items()}
+        values = {name: without_numpy(value) for name, value in values.items()}
         changed = [(p.name, values[p.name]) for p in declared if p.name in values and values[p.name] != p.default]
         attributes = {"edit": edit, "strokes": strokes, "values": tuple(changed), "on": True, "opacity": 1.0}
         for name, value in attributes.items():
@@ -145,7 +145,7 @@ class Step:
 
     def filter_options(self, size: tuple[int, int]) -> Arguments:
         """Return the options of :func:`nonlocal_operator` for an image of size (H, W), the viewing size."""
-        options = {name: value for name, value in self.arguments(size).items() if name in FILTER}
+        options = {name: value for name, value in self.arguments(size).items() if name in FILTER_ARGUMENTS}
         distance = self.declared["spatial_bandwidth"].distance(options["spatial_bandwidth"], size)
         return options | {"spatial_bandwidth": distance}
 

@@ -10,7 +10,7 @@ from torch import Tensor
 from nlfilter_torch.core.checks import check_image, check_photograph
 from nlfilter_torch.core.precision import full_precision, working_dtype
 from nlfilter_torch.photo.declared.presets import Recipe
-from nlfilter_torch.photo.declared.shared_parameters import FILTER
+from nlfilter_torch.photo.declared.shared_parameters import FILTER_ARGUMENTS
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.picture.developing import develop_image, develop_planes, limits_of
 from nlfilter_torch.photo.picture.drawn import Drawn, Painter, drawn_by
@@ -169,7 +169,7 @@ def viewed_stride(step: Step, size: tuple[int, int], stride: float) -> float:
 
 def filter_key(step: Step) -> tuple[object, ...]:
     """Values that the filter of a step depends on; steps with equal values share it in :class:`PreparedStep`."""
-    return tuple(step[p.name] for p in step.declared if p.keyword in FILTER)
+    return tuple(step[p.name] for p in step.declared if p.keyword in FILTER_ARGUMENTS)
 
 
 def apply_recipe(

@@ -9,14 +9,14 @@ from torch import Tensor
 from nlfilter_torch.core.checks import check_order
 from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.nn.parameters import check_learn
-from nlfilter_torch.photo.declared.shared_parameters import KNOTS, SATURATIONS, STRAIGHT
+from nlfilter_torch.photo.declared.shared_parameters import CURVE_KNOTS, SATURATIONS, STRAIGHT
 from nlfilter_torch.photo.declared.steps import Step, json_of
 from nlfilter_torch.photo.edits.applying import apply_step
 from nlfilter_torch.photo.looks.edited_pixels import EditedPhotograph, Pair, images_of
 from nlfilter_torch.photo.looks.look_choice import CHOICES, Candidate
 from nlfilter_torch.photo.looks.look_filter import LOOK_PARTS, lattice_of
 from nlfilter_torch.photo.looks.look_sums import PartLayout, Parts
-from nlfilter_torch.photo.looks.region import SLIDERS, Region, add_photograph
+from nlfilter_torch.photo.looks.region import SLIDERS, RegionSums, add_photograph
 
 KINDS_OF_CURVES = {"tone": "curves"}  # a tone curve for all channels is a part of this name
 FILTER_NAMES = ("bandwidth", "spatial_bandwidth", "patch_size", "landmarks", "sampling", "viewing_size")
@@ -112,11 +112,11 @@ def fit_look(
     step = Step("look") if step is None else step
     names = check_learn(parts, LOOK_PARTS, "parts")
     choices = _choices(names)
-    layout = PartLayout(KNOTS, SATURATIONS, order + 1)
-    regions: list[Region] = []
+    layout = PartLayout(CURVE_KNOTS, SATURATIONS, order + 1)
+    regions: list[RegionSums] = []
     for number, (before, after, masks) in enumerate(images_of(pairs)):
         count = 1 if masks is None else len(masks)
-        regions = regions or [Region(layout, has_lattice="lattice" in names) for _ in range(count)]
+        regions = regions or [RegionSums(layout, has_lattice="lattice" in names) for _ in range(count)]
         if count != len(regions):
             raise ValueError(
                 f"masks must be as many for every pair, got {count} after {len(regions)}; pass one for each region"
@@ -167,7 +167,7 @@ def _step_of(look: Candidate, layout: PartLayout, step: Step) -> Step:
     )
 
 
-def _check_regions(regions: list[Region]) -> None:
+def _check_regions(regions: list[RegionSums]) -> None:
     """Raise unless there are pairs with an edit, and every region has pixels in them."""
     if not regions:
         raise ValueError("pairs must hold a pair of photographs, got none; pass (before, after)")

@@ -28,7 +28,7 @@ LIKELY = 0.95  # share that the layers of a sample of the pixels explain of such
 Shares = tuple[float, float]  # of the change that is explained: of fitted data, and of data left out of the fit
 
 
-class Region:
+class RegionSums:
     """The pixels of a region in all pairs.
 
     Args:
@@ -135,7 +135,7 @@ class Region:
         return LatticeChoice(self._pixels.all(), self._colours.all(), self._groups, self.layout).lattice(bases)
 
 
-def add_photograph(regions: Sequence[Region], number: int, photograph: EditedPhotograph) -> None:
+def add_photograph(regions: Sequence[RegionSums], number: int, photograph: EditedPhotograph) -> None:
     """Add the pixels of a photograph with that number to each of its regions.
 
     They are a sample, unless sliders explain the edit: these are fitted to all pixels.

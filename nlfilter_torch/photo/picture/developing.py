@@ -1,6 +1,6 @@
 """Developing a picture: exposure and white balance in linear light, straightening and crop.
 
-Geometry comes first, then light. A picture is turned in blocks of fixed places, so that one that is read in parts
+Geometry comes first, then light. A picture is rotated in blocks of fixed places, so that one that is read in parts
 becomes the same, bit for bit, as one in memory.
 """
 
@@ -15,9 +15,9 @@ from torch import Tensor
 
 from nlfilter_torch.core.checks import check_dtype, check_tensor
 from nlfilter_torch.core.workers import divided_among, threads_for
-from nlfilter_torch.photo.declared.development import Development, Frame, turned
+from nlfilter_torch.photo.declared.development import Development, Frame, rotated
 
-BLOCK = 256  # side in pixels of the squares that are turned at once
+BLOCK = 256  # side in pixels of the squares that are rotated at once
 MARGIN = 2  # pixels around a point that bicubic interpolation reads
 BLUE_TO_AMBER = 0.75  # stops that temperature 1 adds to red and takes from blue
 GREEN_TO_MAGENTA = 0.5  # stops that tint 1 takes from green
@@ -45,7 +45,7 @@ def develop_image(image: Tensor, development: Development) -> Tensor:
 
     Raises:
         TypeError: if ``image`` is not a floating-point tensor.
-        ValueError: if it has another shape, or the middle of the crop is outside the turned picture.
+        ValueError: if it has another shape, or the middle of the crop is outside the rotated picture.
 
     Example:
         >>> grey = torch.full((1, 1, 4, 6), 0.5)
@@ -74,7 +74,7 @@ def limits_of(image: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def develop_planes(planes: Tensor, frame: Frame) -> Tensor:
-    """Straighten and crop planes (B, C, H, W); values may leave their range where they are turned."""
+    """Straighten and crop planes (B, C, H, W); values may leave their range where they are rotated."""
     rows, columns = range(frame.top, frame.top + frame.height), range(frame.left, frame.left + frame.width)
     if frame.angle == 0:
         return part_of_planes(planes, rows, columns)
@@ -95,7 +95,7 @@ def reframed(planes: Tensor, frame: Frame, other: Frame, size: tuple[int, int]) 
 
 
 def turned_canvas(image: Tensor, development: Development) -> Tensor:
-    """An image (B, C, H, W) in [0, 1] that is turned within its own size, without a crop; empty corners are black."""
+    """An image (B, C, H, W) in [0, 1] that is rotated within its own size, without a crop; empty corners are black."""
     height, width = size = image.shape[-2], image.shape[-1]
     frame = Frame(size, math.radians(development.straighten), 0, 0, *size)
     x, y = torch.arange(width) + (0.5 - width / 2), torch.arange(height)[:, None] + (0.5 - height / 2)
@@ -110,19 +110,19 @@ def part_of_planes(planes: Tensor, rows: range, columns: range) -> Tensor:
 
 
 def bands_of(frame: Frame) -> list[range]:
-    """The rows of a developed picture that are turned at once."""
+    """The rows of a developed picture that are rotated at once."""
     return [range(top, min(top + BLOCK, frame.height)) for top in range(0, frame.height, BLOCK)]
 
 
 def turned_band(read: ReadPart, frame: Frame, rows: range) -> Tensor:
-    """Rows (B, C, h, W) of a developed picture that is turned."""
+    """Rows (B, C, h, W) of a developed picture that is rotated."""
     lefts = range(0, frame.width, BLOCK)
     parts = [turned_part(read, frame, rows, range(left, min(left + BLOCK, frame.width))) for left in lefts]
     return torch.cat(parts, dim=3)
 
 
 def turned_part(read: ReadPart, frame: Frame, rows: range, columns: range) -> Tensor:
-    """A part (B, C, h, w) of a developed picture that is turned, by bicubic interpolation.
+    """A part (B, C, h, w) of a developed picture that is rotated, by bicubic interpolation.
 
     Pixels beyond the border of the picture have the colours of those at the border.
     """
@@ -137,7 +137,7 @@ def turned_part(read: ReadPart, frame: Frame, rows: range, columns: range) -> Te
     pads = _pads(across, inner_columns) + _pads(down, inner_rows)
     source = F.pad(read(inner_rows, inner_columns), pads, mode="replicate")
     # Where the first pixel of the part read is in the part returned, both counted from the middles of pixels.
-    x, y = turned(across.start + 0.5 - width / 2, down.start + 0.5 - height / 2, frame.angle)
+    x, y = rotated(across.start + 0.5 - width / 2, down.start + 0.5 - height / 2, frame.angle)
     x, y = x + width / 2 - frame.left - columns.start - 0.5, y + height / 2 - frame.top - rows.start - 0.5
     cosine, sine = math.cos(frame.angle), math.sin(frame.angle)
     matrix = source.new_tensor([[[cosine, -sine, x], [sine, cosine, y]]]).expand(len(source), -1, -1)
@@ -146,7 +146,7 @@ def turned_part(read: ReadPart, frame: Frame, rows: range, columns: range) -> Te
 
 
 def finished(planes: Tensor, colours: int, limits: tuple[float, float], nodata: float | None = None) -> Tensor:
-    """Planes (1, S, h, w) that were turned, within their ranges.
+    """Planes (1, S, h, w) that were rotated, within their ranges.
 
     Args:
         planes: colours, and one of transparency if there are more.
@@ -164,7 +164,7 @@ def finished(planes: Tensor, colours: int, limits: tuple[float, float], nodata: 
 def _source_of(frame: Frame, column: int, row: int) -> tuple[float, float]:
     """The column and row of the original, counted from the middles of pixels, that a pixel is taken from."""
     height, width = frame.original
-    x, y = turned(frame.left + column + 0.5 - width / 2, frame.top + row + 0.5 - height / 2, -frame.angle)
+    x, y = rotated(frame.left + column + 0.5 - width / 2, frame.top + row + 0.5 - height / 2, -frame.angle)
     return x + width / 2 - 0.5, y + height / 2 - 0.5
 
 

@@ -16,7 +16,7 @@ from nlfilter_torch.photo.picture.pictures import Picture, mask_of, transparency
 Part = tuple[slice, slice]  # rows and columns of a picture
 Open = Callable[[str], Picture]  # opens the picture of marks at a path
 BRUSH_BORDER = 1.0  # width in pixels of the border of a brush that paints on a mask
-SELECTED = 0.5  # brightness from which a mask selects a pixel: the borders of soft masks fade to 0 far outside
+SELECTED_FROM = 0.5  # brightness from which a mask selects a pixel: the borders of soft masks fade to 0 far outside
 
 
 def opened_picture(path: str) -> Picture:
@@ -238,7 +238,7 @@ def _marked(region: Region, picture: Picture, start: int, stop: int) -> tuple[Te
     tile = picture.tile(start, stop, 0)
     if region.shape == "mask":
         weights = mask_of(tile)[0, 0].float()
-        return torch.where(weights < SELECTED, 0.0, weights), None
+        return torch.where(weights < SELECTED_FROM, 0.0, weights), None
     opacity = torch.from_numpy(transparency(tile, "float32")).prod(2)
     return opacity, tile.pixels[0].expand(3, -1, -1).float()  # a grey picture has one channel
 

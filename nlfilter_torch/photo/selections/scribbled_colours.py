@@ -49,7 +49,7 @@ UNLINKED, LINKED = 0.25, 0.5  # least evenness along a path up to which it links
 LINK_STEP, MOST_LINKED = 3, 1000
 INNER_ROWS, MOST_INNER = 16, 64  # points inside the picture that are compared, along its short side, and at most
 MIN_DENSITY = 1e-4  # colours that are rarer than this on both sides belong to neither
-SMALLEST_EXPONENT = -30.0  # of Gaussians: smaller ones give denormal numbers, which are slow
+LEAST_GAUSSIAN = -30.0  # of Gaussians: smaller ones give denormal numbers, which are slow
 EPSILON = 1e-6  # least sum of weights that is divided by; rounding errors of float32 sums of them are smaller
 
 
@@ -251,7 +251,7 @@ def _density(places: Tensor, left: Tensor, weights: Tensor, block: slice) -> Ten
     part = places[:, :, block]
     right = torch.cat([part, part.square().sum(1, keepdim=True), torch.ones_like(part[:, :1])], dim=1)
     exponents = right.mT @ left  # (B, k, m), minus the squared distances
-    return exponents.clamp(SMALLEST_EXPONENT, 0.0).exp() @ weights.mT
+    return exponents.clamp(LEAST_GAUSSIAN, 0.0).exp() @ weights.mT
 
 
 def colours_in_lab(colours: Tensor) -> Tensor:

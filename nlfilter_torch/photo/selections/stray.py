@@ -30,7 +30,7 @@ SLICE = 0.4  # length of a slice, relative to the width of the stroke
 SLICES = 6, 48  # least and largest number of them
 BLUR = 1  # slices on either side of the border of a run that may hold colours of both sides
 LARGEST_STRAY = 0.3  # share of a stroke that may be stray
-SLACK = 0.05  # what the beginning of a run may add to it
+BEGINNING_SLACK = 0.05  # what the beginning of a run may add to it
 # Distances in hundredths of Lab, from which on colours differ strongly: of an end from the nearest colours of the rest,
 # on average, and of a gap, likewise, or of the mean colours of two parts.
 END, GAP = 0.12, 0.18
@@ -178,7 +178,7 @@ class Slices:
         for _ in range(most):
             wider = SliceRun(run.first - before, run.last + after)
             end = run.first if before else run.last - 1
-            if self._nearest(run, end, end + 1)[0] <= least or self.share(wider) > LARGEST_STRAY + SLACK:
+            if self._nearest(run, end, end + 1)[0] <= least or self.share(wider) > LARGEST_STRAY + BEGINNING_SLACK:
                 break
             run = wider
         return run
@@ -207,7 +207,7 @@ LARGEST_AREA = 0.04  # of the picture that a stroke covers; larger areas are rou
 ELONGATED = 5.0  # least squared border of a stroke, relative to four times its area: three times as long as wide
 APART = 2.0  # distance of the means, in sums of the mean distances of cells from their own mean
 COMPACT = 0.75  # share of the smaller part that lies in two pieces
-LIGHTNESS = 0.5  # weight of differences in lightness, much of which is shading
+STRAY_LIGHTNESS = 0.5  # weight of differences in lightness, much of which is shading
 DIVIDING_STEPS = 8  # of the division in two
 
 
@@ -228,7 +228,7 @@ def strays(scribbles: Scribbles, size: tuple[int, int]) -> Tensor:
     shape = (max(1, round(size[0] / side)), max(1, round(size[1] / side)))
     at = blocks_at(scribbles.places, size, shape).cpu().numpy()
     colours = colours_in_lab(scribbles.image.detach().clamp(0.0, 1.0).expand(-1, 3, -1)).double()
-    colours = colours * colours.new_tensor((LIGHTNESS, 1.0, 1.0)).view(1, 3, 1)
+    colours = colours * colours.new_tensor((STRAY_LIGHTNESS, 1.0, 1.0)).view(1, 3, 1)
     painted = (scribbles.weights.detach() > 0).cpu().numpy()
     stray = np.zeros_like(painted)
     for image, points in enumerate(colours.mT.cpu().numpy()):

@@ -4,7 +4,7 @@ import pytest
 from nicegui import Client, ui
 
 from nlfilter_torch.photo.app.tabs import DEVELOP_CONTROLS, DevelopTab
-from nlfilter_torch.photo.declared.development import WHOLE, Development
+from nlfilter_torch.photo.declared.development import WHOLE_CROP, Development
 from nlfilter_torch.photo.declared.presets import Recipe
 from tests.photo.app.page_controls import Controls
 
@@ -44,7 +44,7 @@ def test_the_crop_is_shown_and_reset(client: Client) -> None:
     shown.show(tab, shown.recipe)
     assert shown.developed == ["16:9"]
     shown.click("Whole picture")
-    assert shown.developed[1:] == ["Free", ({"crop": WHOLE}, True)]
+    assert shown.developed[1:] == ["Free", ({"crop": WHOLE_CROP}, True)]
     shown.show(tab, shown.recipe)
     assert select.value == "Free"
 

@@ -17,7 +17,7 @@ from nlfilter_torch.photo.app.dialogs import Question
 from nlfilter_torch.photo.app.library import Library
 from nlfilter_torch.photo.app.page import EDITORS, Editor
 from nlfilter_torch.photo.app.server import SCRIPTS, STATIC, STATIC_ADDRESS
-from nlfilter_torch.photo.declared.development import WHOLE, Development
+from nlfilter_torch.photo.declared.development import WHOLE_CROP, Development
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.picture.photographs import Photograph, write_photograph
 from tests.pages import ROOT
@@ -179,7 +179,7 @@ def test_proportions_are_cut_from_the_crop_of_before_when_straightened(opened: P
 def test_a_crop_that_is_refused_changes_nothing(opened: Page, scripts: list[str]) -> None:
     editor, session = opened.editor, opened.editor.session
     session.load(Recipe((), Development(straighten=45.0)))
-    editor._proportions = Proportions(cut=WHOLE, base=(0.0, 0.0, 0.1, 0.1))
+    editor._proportions = Proportions(cut=WHOLE_CROP, base=(0.0, 0.0, 0.1, 0.1))
     editor._hold("1:1")
     assert "crop must have its middle within the photograph" in opened.errors()[-1]
     assert editor._proportions.name == "Free"

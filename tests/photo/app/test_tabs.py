@@ -3,7 +3,7 @@
 import pytest
 from nicegui import Client, ui
 
-from nlfilter_torch.photo.app.brush import BRUSHES, COLOURS, Brush
+from nlfilter_torch.photo.app.brush import BRUSHES, PALETTE, Brush
 from nlfilter_torch.photo.app.tabs import EditTab
 from nlfilter_torch.photo.declared.parameters import EDITS
 from nlfilter_torch.photo.declared.presets import Recipe
@@ -40,14 +40,14 @@ def test_the_settings_of_the_brush(shown: Controls) -> None:
     words.set_value("out")
     assert shown.brush.paint("recolor") == "out"
     words.set_value("add colour")
-    assert shown.brush.paint("recolor") == f"add {COLOURS[0]}"
+    assert shown.brush.paint("recolor") == f"add {PALETTE[0]}"
     assert shown.brush.paint("defocus") == "in"
     words.set_value("colour")
-    buttons = [button for button in shown.of(ui.button) if button.props.get("aria-label") == COLOURS[2]]
+    buttons = [button for button in shown.of(ui.button) if button.props.get("aria-label") == PALETTE[2]]
     for listener in buttons[0]._event_listeners.values():
         listener.handler(None)
-    assert shown.brush.paint("recolor") == COLOURS[2]
-    assert {field.value for field in shown.of(ui.color_input)} == {COLOURS[2]}
+    assert shown.brush.paint("recolor") == PALETTE[2]
+    assert {field.value for field in shown.of(ui.color_input)} == {PALETTE[2]}
     sizes = [slider for slider in shown.of(ui.slider) if slider.props["aria-label"] == "Brush size"]
     sizes[1].set_value(5.0)
     assert (shown.brush.radius["recolor"], shown.brush.radius["defocus"]) == (0.02, 0.05)

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from nlfilter_torch.photo.declared.development import DEVELOP, WHOLE, Crop, Development
+from nlfilter_torch.photo.declared.development import DEVELOP, WHOLE_CROP, Crop, Development
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.declared.strokes import Stroke
@@ -166,4 +166,4 @@ def test_bad_entries() -> None:
 def test_bad_values_in_python() -> None:
     with pytest.raises(ValueError, match="temperature must be a number from -1 to 1, got 3; correct it"):
         Development(temperature=3)
-    assert Development(crop=WHOLE).is_idle
+    assert Development(crop=WHOLE_CROP).is_idle

@@ -14,7 +14,7 @@ from nlfilter_torch import photo
 from nlfilter_torch.operator.options import FilterOptions
 from nlfilter_torch.photo.declared.declaration import Edit
 from nlfilter_torch.photo.declared.parameters import EDITS, MASK
-from nlfilter_torch.photo.declared.shared_parameters import FILTER
+from nlfilter_torch.photo.declared.shared_parameters import FILTER_ARGUMENTS
 from nlfilter_torch.photo.edits.applying import EDIT_OF
 from nlfilter_torch.photo.picture.drawn import Drawn
 from nlfilter_torch.photo.picture.edit import PhotoEdit
@@ -120,4 +120,4 @@ def test_functions_have_the_declared_defaults() -> None:
                 is_idle = edit.name == "tone" and parameter.idle is not ...
                 wanted = parameter.idle if is_idle else edit.defaults[name]
                 assert function[name].default == wanted
-            assert name in function or name in FILTER or parameter.name == "inside"
+            assert name in function or name in FILTER_ARGUMENTS or parameter.name == "inside"

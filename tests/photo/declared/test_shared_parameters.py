@@ -4,10 +4,10 @@ import pytest
 
 from nlfilter_torch.photo.declared.declaration import Slider
 from nlfilter_torch.photo.declared.shared_parameters import (
-    FILTER,
+    COLOUR_TOLERANCE,
+    FILTER_ARGUMENTS,
     LIMITS,
     LOOK,
-    TOLERANCE,
     VIEWING_SIZE,
     choice,
     filter_parameters,
@@ -33,7 +33,7 @@ def test_kinds_of_parameters() -> None:
 
 def test_the_filter_of_an_edit() -> None:
     parameters = {parameter.keyword: parameter for parameter in filter_parameters(bandwidth=30.0, share=0.25)}
-    assert tuple(parameters) == FILTER
+    assert tuple(parameters) == FILTER_ARGUMENTS
     assert parameters["spatial_bandwidth"].distance(None, (40, 60)) == 10.0
     assert "Default: 0.25 of the short side." in parameters["spatial_bandwidth"].help
     assert not parameters["photometric_bandwidth"].is_valid("auto")
@@ -51,8 +51,8 @@ def test_a_filter_may_estimate_its_bandwidth_and_ignore_distance() -> None:
 
 
 def test_units_of_selections_and_views() -> None:
-    assert TOLERANCE.argument_of(8.0, (40, 60)) == 0.08
-    assert TOLERANCE.keyword == "photometric_bandwidth"
+    assert COLOUR_TOLERANCE.argument_of(8.0, (40, 60)) == 0.08
+    assert COLOUR_TOLERANCE.keyword == "photometric_bandwidth"
     assert VIEWING_SIZE.default_number == 1.5
     assert LIMITS.choices == ("soft", "none")
     with pytest.raises(ValueError, match=r"viewing_size must be at least 0.*pass 0 for the size of the image"):
