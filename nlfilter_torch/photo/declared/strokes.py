@@ -100,7 +100,7 @@ class Stroke(Marking):
     Attributes:
         points: at least one (x, y), as shares of the picture's width and height.
         radius: radius of the brush, as a share of the picture's short side.
-        paint: its meaning, see :func:`meaning_of`.
+        paint: its meaning: in, out, add or remove; after in and add, a colour or sliders may follow.
 
     Example:
         >>> [Stroke(((x, 0.5),), 0.1, "in").reaches((100, 100)) for x in (-0.05, -0.15)]
@@ -140,7 +140,7 @@ class Region(Marking):
         points: corners of a polygon; for other shapes those at the upper left, the upper right and the lower left of
             the parallelogram that they fill.
         shape: what it is.
-        paint: its meaning, see :func:`meaning_of`.
+        paint: its meaning: in, out, add or remove; after in and add, a colour or sliders may follow.
         file: path of the picture in a file.
     """
 

@@ -38,10 +38,9 @@ from nlfilter_torch.photo.selections.by_hand import ByHand, check_drawn
 from nlfilter_torch.photo.selections.connected import Extent, connected
 from nlfilter_torch.photo.selections.matting import LinearMasks, linear_mask, linear_models, solve_linear, solve_mask
 from nlfilter_torch.photo.selections.rough_mask import RoughMasks
-from nlfilter_torch.photo.selections.scribbled_colours import EPSILON, trimap_share
+from nlfilter_torch.photo.selections.scribbled_colours import EPSILON, SOLVED_PIXELS, trimap_share
 from nlfilter_torch.photo.selections.stray import without_strays
 
-SOLVED_PIXELS = 1 << 17  # pixels
 VIEWED = VIEWING_SIZE.default_number  # megapixels; larger pictures are first reduced to this size
 FLOATS_PER_PIXEL = 80  # estimated working memory per pixel of the reduced picture, in addition to its operator
 ROUGH_CONFIDENCE, SCRIBBLE_CONFIDENCE = 0.02, 1000.0  # confidence in the rough mask, and in scribbles

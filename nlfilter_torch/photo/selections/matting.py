@@ -22,7 +22,7 @@ from torch import Tensor
 from nlfilter_torch.core.workers import in_order, single_threaded, threads_for
 from nlfilter_torch.photo.picture.colour import dot
 from nlfilter_torch.photo.picture.resizing import block_means
-from nlfilter_torch.photo.selections.scribbled_colours import by_trimap
+from nlfilter_torch.photo.selections.scribbled_colours import REFERENCE, by_trimap
 
 COARSEST = 48  # minimum short side of the coarsest level, in pixels
 MOST_HALVINGS = 4  # maximum number of reduced levels
@@ -60,7 +60,8 @@ def _sides(offset: tuple[int, int]) -> tuple[Slices, Slices]:
 
 
 NEIGHBOURS = tuple(_sides(offset) for offset in OFFSETS)
-PADDING = ((0, 1, 0, 0), (0, 0, 0, 1), (0, 1, 0, 1), (1, 0, 0, 1))  # from pixels with such a neighbour to all pixels
+#: Padding (left, right, top, bottom) from the pixels with such a neighbour to all pixels.
+PADDING = tuple((max(-right, 0), max(right, 0), 0, down) for down, right in OFFSETS)
 
 
 def neighbour_weights(guide: Tensor, weight: Callable[[Tensor], Tensor]) -> Tensor:
@@ -78,7 +79,6 @@ def neighbour_weights(guide: Tensor, weight: Callable[[Tensor], Tensor]) -> Tens
 JACOBI_STEPS = (2, 4, 8)  # Jacobi steps per level, finest first; the last number is for all coarser levels
 STEEPNESS = 300.0  # decay of the weights with the mean squared difference of the channels
 MIN_WEIGHT = 1e-4
-REFERENCE = 112  # short side, in pixels, for which the confidences were chosen
 
 
 def solve_mask(image: Tensor, rough: Tensor, confidence: Tensor) -> Tensor:
@@ -87,13 +87,13 @@ def solve_mask(image: Tensor, rough: Tensor, confidence: Tensor) -> Tensor:
     Args:
         image: (B, C, H, W), C = 1 or 3.
         rough: t, (B, K, H, W).
-        confidence: c, (B, K, H, W), for a short side of at most :data:`REFERENCE` pixels; rescaled for larger pictures.
+        confidence: c, (B, K, H, W), for a short side of at most that of :data:`REFERENCE`; rescaled for others.
     """
     height, width = image.shape[-2:]
     short = min(height, width)
     levels = pyramid_levels(short)
     planes = torch.cat([image, confidence * rough, confidence], dim=1)
-    scale = min(1.0, REFERENCE / short) ** 2
+    scale = min(1.0, min(REFERENCE) / short) ** 2
     count, channels = rough.shape[1], image.shape[1]
     coarser: Tensor | None = None
     for level, planes_of_level in reversed(list(enumerate(halved(planes, levels)))):

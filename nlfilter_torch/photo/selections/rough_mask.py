@@ -18,6 +18,8 @@ from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles, scribbled_b
 from nlfilter_torch.photo.picture.source import Blocks, Guide, Operator, Planes, Reduced, at, kept
 from nlfilter_torch.photo.selections.scribbled_colours import (
     EPSILON,
+    REFERENCE,
+    Coloured,
     by_trimap,
     colour_likelihood,
     evenness,
@@ -26,12 +28,18 @@ from nlfilter_torch.photo.selections.scribbled_colours import (
     likeness,
     linked_evenly,
     outwards,
+    side_weights,
     trimap_share,
 )
 
 # Gaussians, in pixels: surroundings, grain, average of its strength.
 SURROUND_SIGMA, GRAIN_SIGMA, TEXTURE_SIGMA = 2.0, 1.5, 3.0
 TEXTURE_MARGIN = max(blur_margin(SURROUND_SIGMA), blur_margin(GRAIN_SIGMA) + blur_margin(TEXTURE_SIGMA))
+
+
+def textured_channels(count: int) -> int:
+    """Number of channels of :func:`with_texture` for so many planes: these, their means, and three of texture."""
+    return 2 * count + 3
 
 
 def with_texture(planes: Tensor, brightness: Tensor, weight: float) -> Tensor:
@@ -56,7 +64,6 @@ def with_texture(planes: Tensor, brightness: Tensor, weight: float) -> Tensor:
 
 CHROMA_WEIGHT = 0.7  # weight of hue and saturation; that of lightness is LIGHTNESS
 GUIDE_TEXTURE = 1.5
-NUM_CHANNELS = 9  # channels of the guide
 SMOOTHNESS = 0.25  # of the regression
 CONTRAST = 4.0  # steepness of the curve from likelihood to rough mask
 # Weight of the colours of single pixels in the rough mask, for a few scribbles and for a trimap; the rest is the
@@ -65,7 +72,7 @@ COLOUR_SHARE = (0.65, 1.0)
 # Colours count less where the regression finds no part of the region nearby: standard deviation of "nearby" as a share
 # of the short side, number of rows or columns of the grid it is averaged on, and average from which on colours count.
 AROUND_SIGMA, AROUND_GRID, ENOUGH_AROUND = 0.1, 40, 0.5
-FRAME_PIXELS = 112 * 160  # in larger pictures points of the frame count more, as scribbles have more pixels there
+FRAME_PIXELS = math.prod(REFERENCE)  # in larger pictures points of the frame count more, as scribbles have more pixels
 
 ScribbledPoints = tuple[Callable[[], Iterable[Tensor]], Tensor, Tensor]  # columns, weights and values of pixels
 
@@ -126,7 +133,7 @@ class RoughMasks:
     @staticmethod
     def of(picture: Reduced, options: FilterOptions, reach: float | Tensor, everywhere: bool) -> "RoughMasks":
         """Prepare a picture: build its operator, with options of :func:`nonlocal_operator`, and choose the points."""
-        guide = Guide(options, region_guide, TEXTURE_MARGIN, NUM_CHANNELS, spectral=True, sampled=True)
+        guide = Guide(options, region_guide, TEXTURE_MARGIN, textured_channels(3), spectral=True, sampled=True)
         operator = picture.operator(guide)
         frame, grid = (Points.of(picture, operator, choose(picture.size)) for choose in (frame_places, inner_places))
         bandwidth = torch.as_tensor(options.photometric_bandwidth, dtype=picture.dtype)
@@ -149,12 +156,16 @@ class RoughMasks:
         outside = self.outside(known, unlike)
         likely = sharpened(self.regression(known, outside, frame_links, grid_links)(self.picture))
         likely_frame = torch.maximum(self.frame.values(likely * self.evenness), frame_links)
-        compared = [unlike, likely_frame, self.grid.colours, grid_links, self.photometric_bandwidth, trimap]
+        sides = (
+            Coloured(colours, weights),
+            Coloured(self.frame.colours, side_weights(unlike, likely_frame)),
+            Coloured(self.grid.colours, grid_links),
+        )
         by_colour = kept(
             self.picture,
             ("likelihood", number),
-            [colours, weights, *compared],
-            partial(colour_likelihood, self.picture.image, colours, weights, self.frame.colours, *compared),
+            [*sides[0], *sides[1], *sides[2], self.photometric_bandwidth, trimap],
+            partial(colour_likelihood, self.picture.image, *sides, self.photometric_bandwidth, trimap),
         )
         share = by_trimap(COLOUR_SHARE, trimap).view(-1, 1, 1, 1)
         nearby = 1.0 if self.everywhere else (around(likely) / ENOUGH_AROUND).clamp(max=1.0)

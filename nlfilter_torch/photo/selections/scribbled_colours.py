@@ -2,6 +2,7 @@
 
 import math
 from functools import partial
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -34,6 +35,8 @@ def by_trimap(values: tuple[float, float], trimap: Tensor) -> Tensor:
     return few + (most - few) * trimap
 
 
+SOLVED_PIXELS = 1 << 17  # pixels, about, of the reduced picture in which masks are solved and strays are found
+REFERENCE = (112, 160)  # size of the reduced pictures for which confidences and weights were chosen
 FRAME_POINTS = 64  # approximate number of points along the upper or left border of a picture
 NUM_COMPARED = 512  # approximate number of scribbled pixels that the frame is compared with
 SIMILAR_SHARE = 0.3  # a pixel that is similar to this share of the scribbled ones counts as similar to them
@@ -149,17 +152,28 @@ def evenness(image: Tensor) -> Tensor:
     return 1 / (1 + variance / HALF_EVEN_DEVIATION**2)
 
 
+class Coloured(NamedTuple):
+    """Pixels by their colours (B, C, n) and weights (B, K, n)."""
+
+    colours: Tensor
+    weights: Tensor
+
+
+def side_weights(unlike: Tensor, likely: Tensor) -> Tensor:
+    """Weights (B, 2, n) of pixels along the borders of a picture in the region and outside it, which sum to 1.
+
+    Args:
+        unlike: dissimilarity of these pixels to the scribbles on the region, (B, 1, n).
+        likely: likelihood of these pixels by the regression, (B, 1, n), times their :func:`evenness`. Where an even
+            region, such as a sky, reaches the border of the picture, they show its colours far from its scribbles; in
+            textures, the regression is too often wrong for that.
+    """
+    weights = unlike * torch.cat([likely.square(), (1 - likely).square()], dim=1)
+    return weights / unlike.sum(2, keepdim=True).clamp(min=EPSILON)
+
+
 def colour_likelihood(
-    image: Tensor,
-    scribbled: Tensor,
-    weights: Tensor,
-    frame: Tensor,
-    unlike: Tensor,
-    likely: Tensor,
-    inner: Tensor,
-    linked: Tensor,
-    bandwidth: float | Tensor,
-    trimap: Tensor,
+    image: Tensor, scribbled: Coloured, frame: Coloured, inner: Coloured, bandwidth: float | Tensor, trimap: Tensor
 ) -> Tensor:
     """Likelihood (B, 1, h, w), in [0, 1], that a pixel belongs to a region, by its own colour alone.
 
@@ -168,15 +182,9 @@ def colour_likelihood(
 
     Args:
         image: the reduced picture.
-        scribbled: colours (B, C, n) of scribbled pixels, see :func:`outwards`.
-        weights: of those on the region and on its background, (B, 2, n).
-        frame: colours (B, C, n) of the pixels along the borders of the picture.
-        unlike: dissimilarity of these pixels to the scribbles on the region, (B, 1, n).
-        likely: likelihood of these pixels by the regression, (B, 1, n), times their :func:`evenness`. Where an even
-            region, such as a sky, reaches the border of the picture, they show its colours far from its scribbles; in
-            textures, the regression is too often wrong for that.
-        inner: colours (B, C, m) of :func:`inner_places`.
-        linked: :func:`linked_evenly` of these, (B, 1, m).
+        scribbled: pixels with weights on the region and on its background, see :func:`outwards`.
+        frame: pixels along the borders of the picture, with :func:`side_weights`.
+        inner: :func:`inner_places`, with :func:`linked_evenly` as weights.
         bandwidth: photometric bandwidth of the regression.
         trimap: :func:`trimap_share` of the scribbles, (B,). Many scribbled pixels tell colours apart that differ less.
     """
@@ -184,19 +192,17 @@ def colour_likelihood(
     dense = trimap.view(-1, 1, 1)
     scale = by_trimap(BANDWIDTH_SHARE, dense) * per_image(bandwidth, image, 3)
     number = by_trimap(NUM_COLOURS, dense).round().long()
-    samples = (every_nth(scribbled, side, number) for side in weights.split(1, dim=1))
+    samples = (every_nth(scribbled.colours, side, number) for side in scribbled.weights.split(1, dim=1))
     inside, outside = (density(places, colours_in_lab(sample), shares, scale) for sample, shares in samples)
-    shares = unlike * torch.cat([likely.square(), (1 - likely).square()], dim=1)
-    shares = shares / unlike.sum(2, keepdim=True).clamp(min=EPSILON)
-    within, around = density(places, colours_in_lab(frame), shares, scale).split(1, dim=1)
-    shares = linked / linked.sum(2, keepdim=True).clamp(min=1.0)
-    inside = inside + within + density(places, colours_in_lab(inner), shares, scale)
-    opposed = (weights[:, 1].detach() > 0).any(1).view(-1, 1, 1)
+    within, around = density(places, colours_in_lab(frame.colours), frame.weights, scale).split(1, dim=1)
+    shares = inner.weights / inner.weights.sum(2, keepdim=True).clamp(min=1.0)
+    inside = inside + within + density(places, colours_in_lab(inner.colours), shares, scale)
+    opposed = (scribbled.weights[:, 1].detach() > 0).any(1).view(-1, 1, 1)
     outside = torch.where(opposed, (outside + around) / 2, around)
     return ((inside + MIN_DENSITY) / (inside + outside + 2 * MIN_DENSITY)).unflatten(2, image.shape[-2:])
 
 
-def outwards(scribbles: Scribbles, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
+def outwards(scribbles: Scribbles, size: tuple[int, int]) -> Coloured:
     """Colours (B, C, n) and weights (B, K, n) of scribbled pixels of a picture (H, W), from its middle outwards.
 
     Pixels at the same distance are ordered by brightness, so that the order turns with the picture.
@@ -207,7 +213,7 @@ def outwards(scribbles: Scribbles, size: tuple[int, int]) -> tuple[Tensor, Tenso
     light = scribbles.image.detach().mean(1)
     order = order_by(distances.expand_as(light), light).unsqueeze(1)
     image, weights = scribbles.image, scribbles.weights
-    return image.gather(2, order.expand_as(image)), weights.gather(2, order.expand_as(weights))
+    return Coloured(image.gather(2, order.expand_as(image)), weights.gather(2, order.expand_as(weights)))
 
 
 def every_nth(colours: Tensor, weights: Tensor, number: int | Tensor) -> tuple[Tensor, Tensor]:

@@ -23,7 +23,7 @@ from torch import Tensor
 from nlfilter_torch.core.torch_internals import is_unreadable
 from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles, blocks_at
 from nlfilter_torch.photo.picture.source import Reduced
-from nlfilter_torch.photo.selections.scribbled_colours import colours_in_lab
+from nlfilter_torch.photo.selections.scribbled_colours import SOLVED_PIXELS, colours_in_lab
 
 # Chosen with benchmarks.scribbles on the choosing set.
 SLICE = 0.4  # length of a slice, relative to the width of the stroke
@@ -34,7 +34,9 @@ BEGINNING_SLACK = 0.05  # what the beginning of a run may add to it
 # Distances in hundredths of Lab, from which on colours differ strongly: of an end from the nearest colours of the rest,
 # on average, and of a gap, likewise, or of the mean colours of two parts.
 END, GAP = 0.12, 0.18
-SELF = 2.0  # the same, relative to the mean distance of slices of the rest from the nearest other ones
+# The same, relative to how much colours vary: mean distance of slices of the rest from the nearest other ones, or the
+# sum of the mean distances of cells of both parts from their own mean.
+SPREADS = 2.0
 NARROWEST_GAP = 2  # slices of a gap that hold no other colours
 BEGINNING = 0.35  # share of a run's distance at which it begins
 ADJACENT = 3  # slices of the rest that are nearer to each other are not compared
@@ -105,7 +107,7 @@ class SliceRun:
 
     def is_stray(self, least: float) -> bool:
         """Whether the run is at least that far from the rest, and far enough for how much the rest varies."""
-        return self.distance >= max(least, SELF * self.spread)
+        return self.distance >= max(least, SPREADS * self.spread)
 
     def holds(self, numbers: Cells) -> NDArray[np.bool_]:
         """Which slices with these numbers belong to the run."""
@@ -201,11 +203,9 @@ def _spread(distances: Numbers) -> float:
     return float(nearest[np.isfinite(nearest)].mean()) if np.isfinite(nearest).any() else 0.0
 
 
-COMPARED_CELLS = 1 << 17  # of the picture, about; colours are compared between their means
 FEWEST = 12  # cells of a stroke that may have stray parts
 LARGEST_AREA = 0.04  # of the picture that a stroke covers; larger areas are rough masks, which count as they are
 ELONGATED = 5.0  # least squared border of a stroke, relative to four times its area: three times as long as wide
-APART = 2.0  # distance of the means, in sums of the mean distances of cells from their own mean
 COMPACT = 0.75  # share of the smaller part that lies in two pieces
 STRAY_LIGHTNESS = 0.5  # weight of differences in lightness, much of which is shading
 DIVIDING_STEPS = 8  # of the division in two
@@ -224,7 +224,7 @@ def strays(scribbles: Scribbles, size: tuple[int, int]) -> Tensor:
     """Which pixels of scribbles are stray, (B, K, n); without a gradient. None are if values cannot be read."""
     if is_unreadable(scribbles.weights) or is_unreadable(scribbles.image):
         return torch.zeros_like(scribbles.weights, dtype=torch.bool)
-    side = max(1.0, (size[0] * size[1] / COMPARED_CELLS) ** 0.5)
+    side = max(1.0, (size[0] * size[1] / SOLVED_PIXELS) ** 0.5)
     shape = (max(1, round(size[0] / side)), max(1, round(size[1] / side)))
     at = blocks_at(scribbles.places, size, shape).cpu().numpy()
     colours = colours_in_lab(scribbles.image.detach().clamp(0.0, 1.0).expand(-1, 3, -1)).double()
@@ -294,7 +294,7 @@ def smaller_part(colours: Numbers) -> NDArray[np.bool_] | None:
         np.linalg.norm(colours[side] - end, axis=1).mean() for side, end in zip((~part, part), ends, strict=True)
     )
     distance = np.linalg.norm(ends[1] - ends[0])
-    return part if distance >= max(GAP, APART * spread) else None
+    return part if distance >= max(GAP, SPREADS * spread) else None
 
 
 def _far(distances: NDArray[np.float64]) -> NDArray[np.bool_]:

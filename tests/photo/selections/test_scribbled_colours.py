@@ -10,12 +10,14 @@ from nlfilter_torch.core.blocks import CACHED
 from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles
 from nlfilter_torch.photo.selections import scribbled_colours
 from nlfilter_torch.photo.selections.scribbled_colours import (
+    Coloured,
     colour_likelihood,
     density,
     evenness,
     every_nth,
     linked_evenly,
     outwards,
+    side_weights,
     trimap_share,
 )
 from tests.problems import noise
@@ -47,10 +49,9 @@ def test_colours_of_a_region_where_it_reaches_the_border_belong_to_it() -> None:
 
     def likelihoods(likely: float, inside: float = 0.0) -> torch.Tensor:
         by_regression = torch.tensor([[[1.0, likely, 0.0]]]).double()
-        grid, linked = image.squeeze(2)[..., 1:2], torch.tensor([[[inside]]]).double()
-        return colour_likelihood(
-            image, *outwards(scribbles, (1, 3)), frame, unlike, by_regression, grid, linked, 0.08, torch.zeros(1)
-        ).flatten()
+        grid = Coloured(image.squeeze(2)[..., 1:2], torch.tensor([[[inside]]]).double())
+        along = Coloured(frame, side_weights(unlike, by_regression))
+        return colour_likelihood(image, outwards(scribbles, (1, 3)), along, grid, 0.08, torch.zeros(1)).flatten()
 
     assert likelihoods(0.9)[:2].min() > 0.95
     assert likelihoods(0.1)[1] < 0.05
