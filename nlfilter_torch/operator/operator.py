@@ -199,7 +199,7 @@ class NonlocalOperator(Batch):
 
     @property
     def matrix(self) -> PixelMatrix:
-        """W of the points in a row: products with planes (B, C, N)."""
+        """W for points in a row, whose products are with planes (B, C, N)."""
         return PixelMatrix(self.factor, self.scaling, self.remainder, self.weights, self.communicator)
 
     @property
