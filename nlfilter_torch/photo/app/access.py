@@ -15,7 +15,7 @@ from starlette.responses import PlainTextResponse, RedirectResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 LOCAL = ("127.0.0.1", "localhost", "::1")
-LARGEST = 1_000_000_000  # bytes of an uploaded file
+LARGEST_UPLOAD = 1_000_000_000  # bytes of an uploaded file
 FORM = 100_000  # bytes that a form adds to a file, at most
 TOKEN = "token"  # in the query of the address that is printed
 UNKNOWN = "open the address that the editor printed at its start, which holds its token"
@@ -82,8 +82,11 @@ def refusal(headers: Headers, *, websocket: bool, host: str, names: Iterable[str
     length = headers.get("content-length", "0")
     if "chunked" in headers.get("transfer-encoding", ""):
         return 411, "the size of a file must be given in Content-Length"
-    if not length.isdecimal() or int(length) > LARGEST + FORM:
-        return 413, f"a file must be at most {LARGEST / 1e9:g} GB; make the picture smaller, or use the command line"
+    if not length.isdecimal() or int(length) > LARGEST_UPLOAD + FORM:
+        return (
+            413,
+            f"a file must be at most {LARGEST_UPLOAD / 1e9:g} GB; make the picture smaller, or use the command line",
+        )
     return None
 
 

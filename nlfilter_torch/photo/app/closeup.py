@@ -18,9 +18,9 @@ from nlfilter_torch.photo.picture.sampling import Report
 
 QUIET = 1.0  # seconds without a change, after which the whole photograph is edited
 CELL = 64  # pixels; pieces consist of squares of that size
-PIECE = 1 << 19  # pixels of a piece, at most
-KEPT = 24_000_000  # pixels of all pieces, at most; invisible pieces are dropped first
-LARGEST = 40_000_000  # pixels that a page may ask for at once
+PIECE_PIXELS = 1 << 19  # pixels of a piece, at most
+KEPT_PIECES = 24_000_000  # pixels of all pieces, at most; invisible pieces are dropped first
+LARGEST_VIEW = 40_000_000  # pixels that a page may ask for at once
 
 
 class OutdatedError(Exception):
@@ -119,7 +119,7 @@ class Closeup:
         height, width = self.session.size
         left, top, right, bottom = (int(number) for number in view)
         part = Rectangle(range(max(0, top), min(height, bottom)), range(max(0, left), min(width, right)))
-        return part if 0 < len(part.rows) * len(part.columns) <= LARGEST else None
+        return part if 0 < len(part.rows) * len(part.columns) <= LARGEST_VIEW else None
 
     def _forget(self) -> None:
         """Forget all pieces, which show another edit."""
@@ -167,7 +167,7 @@ class Closeup:
         self._tell(f"closeup.add('{name}', {columns.start}, {rows.start}, {columns.stop}, {rows.stop})")
         total = sum(len(p.rows) * len(p.columns) for p, _ in self._pieces.values())
         for old, (other, _) in list(self._pieces.items()):
-            if total <= KEPT:
+            if total <= KEPT_PIECES:
                 return
             if self._view is not None and not other.meets(self._view):
                 del self._pieces[old]
@@ -185,7 +185,7 @@ class Closeup:
         if self.session is None or self._view is None or self._held:
             return None
         height, width = self.session.size
-        block = first_block(~self._cells(self._view), PIECE // CELL**2)
+        block = first_block(~self._cells(self._view), PIECE_PIXELS // CELL**2)
         if block is None:
             return None
         top, left = self._view.rows.start // CELL, self._view.columns.start // CELL

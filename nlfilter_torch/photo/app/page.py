@@ -14,7 +14,7 @@ from torch import Tensor
 
 from nlfilter_torch.core.progress import Progress
 from nlfilter_torch.photo.app import drawing
-from nlfilter_torch.photo.app.access import LARGEST
+from nlfilter_torch.photo.app.access import LARGEST_UPLOAD
 from nlfilter_torch.photo.app.brush import Brush
 from nlfilter_torch.photo.app.canvas import Canvas
 from nlfilter_torch.photo.app.closeup import AtRest, Closeup
@@ -131,9 +131,9 @@ class Editor:
             ui.space()
             self._tasks = Tasks()
             show_error = self._tasks.show_error
-            self._upload = Upload(self._take_photograph, "image/*", LARGEST, show_error)
+            self._upload = Upload(self._take_photograph, "image/*", LARGEST_UPLOAD, show_error)
             presets = Upload(self._take_preset, PRESET_KINDS, LARGEST_PRESET, show_error)
-            kinds = f"A PNG, JPEG, TIFF, WebP or AVIF file of at most {LARGEST / 1e9:g} GB"
+            kinds = f"A PNG, JPEG, TIFF, WebP or AVIF file of at most {LARGEST_UPLOAD / 1e9:g} GB"
             _button("Open", "folder_open", kinds, js=self._upload.choosing)
             self._undo_button = _button("Undo", "undo", "Ctrl+Z", self._undo)
             self._redo_button = _button("Redo", "redo", "Ctrl+Shift+Z", self._redo)

@@ -56,7 +56,7 @@ def reduce(image: Tensor, stride: int) -> Tensor:
     return F.avg_pool2d(image, stride) if stride > 1 else image
 
 
-def sampled_operator(
+def operator_of_sample(
     guide: Tensor,
     stride: int,
     detail: Step,
@@ -227,7 +227,7 @@ class Preview:
             stride, shown = self._compared(detail)
             luminance = reduce_channels(shown, "luminance")
             bandwidth = detail.arguments(self.size)["photometric_bandwidth"]
-            operator = sampled_operator(
+            operator = operator_of_sample(
                 luminance,
                 stride,
                 detail,

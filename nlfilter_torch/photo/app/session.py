@@ -37,7 +37,7 @@ from nlfilter_torch.photo.picture.tiles import Passes, Statistics
 POINTED = 2  # pixels of the preview on all sides of a point that are averaged
 SPACING = 0.2  # distance of the points of a stroke, as a share of its radius
 UNDOS = 100
-SMALL = 1 << 18  # pixels, up to which statistics are those of all pixels; a sample is nearly as exact, and fast
+FULL_STATISTICS = 1 << 18  # pixels, up to which statistics are those of all; a sample is nearly as exact, and fast
 COLOURED, RARE = 0.03, 0.002  # difference of channels of a colour, and the share of pixels that need not have one
 OPEN_BYTES = 40  # per pixel, for a photograph before and after the edit and the files of both; edits work in tiles
 
@@ -423,7 +423,7 @@ class Session:
 
     def _passes(self, photograph: Photograph, report: Report) -> Passes:
         """How an edit passes over the photograph in tiles."""
-        statistics: Statistics = "full" if math.prod(photograph.size) <= SMALL else "sample"
+        statistics: Statistics = "full" if math.prod(photograph.size) <= FULL_STATISTICS else "sample"
         kind = str(photograph.pixels.numpy().dtype)
         return Passes(kind, statistics, memory=usual_memory(TILED_MEMORY), report=report, folder=self.folder)
 
@@ -485,7 +485,7 @@ class Session:
             for part, values in edit_rows(self._passes(photograph, report), rows, steps, opened.name):
                 pixels[0, :, part] = torch.from_numpy(values).permute(2, 0, 1)
         report("Writing", 0, 1)
-        write_photograph(resized(photograph.with_pixels(pixels), size), target, quality=options.quality)
+        write_photograph(resized_photograph(photograph.with_pixels(pixels), size), target, quality=options.quality)
         self.saved = recipe
         return target
 
@@ -528,7 +528,7 @@ def reduced_size(photograph: Photograph, side: int | None) -> tuple[int, int]:
     return max(1, round(height * scale)), max(1, round(width * scale))
 
 
-def resized(photograph: Photograph, size: tuple[int, int]) -> Photograph:
+def resized_photograph(photograph: Photograph, size: tuple[int, int]) -> Photograph:
     """A photograph at another size (height, width); hidden pixels have colours of pixels nearby."""
     if size == photograph.size:
         return photograph

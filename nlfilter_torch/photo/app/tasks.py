@@ -12,7 +12,7 @@ Result = TypeVar("Result")
 Arguments = TypeVarTuple("Arguments")
 EXPECTED = (ValueError, OSError, MemoryError)  # for unusable files and values; the message says why
 PATIENCE = 0.3  # seconds until the page shows that it is working
-SHOWN = 0.5  # seconds between two texts of the progress
+BETWEEN_TEXTS = 0.5  # seconds between two texts of the progress
 LASTING = 10.0  # seconds that an error is shown
 
 
@@ -54,7 +54,7 @@ class Tasks:
             self._doing.set_text(f"{doing}\u2026")
             self._working.set_visibility(True)
             while not task.done():
-                await asyncio.wait({task}, timeout=SHOWN)
+                await asyncio.wait({task}, timeout=BETWEEN_TEXTS)
                 known = "" if progress is None else str(progress)
                 self._doing.set_text(f"{doing}: {known}" if known else f"{doing}\u2026")
             self._working.set_visibility(False)

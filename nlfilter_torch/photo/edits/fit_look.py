@@ -14,7 +14,7 @@ from nlfilter_torch.photo.declared.steps import Step, json_of
 from nlfilter_torch.photo.edits.applying import apply_step
 from nlfilter_torch.photo.looks.edited_pixels import EditedPhotograph, Pair, images_of
 from nlfilter_torch.photo.looks.look_choice import CHOICES, Candidate
-from nlfilter_torch.photo.looks.look_filter import LOOK_PARTS, lattice_of
+from nlfilter_torch.photo.looks.look_filter import LOOK_PARTS, lattice_from_numbers
 from nlfilter_torch.photo.looks.look_sums import PartLayout, Parts
 from nlfilter_torch.photo.looks.region import SLIDERS, RegionSums, add_photograph
 
@@ -57,7 +57,7 @@ class FittedLook:
         named = {name: torch.tensor(self.step[name]) for name in ("alpha", "bands", "texture")}
         others = {name: torch.tensor(self.step[name]) for name in ("saturation", "stretch", "local")}
         if self.step["lattice"] is not None:
-            others["lattice"] = lattice_of(torch.tensor(self.step["lattice"]))
+            others["lattice"] = lattice_from_numbers(torch.tensor(self.step["lattice"]))
         return {**named, "curves": curves, "matrix": matrix, **others}
 
     def to_json(self) -> str:

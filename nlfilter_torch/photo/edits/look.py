@@ -21,7 +21,7 @@ from nlfilter_torch.photo.looks.look_filter import (
     band_change,
     check_part,
     colours_of_nodes,
-    lattice_of,
+    lattice_from_numbers,
     pointwise,
     texture_change,
 )
@@ -320,7 +320,7 @@ class ChangeOfLight:
 def _lattice(value: Numbers, dtype: torch.dtype) -> Tensor:
     """A lattice as a tensor (3, n, n, n), or with a dimension of the images before; 3 n^3 numbers take this shape."""
     numbers = _numbers(value, "lattice", dtype)
-    return numbers if numbers.ndim > 2 else lattice_of(numbers)
+    return numbers if numbers.ndim > 2 else lattice_from_numbers(numbers)
 
 
 def _numbers(value: Numbers, name: str, dtype: torch.dtype) -> Tensor:

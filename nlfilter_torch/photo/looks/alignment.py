@@ -193,7 +193,7 @@ def _place(before: Tensor, after: Tensor) -> tuple[tuple[int, int], float]:
     """
     whole, part = _grey(before), _grey(after)
     scale = max(1.0, min(whole.shape) / SEARCH_SIDE)
-    small, piece = (reduced(grey, 1 / scale) for grey in (whole, part))
+    small, piece = (reduced_grey(grey, 1 / scale) for grey in (whole, part))
     if min(piece.shape) < 4 or float(piece.std()) == 0:
         return (0, 0), -1.0
     (row, column), correlation = best_match(small, piece[: small.shape[0], : small.shape[1]])
@@ -234,11 +234,11 @@ def _whole_pixels(middle: float, length: float, limit: int) -> tuple[int, int]:
 def _first_place(whole: Tensor, part: Tensor, largest: float) -> tuple[float, float, float] | None:
     """Middle (row, column) of the part and the pixels of the whole in one of its own, by trying sizes."""
     scale = min(1.0, FIRST_SIDE / min(whole.shape))
-    small = reduced(whole, scale)
+    small = reduced_grey(whole, scale)
     best, place = -math.inf, None
     for number in range(STEPS):
         pixel = largest * math.exp(-STEP * number)
-        piece = reduced(part, scale * pixel)[: small.shape[0], : small.shape[1]]
+        piece = reduced_grey(part, scale * pixel)[: small.shape[0], : small.shape[1]]
         if min(piece.shape) < LEAST_PART or float(piece.std()) < LEAST_CONTRAST:
             break
         (row, column), likeness = best_match(small, piece)
@@ -252,7 +252,7 @@ def _refined(
     whole: Tensor, part: Tensor, place: tuple[float, float, float], scale: float
 ) -> tuple[float, float, float]:
     """A place whose correlation is largest in pictures reduced by a factor, by a search along the three axes."""
-    comparison = Comparison(reduced(whole, scale), reduced(part, scale * place[2]), place, scale)
+    comparison = Comparison(reduced_grey(whole, scale), reduced_grey(part, scale * place[2]), place, scale)
     moves: tuple[float, ...] = (0.0, 0.0, 0.0)
     best, step = comparison.correlation(moves), FIRST_MOVE
     while step > LAST_MOVE:
@@ -325,7 +325,7 @@ def correlation_of(first: Tensor, second: Tensor) -> float:
     return float(torch.stack([first.flatten(), second.flatten()]).corrcoef()[0, 1].nan_to_num())
 
 
-def reduced(grey: Tensor, scale: float) -> Tensor:
+def reduced_grey(grey: Tensor, scale: float) -> Tensor:
     """Resize luminance (H, W) by a factor."""
     size = (max(1, round(grey.shape[0] * scale)), max(1, round(grey.shape[1] * scale)))
     return grey if size == tuple(grey.shape) else resize(grey[None, None], size)[0, 0]

@@ -18,7 +18,7 @@ from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.looks.alignment import inside_frame
 from nlfilter_torch.photo.looks.histogram import LocalCurves
 from nlfilter_torch.photo.looks.look_filter import blur_bands, local_curves, stretch_of, textures_of
-from nlfilter_torch.photo.looks.look_sums import SAMPLED, PixelSample, sample, squares
+from nlfilter_torch.photo.looks.look_sums import SAMPLED_PIXELS, PixelSample, sample, squares
 from nlfilter_torch.photo.picture.resizing import resize
 from nlfilter_torch.photo.picture.source import seeded
 from nlfilter_torch.photo.picture.viewing import viewed_size
@@ -26,7 +26,7 @@ from nlfilter_torch.photo.picture.viewing import viewed_size
 Pair = tuple[Tensor, ...]  # before and after an edit, and masks of regions, if any
 AGREEING = 0.5  # least correlation of the luminance of a photograph with that of its edit
 GREYS = 256  # shades, for :func:`means_of_shades`
-SELECTED = 0.9  # value of a mask above which a pixel counts as part of the region
+IN_REGION = 0.9  # value of a mask above which a pixel counts as part of the region
 
 
 class EditedPhotograph:
@@ -109,7 +109,7 @@ class EditedPhotograph:
         are mostly clipped, and with masks, as the sample has few pixels of a small region.
         """
         count = self.free.shape[1]
-        if count <= SAMPLED or self.masks is not None or float(self.free.amax(0).mean()) < 0.5:
+        if count <= SAMPLED_PIXELS or self.masks is not None or float(self.free.amax(0).mean()) < 0.5:
             return None
         places = sample(torch.ones_like(self.free[0]))
         # The landmarks are those of :attr:`layers`.
@@ -133,7 +133,7 @@ class EditedPhotograph:
         """Weights of the pixels, clipped or not, (N,) for each region."""
         if self.masks is None:
             return [self.inside]
-        masks = ((self.masks.to(self.free).flatten(1) - SELECTED) / (1 - SELECTED)).clamp(0, 1)
+        masks = ((self.masks.to(self.free).flatten(1) - IN_REGION) / (1 - IN_REGION)).clamp(0, 1)
         return [self.inside * mask for mask in masks]
 
     def _pixels(self, shown: Tensor, layers: Tensor) -> PixelSample:

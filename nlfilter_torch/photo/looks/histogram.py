@@ -22,7 +22,7 @@ from torch import Tensor
 from nlfilter_torch.operator.features import reduce_channels
 from nlfilter_torch.photo.picture.resizing import block_counts, block_means
 
-LEVEL = 1 / 255  # pictures of a smaller range are not stretched, and colours are divided by no smaller value
+GREY_LEVEL = 1 / 255  # pictures of a smaller range are not stretched, and colours are divided by no smaller value
 KINDS_OF_LEVELS = 3  # of automatic levels
 CONTRAST_LIMITS = (1.5, 2.0, 3.0, 5.0)  # clip limits relative to an even histogram; also the steepest slopes of curves
 STRENGTHS = 2 * len(CONTRAST_LIMITS)  # of tone curves of luminance, and of the largest channel
@@ -58,7 +58,7 @@ class Stretch:
     def of(ends: tuple[Tensor, Tensor]) -> "Stretch":
         """The range between the least and the largest :func:`tones` of a picture, (B, 2 + C, 1, 1) each."""
         width = ends[1] - ends[0]
-        flat = width < LEVEL
+        flat = width < GREY_LEVEL
         return Stretch(ends[0].masked_fill(flat, 0.0), width.masked_fill(flat, 1.0))
 
     def largest(self, values: Tensor) -> Tensor:
@@ -69,7 +69,7 @@ class Stretch:
         """Changes (B, KINDS_OF_LEVELS, C, H, W) of an image (B, C, H, W) by each kind of levels."""
         before = tones(image)
         moved = (before - self.darkest) / self.width - before
-        scaled = moved[:, 1:2] * image / before[:, 1:2].clamp(min=LEVEL)
+        scaled = moved[:, 1:2] * image / before[:, 1:2].clamp(min=GREY_LEVEL)
         return torch.stack([moved[:, :1].expand_as(image), scaled, moved[:, 2:]], dim=1)
 
     def change(self, image: Tensor, strengths: Tensor) -> Tensor:
@@ -153,7 +153,7 @@ class LocalCurves:
         light = brightness(image.unsqueeze(2))
         places = _stretched(light, self.stretch).squeeze(2)
         added, scaled = self._changes_of(places, rows, columns).unbind(1)
-        colours = (image / light[:, 1:, 0].clamp(min=LEVEL)).unsqueeze(1)
+        colours = (image / light[:, 1:, 0].clamp(min=GREY_LEVEL)).unsqueeze(1)
         added = added.unsqueeze(2).expand(-1, -1, image.shape[1], -1)
         return torch.cat([added, scaled.unsqueeze(2) * colours], dim=1)
 

@@ -8,11 +8,11 @@ import torch
 from scipy.optimize import isotonic_regression
 from torch import Tensor
 
-from nlfilter_torch.photo.looks.lattice_fit import ColourChange, FittedLattice, fit_hues, fit_lattice, refined
+from nlfilter_torch.photo.looks.lattice_fit import ColourChange, FittedLattice, fit_hues, fit_lattice, with_details
 from nlfilter_torch.photo.looks.look_choice import SHRINK, SLACK, Candidate
 from nlfilter_torch.photo.looks.look_filter import colours_of_nodes, pointwise, resampled, tone_curve
 from nlfilter_torch.photo.looks.look_sums import (
-    SAMPLED,
+    SAMPLED_PIXELS,
     SQUARES,
     LookSums,
     PartLayout,
@@ -20,7 +20,7 @@ from nlfilter_torch.photo.looks.look_sums import (
     PixelSample,
 )
 
-THINNED = 2 * SAMPLED  # pixels of all pairs at most
+THINNED = 2 * SAMPLED_PIXELS  # pixels of all pairs at most
 COLOUR_PARTS = ("curves", "matrix", "saturation")  # parts that are functions of the colour
 # A lattice is chosen if a look without it leaves more than SLACK times what it leaves, plus CLEAR. Where an edit may
 # depend on the surroundings of pixels, since more than SURROUNDINGS is left, lattices gain a little on the picture and
@@ -130,7 +130,7 @@ class LatticeChoice:
             before = self.colours.before.double()
             predicted = [coloured(before, look, self.layout) for look in (looks[0], looks[-1])]
             more = _change(self.colours, predicted, self._groups(self.colours)).followed_by([hues[0], hues[-1]])
-        lattice = refined(more, lattice)
+        lattice = with_details(more, lattice)
         if bool(hues[-1].any()):
             lattice = replace(lattice.with_more(torch.stack([hues[0], hues[-1]])), without=plain.explained())
         return replace(basis, coefficients=looks[-1]), plain, lattice
@@ -149,7 +149,7 @@ class LatticeChoice:
         """
         square = latin(self.pixels.square.unique(return_inverse=True)[1])
         parts = replace(colours, predicted=colours.predicted[-1:] * (int(square.max()) + 2), folds=square)
-        lattice = refined(parts, fit_lattice(parts))
+        lattice = with_details(parts, fit_lattice(parts))
         return 1 - lattice.without > WITHIN * (1 - lattice.left_out)
 
     def _predicted(self, looks: Sequence[Tensor]) -> list[Tensor]:

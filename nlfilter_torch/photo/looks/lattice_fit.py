@@ -212,7 +212,7 @@ class Problem:
         return self.pixels.energy(self.pixels.left(change, look), look)
 
 
-def refined(pixels: ColourChange, lattice: FittedLattice) -> FittedLattice:
+def with_details(pixels: ColourChange, lattice: FittedLattice) -> FittedLattice:
     """Add finer lattices, as long as they leave less of the first fold, which is left out.
 
     More nodes than before are worth it only if they leave clearly less.

@@ -19,8 +19,8 @@ from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.operator.features import pad_border, reduce_channels
 from nlfilter_torch.photo.declared.declaration import MAX_NODES, nodes_of
 from nlfilter_torch.photo.looks.histogram import (
+    GREY_LEVEL,
     KINDS_OF_LEVELS,
-    LEVEL,
     STRENGTHS,
     LocalCurves,
     Stretch,
@@ -31,7 +31,7 @@ from nlfilter_torch.photo.picture.pixels import ends_of
 
 BLURS = 6  # each twice as wide as the one before
 BAND_MARGIN = 2 * (2**BLURS - 1)  # pixels around a pixel that the widest depends on
-ROUGH = 0.15  # standard deviation of luminance around a pixel at which half of a band counts as texture
+EDGE_CONTRAST = 0.15  # standard deviation of luminance around a pixel at which half of a band counts as texture
 LookPart = Literal["alpha", "bands", "texture", "curves", "matrix", "saturation", "stretch", "local", "lattice"]
 #: Parts of a look, with their shapes for one image; a letter is any length from 2 on, the same wherever it stands.
 PART_SHAPES: dict[str, tuple[int | str, ...]] = {
@@ -132,7 +132,7 @@ def below_largest(image: Tensor) -> Tensor:
 def saturation_hats(image: Tensor, count: int) -> Tensor:
     """Weights (B, K, H, W) of the HSV saturation in K evenly spaced hat functions on [0, 1]."""
     largest, least = image.amax(1, keepdim=True), image.amin(1, keepdim=True)
-    share = ((largest - least) / largest.clamp(min=LEVEL)).clamp(0, 1)
+    share = ((largest - least) / largest.clamp(min=GREY_LEVEL)).clamp(0, 1)
     steps = torch.arange(count).to(image).view(-1, 1, 1)
     return (1 - (share * (count - 1) - steps).abs()).clamp(min=0)
 
@@ -184,7 +184,7 @@ def textures_of(image: Tensor) -> Iterator[Tensor]:
             return
         low = low - band  # the blurred luminance, and its blurred square
         variance = (low[:, 1:] - low[:, :1].square()).clamp(min=0)
-        yield band[:, :1] * (ROUGH**2 / (variance + ROUGH**2))
+        yield band[:, :1] * (EDGE_CONTRAST**2 / (variance + EDGE_CONTRAST**2))
 
 
 def texture_change(image: Tensor, gains: Tensor) -> Tensor:
@@ -205,7 +205,7 @@ def lattice_change(image: Tensor, lattice: Tensor) -> Tensor:
     return interpolate(image.flatten(2), lattices).view_as(image)
 
 
-def lattice_of(numbers: Tensor) -> Tensor:
+def lattice_from_numbers(numbers: Tensor) -> Tensor:
     """A lattice (..., 3, n, n, n) from its numbers in a row, (..., 3 n^3)."""
     nodes = nodes_of(numbers.shape[-1])
     if nodes is None:

@@ -17,7 +17,7 @@ from nlfilter_torch.photo.looks.histogram import KINDS_OF_LEVELS, STRENGTHS
 from nlfilter_torch.photo.looks.look_filter import BLURS, below_largest, saturation_hats
 
 Parts = tuple[str, ...]  # of a look; ``tone`` is one curve for all channels, ``curves`` one for each
-SAMPLED = 1 << 16  # pixels of a pair that sums are taken over
+SAMPLED_PIXELS = 1 << 16  # pixels of a pair that sums are taken over
 SQUARES = 3  # a single pair is divided into so many parts along each side, which are the folds
 
 
@@ -161,10 +161,10 @@ class PixelSample(NamedTuple):
 def sample(weights: Tensor, most: int | None = None) -> Tensor:
     """Indices (P,), ascending, of the pixels that sums are taken over, from weights (H, W).
 
-    They are all pixels of positive weight, or ``most`` of them (None: :data:`SAMPLED`): one at random of each run of
-    equal length.
+    They are all pixels of positive weight, or ``most`` of them (None: :data:`SAMPLED_PIXELS`): one at random of each
+    run of equal length.
     """
-    most = SAMPLED if most is None else most
+    most = SAMPLED_PIXELS if most is None else most
     places = weights.flatten().nonzero().squeeze(1)
     if len(places) <= most:
         return places

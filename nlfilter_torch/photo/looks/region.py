@@ -19,7 +19,7 @@ from nlfilter_torch.photo.looks.look_choice import (
     fit_parts,
     simplest,
 )
-from nlfilter_torch.photo.looks.look_sums import SAMPLED, LookSums, PartLayout, Parts, PixelSample
+from nlfilter_torch.photo.looks.look_sums import SAMPLED_PIXELS, LookSums, PartLayout, Parts, PixelSample
 
 SLIDERS: Parts = ("alpha",)  # of looks that are steps of detail
 FOLDS = 5  # of cross-validation, among which the pairs are divided
@@ -146,7 +146,7 @@ def add_photograph(regions: Sequence[RegionSums], number: int, photograph: Edite
     if not sums or _are_sliders(reduce(LookSums.__add__, sums[0]), layout, LIKELY):
         samples = photograph.regions()
         sums = [pixels.sums(layout) for pixels in samples]
-    many = regions[0].has_lattice and photograph.free.shape[1] > SAMPLED
+    many = regions[0].has_lattice and photograph.free.shape[1] > SAMPLED_PIXELS
     colours = photograph.colours(THINNED) if many else [None] * len(regions)
     for region, pixels, own, more in zip(regions, samples, sums, colours, strict=True):
         region.add(number, pixels, own, photograph.rounding, more)

@@ -9,7 +9,7 @@ import pytest
 from starlette.datastructures import Headers
 from starlette.types import Message, Receive, Scope, Send
 
-from nlfilter_torch.photo.app.access import LARGEST, PROTECTION, Guard, forget_token, names_of, refusal, token_in
+from nlfilter_torch.photo.app.access import LARGEST_UPLOAD, PROTECTION, Guard, forget_token, names_of, refusal, token_in
 
 OWN = "127.0.0.1:8080"
 
@@ -59,8 +59,8 @@ def test_addresses_of_an_editor_for_others() -> None:
 
 
 def test_uploads_have_a_limit() -> None:
-    assert status({"content-length": str(LARGEST)}) is None
-    assert status({"content-length": str(2 * LARGEST)}) == 413
+    assert status({"content-length": str(LARGEST_UPLOAD)}) is None
+    assert status({"content-length": str(2 * LARGEST_UPLOAD)}) == 413
     assert status({"content-length": "many"}) == 413
     assert status({"transfer-encoding": "chunked"}) == 411
 

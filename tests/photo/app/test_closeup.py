@@ -129,8 +129,8 @@ def test_pieces_cover_what_is_seen_and_a_pan_adds_what_is_new(page: Page, large:
 def test_pieces_are_not_too_large_and_those_out_of_sight_are_dropped(
     page: Page, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(closeup, "PIECE", 6 * CELL**2)
-    monkeypatch.setattr(closeup, "KEPT", 30_000)
+    monkeypatch.setattr(closeup, "PIECE_PIXELS", 6 * CELL**2)
+    monkeypatch.setattr(closeup, "KEPT_PIECES", 30_000)
     told = page.look(0, 0, 192, 192)
     assert told == ["closeup.add('piece-1', 0, 0, 192, 128)", "closeup.add('piece-2', 0, 128, 192, 192)"]
     told = page.look(256, 0, 384, 128)

@@ -10,7 +10,7 @@ from nlfilter_torch import estimate_bandwidth, nonlocal_operator, polynomial_fil
 from nlfilter_torch.operator.features import reduce_channels
 from nlfilter_torch.operator.operator import NonlocalOperator
 from nlfilter_torch.photo import region_mask
-from nlfilter_torch.photo.app.preview import PIXELS, Preview, reduce, sampled_operator
+from nlfilter_torch.photo.app.preview import PIXELS, Preview, operator_of_sample, reduce
 from nlfilter_torch.photo.app.session import Session
 from nlfilter_torch.photo.declared.parameters import EDITS
 from nlfilter_torch.photo.declared.presets import Recipe
@@ -241,7 +241,7 @@ def test_strokes_beside_the_photograph_are_refused(session: Session) -> None:
 def test_a_slider_moves_without_the_operator(session: Session, monkeypatch: pytest.MonkeyPatch) -> None:
     session.set("detail", alpha=(3.0, 1.0, 1.0, 1.0))
     session.render()
-    monkeypatch.setattr("nlfilter_torch.photo.app.preview.sampled_operator", None)
+    monkeypatch.setattr("nlfilter_torch.photo.app.preview.operator_of_sample", None)
     session.set("detail", alpha=(2.0, 1.0, 1.0, 1.0))
     assert difference(session.render(), apply_recipe(session.recipe, cat())) < 1
     session.set("detail", bandwidth=12.0)
@@ -264,7 +264,7 @@ def test_sampled_operator_is_a_sample_of_the_whole() -> None:
     whole = polynomial_filter(nonlocal_operator(image, photometric_bandwidth=bandwidth), image, alpha)
     for stride in (1, 2, 3):
         first = (stride - 1) // 2
-        operator = sampled_operator(
+        operator = operator_of_sample(
             image,
             stride,
             Step("detail", landmarks=100),
@@ -288,7 +288,7 @@ def test_sampled_operator_in_colour_and_nearby() -> None:
     options = {"patch_size": 3, "photometric_bandwidth": 0.1, "spatial_bandwidth": 60.0, "num_landmarks": 200}
     whole = nonlocal_operator(image, guide_channels="all", **options) @ image  # type: ignore[arg-type]
     detail = Step("detail", landmarks=200, spatial_bandwidth=60.0, patch_size=3)
-    operator = sampled_operator(image, 2, detail, bandwidth=0.1, distance=60.0, channels="all", patch_size=3)
+    operator = operator_of_sample(image, 2, detail, bandwidth=0.1, distance=60.0, channels="all", patch_size=3)
     filtered, wanted = operator @ image[..., ::2, ::2], whole[..., ::2, ::2]
     assert (filtered - wanted).square().mean().sqrt() * 255 < 0.8
 

@@ -39,7 +39,7 @@ def test_work_that_takes_long_is_shown_with_its_progress(
     tasks: Tasks, client: Client, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(module, "PATIENCE", 0.01)
-    monkeypatch.setattr(module, "SHOWN", 0.01)
+    monkeypatch.setattr(module, "BETWEEN_TEXTS", 0.01)
     progress = Progress()
 
     def wait_for(text: str) -> Callable[[], str]:

@@ -12,8 +12,8 @@ from tests.looks import ALPHA, CAT, CUP, FEW, explained, in_bytes, single_look
 
 
 def test_layers_of_a_sample_are_nearly_those_of_all_pixels(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("nlfilter_torch.photo.looks.look_sums.SAMPLED", 2000)
-    monkeypatch.setattr("nlfilter_torch.photo.looks.edited_pixels.SAMPLED", 2000)
+    monkeypatch.setattr("nlfilter_torch.photo.looks.look_sums.SAMPLED_PIXELS", 2000)
+    monkeypatch.setattr("nlfilter_torch.photo.looks.edited_pixels.SAMPLED_PIXELS", 2000)
     photograph = EditedPhotograph(CAT[0], (CAT[0] ** 0.7), None, FEW, 3, None)
     regions = photograph.regions_of_sample()
     assert regions is not None

@@ -11,7 +11,7 @@ from nlfilter_torch.photo.looks.lattice_fit import (
     fit_hues,
     fit_lattice,
     hue_columns,
-    refined,
+    with_details,
 )
 from nlfilter_torch.photo.looks.look_filter import colours_of_nodes, lattice_change
 
@@ -89,7 +89,7 @@ def rippled(count: int, ripple: float, noise: float = 0.0) -> ColourChange:
 def test_what_only_a_fine_lattice_can_say_is_explained_where_there_are_pixels() -> None:
     sample = rippled(20_000, 0.02)
     smooth = fit_lattice(sample)
-    fine = refined(sample, smooth)
+    fine = with_details(sample, smooth)
     assert fine.changes.shape == (2, 3, 33, 33, 33)
     assert 1 - fine.left_out < 0.5 * (1 - smooth.left_out)
     assert 1 - fine.fitted < 0.5 * (1 - smooth.fitted)
@@ -101,7 +101,7 @@ def test_what_only_a_fine_lattice_can_say_is_explained_where_there_are_pixels() 
 def test_noise_has_no_details() -> None:
     sample = rippled(3000, 0.0, 0.05)
     smooth = fit_lattice(sample)
-    fine = refined(sample, smooth)
+    fine = with_details(sample, smooth)
     assert fine.changes.shape == smooth.changes.shape
     assert fine.left_out == smooth.left_out
 
@@ -109,7 +109,7 @@ def test_noise_has_no_details() -> None:
 def test_nothing_is_added_where_nothing_is_left() -> None:
     sample = rippled(500, 0.0)
     perfect = replace(sample, predicted=[sample.after] * 4)
-    fine = refined(perfect, fit_lattice(perfect))
+    fine = with_details(perfect, fit_lattice(perfect))
     assert fine.fitted == 1
     assert float(fine.changes.abs().max()) == 0
 
