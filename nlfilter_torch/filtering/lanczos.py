@@ -25,7 +25,7 @@ from nlfilter_torch.operator.pixel_matrix import PixelMatrix
 CHUNK = 16  # steps between two estimates of the error
 EARLIER = 0.75  # share of the steps whose result the last one is compared with
 STEPS = (128, 1024)  # limits of the number of steps for large and small images
-NEGLIGIBLE = 50  # lengths of a new vector, in units of rounding, that count as zero
+ROUNDING_LENGTHS = 50  # lengths of a new vector, in units of rounding, that count as zero
 BASIS = 1 << 26  # numbers in the basis of a plane up to which steps are not limited to the lower limit
 
 
@@ -93,7 +93,7 @@ class Lanczos:
         following = following - _rows(inner.unsqueeze(3), basis)
         following = following - _rows(self._inner(basis, following).unsqueeze(3), basis)
         length = self._inner(following.unsqueeze(2), following).squeeze(2).clamp(min=0.0).sqrt()
-        length = torch.where(length > NEGLIGIBLE * torch.finfo(following.dtype).eps, length, 0.0)
+        length = torch.where(length > ROUNDING_LENGTHS * torch.finfo(following.dtype).eps, length, 0.0)
         self._basis[:, :, basis.shape[2]] = _normalised(following, length)
         # An exhausted space is continued by zeros, with eigenvalues of 1 that nothing is coupled to.
         self._diagonal.append(torch.where(alive, inner[:, :, -1], 1.0))

@@ -27,7 +27,7 @@ from nlfilter_torch.operator.scaling import KernelMatrix
 
 # Share of the diagonal correction that a point of weight 0 keeps: its own value counts where little else does.
 OWN = 1e-3
-FEW = 1e-6  # affinities to all that counts, below which a point of weight 0 keeps its value
+LITTLE = 1e-6  # affinities to all that counts, below which a point of weight 0 keeps its value
 
 
 def hidden_points(weights: Tensor | None) -> Tensor | None:
@@ -146,7 +146,7 @@ def extended(
     """
     total = matrix.moment(scaling)
     sums = spread(total.to(factor).mT, factor).squeeze(1)  # u . t
-    alone = hidden & ~(sums > (FEW if completed else torch.finfo(sums.dtype).tiny ** 0.5))
+    alone = hidden & ~(sums > (LITTLE if completed else torch.finfo(sums.dtype).tiny ** 0.5))
     sums = torch.where(hidden & ~alone, sums, 1.0)
     own = OWN * diagonal
     root = 2 / (sums + (sums.square() + 4 * own).sqrt()) if completed else 1 / sums  # of d (u . t + c d) = 1

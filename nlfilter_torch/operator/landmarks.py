@@ -48,7 +48,7 @@ ITERATIONS = 5
 # Scores that differ by at most this many units of rounding are tied. Constant and periodic pictures with coordinates
 # have many ties, which must not be decided by a kernel's order of summation.
 TIE = 16
-LARGEST = 1e16  # limit of features: sums of their squares do not overflow float32
+LARGEST_FEATURE = 1e16  # limit of features: sums of their squares do not overflow float32
 MANY = 1 << 24  # a permutation of more pixels than this would take more memory than the image
 
 
@@ -239,7 +239,8 @@ def clusters(
 ) -> tuple[Tensor, Tensor]:
     """Cluster points (B, D, S) by k-means: indices (B, 1, M) of the initial centroids, and assignment (B, S)."""
     points = points - points.mean(dim=2, keepdim=True)  # small offsets keep ||x||^2 + ||z||^2 - 2xz accurate
-    points = points.clamp(-LARGEST, LARGEST).float()  # float32 suffices here, and the kernels in C take nothing else
+    # Single precision suffices here, and the kernels in C take nothing else.
+    points = points.clamp(-LARGEST_FEATURE, LARGEST_FEATURE).float()
     few = draw_few(points.shape[2], count, generator).to(points.device)
     chosen = _pivots(pick(points, few.expand(len(points), 1, -1)), count, generator)
     start = communicator.broadcast(few[chosen]).unsqueeze(1)  # (B, 1, M)

@@ -19,11 +19,11 @@ from nlfilter_torch.core.precision import once_differentiable
 from nlfilter_torch.core.torch_internals import factors_of, for_each_gradient, is_hidden, register
 from nlfilter_torch.operator.options import Completion
 
-CANCELLATION = 1e-7  # error of a squared distance above which distances are not computed from matrix products
+DISTANCE_ERROR = 1e-7  # error of a squared distance above which distances are not computed from matrix products
 LARGEST_SQUARE = 60.0  # distance: smaller affinities would become denormal numbers of float32, which are slow
 JITTER = 1e-5  # added to the landmark block; limits the amplification of rounding by the inverse factor to 316 times
 
-CONVERGED = 1e-12  # distance from 1, the limit of all eigenvalues of the Newton-Schulz iteration
+ROOT_CONVERGED = 1e-12  # distance from 1, the limit of all eigenvalues of the Newton-Schulz iteration
 
 
 def inverse_cholesky(landmarks: Tensor) -> Tensor:
@@ -64,7 +64,7 @@ def inverse_root(affinity: Tensor) -> Tensor:
     most = affinity.sum(2, keepdim=True).amax(1, keepdim=True)  # bounds the eigenvalues; at most M + JITTER
     root, inverse = affinity / most, identity
     least = (JITTER / (count + JITTER)) ** 0.5
-    while least < 1 - CONVERGED:
+    while least < 1 - ROOT_CONVERGED:
         scale = (3 / (1 + least + least * least)) ** 0.5
         step = torch.baddbmm(identity, inverse, root, beta=1.5 * scale, alpha=-0.5 * scale**3)
         root, inverse = torch.bmm(root, step), torch.bmm(step, inverse)
@@ -77,7 +77,7 @@ def _squared_distances(points: Tensor) -> Tensor:
     norms = points.square().sum(1)
     # Matrix products cancel where points are many bandwidths apart, and the affinity matrix may then have a negative
     # eigenvalue.
-    if not is_hidden(points) and not float(norms.detach().max()) * torch.finfo(points.dtype).eps < CANCELLATION:
+    if not is_hidden(points) and not float(norms.detach().max()) * torch.finfo(points.dtype).eps < DISTANCE_ERROR:
         return torch.stack([(points - landmark.unsqueeze(2)).square().sum(1) for landmark in points.unbind(2)], dim=1)
     return norms.unsqueeze(2) + norms.unsqueeze(1) - 2 * points.mT @ points
 

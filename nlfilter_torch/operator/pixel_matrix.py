@@ -21,7 +21,7 @@ from nlfilter_torch.core.kernels.tall_skinny import compute_grams, moment, sprea
 from nlfilter_torch.core.precision import once_differentiable
 from nlfilter_torch.core.torch_internals import for_each_gradient, in_transform, is_hidden, outer_product
 
-SMALL = 1 << 17  # pixels up to which Gram matrices are summed in float64 throughout
+SUMMED_EXACTLY = 1 << 17  # pixels up to which Gram matrices are summed in float64 throughout
 LEAST_APART = 1e-9  # of the smallest difference from r
 ROWS = 8  # images in one product; the kernels in C are fastest for at most so many
 
@@ -256,7 +256,7 @@ class _Powers(torch.autograd.Function):
 
 def sums_exactly(dtype: torch.dtype, pixels: int) -> bool:
     """Whether Gram matrices of so many pixels are summed in float64."""
-    return dtype == torch.float32 and pixels <= SMALL
+    return dtype == torch.float32 and pixels <= SUMMED_EXACTLY
 
 
 def capacitance_inverse(gram: Tensor) -> Tensor:

@@ -16,7 +16,7 @@ a uniform sample misses, converge last. On photographs of a megapixel each sweep
 
 - float64: steps by conjugate gradients on a float32 copy of the factor. With the sample's Jacobian and BFGS updates in
   their place, balancing took 25 to 55 % longer on five photographs of 400x400 pixels (10 and 20 grey levels).
-- kernels whose approximate affinities are so negative that the scaling of a pixel exceeds :data:`LARGEST`:
+- kernels whose approximate affinities are so negative that the scaling of a pixel exceeds :data:`LARGEST_ROOT`:
   :func:`damped` is Newton's method on d with an exact line search. It is slower, but always convergent, since any
   positive d is a start, while a t may leave a point without a root.
 - kernels of the paper's method, whose scalings are large: :mod:`~nlfilter_torch.operator.sinkhorn`.
@@ -37,23 +37,27 @@ from nlfilter_torch.core.torch_internals import is_hidden
 from nlfilter_torch.core.warning import warn
 
 EXCESS = {torch.float32: 1e-5, torch.float64: 1e-10}  # amount by which d of a pixel may exceed 1 through rounding
-LARGEST = 2.0  # bound of d while t is approximate; solutions with a larger d are left to the damped method
-PER_LANDMARK = (8, 32, 160)  # sampled pixels: minimum, usual, maximum; the Jacobian is then within 35, 18 or 8 %
+LARGEST_ROOT = 2.0  # bound of d while t is approximate; solutions with a larger d are left to the damped method
+SAMPLED_PER_LANDMARK = (
+    8,
+    32,
+    160,
+)  # sampled pixels: minimum, usual, maximum; the Jacobian is then within 35, 18 or 8 %
 EXPLORED = 8192  # maximum number of pixels for the initial guess
 SHARE = 8  # one in this many pixels is sampled, within these bounds
 LARGE = 64  # at least one in this many pixels is sampled: larger images have rarer pixels
 GUESSES = 3  # fixed-point steps of the initial guess; more do not help pixels outside its sample
-REFINEMENTS = 3  # Newton steps on a sample; after two the Jacobian still changes
+SAMPLE_STEPS = 3  # Newton steps on a sample; after two the Jacobian still changes
 UNIFORM = 0.05  # fraction of the sample drawn uniformly; limits the weight of a pixel to 20 times the average
 MAX_SWEEPS = 12
 ACCELERATOR_SWEEPS = 5  # reading the residual would stall the queue of an accelerator
 FIRST_TOLERANCE = 1e-6  # tolerance of the float32 solution from which a float64 solution starts
 RESAMPLED = 0.2  # a new sample is drawn after a sweep that reduces the error by less than a factor of five
-MAX_STEPS = 50  # of the damped method; about ten are needed from any start
+DAMPED_STEPS = 50  # of the damped method; about ten are needed from any start
 SMALL_STEP = 0.1  # relative change of d below which full steps converge quadratically
 # Conjugate gradients: maximum number of steps, each of which gains a factor of at least 5.8, and the relative residual,
 # below the rounding of the dtype, at which they stop.
-STEPS = {torch.float32: 10, torch.float64: 24}
+GRADIENT_STEPS = {torch.float32: 10, torch.float64: 24}
 SOLVED = {torch.float32: 1e-7, torch.float64: 1e-16}
 UNSOLVED = 1e-2  # relative residual after the last step that causes a warning
 
@@ -122,14 +126,14 @@ class KernelMatrix:
         """Largest magnitude of the values (B, N) of each image, (B,); infinite if one of the values is NaN."""
         return self.communicator.max(values.abs().amax(1).nan_to_num(nan=torch.inf))
 
-    def scaling(self, total: Tensor, most: float = LARGEST) -> Tensor:
+    def scaling(self, total: Tensor, most: float = LARGEST_ROOT) -> Tensor:
         """The scaling d(t), (B, N), for t (B, M, 1) in float64, at most ``most``."""
         return scaling_from_moment(self.factor, self.diagonal, total.to(self.factor)).clamp_(max=most)
 
     def sweep(self, total: Tensor) -> tuple[Tensor, Tensor]:
         """The scaling d(t), (B, N), and its moment (B, M, 1), in one read of the factor."""
         half = (total / 2).squeeze(2).to(self.factor)
-        scaling, actual = sweep(self.factor, self.diagonal, half, LARGEST, self.weights)
+        scaling, actual = sweep(self.factor, self.diagonal, half, LARGEST_ROOT, self.weights)
         return scaling, self.communicator.sum(actual.unsqueeze(2))
 
     def at(self, places: Tensor, weights: Tensor) -> "KernelMatrix":
@@ -151,7 +155,7 @@ def newton(
     total: Tensor,
     *,
     steps: int,
-    most: float = LARGEST,
+    most: float = LARGEST_ROOT,
     bias: Tensor | float = 0.0,
     tolerance: float = 0.0,
 ) -> tuple[Tensor, Tensor, Tensor]:
@@ -301,7 +305,7 @@ def sampled_newton(matrix: KernelMatrix, tolerance: float) -> Balancing:
         return _refined(matrix, tolerance)
     watched, ranks = not is_hidden(matrix.factor), matrix.communicator.size
     landmarks, pixels = matrix.factor.shape[1:]
-    least, usual, most = (bound * landmarks // ranks for bound in PER_LANDMARK)
+    least, usual, most = (bound * landmarks // ranks for bound in SAMPLED_PER_LANDMARK)
     count = max(min(pixels // SHARE, max(most, pixels // LARGE)), min(usual, EXPLORED // ranks), least)
     total = _guess(matrix)
     scaling, actual = matrix.sweep(total)
@@ -314,7 +318,7 @@ def sampled_newton(matrix: KernelMatrix, tolerance: float) -> Balancing:
             # The sample predicts how the moment changes with t. Its error at the current t, where the true moment is
             # known, is subtracted.
             bias = actual - sample.moment(part)
-            total, lower, _ = newton(sample.whole, actual, steps=REFINEMENTS, bias=bias)
+            total, lower, _ = newton(sample.whole, actual, steps=SAMPLE_STEPS, bias=bias)
             inverse = torch.cholesky_inverse(lower)
         else:
             total = total - inverse @ error
@@ -392,7 +396,7 @@ def damped(matrix: KernelMatrix, start: Balancing, goal: float) -> Balancing:
     usable = start.scaling.isfinite() & (start.scaling > 0)
     scaling = torch.where(usable, start.scaling, torch.ones_like(start.scaling))
     best, slow = start, 0
-    for steps in range(1, MAX_STEPS + 1):
+    for steps in range(1, DAMPED_STEPS + 1):
         total = matrix.moment(scaling)
         deficit = 1 - matrix.row_sums(scaling, total)
         share = 1 / (1 + scaling * (scaling * matrix.diagonal))  # 1 / (1 + r)
@@ -443,11 +447,11 @@ def _total(values: Tensor, *, weights: Tensor | None, communicator: Communicator
 def conjugate_gradients(matrix: KernelMatrix, weight: Tensor, right: Tensor, inverse: Tensor) -> Tensor:
     """Solve ``(I + U diag(weight) U^T) s = right`` for s, (B, M, 1) in float64, with the factor U of a kernel.
 
-    Preconditioned conjugate gradients, at most :data:`STEPS` of them: the eigenvalues of the matrix lie in [1, 2] where
-    the kernel is balanced, so that each step gains a factor of at least 5.8 whatever the preconditioner. On CPUs the
-    iteration ends when the residual reaches :data:`SOLVED`, and it warns if the steps leave more than :data:`UNSOLVED`,
-    as they may where balancing failed. On accelerators all steps are taken, since reading a residual would stall the
-    queue.
+    Preconditioned conjugate gradients, at most :data:`GRADIENT_STEPS` of them: the eigenvalues of the matrix lie in
+    [1, 2] where the kernel is balanced, so that each step gains a factor of at least 5.8 whatever the preconditioner.
+    On CPUs the iteration ends when the residual reaches :data:`SOLVED`, and it warns if more than :data:`UNSOLVED` is
+    left, as it may be where balancing failed. On accelerators all steps are taken, since reading a residual would stall
+    the queue.
     """
     factor, communicator = matrix.factor, matrix.communicator
     tiny = torch.finfo(torch.float64).tiny  # avoids 0 / 0: if the right side is zero, so is the solution
@@ -455,7 +459,7 @@ def conjugate_gradients(matrix: KernelMatrix, weight: Tensor, right: Tensor, inv
     preconditioned = inverse @ residual
     direction, size = preconditioned, (residual * preconditioned).sum(1, keepdim=True)
     goal = SOLVED[factor.dtype] ** 2 * size
-    for _ in range(STEPS[factor.dtype]):
+    for _ in range(GRADIENT_STEPS[factor.dtype]):
         image = direction + communicator.sum(weigh(factor, weight, direction.to(factor).squeeze(2)).unsqueeze(2))
         step = size / (direction * image).sum(1, keepdim=True).clamp(min=tiny)
         solution, residual = solution + step * direction, residual - step * image

@@ -49,8 +49,8 @@ TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-12}
 ALARM = {torch.float32: 1e-4, torch.float64: 1e-9}
 MOST_ROUNDS = 8  # of removing isolated pixels; one or two are usual
 # Chebyshev semi-iteration:
-MAX_SWEEPS = 40
-ACCELERATOR_SWEEPS = 12  # reading the residual would stall the queue of an accelerator
+CHEBYSHEV_SWEEPS = 40
+UNWATCHED_CHEBYSHEV_SWEEPS = 12  # reading the residual would stall the queue of an accelerator
 TRUSTED = (1e-2, 1e2)  # row sums are clamped to this range before taking their logarithm
 SMALLEST_SUM = 1e-12  # lower bound of the initial row sums, which may be negative
 STALL = 1e-3  # below this residual, the iteration ends after two consecutive sweeps that do not halve it
@@ -227,7 +227,7 @@ def _chebyshev(matrix: KernelMatrix, tolerance: float) -> Balancing:
         previous, worst = worst, residual.max().item() if watched else worst
         slow = slow + 1 if worst > previous / 2 else 0
         stalled = worst < STALL and slow > 1  # because of rounding; a single slow sweep may have other causes
-        if worst <= tolerance or stalled or sweeps == (MAX_SWEEPS if watched else ACCELERATOR_SWEEPS):
+        if worst <= tolerance or stalled or sweeps == (CHEBYSHEV_SWEEPS if watched else UNWATCHED_CHEBYSHEV_SWEEPS):
             break
         scaling, total = following, next_total
     identity = torch.eye(factor.shape[1], dtype=torch.float64, device=factor.device).expand(len(factor), -1, -1)

@@ -5,11 +5,12 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.operator.scaling import (
-    LARGEST,
+    LARGEST_ROOT,
     Balancing,
     KernelMatrix,
     conjugate_gradients,
     damped,
+    newton,
     scaling_from_moment,
 )
 from nlfilter_torch.operator.sinkhorn import solve
@@ -48,7 +49,7 @@ def test_damped_steps_take_over_where_sweeps_do_not_converge() -> None:
     factor = torch.tensor([[[1.0, -0.9, -0.9, 0.4]]], dtype=torch.float64)
     diagonal = 1 - factor.square().sum(1) + 1e-3
     result = solve(KernelMatrix(factor, diagonal), 1e-12, True)
-    assert result.scaling.max() > LARGEST
+    assert result.scaling.max() > LARGEST_ROOT
     sums = result.scaling * ((factor.mT @ result.moment).squeeze(2) + diagonal * result.scaling)
     torch.testing.assert_close(sums, torch.ones_like(sums), atol=1e-11, rtol=0)
 
@@ -90,3 +91,20 @@ def test_conjugate_gradients_that_run_out_of_steps_say_so() -> None:
     with pytest.warns(UserWarning, match="balancing left a linear system unsolved"):
         solution = conjugate_gradients(KernelMatrix(factor, weight), weight, right, identity)
     assert float((solution - expected).norm() / expected.norm()) > 0.01
+
+
+def test_blocks_are_balanced_like_the_whole() -> None:
+    """Newton's method over blocks and, with a bias, over a sample of them."""
+    factor = noise(1, 5, 60, seed=3)
+    factor = factor / factor.norm(dim=1, keepdim=True) * 0.9
+    matrix = KernelMatrix(factor, 1 - factor.square().sum(1))
+    parts = zip(factor.split(25, dim=2), matrix.diagonal.split(25, dim=1), strict=True)
+    blocks = [KernelMatrix(*part) for part in parts]
+    expected = solve(matrix, 1e-12, True).moment
+    total, _, change = newton(lambda function: map(function, blocks), 3 * expected, steps=20, tolerance=1e-9)
+    torch.testing.assert_close(total, expected)
+    assert change <= 1e-9
+    sampled = blocks[0]
+    bias = matrix.sweep(expected)[1] - sampled.sweep(expected)[1]
+    total, _, _ = newton(sampled.whole, 2 * expected, steps=20, bias=bias)
+    torch.testing.assert_close(total, expected)

@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
-SMALL = 1 << 15  # elements of a factor below which starting a second thread takes longer than it saves
+ONE_THREAD = 1 << 15  # elements of a factor below which starting a second thread takes longer than it saves
 Result = TypeVar("Result")
 
 _POINTER, _LONG, _INT, _FLOAT = ctypes.c_void_p, ctypes.c_long, ctypes.c_int, ctypes.c_float
@@ -152,7 +152,7 @@ def pointer(tensor: Tensor | None) -> int | None:
 
 def threads(factor: Tensor) -> int:
     """Number of threads: as many as torch uses, but 1 for small factors."""
-    return 1 if factor.numel() < SMALL else torch.get_num_threads()
+    return 1 if factor.numel() < ONE_THREAD else torch.get_num_threads()
 
 
 def run(name: str, threads: int, count: int, *arguments: int | float | None) -> None:

@@ -15,14 +15,14 @@ from nlfilter_torch.core.kernels.library import by_rows, kernel, place, pointer,
 from nlfilter_torch.core.precision import once_differentiable
 from nlfilter_torch.core.torch_internals import for_each_gradient, register
 
-FEW = range(1, 9)  # numbers of rows for which the kernels in C are fastest
+FEW_ROWS = range(1, 9)  # numbers of rows for which the kernels in C are fastest
 MOST_SPREAD = 9  # with more rows than this, undivided products are no slower
 MOST_GATHERED = 24
 COMPILED_BLOCKS = 8  # of the sums of a compiled program, for images of any size
 
 
 def _compiled_spread(rows: Tensor, factor: Tensor, scaling: Tensor | None = None) -> Tensor | None:
-    if rows.shape[1] not in FEW:
+    if rows.shape[1] not in FEW_ROWS:
         return None
     factor = by_rows(factor)
     batch, landmarks, pixels = factor.shape
@@ -73,7 +73,7 @@ def gather(images: Tensor, factor: Tensor) -> Tensor:
 
 
 def _compiled_moment(factor: Tensor, images: Tensor) -> Tensor | None:
-    if images.shape[1] not in FEW:
+    if images.shape[1] not in FEW_ROWS:
         return None
     factor = by_rows(factor)
     batch, landmarks, pixels = factor.shape

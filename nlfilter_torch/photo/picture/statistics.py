@@ -18,12 +18,12 @@ from torch import Tensor
 from nlfilter_torch.core.kernels.tall_skinny import positive_root, spread
 from nlfilter_torch.core.warning import warn
 from nlfilter_torch.operator.pixel_matrix import Columns
-from nlfilter_torch.operator.scaling import LARGEST, KernelMatrix, Pass, newton
+from nlfilter_torch.operator.scaling import LARGEST_ROOT, KernelMatrix, Pass, newton
 
 # Relative Newton step at which to stop; the error after it is its square.
 CONVERGED = {torch.float32: 1e-5, torch.float64: 1e-7}
 MAX_PASSES = 12
-ALARM = 1e-3
+UNSETTLED = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,9 +57,9 @@ def balance_by_passes(
     ``bias`` is added to the sum over the blocks. ``completed`` means that the kernel has a unit diagonal and no
     negative entry, so that no scaling can be large.
     """
-    most = LARGEST if completed else float("inf")
+    most = LARGEST_ROOT if completed else float("inf")
     total, _, change = newton(blocks, total, steps=MAX_PASSES, most=most, bias=bias, tolerance=CONVERGED[dtype])
-    if change > ALARM:
+    if change > UNSETTLED:
         warn(
             f"balancing still changed by {float(change):.1e} after {MAX_PASSES} passes; "
             "raise photometric_bandwidth or num_landmarks, or use completion='diagonal'"
@@ -115,7 +115,7 @@ class Guess:
     def columns(self, block: Block, half: Tensor | None = None) -> Columns:
         """The columns of a block; ``half`` is ``u . t / 2``, (1, n), if known."""
         half = block.affinities(self.moment / 2) if half is None else half
-        scaling = positive_root(half, block.diagonal).clamp_(max=LARGEST)  # large where the guess misses a pixel
+        scaling = positive_root(half, block.diagonal).clamp_(max=LARGEST_ROOT)  # large where the guess misses a pixel
         return Columns(block.factor, scaling, scaling * (scaling * block.diagonal), block.weights)
 
     def totals(self, block: Block) -> tuple[Columns, tuple[Tensor, ...]]:
