@@ -6,7 +6,7 @@ from torch import Tensor
 from benchmarks.photographs import SIZE, luminance, scene
 from docs.scenes import SIDE, Numbers, rounded
 from nlfilter_torch.photo import abstract
-from nlfilter_torch.photo.edits.abstract import edge_lines, quantize
+from nlfilter_torch.photo.edits.abstract import Drawing
 from nlfilter_torch.photo.picture.colour import merge_luminance, split_luminance
 from nlfilter_torch.photo.plotting import show_images
 
@@ -49,5 +49,6 @@ def winnemoeller(image: Tensor) -> Tensor:
     for _ in range(ROUNDS):
         flat = bilateral_blur(flat, (13, 13), RANGE, (SPREAD, SPREAD))
     bright, chroma = split_luminance(flat)
-    toned = quantize(bright, TONES) * (1 - LINES * (1 - edge_lines(bright, 1.0)))
+    drawing = Drawing(LINES, 1.0, TONES)
+    toned = drawing.quantized(bright, TONES) * (1 - LINES * (1 - drawing.lines(bright)))
     return merge_luminance(toned, chroma)
