@@ -25,7 +25,7 @@ from nlfilter_torch.photo.cli.process import INTERRUPTED
 from nlfilter_torch.photo.cli.progress import steps
 from nlfilter_torch.photo.cli.recipe_job import apply_files
 from nlfilter_torch.photo.cli.workers import Crew, worker_pool
-from nlfilter_torch.photo.declared.parameters import EDITS
+from nlfilter_torch.photo.declared.parameters import DETAIL
 from nlfilter_torch.photo.declared.presets import Recipe, named_recipe
 from nlfilter_torch.photo.files.rows import WHOLE_MEMORY, free_memory
 from nlfilter_torch.photo.files.writing import remove_stale
@@ -58,7 +58,7 @@ class Tally:
 
 def batch_of_detail(settings: Mapping[str, Any], folder: Path, target: Path, files: FolderOptions) -> None:
     """Edit the details of all photographs of a folder, with these values of options."""
-    edit_photographs(partial(edit_photograph, EDITS["detail"], **settings), settings, folder, target, files)
+    edit_photographs(partial(edit_photograph, DETAIL, **settings), settings, folder, target, files)
 
 
 def batch_of_recipe(name: str, recipe: Recipe, folder: Path, target: Path, files: FolderOptions) -> None:

@@ -19,7 +19,7 @@ from nlfilter_torch.photo.cli.edits import (
 )
 from nlfilter_torch.photo.declared.development import DEVELOP, Development
 from nlfilter_torch.photo.declared.json_values import Value
-from nlfilter_torch.photo.declared.parameters import EDITS
+from nlfilter_torch.photo.declared.parameters import DETAIL, EDITS
 from nlfilter_torch.photo.declared.presets import CHARACTERS, LOOKS, PRESETS, PURPOSES, Recipe, find_recipe
 
 #: Edits without scribbles.
@@ -162,7 +162,7 @@ def batch(
 
     On several machines that share the folders: `nlfilter-torch batch shots edited --cluster tcp://host:8786`
     """
-    step = step_of(EDITS["detail"], values)
+    step = step_of(DETAIL, values)
     if not files.force:
         check_usual(step, typed_options(context, values))
     settings = {**values, "seed": seed}
@@ -298,7 +298,7 @@ def inspect(source: options.Source, folder: Figures, seed: options.Seed = 0, **v
 
     Example: `nlfilter-torch inspect in.jpg looks --alpha 3,3,4,1.05`
     """
-    step = step_of(EDITS["detail"], values)
+    step = step_of(DETAIL, values)
 
     from nlfilter_torch.photo.cli.inspect import write_diagnostics
 

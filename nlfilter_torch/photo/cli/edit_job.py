@@ -186,7 +186,7 @@ class ChangeMeter:
     @property
     def change(self) -> float:
         """The change of the pixels that were added."""
-        return options.GREY_LEVELS * (self._squares / max(self._count, 1)) ** 0.5
+        return options.LEVELS_OF_WHITE * (self._squares / max(self._count, 1)) ** 0.5
 
 
 def write_map(map_of: Callable[[Tensor], Tensor], rows: Rows, path: Path) -> None:

@@ -11,13 +11,13 @@ import typer
 from nlfilter_torch.photo.cli import options
 from nlfilter_torch.photo.declared.declaration import FILTER_PANEL, UNIT_NAMES, Edit, Kind, Parameter, ScribbleKind
 from nlfilter_torch.photo.declared.json_values import Value
-from nlfilter_torch.photo.declared.parameters import DETAIL, EDITS
+from nlfilter_torch.photo.declared.parameters import DETAIL
 from nlfilter_torch.photo.declared.presets import LOOKS, PRESETS, Recipe, find_recipe
 from nlfilter_torch.photo.declared.steps import Step
 
 Command = Callable[..., None]  # typer reads its signature
 #: Options of detail that do not concern regions.
-DETAIL_OPTIONS = tuple(p.name for p in EDITS["detail"] if p.is_option and p.name not in ("reach", "tolerance"))
+DETAIL_OPTIONS = tuple(p.name for p in DETAIL if p.is_option and p.name not in ("reach", "tolerance"))
 NUMBERS: dict[Kind, type[float]] = {"number": float, "count": int, "odd": int}
 
 
@@ -123,6 +123,7 @@ def scribble_options(edit: Edit) -> dict[str, object]:
 def option_value(parameter: Parameter, value: Value) -> float | str | None:
     """Convert the value of a parameter to that of its option.
 
+    >>> from nlfilter_torch.photo.declared.parameters import EDITS
     >>> option_value(EDITS["detail"]["alpha"], (3.0, 1.05)), option_value(EDITS["tone"]["bandwidth"], 20.0)
     ('3,1.05', '20')
     """
@@ -161,7 +162,7 @@ def with_options(*names: str, more: Iterable[Edit] = ()) -> Callable[[Command], 
     """Replace the ``**values`` of a command by the named options of detail and all options of the edits in ``more``."""
 
     def decorate(function: Command) -> Command:
-        added = {name: _declared(EDITS["detail"][name]) for name in names}
+        added = {name: _declared(DETAIL[name]) for name in names}
         for edit in more:
             for parameter in edit:
                 if parameter.is_option and parameter.name not in added:

@@ -107,7 +107,7 @@ def summarize(operator: NonlocalOperator, spectrum: Spectrum, guide: Tensor) -> 
         "width": width,
         "landmarks": figures.pop("num_landmarks"),
         "rank": figures.pop("rank"),
-        "bandwidth": options.GREY_LEVELS * figures.pop("photometric_bandwidth"),
+        "bandwidth": options.LEVELS_OF_WHITE * figures.pop("photometric_bandwidth"),
         **figures,
         "captured_energy": float(captured_energy(spectrum, guide)),
     }
@@ -130,13 +130,13 @@ SELECTION = (slice(300, 320), slice(60, 80))  # rows and columns of a patch of t
 # Chosen by eye: half the default width keeps the mask on the suit, three times the default time fills its folds.
 SELECTION_WIDTH = 2.0
 SELECTION_TIME = 3.0
-SELECTION_BANDWIDTH = 25 / options.GREY_LEVELS
+SELECTION_BANDWIDTH = 25 / options.LEVELS_OF_WHITE
 
 
 def write_examples(folder: Path) -> None:
     """Write pictures of each step of the filter on an example photograph, and print the figures of its filter."""
     check_folder(folder)
-    image = torch.from_numpy(skimage.data.astronaut()).permute(2, 0, 1)[None].float() / options.GREY_LEVELS
+    image = torch.from_numpy(skimage.data.astronaut()).permute(2, 0, 1)[None].float() / options.LEVELS_OF_WHITE
     with steps(4) as begin:
         begin("Comparing patches")
         luminance = reduce_channels(image, "luminance")

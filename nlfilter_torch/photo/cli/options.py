@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from nlfilter_torch.photo.files.formats import Depth
 
 FILES_PANEL = "Files and memory"  # section in the help
-GREY_LEVELS = 255.0  # grey levels between black and white, whatever the depth of the file
+LEVELS_OF_WHITE = 255.0  # grey levels between black and white, whatever the depth of the file
 
 
 FileDepth = Literal["8", "16", "float"]  # what a channel of the output file holds

@@ -35,7 +35,7 @@ SIGNATURE = b"\x89PNG\r\n\x1a\n"
 XMP_TEXT = b"XML:com.adobe.xmp"
 RAW_KEY = b"Raw profile type "  # of texts in which some programs write EXIF, XMP and IPTC as hexadecimal numbers
 SAMPLES = {0: 1, 2: 3, 3: 3, 4: 2, 6: 4}  # by the type of colours
-PALETTE = 3
+INDEXED = 3
 ADAM7 = (
     (0, 0, 8, 8),
     (0, 4, 8, 8),
@@ -259,7 +259,7 @@ def _interlaced(
         (chunk.name, bytes(data[chunk.start : chunk.stop])) for chunk in parts if chunk.name in (b"PLTE", b"tRNS")
     ]
     channels = np.empty(shape, dtype)
-    stored = 1 if kind == PALETTE else SAMPLES[kind]
+    stored = 1 if kind == INDEXED else SAMPLES[kind]
     for top, left, down, across in ADAM7:
         rows, columns = -(-(height - top) // down), -(-(width - left) // across)
         if rows <= 0 or columns <= 0:
