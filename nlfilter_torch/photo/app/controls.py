@@ -9,7 +9,7 @@ from nicegui import ui
 from nlfilter_torch.photo.declared import declaration
 from nlfilter_torch.photo.declared.declaration import Parameter
 from nlfilter_torch.photo.declared.json_values import Value
-from nlfilter_torch.photo.declared.parameters import EDITS
+from nlfilter_torch.photo.declared.parameters import DETAIL, EDITS
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.declared.steps import Step
 
@@ -98,7 +98,7 @@ LAYERS = (
 def detail_sliders(name: str, count: int) -> tuple[Control, ...]:
     """A slider for each layer of the details; ``name`` is ``alpha`` or ``inside``."""
     layers = LAYERS if count == 4 else tuple((f"Layer {i + 1}", "Fine to coarse.") for i in range(count - 1))
-    parameter = EDITS["detail"][name]
+    parameter = DETAIL[name]
     finer = [
         Control("detail", parameter, declaration.Slider(label, 0, 5, 0.05), text + " 1 leaves it, 0 removes it.", i)
         for i, (label, text) in enumerate(layers)

@@ -19,7 +19,7 @@ from nlfilter_torch.photo.declared.json_values import Value
 from nlfilter_torch.photo.declared.parameters import EDITS
 from nlfilter_torch.photo.declared.presets import Recipe, on_frame
 from nlfilter_torch.photo.declared.steps import Step
-from nlfilter_torch.photo.declared.strokes import Mark, thin
+from nlfilter_torch.photo.declared.strokes import Mark, Region, thin
 from nlfilter_torch.photo.edits.applying import apply_recipe
 from nlfilter_torch.photo.edits.parts import Parts, Rectangle
 from nlfilter_torch.photo.edits.recipe import edit_rows
@@ -502,8 +502,22 @@ class Session:
         return target
 
     def load_preset(self, content: bytes, name: str) -> None:
-        """Load an edit from the content of a file; raises ValueError if it has none, or if no photograph is open."""
-        opened, recipe = self._opened_to("edit"), Recipe.from_file(content, name)
+        """Load an edit from the content of a file, in which masks are named as seen from the editor's folder.
+
+        Raises:
+            ValueError: if it has no edit, or names a mask outside the folder, or if no photograph is open.
+        """
+        opened, path, folder = self._opened_to("edit"), self.folder / name, self.folder.resolve()
+        try:
+            recipe = Recipe.from_file(content, str(path))
+        except ValueError as error:
+            raise ValueError(str(error).replace(str(path), name)) from error
+        for mark in (mark for step in recipe.steps for mark in step.strokes if isinstance(mark, Region) and mark.file):
+            if not Path(mark.file).resolve().is_relative_to(folder):
+                raise ValueError(
+                    f"masks of {name} must be files in {folder}, got {mark.file}; move the file there, or apply the "
+                    "edit on the command line"
+                )
         recipe.check_crop(opened.photograph.size, name)
         self.load(recipe)
 

@@ -123,8 +123,8 @@ def scribble_options(edit: Edit) -> dict[str, object]:
 def option_value(parameter: Parameter, value: Value) -> float | str | None:
     """Convert the value of a parameter to that of its option.
 
-    >>> from nlfilter_torch.photo.declared.parameters import EDITS
-    >>> option_value(EDITS["detail"]["alpha"], (3.0, 1.05)), option_value(EDITS["tone"]["bandwidth"], 20.0)
+    >>> from nlfilter_torch.photo.declared.parameters import TONE
+    >>> option_value(DETAIL["alpha"], (3.0, 1.05)), option_value(TONE["bandwidth"], 20.0)
     ('3,1.05', '20')
     """
     if isinstance(value, tuple):

@@ -105,8 +105,8 @@ def parse_crop(text: str) -> Crop:
 def parse_number(text: str, parameter: Parameter) -> float | str:
     """Parse the value of an option that takes a positive number, or one of the parameter's words.
 
-    >>> from nlfilter_torch.photo.declared.parameters import EDITS
-    >>> [parse_number(text, EDITS["detail"]["bandwidth"]) for text in ("51", "auto")]
+    >>> from nlfilter_torch.photo.declared.parameters import DETAIL
+    >>> [parse_number(text, DETAIL["bandwidth"]) for text in ("51", "auto")]
     [51.0, 'auto']
     """
     if text in parameter.words:

@@ -198,6 +198,21 @@ def test_another_photograph_begins_a_new_edit(session: Session, tmp_path: Path) 
     assert session.suggested_name() == "coffee-edited.jpg"
 
 
+def test_masks_of_a_loaded_edit_are_files_of_the_folder(session: Session, tmp_path: Path) -> None:
+    """Whoever sends an edit to the editor cannot have it open files elsewhere."""
+    (tmp_path / "inside").mkdir()
+    for file, inside in (("inside/mask.png", True), ("../mask.png", False), (str(tmp_path.parent / "mask.png"), False)):
+        strokes = [{"paint": "in", "mask": file}]
+        content = json.dumps({"version": 1, "steps": [{"edit": "defocus", "strokes": strokes}]}).encode()
+        if inside:
+            session.load_preset(content, "edit.json")
+            (mark,) = session.recipe.current("defocus").strokes
+            assert mark.file == str(tmp_path / file)
+        else:
+            with pytest.raises(ValueError, match=r"masks of edit\.json must be files in .*, got .*mask\.png; move"):
+                session.load_preset(content, "edit.json")
+
+
 def test_colour_tables_are_loaded_as_looks(session: Session) -> None:
     colours = np.stack(np.meshgrid(*[np.arange(4) / 3] * 3, indexing="ij"))
     table = np.stack([colours[0] ** 1.4, colours[1], 0.7 * colours[2]])
