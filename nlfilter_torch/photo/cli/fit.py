@@ -9,7 +9,7 @@ from nlfilter_torch.photo.cli import options
 from nlfilter_torch.photo.cli.edits import step_of, with_options
 from nlfilter_torch.photo.declared.colour_tables import CUBE_NODES
 from nlfilter_torch.photo.declared.json_values import Value
-from nlfilter_torch.photo.declared.parameters import LOOK
+from nlfilter_torch.photo.declared.shared_parameters import LOOK
 
 Before = Annotated[str, typer.Argument(metavar="BEFORE", help="The photograph before the edit, or a folder of them.")]
 After = Annotated[
