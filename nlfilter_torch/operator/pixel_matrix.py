@@ -136,7 +136,7 @@ class PixelMatrix(Columns):
     @property
     def mass(self) -> Tensor:
         """Coefficients (B, N) of sums on the right of the product."""
-        return self.scaling if self.transposed else super().mass
+        return self.scaling if self.transposed else weighted(self.scaling, self.weights)
 
     def sums(self, planes: Tensor) -> Tensor:
         """Sums over all points on the right of the product, (B, M, C) in float64."""

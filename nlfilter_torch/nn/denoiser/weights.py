@@ -3,7 +3,8 @@
 from collections.abc import Mapping
 from pathlib import Path
 
-import safetensors.torch
+import numpy as np
+import safetensors.numpy
 import torch
 from torch import Tensor
 
@@ -16,7 +17,7 @@ def read_weights(path: Path, shapes: Mapping[str, tuple[int, ...]]) -> dict[str,
         ValueError: if the file is damaged, or lacks a tensor of that name and shape.
     """
     try:
-        weights = safetensors.torch.load(path.read_bytes())
+        weights = safetensors.numpy.load(path.read_bytes())
     except OSError as error:
         raise FileNotFoundError(
             f"weights must be a safetensors file, but {path} cannot be read: {error.strerror}; reinstall "
@@ -31,6 +32,6 @@ def read_weights(path: Path, shapes: Mapping[str, tuple[int, ...]]) -> dict[str,
                 f"weights must hold {name} of shape {shape}, but {path} has {'none' if got is None else got}; "
                 "they belong to another layer"
             )
-        if weights[name].dtype != torch.float32:
+        if weights[name].dtype != np.float32:
             raise ValueError(f"weights must be numbers of float32, but {path} has {weights[name].dtype}; convert them")
-    return {name: weights[name] for name in shapes}
+    return {name: torch.tensor(weights[name]) for name in shapes}

@@ -64,7 +64,7 @@ DEVELOP = Edit(
             "straighten",
             "number",
             0.0,
-            "Degrees by which the photograph is rotated, clockwise above 0, counter-clockwise below. Empty corners are "
+            "Degrees by which the photograph is turned, clockwise above 0, counter-clockwise below. Empty corners are "
             "cut off, and the proportions kept.",
             -45,
             45,
@@ -177,7 +177,7 @@ class Development:
         share = min(1.0, *(_reach(middle, (x * half[0], y * half[1]), angle, size) for x in (-1, 1) for y in (-1, 1)))
         if share <= 0:
             raise ValueError(
-                f"crop must have its middle within the photograph rotated by {self.straighten:g} degrees, got "
+                f"crop must have its middle within the photograph turned by {self.straighten:g} degrees, got "
                 f"{', '.join(f'{edge:g}' for edge in self.crop)}; move it inwards"
             )
         columns, rows = (_inside(m + n / 2, share * h) for m, n, h in zip(middle, (width, height), half, strict=True))

@@ -63,7 +63,7 @@ def upright(channels: NDArray[Scalar], orientation: int) -> NDArray[Scalar]:
 def exif_orientation(value: object) -> int:
     """Return the EXIF orientation, 1 to 8; 1 (upright) if ``value`` is invalid.
 
-    >>> orientation_of(6), orientation_of("upside down")
+    >>> exif_orientation(6), exif_orientation("upside down")
     (6, 1)
     """
     return int(value) if isinstance(value, int) and 1 <= value <= 8 else 1

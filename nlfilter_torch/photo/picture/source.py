@@ -17,6 +17,7 @@ Some pixels of a picture have three forms: :class:`Picture`, all of them, as the
 rows with its halo; and :class:`Tiling`, rows to write.
 """
 
+import math
 from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -254,16 +255,20 @@ def at(source: Source[M], places: Tensor) -> tuple[Tensor, Tensor | None]:
 
     None in place of the latter is 1 each.
     """
-    parts = list(source.over(partial(_at, places), "Looking", places=places))
+    parts = list(source.over(partial(_at, places, math.prod(source.size)), "Looking", places=places))
     if not parts:
         return torch.zeros(source.batch, source.channels, 0, dtype=source.dtype), None
     colours, weights = zip(*parts, strict=True)
     return torch.cat(colours, dim=2), None if weights[0] is None else torch.cat(weights, dim=2)
 
 
-def _at(places: Tensor, block: Block) -> tuple[Tensor, Tensor | None]:
-    """Of the pixels that lie in a block."""
+def _at(places: Tensor, pixels: int, block: Block) -> tuple[Tensor, Tensor | None]:
+    """Of the pixels that lie in a block of a picture of so many."""
     image, weights = block.image.flatten(2), block.weights
-    first, last = torch.searchsorted(places, places.new_tensor([block.first, block.first + image.shape[2]])).tolist()
-    chosen = places[first:last] - block.first
+    if image.shape[2] == pixels:
+        chosen = places  # without reading values, which a GPU would have to wait for
+    else:
+        ends = places.new_tensor([block.first, block.first + image.shape[2]])
+        first, last = torch.searchsorted(places, ends).tolist()
+        chosen = places[first:last] - block.first
     return image[:, :, chosen], None if weights is None else weights.flatten(2)[:, :, chosen]
