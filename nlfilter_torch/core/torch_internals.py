@@ -12,7 +12,7 @@ skipped, and iterations run a fixed number of steps.
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import lru_cache, wraps
 from typing import Any, ParamSpec, TypeVar, cast
 
@@ -33,11 +33,12 @@ from torch._C._functorch import (
 from torch._functorch.pyfunctorch import temporarily_clear_interpreter_stack
 from torch._subclasses.fake_tensor import FakeTensor
 from torch.autograd import forward_ad
-from torch.utils._pytree import tree_map_only
+from torch.utils._pytree import register_pytree_node, tree_map_only
 
 P = ParamSpec("P")
 R = TypeVar("R")
 Definition = TypeVar("Definition", bound=Callable[..., Any])
+Options = TypeVar("Options", bound=type[Any])
 
 OPERATORS = torch.library.Library("nlfilter", "DEF")
 DEFINITIONS: dict[Any, Callable[..., Any]] = {}  # of the operators of torch.ops.nlfilter
@@ -169,6 +170,17 @@ def outside_transforms(function: Callable[P, R]) -> Callable[P, R]:
             return function(*args, **kwargs)
 
     return wrapper
+
+
+def with_tensors(options: Options) -> Options:
+    """Let :func:`outside_transforms` see the tensors that are fields of a dataclass."""
+    names = [field.name for field in fields(options)]
+    register_pytree_node(
+        options,
+        lambda value: ([getattr(value, name) for name in names], None),
+        lambda values, _: options(**dict(zip(names, values, strict=True))),
+    )
+    return options
 
 
 @contextmanager

@@ -7,6 +7,7 @@ from typing import Any, Literal, Protocol, Self, runtime_checkable
 import torch
 from torch import Tensor
 
+from nlfilter_torch.core.torch_internals import with_tensors
 from nlfilter_torch.operator.assignment import Assignment
 
 
@@ -33,6 +34,7 @@ AUTO: Literal["auto"] = "auto"  # photometric bandwidth: estimate it from the gu
 SAMPLING: Sampling = "kmeans"  # how landmarks are chosen by default
 
 
+@with_tensors
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FilterOptions:
     """How a filter is built; see :func:`nonlocal_operator` for the meaning of the options.
