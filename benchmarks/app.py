@@ -65,7 +65,7 @@ def in_the_library(path: Path, repeats: int) -> None:
 
     def stroke(shift: float) -> None:
         session.add_stroke("detail", [(shift * size[1], 0.8 * size[0]), (0.6 * size[1], 0.85 * size[0])], 0.01, "in")
-        session.preview.mask(session.recipe.current("detail"))
+        session.preview.masks(session.recipe.current("detail"))
 
     report("first stroke to mask", [milliseconds(lambda: stroke(0.3))])
     report("stroke to mask", [milliseconds(lambda i=i: stroke(0.3 + i / 100)) for i in range(repeats)])
