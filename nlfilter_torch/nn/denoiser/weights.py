@@ -25,6 +25,8 @@ def read_weights(path: Path, shapes: Mapping[str, tuple[int, ...]]) -> dict[str,
         ) from None
     except safetensors.SafetensorError as error:
         raise ValueError(f"weights must be a complete safetensors file, but {path} is damaged: {error}") from None
+    except KeyError as error:  # a type that numpy lacks, such as bfloat16
+        raise ValueError(f"weights must be numbers of float32, but {path} has {error}; convert them") from None
     for name, shape in shapes.items():
         got = tuple(weights[name].shape) if name in weights else None
         if got != shape:

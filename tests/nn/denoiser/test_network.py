@@ -365,10 +365,10 @@ def test_files_that_are_damaged_or_of_something_else_name_themselves(tmp_path: P
         ValueError, match=r"must hold log_bandwidths of shape \(2,\), but .*weights.safetensors has none"
     ):
         NonlocalDenoiser.trained(path)
-    half = {name: value.half() for name, value in TRAINED_ONE.state_dict().items()}
-    save_file(half, path)
-    with pytest.raises(ValueError, match=r"must be numbers of float32, but .* has torch.float16"):
-        NonlocalDenoiser.trained(path)
+    for dtype, called in ((torch.float16, "float16"), (torch.bfloat16, "'BF16'")):
+        save_file({name: value.to(dtype) for name, value in TRAINED_ONE.state_dict().items()}, path)
+        with pytest.raises(ValueError, match=f"must be numbers of float32, but .* has {called}; convert them"):
+            NonlocalDenoiser.trained(path)
 
 
 def test_a_second_pass_repeats_the_first_until_it_is_trained(tmp_path: Path) -> None:
