@@ -15,7 +15,7 @@ a uniform sample misses, converge last. On photographs of a megapixel each sweep
 10 to 100. Three things do not go without a method of their own:
 
 - float64: steps by conjugate gradients on a float32 copy of the factor. With the sample's Jacobian and BFGS updates in
-  their place, balancing took 25 to 55 % longer on five photographs of 400x400 pixels (10 and 20 grey levels).
+  their place, balancing took 20 to 55 % longer on five photographs of 400x400 pixels (10 and 20 grey levels).
 - kernels whose approximate affinities are so negative that the scaling of a pixel exceeds :data:`LARGEST_ROOT`:
   :func:`damped` is Newton's method on d with an exact line search. It is slower, but always convergent, since any
   positive d is a start, while a t may leave a point without a root.

@@ -13,8 +13,8 @@ the affine map from a picture that uses little of its range (:class:`WorkingRang
 and :meth:`Fitted.output` undoes it where they are written. What previews keep from one edit to the next is apart from
 sources, in :func:`kept`.
 
-Some pixels of a picture have three forms: :class:`Picture`, all of them, as they are stored; :class:`Tile`, a block of
-rows with its halo; and :class:`Tiling`, rows to write.
+Pixels pass between files and sources as a :class:`Picture`, all of them as they are stored, a :class:`Tile`, a block of
+rows with its halo, and a :class:`Tiling`, rows to write.
 """
 
 import math
