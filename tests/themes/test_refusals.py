@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -762,6 +763,38 @@ MODULES: dict[str, list[Refusal]] = {
     ),
 }
 
+LEAVES = "^box must lie within the picture, which is 22 pixels wide and 20 high, got"
+NARROW, NO_NUMBERS_OF_BOX = "^box must be at least 1 pixel wide and high, got", "^box must be four numbers .*, got"
+NO_BOXES: dict[Any, tuple[str, type[Exception]]] = {
+    (1, 2, 3): (rf"{NO_NUMBERS_OF_BOX} \(1, 2, 3\); reshape it", ValueError),
+    (0, 0, 100, 20): (rf"{LEAVES} \(0, 0, 100, 20\); move or shrink", ValueError),
+    (-1, 0, 10, 20): (rf"{LEAVES} \(-1, 0, 10, 20\); move or shrink", ValueError),
+    (10, 0, 5, 20): (rf"{NARROW} \(10, 0, 5, 20\); give left, top, right and bottom", ValueError),
+    (5, 5, 5, 5): (rf"{NARROW} \(5, 5, 5, 5\); give left, top, right and bottom", ValueError),
+    (NAN, 0, 5, 5): ("^box must be finite, got 1 NaN or infinite value", ValueError),
+    (0, 0, INFINITY, 5): ("^box must be finite, got 1 NaN or infinite value", ValueError),
+    "left": (f"{NO_NUMBERS_OF_BOX} 'left'; give left, top", TypeError),
+    7: (f"{NO_NUMBERS_OF_BOX} 7; give left, top", TypeError),
+    torch.ones(3, 4): (rf"{NO_NUMBERS_OF_BOX} \(3, 4\); reshape", ValueError),
+    torch.ones(5, 1, 4): (rf"{NO_NUMBERS_OF_BOX} \(5, 1, 4\); reshape", ValueError),
+    torch.ones(1, 3, 4): ("^box must be one for all regions or one for each of the 1 regions, got 3; add", ValueError),
+    torch.ones(1, 1, 4).bool(): ("^box must hold numbers of pixels, got torch.bool; convert", TypeError),
+    (10, 10, 22, 20): ("^box must hold most of the .* on its object in every image, got some that lie m", ValueError),
+}
+WITH_BOX: dict[str, Callable[[Any], object]] = {
+    "region_mask": lambda v: region_mask(RGB, SPOT, box=v, num_landmarks=20),
+    "defocus": lambda v: defocus(RGB, SPOT, box=v, num_landmarks=20),
+    "recolor": lambda v: recolor(RGB, **STROKES, box=v, num_landmarks=20),
+    "enhance": lambda v: enhance(RGB, ONES, SPOT, box=v, num_landmarks=20),
+}
+
+
+@pytest.mark.parametrize("function", WITH_BOX)
+def test_refused_boxes(function: str) -> None:
+    call = WITH_BOX[function]
+    check_refusals(Refusal(partial(call, value), *said) for value, said in NO_BOXES.items())
+
+
 EDITS: dict[str, list[Refusal]] = {
     "enhance": [
         *refusals(
@@ -871,6 +904,7 @@ EDITS: dict[str, list[Refusal]] = {
     "region_mask": refusals(
         region_mask,
         {"image": RGB[:1], "scribbles": SPOT},
+        ({"scribbles": None}, "^scribbles must be a torch.Tensor, got NoneType; paint some, or pass box or", TypeError),
         ({"scribbles": 0 * SPOT}, "^scribbles must hold a painted pixel"),
         ({"scribbles": 2 * SPOT}, r"^scribbles must be in \[0, 1\]"),
         ({"scribbles": torch.ones(1, 1, 9, 9)}, "^scribbles must have the height and width of the image"),

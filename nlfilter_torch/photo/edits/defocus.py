@@ -12,6 +12,7 @@ from nlfilter_torch.core.checks import check_reach
 from nlfilter_torch.operator.options import Completion, Sampling
 from nlfilter_torch.photo.declared.declaration import Edit
 from nlfilter_torch.photo.declared.parameters import DEFOCUS
+from nlfilter_torch.photo.picture.boxes import Box
 from nlfilter_torch.photo.picture.drawn import Drawn
 from nlfilter_torch.photo.picture.in_memory import edited
 from nlfilter_torch.photo.picture.pixels import M
@@ -19,7 +20,7 @@ from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles
 from nlfilter_torch.photo.picture.source import Fitted, Source
 from nlfilter_torch.photo.selections.by_hand import ByHand, check_drawn
 from nlfilter_torch.photo.selections.connected import Extent
-from nlfilter_torch.photo.selections.mask import ObjectEdit, background_of, fit_regions
+from nlfilter_torch.photo.selections.mask import ObjectEdit, background_of, boxed, fit_regions
 
 Aperture = Literal["disc", "gaussian"]
 
@@ -35,6 +36,7 @@ def defocus(
     focus_region: Tensor | None,
     *,
     background: Tensor | None = None,
+    box: Box | None = None,
     added: Tensor | None = None,
     removed: Tensor | None = None,
     radius: float | None = None,
@@ -56,9 +58,12 @@ def defocus(
 
     Args:
         image: (B, C, H, W) in [0, 1], C = 1 or 3.
-        focus_region: (B, 1, H, W) in [0, 1], above 0 on part or all of the subject; None if it is ``added``.
+        focus_region: (B, 1, H, W) in [0, 1], above 0 on part or all of the subject; None if it is ``added``,
+            or in a ``box``.
         background: (B, 1, H, W) in [0, 1], background scribbles, above 0 on pixels that are blurred together with
             similar ones. ``focus_region`` takes precedence over it.
+        box: ``(left, top, right, bottom)`` in pixels, a rectangle that holds the subject, or a tensor (B, 1, 4); all
+            outside it is blurred, see :func:`region_mask`.
         added: (B, 1, H, W) in [0, 1], painted on the mask of the subject by hand: 1 stays sharp, whatever is computed.
         removed: (B, 1, H, W) in [0, 1], likewise: 1 is blurred. It takes precedence over ``added``.
         radius: radius of the strongest blur, in pixels, at most half the short side; None is 2.5 % of the short side.
@@ -113,13 +118,16 @@ class Defocus(ObjectEdit):
         lens = Lens(float(DEFOCUS["radius"].pixels(self.radius, source.size)), self.aperture)
         check_reach(lens.radius, "radius", source.size)
         region, added = drawn.masks.get("focus_region"), drawn.masks.get("added")
-        check_drawn(region, added, "focus_region")
+        check_drawn(region, added, "focus_region", drawn.box)
         by_hand = ByHand.of(source, added, drawn.masks.get("removed"), 1)
         inside, background = [], list[Scribbles]()
-        if region is not None or added is None:
-            inside = [source.scribbles(region, None, "focus_region", needed=added is None)]
+        if region is not None:
+            needed = added is None and drawn.box is None
+            inside = [source.scribbles(region, None, "focus_region", needed=needed)]
+        inside, boxes = boxed(source, drawn.box, inside, 1, "focus_region")
+        if inside:
             background = background_of(source, drawn.masks.get("background"), inside[0], "background")
-        subject = fit_regions(source, inside, background, self.selection_in(source.size), by_hand)
+        subject = fit_regions(source, inside, background, self.selection_in(source.size), by_hand, boxes)
         return Fitted(subject.masks, lens.finish, lens.reach)
 
 

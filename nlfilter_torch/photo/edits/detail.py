@@ -1,6 +1,5 @@
 """Detail sliders for the whole image, or for everything similar to painted regions. Paper: Figs. 12, 13."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import ClassVar, Literal, Self
@@ -21,6 +20,7 @@ from nlfilter_torch.operator.features import blur_margin
 from nlfilter_torch.operator.options import Completion, GuideChannels, Sampling
 from nlfilter_torch.photo.declared.declaration import Arguments, Edit
 from nlfilter_torch.photo.declared.parameters import DETAIL, MASK
+from nlfilter_torch.photo.picture.boxes import Box, boxes_of, scaled
 from nlfilter_torch.photo.picture.changes import (
     VARIANCE_SIGMA,
     DetailChange,
@@ -52,6 +52,7 @@ def enhance(
     regions: Tensor | None = None,
     *,
     negative: Tensor | None = None,
+    box: Box | None = None,
     added: Tensor | None = None,
     removed: Tensor | None = None,
     outside: Tensor | None = None,
@@ -83,6 +84,8 @@ def enhance(
         regions: (B, K, H, W) in [0, 1], above 0 on part or all of each of K regions, like the scribbles of
             :func:`region_mask`; None edits the whole image.
         negative: (B, 1 or K, H, W) in [0, 1], above 0 on part of the background of all regions, or of each region.
+        box: ``(left, top, right, bottom)`` in pixels, a rectangle that holds each region, or a tensor (B, K, 4), see
+            :func:`region_mask`; it may take the place of ``regions``.
         added: (B, K, H, W) in [0, 1], painted on the masks of the regions by hand, see :func:`region_mask`; it may take
             the place of ``regions``.
         removed: (B, 1 or K, H, W) in [0, 1], likewise: pixels that belong to no region, or not to each.
@@ -163,24 +166,29 @@ class Detail(PhotoEdit):
         """Fit the change of detail of a picture, or of its regions."""
         alpha = self.alpha if drawn.sliders is None else drawn.sliders
         outside = self.outside if drawn.outside is None else drawn.outside
-        return replace(self, alpha=alpha, outside=outside)._fit(source, drawn.masks)
+        return replace(self, alpha=alpha, outside=outside)._fit(source, drawn)
 
-    def _fit(self, source: Source[M], masks: Mapping[str, M]) -> Fitted:
+    def _fit(self, source: Source[M], drawn: Drawn[M]) -> Fitted:
         """:meth:`fit` with the sliders of the edit."""
+        masks = drawn.masks
         counts = [num_regions(source, masks[name], name) for name in ("regions", "added") if name in masks]
-        self._check(source.batch, masks)
+        self._check(source.batch, drawn)
+        if drawn.box is not None:
+            boxes = boxes_of(drawn.box, source.size, source.batch, counts[0] if counts else None)
+            drawn, counts = replace(drawn, box=boxes), [boxes.shape[1]]
         if not counts:
             return self._fit_whole(source)
-        return self._fit_regions(source, masks, region_sliders(self.alpha, counts[0]))
+        return self._fit_regions(source, drawn, region_sliders(self.alpha, counts[0]))
 
-    def _check(self, batch: int, masks: Mapping[str, object]) -> None:
+    def _check(self, batch: int, drawn: Drawn[M]) -> None:
         """Raise an error for an invalid setting."""
+        masks = drawn.masks
         alpha, outside = self.alpha, self.outside
         check_alpha(alpha)
         check_count(self.options.num_landmarks, "num_landmarks")
         DETAIL.check(batch, channels=self.channels, limits=self.limits, viewing_size=self.viewing_size)
         DETAIL.check(batch, threshold=self.threshold, residual=self.residual)
-        marked = "regions" in masks or "added" in masks
+        marked = "regions" in masks or "added" in masks or drawn.box is not None
         if not marked and (outside is not None or masks):
             name = next((name for name in ("negative", "removed") if name in masks), "outside")
             raise ValueError(f"{name} must be given together with regions, got no regions; mark the regions to edit")
@@ -222,12 +230,12 @@ class Detail(PhotoEdit):
             return Fitted(change.whole)
         return self._fitted(change)
 
-    def _fit_regions(self, source: Source[M], masks: Mapping[str, M], sliders: Tensor) -> Fitted:
-        outside = self.outside
+    def _fit_regions(self, source: Source[M], drawn: Drawn[M], sliders: Tensor) -> Fitted:
+        masks, outside = drawn.masks, self.outside
         elsewhere = torch.zeros_like(sliders[0]) if outside is None else outside - 1
         brighter = None if outside is None else change_of_mean(torch.cat([sliders, outside[None] - 1]))
         brighter = None if brighter is None else brighter.to(source.dtype)
-        regional = partial(self._change_of_regions, source, masks, [*sliders, elsewhere])
+        regional = partial(self._change_of_regions, source, drawn, [*sliders, elsewhere])
         size = viewed_size(source.size, self.viewing_size)
         if size != source.size:
             by_hand = ByHand.of(source, masks.get("added"), masks.get("removed"), len(sliders))
@@ -267,14 +275,16 @@ class Detail(PhotoEdit):
         return Fitted(change, self._limited, blur_margin(VARIANCE_SIGMA))
 
     def _change_of_regions(
-        self, source: Source[M], masks: Mapping[str, M], sliders: list[Tensor], viewed: Source[M]
+        self, source: Source[M], drawn: Drawn[M], sliders: list[Tensor], viewed: Source[M]
     ) -> "RegionalChange":
         """The change of the regions of a picture at the viewing size, by a row of sliders for each and for the rest."""
         selector = self.selection()  # takes the state of the generator before the filter draws from it
         first = self._detail(viewed, sliders[0])
         if viewed.size != source.size:
-            masks = {name: resized_masks(source, mask, viewed.size, name) for name, mask in masks.items()}
-        regions = selector.select(viewed, self.marks(Drawn(masks)))
+            masks = {name: resized_masks(source, mask, viewed.size, name) for name, mask in drawn.masks.items()}
+            box = None if drawn.box is None else scaled(torch.as_tensor(drawn.box), source.size, viewed.size)
+            drawn = Drawn(masks, box=box)
+        regions = selector.select(viewed, self.marks(drawn))
         return RegionalChange([replace(first, sliders=row) for row in sliders], regions)
 
     def _limited(self, image: Tensor, changes: Tensor, _: Inner) -> Tensor:

@@ -14,6 +14,7 @@ from nlfilter_torch.operator.options import Completion, Sampling
 from nlfilter_torch.photo.declared.declaration import Edit
 from nlfilter_torch.photo.declared.parameters import RECOLOR
 from nlfilter_torch.photo.looks.look_filter import acts
+from nlfilter_torch.photo.picture.boxes import Box, boxes_of, check_scribbles_in
 from nlfilter_torch.photo.picture.colour import dot, merge_luminance, split_luminance
 from nlfilter_torch.photo.picture.drawn import Drawn
 from nlfilter_torch.photo.picture.in_memory import edited
@@ -40,6 +41,7 @@ def recolor(
     stroke_mask: Tensor | None,
     *,
     keep: Tensor | None = None,
+    box: Box | None = None,
     added: Tensor | None = None,
     removed: Tensor | None = None,
     brightness: float | Tensor = RECOLOR.defaults["brightness"],
@@ -67,6 +69,8 @@ def recolor(
         stroke_mask: (B, 1, H, W) in [0, 1], above 0 where painted.
         keep: (B, 1, H, W) in [0, 1], background scribbles, above 0 on pixels that stay unchanged together with similar
             ones. Strokes take precedence over it.
+        box: ``(left, top, right, bottom)`` in pixels, a rectangle that holds all that takes a new colour, or a tensor
+            (B, 1, 4); outside it nothing changes, see :func:`region_mask`.
         added: (B, 4, H, W), RGB and, in [0, 1], how much of it: painted by hand, takes that colour whatever is
             computed. Without other strokes, these are None.
         removed: (B, 1, H, W) in [0, 1], likewise: 1 stays unchanged. It takes precedence over ``added``.
@@ -135,7 +139,11 @@ class Recolor(ObjectEdit):
         kept = list[Scribbles]()
         if painted.strokes is not None:
             kept = background_of(source, drawn.masks.get("keep"), painted.strokes, "keep")
-        objects = fit_regions(source, groups.inside, kept, self.selection_in(source.size), by_hand)
+        boxes = None
+        if drawn.box is not None and painted.strokes is not None:
+            boxes = boxes_of(drawn.box, source.size, source.batch, 1).expand(-1, len(groups.inside), -1)
+            check_scribbles_in(boxes[:, :1], [painted.strokes], source.size, "strokes")
+        objects = fit_regions(source, groups.inside, kept, self.selection_in(source.size), by_hand, boxes)
         change = Recoloring(colours, old, valid, under, brightening)
         reduced, masks = change.compared(objects.reduced), objects.reduced_masks()
         shares = [refine_mask(reduced, share) for share in change.shares(masks).split(1, dim=1)]
@@ -163,13 +171,13 @@ class RecoloredPixels:
     def __call__(self, pixels: Pixels) -> Tensor:
         """Recolour pixels."""
         sides = [Sides.of(self.objects.rows(planes, pixels)) for planes in self.beside]
-        by_hand = None if self.objects.by_hand is None else partial(self.objects.by_hand.over, pixels=pixels)
+        finished = partial(self.objects.finished, pixels=pixels)
         by_hue = []
         for planes, scribbles in zip(self.by_hue, self.objects.scribbles if self.by_hue else [], strict=True):
             factor, enclosed = self.objects.rows(planes, pixels).split(1, dim=1)
             front, back = scribbles.planes(pixels).split(1, dim=1)
             by_hue.append((torch.lerp(factor, torch.ones_like(factor), front), enclosed * (1 - back)))
-        return self.change(pixels.image, self.objects.computed(pixels), sides, by_hand, by_hue)
+        return self.change(pixels.image, self.objects.computed(pixels), sides, finished, by_hue)
 
 
 def with_room(chroma: Tensor, brightness: Tensor) -> Tensor:
@@ -266,18 +274,19 @@ class Recoloring:
         pixels: Tensor,
         masks: Tensor,
         beside: list[Sides],
-        by_hand: Callable[[Tensor], Tensor] | None = None,
+        finished: Callable[[Tensor], Tensor] | None = None,
         by_hue: Sequence[tuple[Tensor, Tensor]] = (),
     ) -> Tensor:
         """Recolour pixels (B, 3, H, W), given masks (B, K, H, W) and the colours on both sides of their borders.
 
-        ``by_hand`` paints on the shares (B, K, H, W) of the colours; ``by_hue`` corrects each, see :meth:`corrected`.
+        ``finished`` limits the shares (B, K, H, W) of the colours and paints on them, see :meth:`Regions.finished`;
+        ``by_hue`` corrects each, see :meth:`corrected`.
         """
         luminance, chroma = split_luminance(pixels)
         compared = chroma if self.brightening is None else pixels  # :meth:`compared`
         shares = self.corrected(luminance, chroma, self.refined(compared, masks, beside), by_hue)
-        if by_hand is not None:
-            shares = by_hand(shares) * self.valid[..., None, None]
+        if finished is not None:
+            shares = finished(shares) * self.valid[..., None, None]
         brightness, changed, total = luminance, chroma, torch.zeros_like(luminance)
         for k in range(shares.shape[1]):
             sides, share = beside[k], shares[:, k : k + 1]

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from nlfilter_torch.photo.declared.declaration import Edit
 from nlfilter_torch.photo.declared.strokes import Mark, ScribbleRole, sliders_of
+from nlfilter_torch.photo.picture.boxes import Box
 from nlfilter_torch.photo.picture.pixels import M as M
 
 M_co = TypeVar("M_co", covariant=True)  # as M, of values that are only read
@@ -28,17 +29,19 @@ class Drawn(Generic[M_co]):
             of ``masks``.
         sliders: (K, k+1), a row for each region that has sliders of its own; None if none has.
         outside: sliders (k+1,) outside these regions; None leaves the other pixels unchanged.
+        box: rectangles that hold the objects, in pixels, see :func:`~nlfilter_torch.photo.picture.boxes.boxes_of`.
     """
 
     masks: Mapping[str, M_co] = field(default_factory=dict)
     colours: M_co | None = None
     sliders: Tensor | None = None
     outside: Tensor | None = None
+    box: Box | None = None
 
     @staticmethod
-    def of(masks: Mapping[str, M | None], colours: M | None = None) -> "Drawn[M]":
+    def of(masks: Mapping[str, M | None], colours: M | None = None, box: Box | None = None) -> "Drawn[M]":
         """Scribbles of which some may be None, where there are none."""
-        return Drawn({name: mask for name, mask in masks.items() if mask is not None}, colours)
+        return Drawn({name: mask for name, mask in masks.items() if mask is not None}, colours, box=box)
 
 
 class Painter(Protocol[M]):

@@ -126,4 +126,4 @@ class PhotoEdit(ABC):
             mask = drawn.masks.get(scribble.argument, coloured)
             if mask is not None:
                 masks[MARKS[scribble.role]] = mask
-        return Drawn(masks)
+        return Drawn(masks, box=drawn.box)

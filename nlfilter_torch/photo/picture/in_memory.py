@@ -314,7 +314,7 @@ def edited(edit: type[PhotoEdit], arguments: Arguments) -> Tensor:
     """
     name, image = next(iter(arguments.items()))
     masks = {scribble.argument: arguments[scribble.argument] for scribble in edit.declared.scribbles}
-    drawn = Drawn.of(masks, arguments.get("strokes"))
+    drawn = Drawn.of(masks, arguments.get("strokes"), arguments.get("box"))
     return edit_image(edit.of(arguments), image, drawn, name=name, channels=edit.image_channels)
 
 

@@ -72,6 +72,13 @@ class Scribbles:
             colours=None if self.colours is None else self.colours[..., kept],
         )
 
+    def repainted(self, planes: Tensor, image: Tensor) -> "Scribbles":
+        """Scribbles of weights (B, K, H, W) on all of an image (B, C, H, W), which these are on, too."""
+        marked = (planes.detach() > 0).flatten(2).any(0).any(0)
+        marked[self.places] = True  # pixels of weight 0 matter to the derivative by the weights
+        places = marked.nonzero().squeeze(1)
+        return Scribbles(places, planes.flatten(2)[..., places], image.flatten(2)[..., places])
+
     def planes(self, pixels: Pixels) -> Tensor:
         """Return the weights (B, K, h, w) at some pixels of the picture."""
         height, width = pixels.image.shape[-2:]

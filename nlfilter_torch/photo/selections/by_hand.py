@@ -86,10 +86,10 @@ def _planes_of(source: Source[M], masks: M | None, name: str) -> tuple[Planes | 
     return (None, 0) if masks is None else (region_weights(source, masks, name), num_regions(source, masks, name))
 
 
-def check_drawn(scribbles: object, added: object, name: str) -> None:
-    """Raise TypeError if there are neither scribbles, which errors call ``name``, nor what is added by hand."""
-    if scribbles is None and added is None:
-        raise TypeError(f"{name} must be a torch.Tensor, got NoneType; paint some, or pass added")
+def check_drawn(scribbles: object, added: object, name: str, box: object = None) -> None:
+    """Raise TypeError if there are no scribbles, which errors call ``name``, no box, and nothing is added by hand."""
+    if scribbles is None and added is None and box is None:
+        raise TypeError(f"{name} must be a torch.Tensor, got NoneType; paint some, or pass box or added")
 
 
 def opaque(source: Source[M], painted: Scribbles) -> Scribbles:

@@ -24,15 +24,16 @@ from nlfilter_torch.operator.options import Completion, FilterOptions, Sampling,
 from nlfilter_torch.photo.declared.declaration import Edit
 from nlfilter_torch.photo.declared.parameters import MASK
 from nlfilter_torch.photo.declared.shared_parameters import VIEWING_SIZE
+from nlfilter_torch.photo.picture.boxes import Box, boxes_of, check_scribbles_in, in_boxes, scaled
 from nlfilter_torch.photo.picture.drawn import Drawn
 from nlfilter_torch.photo.picture.edit import PhotoEdit
-from nlfilter_torch.photo.picture.in_memory import edited, in_blocks
+from nlfilter_torch.photo.picture.in_memory import InMemory, edited, in_blocks
 from nlfilter_torch.photo.picture.measuring import shrunk
 from nlfilter_torch.photo.picture.pixels import M, Pixels, corner
 from nlfilter_torch.photo.picture.resizing import enlarged
 from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles, parts_in_blocks
 from nlfilter_torch.photo.picture.source import Fitted, Reduced, Source, at, kept
-from nlfilter_torch.photo.picture.tiled_scribbles import read_regions
+from nlfilter_torch.photo.picture.tiled_scribbles import num_regions, read_regions
 from nlfilter_torch.photo.picture.viewing import viewed_size
 from nlfilter_torch.photo.selections.by_hand import ByHand, check_drawn
 from nlfilter_torch.photo.selections.connected import Extent, connected
@@ -45,6 +46,7 @@ VIEWED = VIEWING_SIZE.default_number  # megapixels; larger pictures are first re
 FLOATS_PER_PIXEL = 80  # estimated working memory per pixel of the reduced picture, in addition to its operator
 ROUGH_CONFIDENCE, SCRIBBLE_CONFIDENCE = 0.02, 1000.0  # confidence in the rough mask, and in scribbles
 ODDS, STEEPNESS = 1.5, 1.4  # of the curve from the solution along borders, too low halfway, to masks
+AROUND_BOX = 0.1  # width of what tells the background around a box, as a share of the side of a square of its area
 MOST_WAITING = 2  # threads: operations on so few pixels are not worth dividing between two
 
 
@@ -53,6 +55,7 @@ def region_mask(
     scribbles: Tensor | None,
     background: Tensor | None = None,
     *,
+    box: Box | None = None,
     added: Tensor | None = None,
     removed: Tensor | None = None,
     reach: float | Tensor = MASK.defaults["reach"],
@@ -79,9 +82,14 @@ def region_mask(
         image: (B, C, H, W) in [0, 1], C = 1 or 3.
         scribbles: (B, K, H, W) in [0, 1], above 0 on part or all of each of K regions; a rough mask is fine. Exactly 0
             elsewhere: pixels with faint scribbles count as parts of the region too. Scribbles of other regions are
-            background, except where they overlap. None computes no masks: they are ``added``.
+            background, except where they overlap. None computes no masks, unless there is a ``box``: they are
+            ``added``.
         background: (B, 1 or K, H, W) in [0, 1], above 0 on part of the background of all regions or of each;
             ``scribbles`` take precedence. None means no background scribbles.
+        box: ``(left, top, right, bottom)`` in pixels: a rectangle that holds the object of every region, for which it
+            may take the place of ``scribbles``; or a tensor (B, K, 4), one for each region. What lies outside is
+            background, where masks are exactly 0, and so are scribbles there; pixels just outside tell what the
+            background looks like. A box that is the whole picture says nothing.
         added: (B, K, H, W) in [0, 1], painted on the masks by hand: where it is 1, the mask of that region is 1,
             whatever is computed, and those of the others are 0. A region without scribbles is what is added to it.
         removed: (B, 1 or K, H, W) in [0, 1], likewise: where it is 1, masks are 0. It takes precedence over ``added``.
@@ -103,7 +111,7 @@ def region_mask(
 
     Raises:
         TypeError, ValueError: if a tensor has another size, leaves [0, 1], or has no painted pixel that no other
-            scribble overrides.
+            scribble overrides; if a box does not lie in the picture, or most of the scribbles do not lie in it.
 
     Example:
         >>> image = torch.rand(1, 3, 32, 32, generator=torch.Generator().manual_seed(0)) * 0.2
@@ -146,8 +154,11 @@ class RegionMask(PhotoEdit):
         if source.channels not in (1, 3):
             raise ValueError(f"image must have 1 or 3 channels, got {source.channels}; select 1 or 3")
         scribbles, background, added = (drawn.masks.get(name) for name in ("scribbles", "background", "added"))
-        check_drawn(scribbles, added, self.names[0])
-        inside = [] if scribbles is None else read_regions(source, scribbles, self.names[0], needed=added is None)
+        check_drawn(scribbles, added, self.names[0], drawn.box)
+        needed = added is None and drawn.box is None
+        inside = [] if scribbles is None else read_regions(source, scribbles, self.names[0], needed=needed)
+        count = len(inside) or (None if added is None else num_regions(source, added, "added"))
+        inside, boxes = boxed(source, drawn.box, inside, count, self.names[0])
         by_hand = ByHand.of(source, added, drawn.masks.get("removed"), len(inside) or None)
         outside = [] if background is None else read_regions(source, background, self.names[1])
         if len(outside) not in (0, 1, len(inside)):
@@ -157,7 +168,7 @@ class RegionMask(PhotoEdit):
             )
         if not inside:
             outside = []
-        regions = fit_regions(source, inside, outside, self, by_hand)
+        regions = fit_regions(source, inside, outside, self, by_hand, boxes)
         if outside and by_hand is None and bool((regions.background_weights.detach() <= 0).any()):
             raise ValueError(
                 f"{self.names[1]} must hold a painted pixel outside the scribbles of each region in every image, got "
@@ -194,6 +205,7 @@ class Regions:
         functions: linear functions from colours in [0, 1] to masks, (B, K, C+1, h, w), see :meth:`LinearMasks.fit`.
         scribbles: for each region, weights on the region and on its background.
         by_hand: what is painted on the masks, or None.
+        boxes: rectangles that hold the objects, (B, K, 4) in pixels of the picture, or None.
     """
 
     reduced: Tensor
@@ -201,6 +213,7 @@ class Regions:
     functions: Tensor
     scribbles: list[Scribbles]
     by_hand: ByHand | None = None
+    boxes: Tensor | None = None
 
     @property
     def background_weights(self) -> Tensor:
@@ -214,11 +227,16 @@ class Regions:
 
     def masks(self, pixels: Pixels) -> Tensor:
         """Masks (B, K, h, w) of the given pixels."""
-        computed = self.computed(pixels)
-        return computed if self.by_hand is None else self.by_hand.over(computed, pixels)
+        return self.finished(self.computed(pixels), pixels)
+
+    def finished(self, masks: Tensor, pixels: Pixels) -> Tensor:
+        """Computed masks (B, K, h, w) of the given pixels: 0 outside the boxes, and with what is painted by hand."""
+        if self.boxes is not None:
+            masks = torch.where(in_boxes(self.boxes, pixels), masks, 0.0)
+        return masks if self.by_hand is None else self.by_hand.over(masks, pixels)
 
     def computed(self, pixels: Pixels) -> Tensor:
-        """Masks (B, K, h, w) of the given pixels, without what is painted on them by hand."""
+        """Masks (B, K, h, w) of the given pixels as they are computed, see :meth:`finished`."""
         image, masks = pixels.image.clamp(0.0, 1.0) - 0.5, []
         for functions, scribbles in zip(self.functions.unbind(1), self.scribbles, strict=True):
             mask = calibrated(linear_mask(image, self.rows(functions, pixels)))
@@ -235,7 +253,13 @@ class Regions:
     def reduced_masks(self) -> Tensor:
         """Computed masks (B, K, h, w) of the reduced picture."""
         image = self.reduced - 0.5
-        return torch.cat([calibrated(linear_mask(image, functions)) for functions in self.functions.unbind(1)], dim=1)
+        masks = [calibrated(linear_mask(image, functions)) for functions in self.functions.unbind(1)]
+        if self.boxes is None:
+            return torch.cat(masks, dim=1)
+        rows, columns = self.reduced.shape[-2:]
+        size = round(rows * self.steps[0]), round(columns * self.steps[1])
+        held = in_boxes(scaled(self.boxes, size, (rows, columns)), InMemory(self.reduced))
+        return torch.where(held, torch.cat(masks, dim=1), 0.0)
 
 
 def background_of(source: Source[M], mask: M | None, inside: Scribbles, name: str) -> list[Scribbles]:
@@ -256,20 +280,47 @@ def background_of(source: Source[M], mask: M | None, inside: Scribbles, name: st
     return [background]
 
 
+def boxed(
+    source: Source[M], box: Box | None, inside: list[Scribbles], count: int | None, name: str
+) -> tuple[list[Scribbles], Tensor | None]:
+    """The scribbles on each region, and the boxes (B, K, 4) that hold them, or None; without scribbles, empty ones.
+
+    Args:
+        source: the picture.
+        box: as a user gives it.
+        inside: scribbles on each of ``count`` regions, or none at all.
+        count: of regions; None is that of the boxes.
+        name: of the scribbles, in errors.
+
+    Raises:
+        TypeError, ValueError: if the boxes do not suit the picture, or the scribbles.
+    """
+    if box is None:
+        return inside, None
+    boxes = boxes_of(box, source.size, source.batch, count)
+    check_scribbles_in(boxes, inside, source.size, name)
+    if not inside:
+        nowhere, _ = at(source, torch.zeros(0, dtype=torch.long))
+        inside = [Scribbles(torch.zeros(0, dtype=torch.long), nowhere[:, :1], nowhere)] * boxes.shape[1]
+    return inside, boxes
+
+
 def fit_regions(
     source: Source[M],
     inside: list[Scribbles],
     background: list[Scribbles],
     settings: RegionMask,
     by_hand: ByHand | None = None,
+    boxes: Tensor | None = None,
 ) -> Regions:
     """Compute the masks of regions from scribbles on each, and on the background: none, for all, or for each.
 
-    Masks of regions without scribbles in an image are 0, except for what is painted by hand.
+    With ``boxes`` (B, K, 4), in pixels of the picture, there may be no scribbles on a region; see :func:`boxed`.
+    Without either, its masks are 0, except for what is painted by hand.
     """
     MASK.check(source.batch, reach=settings.reach, extent=settings.extent)
-    if by_hand is None:
-        return _computed_regions(source, inside, background, settings)
+    if by_hand is None or boxes is not None:
+        return replace(_computed_regions(source, inside, background, settings, boxes=boxes), by_hand=by_hand)
     count = by_hand.count
     marked = [drawn.painted for drawn in inside]
     numbers = [k for k, images in enumerate(marked) if bool(images.any())]
@@ -295,10 +346,12 @@ def _computed_regions(
     background: list[Scribbles],
     settings: RegionMask,
     marked: Tensor | None = None,
+    boxes: Tensor | None = None,
 ) -> Regions:
     """:func:`fit_regions` without what is painted by hand.
 
-    ``marked`` (B, K) tells which images have scribbles on each region; None is all of them.
+    ``marked`` (B, K) tells which images have scribbles on each region; None is all of them, or those without have a
+    box.
     """
     inside, background = ([without_strays(drawn, source.size) for drawn in side] for side in (inside, background))
     several = len(background) > 1
@@ -316,9 +369,12 @@ def _computed_regions(
     )
     threads = threads_for(small.image)
     with single_threaded(threads if threads <= MOST_WAITING else 1):
-        rough = RoughMasks.of(small, options, settings.reach, everywhere)
+        held = None if boxes is None else scaled(boxes, source.size, small.size).to(small.image)
+        rough = RoughMasks.of(small, options, settings.reach, everywhere, held)
         counted = scribbles if marked is None else list(map(_filled, scribbles, marked.unbind(1)))
         reduced = [blocks_of(drawn, small, source.size, steps) for drawn in counted]
+        if held is not None:
+            reduced = [opposed_outside(drawn, held[:, k : k + 1], small) for k, drawn in enumerate(reduced)]
         image = small.image.clamp(0.0, 1.0)  # a far brighter pixel of a float file would upset the linear functions
         masks = torch.cat([rough.mask(number, drawn) for number, drawn in enumerate(reduced)], dim=1)
         front, back = torch.stack([drawn.planes(small) for drawn in reduced], dim=2).unbind(1)
@@ -326,9 +382,11 @@ def _computed_regions(
         functions = kept(small, "borders", [masks, front, back], fit)
     if marked is not None:
         functions = functions * marked[:, :, None, None, None]
-    regions = Regions(image, steps, functions, scribbles)
+    regions = Regions(image, steps, functions, scribbles, boxes=boxes)
     if settings.extent != "object":
         return regions
+    if held is not None:  # without a scribble, all that is found in a box belongs to the object
+        front = torch.where(front.amax((2, 3), keepdim=True) > 0, front, in_boxes(held, small).to(front))
     return replace(regions, functions=functions * connected(regions.reduced_masks(), front).unsqueeze(2))
 
 
@@ -391,9 +449,26 @@ def blocks_of(scribbles: Scribbles, small: Source[M], size: tuple[int, int], ste
     return Scribbles(places, weights.clamp(max=1.0), at(small, places)[0], colours)
 
 
+def opposed_outside(scribbles: Scribbles, boxes: Tensor, small: Reduced) -> Scribbles:
+    """Two planes of scribbles, on a region and on its background, with pixels just outside its box on the background.
+
+    Args:
+        scribbles: on the reduced picture; what lies outside the box does not count.
+        boxes: (B, 1, 4), in its pixels.
+        small: the reduced picture.
+    """
+    sides = boxes[..., 2:] - boxes[..., :2]
+    margin = (AROUND_BOX * sides.prod(2, keepdim=True).sqrt()).clamp(min=1.0).expand(-1, -1, 2)
+    wider = torch.cat([boxes[..., :2] - margin, boxes[..., 2:] + margin], dim=2)
+    inside = in_boxes(boxes, small)
+    front, back = scribbles.planes(small).split(1, dim=1)
+    back = torch.where(inside, back, in_boxes(wider, small).to(back))
+    return scribbles.repainted(torch.cat([torch.where(inside, front, 0.0), back], dim=1), small.image)
+
+
 def _added(blocks: Tensor, shares: Tensor, count: int, values: Tensor) -> Tensor:
     """Sums (B, C, count) of the shares of values (B, C, n) in blocks; both are repeated for each part of a pixel."""
-    repeated = values.repeat(1, 1, len(blocks) // values.shape[2]) * shares
+    repeated = values.repeat(1, 1, len(blocks) // max(values.shape[2], 1)) * shares
     return values.new_zeros(*values.shape[:2], count).index_add(2, blocks, repeated)
 
 

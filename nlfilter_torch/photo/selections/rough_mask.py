@@ -12,6 +12,7 @@ from nlfilter_torch.filtering.scribbles import fit_strokes
 from nlfilter_torch.operator.features import blur, blur_margin, pad_border
 from nlfilter_torch.operator.options import FilterOptions
 from nlfilter_torch.operator.pixel_matrix import Columns
+from nlfilter_torch.photo.picture.boxes import in_boxes
 from nlfilter_torch.photo.picture.colour import LIGHTNESS, hundredths_of_lab
 from nlfilter_torch.photo.picture.resizing import block_means, enlarged
 from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles, scribbled_blocks
@@ -72,6 +73,7 @@ COLOUR_SHARE = (0.65, 1.0)
 # Colours count less where the regression finds no part of the region nearby: standard deviation of "nearby" as a share
 # of the short side, number of rows or columns of the grid it is averaged on, and average from which on colours count.
 AROUND_SIGMA, AROUND_GRID, ENOUGH_AROUND = 0.1, 40, 0.5
+MIDDLE = 0.4  # of the sides of a box: the part of it that stands for scribbles on its object where there are none
 FRAME_PIXELS = math.prod(REFERENCE)  # in larger pictures points of the frame count more, as scribbles have more pixels
 
 ScribbledPoints = tuple[Callable[[], Iterable[Tensor]], Tensor, Tensor]  # columns, weights and values of pixels
@@ -120,6 +122,7 @@ class RoughMasks:
         photometric_bandwidth: of the filter.
         reach: that of :func:`region_mask`.
         everywhere: whether single pixels count wherever they are, not only near what the regression selects.
+        boxes: rectangles that hold the objects of K regions, (B, K, 4) in pixels of the reduced picture, or None.
     """
 
     picture: Reduced
@@ -129,15 +132,22 @@ class RoughMasks:
     photometric_bandwidth: Tensor
     reach: float | Tensor
     everywhere: bool = False
+    boxes: Tensor | None = None
 
     @staticmethod
-    def of(picture: Reduced, options: FilterOptions, reach: float | Tensor, everywhere: bool) -> "RoughMasks":
+    def of(
+        picture: Reduced,
+        options: FilterOptions,
+        reach: float | Tensor,
+        everywhere: bool,
+        boxes: Tensor | None = None,
+    ) -> "RoughMasks":
         """Prepare a picture: build its operator, with options of :func:`nonlocal_operator`, and choose the points."""
         guide = Guide(options, region_guide, TEXTURE_MARGIN, textured_channels(3), spectral=True, sampled=True)
         operator = picture.operator(guide)
         frame, grid = (Points.of(picture, operator, choose(picture.size)) for choose in (frame_places, inner_places))
         bandwidth = torch.as_tensor(options.photometric_bandwidth, dtype=picture.dtype)
-        return RoughMasks(picture, operator, frame, grid, bandwidth, reach, everywhere)
+        return RoughMasks(picture, operator, frame, grid, bandwidth, reach, everywhere, boxes)
 
     @cached_property
     def evenness(self) -> Tensor:
@@ -145,7 +155,13 @@ class RoughMasks:
         return kept(self.picture, "evenness", [], partial(evenness, self.picture.image))
 
     def mask(self, number: int, scribbles: Scribbles) -> Tensor:
-        """The rough mask (B, 1, H, W) of a region with that number, from scribbles on it and on its background."""
+        """The rough mask (B, 1, H, W) of a region with that number, from scribbles on it and on its background.
+
+        With boxes, there may be no scribbles on it.
+        """
+        held = None if self.boxes is None else self.boxes[:, number : number + 1]
+        if held is not None:
+            scribbles = self.with_middle(scribbles, held)
         colours, weights = outwards(scribbles, self.picture.size)
         planes = scribbles.planes(self.picture)
         trimap = trimap_share(planes.flatten(2))
@@ -169,7 +185,18 @@ class RoughMasks:
         )
         share = by_trimap(COLOUR_SHARE, trimap).view(-1, 1, 1, 1)
         nearby = 1.0 if self.everywhere else (around(likely) / ENOUGH_AROUND).clamp(max=1.0)
-        return likely + (by_colour - likely) * share * nearby
+        mask = likely + (by_colour - likely) * share * nearby
+        return mask if held is None else torch.where(in_boxes(held, self.picture), mask, 0.0)
+
+    def with_middle(self, scribbles: Scribbles, boxes: Tensor) -> Scribbles:
+        """Scribbles, with those on the region in the middle of its box (B, 1, 4) in images that have none."""
+        around = (boxes[..., :2] + boxes[..., 2:]) / 2, (boxes[..., 2:] - boxes[..., :2]) * MIDDLE / 2
+        middles = torch.cat([around[0] - around[1], around[0] + around[1]], dim=2)
+        middle = in_boxes(middles, self.picture).to(scribbles.weights)
+        front, back = scribbles.planes(self.picture).split(1, dim=1)
+        bare = front.detach().amax((2, 3), keepdim=True) == 0
+        planes = torch.cat([torch.where(bare, middle * (1 - back), front), back], dim=1)
+        return scribbles.repainted(planes, self.picture.image)
 
     @property
     def pixels(self) -> int:

@@ -135,13 +135,11 @@ def test_gradients_reach_what_is_painted(image: torch.Tensor) -> None:
 
 
 def test_an_edit_needs_something_that_is_painted(image: torch.Tensor) -> None:
-    with pytest.raises(TypeError, match=r"scribbles must be a torch.Tensor, got NoneType; paint some, or pass added"):
+    with pytest.raises(TypeError, match=r"scribbles must be a torch.Tensor, got NoneType; paint some, or pass"):
         region_mask(image, None)
-    with pytest.raises(
-        TypeError, match=r"focus_region must be a torch.Tensor, got NoneType; paint some, or pass added"
-    ):
+    with pytest.raises(TypeError, match=r"focus_region must be a torch.Tensor, got NoneType; paint some, or pass"):
         defocus(image, None, removed=ERASER)
-    with pytest.raises(TypeError, match=r"stroke_mask must be a torch.Tensor, got NoneType; paint some, or pass added"):
+    with pytest.raises(TypeError, match=r"stroke_mask must be a torch.Tensor, got NoneType; paint some, or pass"):
         recolor(image, None, None, removed=ERASER)
     with pytest.raises(ValueError, match=r"added must have 4 channel\(s\), got 1"):
         recolor(image, image, SCRIBBLE, added=BRUSH)

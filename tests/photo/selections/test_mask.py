@@ -16,8 +16,9 @@ from nlfilter_torch.photo.picture.resizing import block_means
 from nlfilter_torch.photo.picture.tiled import Tiled
 from nlfilter_torch.photo.picture.tiles import Passes
 from nlfilter_torch.photo.selections import mask as masks
+from nlfilter_torch.photo.selections.connected import Extent
 from nlfilter_torch.photo.selections.mask import RegionMask
-from tests.pairwise import each_value
+from tests.pairwise import each_value, pairwise
 from tests.problems import box, colour, noise, seeded
 from tests.streams import settings_of
 
@@ -121,6 +122,38 @@ def test_gradients() -> None:
         assert float(ends[1] - ends[0]) / 2 == pytest.approx(float((gradient * step).sum()), rel=2e-3, abs=1e-12)
 
 
+@pytest.mark.parametrize(
+    ("extent", "scribbled", "held"), pairwise(["near", "object", "everywhere"], [False, True], [(12, 10), (7, 6)])
+)
+def test_a_box_takes_the_place_of_scribbles_and_all_outside_is_background(
+    extent: Extent, scribbled: bool, held: tuple[int, int]
+) -> None:
+    image, inside = square()
+    left, top = held
+    scribble = box(18, 20, 3, 6, size=SIZE) if scribbled else None
+    mask = region_mask(image, scribble, box=(left, top, 48 - left, 40 - top), extent=extent)
+    assert ((mask > 0.5) == (inside > 0.5)).float().mean() > 0.99
+    outside = 1 - box(top, left, 40 - 2 * top, 48 - 2 * left, size=SIZE)
+    assert mask[outside > 0].max() == 0
+
+
+def test_each_region_has_its_box_and_images_without_scribbles_have_one() -> None:
+    image, inside = square()
+    images, boxes = torch.cat([image, image.flip(3)]), torch.tensor([[[10.0, 8, 38, 32]], [[11, 7, 37, 33]]])
+    scribbles = torch.cat([box(18, 20, 3, 6, size=SIZE), 0 * inside])
+    together = region_mask(images, scribbles, box=boxes)
+    alone = region_mask(images[1:], None, box=boxes[1:])
+    torch.testing.assert_close(together[1:], alone, atol=2e-3, rtol=0)
+    assert ((together > 0.5) == (torch.cat([inside, inside.flip(3)]) > 0.5)).float().mean() > 0.99
+    both = region_mask(image, None, box=torch.tensor([[[10.0, 8, 38, 32], [0, 0, 8, 8]]]))
+    assert both.shape == (1, 2, *SIZE)
+    assert both[:, 1, 8:].max() == 0
+    painted = box(0, 44, size=SIZE)
+    by_hand = region_mask(image, None, box=(10, 8, 38, 32), added=painted, removed=box(18, 20, size=SIZE))
+    assert by_hand[painted > 0].min() == 1
+    assert by_hand[..., 18:22, 20:24].max() == 0
+
+
 @pytest.mark.parametrize("tile_rows", [16, 40])
 def test_tiles_are_as_in_memory(tile_rows: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sampling, "CHUNK", 300)
@@ -134,6 +167,11 @@ def test_tiles_are_as_in_memory(tile_rows: int, monkeypatch: pytest.MonkeyPatch)
     fitted = settings_of(RegionMask, num_landmarks=40).fit(tiled, Drawn({"scribbles": rows[1], "background": rows[2]}))
     mask = np.concatenate([values for _, values in tiled.rows(fitted)])
     np.testing.assert_allclose(mask[..., 0], wanted[0, 0].numpy(), atol=1e-5)
+    held = (30, 20, 100, 90)
+    alone = region_mask(image, None, box=held, num_landmarks=40)
+    fitted = settings_of(RegionMask, num_landmarks=40).fit(tiled, Drawn(box=held))
+    mask = np.concatenate([values for _, values in tiled.rows(fitted)])
+    np.testing.assert_allclose(mask[..., 0], alone[0, 0].numpy(), atol=1e-5)
 
 
 def test_masks_of_a_reduced_picture_follow_the_borders_of_the_large_one(monkeypatch: pytest.MonkeyPatch) -> None:
