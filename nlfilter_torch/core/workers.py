@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from threading import Barrier, Lock
-from typing import TypeVar
+from typing import TypeVar, TypeVarTuple
 
 import torch
 from torch import Tensor
@@ -18,11 +18,16 @@ from nlfilter_torch.core.torch_internals import has_modes, is_hidden
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
+Rest = TypeVarTuple("Rest")
 _setting = Lock()  # torch's default for new threads is shared by the process, and is changed temporarily
 
 
 def in_order(
-    function: Callable[[Item], Result], items: Iterable[Item], workers: int, *, divided: bool = True
+    function: Callable[[Item, *Rest], Result],
+    items: Iterable[Item],
+    workers: int,
+    *arguments: *Rest,
+    divided: bool = True,
 ) -> Iterator[Result]:
     """Apply a function to items without gradients, and yield the results in order; items are consumed as needed.
 
@@ -31,11 +36,13 @@ def in_order(
         items: up to twice as many as there are workers, plus one, are in memory at once, so that no worker waits for
             a slower one.
         workers: number of threads, which share torch's threads for operations; 1 runs in the calling thread.
+        arguments: further ones of the function.
         divided: whether workers divide operations among several threads, if there are fewer workers than threads.
     """
     call = torch.no_grad()(function)
     if workers == 1:
-        yield from map(call, items)
+        for item in items:
+            yield call(item, *arguments)
         return
     started = Barrier(workers + 1)
     with ThreadPoolExecutor(workers) as pool:
@@ -45,16 +52,20 @@ def in_order(
             started.wait()
         waiting: deque[Future[Result]] = deque()
         for item in items:
-            waiting.append(pool.submit(call, item))
+            waiting.append(pool.submit(call, item, *arguments))
             if len(waiting) > 2 * workers:
                 yield waiting.popleft().result()
         while waiting:
             yield waiting.popleft().result()
 
 
-def divided_among(workers: int, function: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
+def divided_among(
+    workers: int, function: Callable[[Item, *Rest], Result], items: Iterable[Item], *arguments: *Rest
+) -> Iterator[Result]:
     """:func:`in_order`, but one worker keeps gradients."""
-    return map(function, items) if workers == 1 else in_order(function, items, workers)
+    if workers == 1:
+        return (function(item, *arguments) for item in items)
+    return in_order(function, items, workers, *arguments)
 
 
 def threads_for(*tensors: Tensor) -> int:

@@ -25,7 +25,7 @@ a uniform sample misses, converge last. On photographs of a megapixel each sweep
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import partial
-from typing import Protocol, TypeVar
+from typing import Protocol, TypeVar, TypeVarTuple
 
 import torch
 from torch import Tensor
@@ -63,13 +63,14 @@ UNSOLVED = 1e-2  # relative residual after the last step that causes a warning
 
 Block = TypeVar("Block", covariant=True)
 Result = TypeVar("Result")
+Rest = TypeVarTuple("Rest")
 
 
 class Pass(Protocol[Block]):
     """A pass over blocks of columns, in memory or of a picture."""
 
-    def __call__(self, function: Callable[[Block], Result], /) -> Iterable[Result]:
-        """Apply a function to each block, and yield the results in order."""
+    def __call__(self, function: Callable[[Block, *Rest], Result], /, *arguments: *Rest) -> Iterable[Result]:
+        """Apply a function, which takes the arguments, too, to each block, and yield the results in order."""
 
 
 def summed(parts: Iterable[tuple[Tensor, ...]]) -> tuple[Tensor, ...]:
@@ -106,9 +107,9 @@ class KernelMatrix:
     weights: Tensor | None = None
     communicator: Communicator = ALONE
 
-    def whole(self, function: Callable[["KernelMatrix"], Result]) -> Iterable[Result]:
+    def whole(self, function: Callable[["KernelMatrix", *Rest], Result], *arguments: *Rest) -> Iterable[Result]:
         """A pass over all points, as one block."""
-        return [function(self)]
+        return [function(self, *arguments)]
 
     def moment(self, values: Tensor) -> Tensor:
         """``U (weights * values)`` for values (B, N), summed over the ranks: (B, M, 1) in float64."""
@@ -179,7 +180,7 @@ def newton(
     """
     identity = torch.eye(total.shape[1], dtype=total.dtype, device=total.device)
     for _ in range(steps):
-        sums, slope = summed(blocks(partial(KernelMatrix.moment_and_slope, total=total, most=most)))
+        sums, slope = summed(blocks(KernelMatrix.moment_and_slope, total, most))
         lower = torch.linalg.cholesky_ex(identity + slope).L  # J is positive definite
         step = torch.cholesky_solve(sums + bias - total, lower)
         total = total + step

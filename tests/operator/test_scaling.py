@@ -1,5 +1,8 @@
 """The scaling as the root for a moment, and the damped method, which converges from any start."""
 
+from collections.abc import Callable, Iterator
+from typing import Any
+
 import pytest
 import torch
 from torch import Tensor
@@ -101,7 +104,11 @@ def test_blocks_are_balanced_like_the_whole() -> None:
     parts = zip(factor.split(25, dim=2), matrix.diagonal.split(25, dim=1), strict=True)
     blocks = [KernelMatrix(*part) for part in parts]
     expected = solve(matrix, 1e-12, True).moment
-    total, _, change = newton(lambda function: map(function, blocks), 3 * expected, steps=20, tolerance=1e-9)
+
+    def over(function: Callable[..., Any], *arguments: object) -> Iterator[Any]:
+        return (function(block, *arguments) for block in blocks)
+
+    total, _, change = newton(over, 3 * expected, steps=20, tolerance=1e-9)
     torch.testing.assert_close(total, expected)
     assert change <= 1e-9
     sampled = blocks[0]

@@ -344,7 +344,7 @@ class Estimates(Generic[M]):
 
     def _interpolated(self, estimate: LocalValues, pixels: Pixels, own: Tensor) -> Tensor:
         place = (estimate.links, pixels.first, pixels.image.shape)
-        return kept(self.viewed, place, [estimate.values], partial(estimate, own, pixels.first))
+        return kept(self.viewed, place, [estimate.values], estimate, own, pixels.first)
 
 
 @dataclass(frozen=True, eq=False)
@@ -363,8 +363,8 @@ class Propagation(Generic[M]):
         """
         size, places, cubed = self.viewed.size, self.scribbles.places, self.scribbles.weights**3
         guide = reduced(self.viewed, luminance, links.step(size))
-        solve = partial(LocalValues.of, links, guide, size, places, cubed, values, self.groups, predicted)
-        return kept(self.viewed, links, [guide, places, cubed, values], solve)
+        tensors, known = [guide, places, cubed, values], (size, places, cubed, values, self.groups, predicted)
+        return kept(self.viewed, links, tensors, LocalValues.of, links, guide, *known)
 
 
 def usual_chroma(image: Tensor) -> Tensor:
@@ -424,12 +424,12 @@ def extended(
             before - torch.cat(blocks, dim=2)
             for before, blocks in zip(residuals, zip(*explained, strict=True), strict=True)
         ]
-        planes.append(operator.of_columns(partial(_of_factor, fits[0])))
+        planes.append(operator.of_columns(_of_factor, fits[0]))
         del operator  # frees its factor before the next one is computed
     return planes, residuals
 
 
-def _of_factor(fit: Callable[[Tensor], Tensor], columns: Columns) -> Tensor:
+def _of_factor(columns: Columns, fit: Callable[[Tensor], Tensor]) -> Tensor:
     """What a regression gives for columns of the factor."""
     return fit(columns.factor)
 

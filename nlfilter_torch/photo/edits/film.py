@@ -165,12 +165,14 @@ class Frame(Tiled):
     def _resized_references(self, size: tuple[int, int]) -> References:
         return References([Tiled.resized(frame, size).picture for frame in self.reference_frames()])
 
-    def measured(self, function: Callable[[Source[RowSource]], Tensor]) -> Tensor:
+    def measured(
+        self, function: Callable[Concatenate[Source[RowSource], P], Tensor], *args: P.args, **kwargs: P.kwargs
+    ) -> Tensor:
         """The mean of a measurement over the references."""
-        return self.cached_result(self._average, function)
+        return self.cached_result(self._average, function, *args, **kwargs)
 
     def _average(
-        self, function: "Callable[Concatenate[Frame, P], Tensor]", *args: P.args, **kwargs: P.kwargs
+        self, function: Callable[Concatenate[Source[RowSource], P], Tensor], /, *args: P.args, **kwargs: P.kwargs
     ) -> Tensor:
         """The mean of a function over the references."""
         return average([function(frame, *args, **kwargs) for frame in self.reference_frames()])

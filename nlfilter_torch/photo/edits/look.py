@@ -275,10 +275,10 @@ def _change_of_light(source: Source[M], levels: Tensor, strengths: Tensor) -> Pl
     """The change (B, C, h, w) by automatic levels and local tone curves, or None if there is none."""
     if not acts(levels, 0.0) and not acts(strengths, 0.0):
         return None
-    stretch = kept(source, "range of brightness", [], partial(_range_of, source))
+    stretch = kept(source, "range of brightness", [], _range_of, source)
     curves = None
     if acts(strengths, 0.0):
-        curves = kept(source, "local curves", [], partial(_curves_of, source, stretch)).weighed(strengths)
+        curves = kept(source, "local curves", [], _curves_of, source, stretch).weighed(strengths)
     return ChangeOfLight(stretch, curves, levels if curves is None or acts(levels, 0.0) else None)
 
 

@@ -9,7 +9,7 @@ are rare, they are defects.
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cache, partial
+from functools import cache
 
 import torch
 from torch import Tensor
@@ -194,7 +194,7 @@ def hot_pixels_of(source: Source[M]) -> HotPixels | None:
     ends = torch.nanquantile(values.flatten(1), colours.new_tensor(RANGE).double(), dim=1)
     ends = torch.where(ends.isfinite(), ends, 0.0)
     floor = FLOOR * (ends[1] - ends[0])
-    parts = list(source.over(partial(_numbers, floor=floor), "Looking closely", margin=MARGIN))
+    parts = list(source.over(_numbers, "Looking closely", floor, margin=MARGIN))
     sums = torch.stack([part.numbers for part in parts]).sum(0)
     count, outliers, close = sums[:, :3].unbind(1)
     strong, others = sums[:, 3:].unflatten(1, (2, BINS)).unbind(1)
@@ -258,13 +258,13 @@ Repaired = Callable[[Tensor, Tensor], Tensor]  # of places (n,) and their colour
 @torch.no_grad()
 def noise_of(source: Source[M], channels: GuideChannels = "all") -> Noise:
     """Estimate the noise of any source, or of its luminance, as white noise."""
-    return Noise(*source.measured(partial(_measured, channels=channels)))
+    return Noise(*source.measured(_measured, channels))
 
 
 @torch.no_grad()
 def profile_of(source: Source[M], repaired: Repaired | None = None) -> NoiseProfile:
     """Estimate the noise of any source, some of whose colours are replaced, by scale, plane and brightness."""
-    return profile_of_measured(source.measured(partial(_measured_profile, repaired=repaired)))
+    return profile_of_measured(source.measured(_measured_profile, repaired))
 
 
 def _measured_profile(source: Source[M], repaired: Repaired | None) -> Tensor:

@@ -1,7 +1,6 @@
 """Sharpening with little noise gain: unsharp masking of what the filter shows not to be noise. Paper: Fig. 6."""
 
 from dataclasses import dataclass
-from functools import partial
 from typing import ClassVar
 
 import torch
@@ -110,7 +109,7 @@ class Sharpen(PhotoEdit):
         """The unsharp mask of a picture at the viewing size."""
         check_reach(self.guide_blur, "guide_blur", viewed.size)
         layers = viewed.operator(self.guide(viewed.size)).layers(luminance, 1)
-        noise = kept(viewed, "noise of luminance", [], partial(noise_of, viewed, "luminance"))
+        noise = kept(viewed, "noise of luminance", [], noise_of, viewed, "luminance")
         strength = (torch.as_tensor(self.amount, dtype=viewed.dtype).reshape(-1, 1, 1, 1) - 1) / UNIT
         margin = blur_margin(RADIUS) + blur_margin(VARIANCE_SIGMA)
         mask = UnsharpMask(layers, noise, strength)

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 
 import torch
 from torch import Tensor
@@ -147,10 +146,10 @@ class DetailChange:
 def synthesize(operator: Operator, response: Response, coefficients: Tensor) -> Planes:
     """Compute ``V f(S) V^T y`` for a response f and coefficients (B, C, M) of y."""
     total = coefficients @ operator.pairs.gain(response).mT
-    return operator.of_columns(partial(_spread, total))
+    return operator.of_columns(_spread, total)
 
 
-def _spread(total: Tensor, columns: Columns) -> Tensor:
+def _spread(columns: Columns, total: Tensor) -> Tensor:
     return spread(total.to(columns.factor), columns.factor, columns.scaling)
 
 

@@ -3,8 +3,8 @@
 import math
 from collections.abc import Callable, Hashable, Iterator
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
-from typing import cast
+from functools import cached_property
+from typing import Concatenate, cast
 
 import torch
 from torch import Tensor
@@ -35,6 +35,8 @@ from nlfilter_torch.photo.picture.source import (
     Cache,
     Guide,
     Kept,
+    P,
+    Rest,
     Source,
     kept,
     kept_in,
@@ -78,7 +80,7 @@ class InMemory:
             return self._build(guide)
         named = tuple((name, without_tensors(value)) for name, value in options)
         copies = [tensor.clone() for tensor in tensors]
-        return kept(self, (guide.transform, guide.blur, *named), copies, partial(self._build, guide))
+        return kept(self, (guide.transform, guide.blur, *named), copies, self._build, guide)
 
     def _build(self, guide: Guide) -> "InMemoryOperator":
         options = guide.options
@@ -147,15 +149,15 @@ class InMemory:
 
     def over(
         self,
-        function: Callable[[Block], Kept],
+        function: Callable[[Block, *Rest], Kept],
         stage: str,
-        *,
+        *arguments: *Rest,
         margin: int = 0,
         step: int = 1,
         places: Tensor | None = None,
     ) -> Iterator[Kept]:
         """Apply a function to the image."""
-        yield function(self)
+        yield function(self, *arguments)
 
     def emit(self, fitted: Fitted) -> Iterator[tuple[Tensor, Tensor | None]]:
         """Yield :meth:`all`."""
@@ -169,9 +171,11 @@ class InMemory:
         result = planes if fitted.finish is None else fitted.finish(seen.image, planes, EVERYWHERE)
         return fitted.output(self.image, result)
 
-    def measured(self, function: Callable[[Source[Tensor]], Tensor]) -> Tensor:
+    def measured(
+        self, function: Callable[Concatenate[Source[Tensor], P], Tensor], *args: P.args, **kwargs: P.kwargs
+    ) -> Tensor:
         """Apply a measurement to the image."""
-        return function(self)
+        return function(self, *args, **kwargs)
 
 
 @dataclass(frozen=True, eq=False)
@@ -203,21 +207,22 @@ class InMemoryOperator:
         columns = Columns(operator.factor[:, :, places], scaling, operator.remainder[:, places])
         return sampled_pairs([columns], count, operator.factor.dtype)
 
-    def of_columns(self, function: Callable[[Columns], Tensor]) -> Planes:
+    def of_columns(self, function: Callable[[Columns, *Rest], Tensor], *arguments: *Rest) -> Planes:
         """Apply a function to the columns of all pixels."""
-        planes = function(self.operator.matrix)
+        planes = function(self.operator.matrix, *arguments)
         return part_of(planes.unflatten(2, self.source.size))
 
     def layers(self, planes: Planes, order: int) -> Planes:
         """Compute :func:`detail_layers`."""
         values = planes(self.source)
-        name = ("layers", order)
-        return part_of(kept_in(self.cache, name, [values], lambda: detail_layers(self.operator, values, order=order)))
+        return part_of(
+            kept_in(self.cache, ("layers", order), [values], detail_layers, self.operator, values, order=order)
+        )
 
     def coefficients(self, planes: Planes) -> Tensor:
         """Compute :meth:`Spectrum.coefficients`."""
         values, spectrum = planes(self.source), cast(Spectrum, self.pairs)
-        return kept_in(self.cache, "coefficients", [values], lambda: spectrum.coefficients(values))
+        return kept_in(self.cache, "coefficients", [values], spectrum.coefficients, values)
 
     def rational(self, planes: Planes, form: RationalForm, weights: Tensor) -> Planes:
         """Compute :func:`rational_product`; with a cache, other weights take little time."""
@@ -226,7 +231,7 @@ class InMemoryOperator:
         if matrix.needs_gradient:
             result = rational_product(matrix, values, form, weights)
         else:
-            terms = kept_in(self.cache, form, [values], partial(pole_terms, matrix, values, form))
+            terms = kept_in(self.cache, form, [values], pole_terms, matrix, values, form)
             result = weigh_poles(values, terms, weights)
         return part_of(result.unflatten(2, self.source.size))
 
@@ -254,7 +259,7 @@ def in_blocks(source: Source[M], step: float, floats: int) -> InMemory:
             f"{cast(InTiles, source).picture.name} needs at least {needed / 1e6:.0f} MB of memory, but only "
             f"{source.memory / 1e6:.0f} MB may be used; allow more, or use a smaller picture"
         )
-    return kept(source, ("blocks", step), [], partial(_in_blocks, source, step))
+    return kept(source, ("blocks", step), [], _in_blocks, source, step)
 
 
 def _in_blocks(source: Source[M], step: float) -> InMemory:
@@ -295,7 +300,7 @@ def fit_edit(edit: PhotoEdit, source: Source[M], drawn: Drawn[M], *, working: Wo
             range that they use.
     """
     if edit.relative and working is None:
-        working = kept(source, "working range", [], partial(range_of, source))
+        working = kept(source, "working range", [], range_of, source)
     if not edit.relative or working is None:
         return edit.fit(source, drawn)
     fitted = edit.in_range(working).fit(source.in_range(working), drawn)

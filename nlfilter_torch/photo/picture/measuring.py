@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable, Iterable
-from functools import partial
 
 import torch
 from torch import Tensor
@@ -18,14 +17,14 @@ Sums = tuple[Tensor, Tensor | float]  # over pixels: of values times weights, (B
 
 def mean(source: Source[M], planes: Planes) -> Tensor:
     """Means (B, C, 1, 1) of planes over all pixels."""
-    return source.measured(partial(_mean, planes))
+    return source.measured(_mean, planes)
 
 
-def _mean(planes: Planes, source: Source[M]) -> Tensor:
-    return _quotient(source.over(partial(_sums_of, planes), "Averaging"), source.dtype)
+def _mean(source: Source[M], planes: Planes) -> Tensor:
+    return _quotient(source.over(_sums_of, "Averaging", planes), source.dtype)
 
 
-def _sums_of(planes: Planes, block: Block) -> Sums:
+def _sums_of(block: Block, planes: Planes) -> Sums:
     return sums(planes(block), block.weights)
 
 
@@ -44,25 +43,25 @@ def _quotient(parts: Iterable[Sums], dtype: torch.dtype) -> Tensor:
 
 def mean_of(source: Source[M], fitted: Fitted, function: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
     """Means (B, S, 1, 1) of a function of the image and of an edit's result; the function returns (B, S, h, W)."""
-    return source.measured(partial(_mean_of, fitted.then(function)))
+    return source.measured(_mean_of, fitted.then(function))
 
 
-def _mean_of(fitted: Fitted, source: Source[M]) -> Tensor:
+def _mean_of(source: Source[M], fitted: Fitted) -> Tensor:
     return _quotient((sums(*part) for part in source.emit(fitted)), source.dtype)
 
 
 def ends(source: Source[M], planes: Planes) -> tuple[Tensor, Tensor]:
     """Least and largest values (B, C, 1, 1) of planes over all pixels that count."""
-    least, largest = source.measured(partial(_ends, planes))
+    least, largest = source.measured(_ends, planes)
     return least, largest
 
 
-def _ends(planes: Planes, source: Source[M]) -> Tensor:
-    parts = torch.stack(list(source.over(partial(_ends_of, planes), "Finding black and white")))
+def _ends(source: Source[M], planes: Planes) -> Tensor:
+    parts = torch.stack(list(source.over(_ends_of, "Finding black and white", planes)))
     return torch.stack([parts[:, 0].amin(0), parts[:, 1].amax(0)])
 
 
-def _ends_of(planes: Planes, block: Block) -> Tensor:
+def _ends_of(block: Block, planes: Planes) -> Tensor:
     return torch.stack(ends_of(planes(block), block.weights))
 
 
@@ -87,10 +86,10 @@ def cached(source: Source[M], fitted: Fitted) -> Fitted:
 
 def shrunk(source: Source[M], planes: Planes, size: tuple[int, int]) -> Tensor:
     """Planes (B, C, h, w) of all pixels in a smaller size."""
-    return _joined(source.over(partial(_resized, planes, source.size, size), "Reducing"), size[0])
+    return _joined(source.over(_resized, "Reducing", planes, source.size, size), size[0])
 
 
-def _resized(planes: Planes, size: tuple[int, int], wanted: tuple[int, int], block: Block) -> tuple[int, Tensor]:
+def _resized(block: Block, planes: Planes, size: tuple[int, int], wanted: tuple[int, int]) -> tuple[int, Tensor]:
     return resized_part(planes(block), block.first // block.width, size, wanted)
 
 
@@ -105,7 +104,7 @@ def reduced(source: Source[M], planes: Planes, step: float) -> Tensor:
 def reduced_with_weights(source: Source[M], planes: Planes, step: float) -> tuple[Tensor, Tensor | None]:
     """The same, and the means (B, 1, H / step, W / step) of how much the pixels count; None is 1 each."""
     rows = block_counts(source.size, step)[0]
-    parts = list(source.over(partial(_reduced, planes, source.size, step), "Reducing", step=max(1, int(step))))
+    parts = list(source.over(_reduced, "Reducing", planes, source.size, step, step=max(1, int(step))))
     means = _joined(((first, means) for first, means, _ in parts), rows).to(source.dtype)
     counted = [(first, part) for first, _, part in parts if part is not None]
     if not counted:
@@ -114,7 +113,7 @@ def reduced_with_weights(source: Source[M], planes: Planes, step: float) -> tupl
     return torch.where(weights > LEAST_SHARE, weighted / weights.clamp(min=LEAST_SHARE), means), weights
 
 
-def _reduced(planes: Planes, size: tuple[int, int], step: float, block: Block) -> tuple[int, Tensor, Tensor | None]:
+def _reduced(block: Block, planes: Planes, size: tuple[int, int], step: float) -> tuple[int, Tensor, Tensor | None]:
     """The first row that a block contributes to, and its part of the means: of planes, and those that count."""
     values, weights, start = planes(block), block.weights, block.first // block.width
     first, means = block_parts(values, start, size, step)

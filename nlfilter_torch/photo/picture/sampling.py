@@ -39,7 +39,7 @@ from nlfilter_torch.operator.orientation import (
     stretched_sums,
 )
 from nlfilter_torch.operator.pixel_matrix import Columns
-from nlfilter_torch.operator.scaling import Result
+from nlfilter_torch.operator.scaling import Rest, Result
 from nlfilter_torch.operator.sinkhorn import solve, warn_of_residual
 from nlfilter_torch.photo.picture.counted import CountedPixels
 from nlfilter_torch.photo.picture.pictures import Picture, Tile
@@ -149,7 +149,7 @@ class ColumnCache:
 
 @dataclass(frozen=True)
 class PassOverPicture:
-    """A pass over every pixel of a picture.
+    """A pass over every pixel of a picture, or over those of a sample.
 
     Attributes:
         picture: guide of the picture.
@@ -158,6 +158,7 @@ class PassOverPicture:
         stage: name for the progress.
         workers: number of tiles computed at once.
         cache: columns cached from earlier passes.
+        sample: blocks of the pixels of the sample, if only these are visited.
     """
 
     picture: GuidePicture
@@ -166,19 +167,25 @@ class PassOverPicture:
     stage: str
     workers: int
     cache: ColumnCache
+    sample: list[Block] | None = None
 
-    def __call__(self, function: Callable[[Block], Result]) -> Iterator[Result]:
+    def __call__(self, function: Callable[[Block, *Rest], Result], /, *arguments: *Rest) -> Iterator[Result]:
         """Apply a function to each block, and yield the results in order."""
+        if self.sample is not None:
+            self.report(self.stage, 0, 1)
+            yield from in_order(function, self.sample, self.workers, *arguments)
+            return
         picture = self.picture
         height, rows = picture.size[0], picture.statistics_rows
         tiles = picture.picture.tiles(self._radius + picture.margin, rows)
         self.report(self.stage, 0, height)
-        for number, result in enumerate(in_order(partial(self._applied, function), tiles, self.workers), start=1):
+        results = in_order(self._applied, tiles, self.workers, function, *arguments)
+        for number, result in enumerate(results, start=1):
             yield result
             self.report(self.stage, min(number * rows, height), height)
 
-    def _applied(self, function: Callable[[Block], Result], tile: Tile) -> Result:
-        return function(self._block(tile))
+    def _applied(self, tile: Tile, function: Callable[[Block, *Rest], Result], *arguments: *Rest) -> Result:
+        return function(self._block(tile), *arguments)
 
     @property
     def _radius(self) -> int:

@@ -20,8 +20,7 @@ rows with its halo, and a :class:`Tiling`, rows to write.
 import math
 from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
-from typing import Protocol, TypeVar, cast, runtime_checkable
+from typing import Concatenate, ParamSpec, Protocol, TypeVar, TypeVarTuple, cast, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -43,6 +42,8 @@ SAMPLE = 1 << 15  # size of the sample of pixels that sums are estimated from, w
 
 Part = TypeVar("Part")
 Kept = TypeVar("Kept")
+Rest = TypeVarTuple("Rest")
+P = ParamSpec("P")
 Cache = dict[Hashable, tuple[Sequence[Tensor], object]]  # results by their names, with the tensors they depend on
 Blocks = Callable[[], Iterable[Tensor]]  # columns (B, M, n) of the factor, block by block
 
@@ -97,8 +98,8 @@ class Operator(Protocol):
     def pairs(self) -> RitzPairs:
         """Spectrum of W, without the values of the eigenvectors at pixels."""
 
-    def of_columns(self, function: Callable[[Columns], Tensor]) -> Planes:
-        """Apply a function, which returns (B, C, n), to the columns of the pixels."""
+    def of_columns(self, function: Callable[[Columns, *Rest], Tensor], *arguments: *Rest) -> Planes:
+        """Apply a function, which returns (B, C, n), to the columns of the pixels and these arguments."""
 
     def layers(self, planes: Planes, order: int) -> Planes:
         """Detail layers (B, k+1, C, h, W) of planes of the picture."""
@@ -145,9 +146,9 @@ class Source(Protocol[M]):
 
     def over(
         self,
-        function: Callable[[Block], Part],
+        function: Callable[[Block, *Rest], Part],
         stage: str,
-        *,
+        *arguments: *Rest,
         margin: int = 0,
         step: int = 1,
         places: Tensor | None = None,
@@ -159,6 +160,7 @@ class Source(Protocol[M]):
         Args:
             function: of a block.
             stage: name for the progress.
+            arguments: further ones of the function.
             margin: rows of the halo of a block on both sides, except beyond the picture.
             step: all blocks but the last have a multiple of so many rows.
             places: row-major indices, ascending; blocks with none of these pixels may be left out.
@@ -192,7 +194,9 @@ class Source(Protocol[M]):
         There is no warning of values far outside [0, 1] from now on.
         """
 
-    def measured(self, function: Callable[["Source[M]"], Tensor]) -> Tensor:
+    def measured(
+        self, function: "Callable[Concatenate[Source[M], P], Tensor]", *args: P.args, **kwargs: P.kwargs
+    ) -> Tensor:
         """Apply a measurement to the picture; for a frame of a film, average it over the reference frames."""
 
 
@@ -207,18 +211,41 @@ class Keeping(Protocol):
     cache: Cache | None
 
 
-def kept(source: Source[M], name: Hashable, tensors: Sequence[Tensor], compute: Callable[[], Kept]) -> Kept:
-    """The result, called ``name``, of a function of picture and tensors; previews keep it for the next edit."""
-    return kept_in(source.cache if isinstance(source, Keeping) else None, name, tensors, compute)
+def kept(
+    source: Source[M],
+    name: Hashable,
+    tensors: Sequence[Tensor],
+    function: Callable[P, Kept],
+    *args: P.args,
+    **kwargs: P.kwargs,
+) -> Kept:
+    """The result of a function that depends on picture and tensors alone; previews keep it for the next edit.
+
+    Args:
+        source: the picture.
+        name: of the result.
+        tensors: with which the result changes.
+        function: computes it.
+        args: of the function.
+        kwargs: of the function.
+    """
+    return kept_in(source.cache if isinstance(source, Keeping) else None, name, tensors, function, *args, **kwargs)
 
 
-def kept_in(cache: Cache | None, name: Hashable, tensors: Sequence[Tensor], compute: Callable[[], Kept]) -> Kept:
+def kept_in(
+    cache: Cache | None,
+    name: Hashable,
+    tensors: Sequence[Tensor],
+    function: Callable[P, Kept],
+    *args: P.args,
+    **kwargs: P.kwargs,
+) -> Kept:
     """The result of a function, from a cache if it was last computed from equal tensors under this name."""
     if cache is None:
-        return compute()
+        return function(*args, **kwargs)
     entry = cache.get(name)
     if entry is None or not all(torch.equal(a, b) for a, b in zip(entry[0], tensors, strict=True)):
-        entry = cache[name] = (tensors, compute())
+        entry = cache[name] = (tensors, function(*args, **kwargs))
     return cast(Kept, entry[1])
 
 
@@ -255,14 +282,14 @@ def at(source: Source[M], places: Tensor) -> tuple[Tensor, Tensor | None]:
 
     None in place of the latter is 1 each.
     """
-    parts = list(source.over(partial(_at, places, math.prod(source.size)), "Looking", places=places))
+    parts = list(source.over(_at, "Looking", places, math.prod(source.size), places=places))
     if not parts:
         return torch.zeros(source.batch, source.channels, 0, dtype=source.dtype), None
     colours, weights = zip(*parts, strict=True)
     return torch.cat(colours, dim=2), None if weights[0] is None else torch.cat(weights, dim=2)
 
 
-def _at(places: Tensor, pixels: int, block: Block) -> tuple[Tensor, Tensor | None]:
+def _at(block: Block, places: Tensor, pixels: int) -> tuple[Tensor, Tensor | None]:
     """Of the pixels that lie in a block of a picture of so many."""
     image, weights = block.image.flatten(2), block.weights
     if image.shape[2] == pixels:

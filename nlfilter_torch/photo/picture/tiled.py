@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
-from typing import Self, TypeVar
+from typing import Concatenate, Self, TypeVar
 
 import numpy as np
 import torch
@@ -23,7 +23,7 @@ from nlfilter_torch.photo.picture.pixels import Block, Fitted, WorkingRange
 from nlfilter_torch.photo.picture.resizing import resized_parts, weights_of
 from nlfilter_torch.photo.picture.sampling import ColumnCache, GuidePicture, take_pilot
 from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles
-from nlfilter_torch.photo.picture.source import Guide, Source
+from nlfilter_torch.photo.picture.source import Guide, P, Rest, Source
 from nlfilter_torch.photo.picture.tiled_operator import TiledOperator
 from nlfilter_torch.photo.picture.tiled_scribbles import (
     check_scribble_memory,
@@ -209,9 +209,9 @@ class Tiled:
 
     def over(
         self,
-        function: Callable[[Block], Part],
+        function: Callable[[Block, *Rest], Part],
         stage: str,
-        *,
+        *arguments: *Rest,
         margin: int = 0,
         step: int = 1,
         places: Tensor | None = None,
@@ -231,9 +231,10 @@ class Tiled:
         self.passes.report(stage, 0, height)
         for tile in (next(tiles) for _ in starts[:1]):
             with torch.no_grad():
-                result = function(tile)
+                result = function(tile, *arguments)
             yield result
-        for start, result in zip(starts[1:], in_order(function, tiles, self.passes.workers(1)), strict=True):
+        others = in_order(function, tiles, self.passes.workers(1), *arguments)
+        for start, result in zip(starts[1:], others, strict=True):
             self.passes.report(stage, start, height)  # those before this one
             yield result
 
@@ -339,9 +340,11 @@ class Tiled:
             yield planes, None if self.counted is None else self.counted.rows(rows.start, rows.stop)
 
     @torch.no_grad()
-    def measured(self, function: Callable[[Source[RowSource]], Tensor]) -> Tensor:
+    def measured(
+        self, function: Callable[Concatenate[Source[RowSource], P], Tensor], *args: P.args, **kwargs: P.kwargs
+    ) -> Tensor:
         """Apply a measurement to the picture."""
-        return function(self)
+        return function(self, *args, **kwargs)
 
     @property
     def plain(self) -> Passes:

@@ -16,7 +16,7 @@ from nlfilter_torch.operator.eigenvalue_bound import exceeds, limiter, slack
 from nlfilter_torch.operator.features import reduce_channels
 from nlfilter_torch.operator.operator import Kernel
 from nlfilter_torch.operator.pixel_matrix import Columns, capacitance_inverse, sums_exactly
-from nlfilter_torch.operator.scaling import Pass, PixelScaling, summed
+from nlfilter_torch.operator.scaling import Pass, PixelScaling, Rest, summed
 from nlfilter_torch.operator.spectrum import RitzPairs
 from nlfilter_torch.photo.picture import sampling
 from nlfilter_torch.photo.picture.pictures import Tile, TileFilter, TileLayers
@@ -87,12 +87,14 @@ class ColumnPlanes:
     """Planes computed by a function of the columns of an operator."""
 
     operator: "TiledOperator"
-    function: Callable[[Columns], Tensor]
+    function: Callable[..., Tensor]
+    arguments: tuple[object, ...]
 
     def __call__(self, pixels: Pixels) -> Tensor:
         """The planes (1, C, h, w) at the pixels."""
         height, width = pixels.image.shape[-2:]
-        return self.function(with_columns(pixels).columns(self.operator)).unflatten(2, (height, width))
+        columns = with_columns(pixels).columns(self.operator)
+        return self.function(columns, *self.arguments).unflatten(2, (height, width))
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,16 +188,15 @@ class TiledOperator:
         """
         if self._pixel_scaling is not None:
             return
-        total, dtype = self.pilot.moment, self.guide.dtype
-        balanced = partial(balance_by_passes, dtype=dtype, completed=self.pilot.completed)
+        total, tolerance = self.pilot.moment, CONVERGED[self.guide.dtype]
         biases: tuple[Tensor, ...] | None = None
         if self.sample_size is not None:
             self._sample, biases = self._draw_sample(self.sample_size, planes, order)
-            total = balanced(self.over("Balancing"), total, bias=biases[0])
+            total = self._balanced(total, biases[0])
         if self.full_passes:
             self._sample = biases = None
-            total = balanced(self.over("Balancing"), total)
-        self._pixel_scaling = PixelScaling(total, self.pilot.completed, CONVERGED[dtype])
+            total = self._balanced(total)
+        self._pixel_scaling = PixelScaling(total, self.pilot.completed, tolerance)
         limit = self._limiter(total) if self.bounded else None
         if limit is not None:
             self.kernel = replace(self.kernel, limiter=limit.to(self.kernel.landmarks))
@@ -210,6 +211,11 @@ class TiledOperator:
         sample = self._summed_up(planes, order, self.over("Summing up"))
         self._sums[planes] = replace(sample, moments=sample.moments + moments)
 
+    def _balanced(self, total: Tensor, bias: Tensor | float = 0.0) -> Tensor:
+        """The moment of all pixels, or of the sample and a ``bias`` that stands for the others."""
+        blocks, completed = self.over("Balancing"), self.pilot.completed
+        return balance_by_passes(blocks, total, self.guide.dtype, completed=completed, bias=bias)
+
     def _limiter(self, total: Tensor) -> Tensor | None:
         """The ``X^(1/2)`` (1, M, M) to multiply the factor by, or None if no eigenvalue exceeds 1."""
         blocks, allowed = self.over("Bounding"), slack(self.guide.dtype, CONVERGED[self.guide.dtype])
@@ -218,7 +224,10 @@ class TiledOperator:
 
     def _gram_below(self, blocks: Pass[Block], at: Tensor, power: int) -> Tensor:
         """:meth:`Columns.gram_below` of all pixels, in a pass over them."""
-        return summed(blocks(lambda block: (self.block_columns(block).gram_below(at, power),)))[0]
+        return summed(blocks(self._gram_of_block, at, power))[0]
+
+    def _gram_of_block(self, block: Block, at: Tensor, power: int) -> tuple[Tensor]:
+        return (self.block_columns(block).gram_below(at, power),)
 
     def _draw_sample(self, count: int, planes: Planes, order: int) -> tuple[list[Block], tuple[Tensor, ...]]:
         """Draw about ``count`` pixels; also return the sums over all pixels minus theirs, both at the pilot's guess."""
@@ -228,7 +237,7 @@ class TiledOperator:
         known = Sums(*sums_of_powers(columns, values(pilot.sample, columns), order))
         guess = replace(guess, coefficients=known.coefficients()[:, :-1])
         draws = Draws(pilot, columns, count, self.guide.pixels)
-        drawn, totals = zip(*self._over_picture("Sampling")(partial(_draw_and_sum, guess, draws)), strict=True)
+        drawn, totals = zip(*self._over_picture("Sampling")(_draw_and_sum, guess, draws), strict=True)
         step = -(-len(drawn) // SAMPLE_BLOCKS)
         sample = [Block.concatenate(drawn[first : first + step]) for first in range(0, len(drawn), step)]
         own = summed(totals for _, totals in in_order(guess.totals, sample, self.workers))
@@ -279,12 +288,9 @@ class TiledOperator:
         """Columns of pixels with a given factor and diagonal."""
         return Columns(factor, *self.pixel_scaling(factor, diagonal))
 
-    def over(self, stage: str) -> Pass[Block]:
+    def over(self, stage: str) -> PassOverPicture:
         """A pass over the sample, or over all pixels if there is none."""
-        if self._sample is None:
-            return self._over_picture(stage)
-        self.report(stage, 0, 1)
-        return partial(in_order, items=self._sample, workers=self.workers)
+        return replace(self._over_picture(stage), sample=self._sample)
 
     def pixels(self, block: Block) -> BlockPixels:
         """The pixels of a block, with their columns."""
@@ -309,9 +315,9 @@ class TiledOperator:
         return replace(self.scaled(block.factor, block.diagonal), weights=block.weights)
 
     def _summed_up(self, planes: Planes, order: int, blocks: Pass[Block]) -> Sums:
-        return Sums(*summed(blocks(partial(self._sums_of_block, planes, order))))
+        return Sums(*summed(blocks(self._sums_of_block, planes, order)))
 
-    def _sums_of_block(self, planes: Planes, order: int, block: Block) -> tuple[Tensor, Tensor]:
+    def _sums_of_block(self, block: Block, planes: Planes, order: int) -> tuple[Tensor, Tensor]:
         pixels = self.pixels(block)
         return sums_of_powers(pixels.known_columns, planes(pixels).flatten(2), order)
 
@@ -333,9 +339,9 @@ class TiledOperator:
             return columns
         return replace(columns, scaling=columns.scaling * counted.at(places).to(columns.scaling).sqrt())
 
-    def of_columns(self, function: Callable[[Columns], Tensor]) -> Planes:
+    def of_columns(self, function: Callable[[Columns, *Rest], Tensor], *arguments: *Rest) -> Planes:
         """Planes computed by a function of columns."""
-        return ColumnPlanes(self, function)
+        return ColumnPlanes(self, function, arguments)
 
     def at(self, places: Tensor) -> Blocks:
         """Columns of single pixels, whose features are read now and kept in memory."""
@@ -367,10 +373,10 @@ class TiledOperator:
 
     def _shifted(self, planes: Planes, shifts: Tensor, blocks: Pass[Block]) -> Tensor:
         """Coefficients of the factor in the solutions of shifted systems, (1, J, M, C)."""
-        grams, sums = summed(blocks(partial(self._shifted_of_block, planes, shifts)))
+        grams, sums = summed(blocks(self._shifted_of_block, planes, shifts))
         return capacitance_inverse(grams) @ sums
 
-    def _shifted_of_block(self, planes: Planes, shifts: Tensor, block: Block) -> tuple[Tensor, Tensor]:
+    def _shifted_of_block(self, block: Block, planes: Planes, shifts: Tensor) -> tuple[Tensor, Tensor]:
         pixels, exact = self.pixels(block), sums_exactly(self.guide.dtype, self.guide.pixels)
         columns, values = pixels.known_columns, planes(pixels).flatten(2)
         return columns.shifted_grams(shifts, exact=exact), columns.shifted_sums(values, shifts)
@@ -380,10 +386,10 @@ class TiledOperator:
     def mean(self, planes: Planes) -> Tensor:
         """Means over the sample, or over all pixels if there is none."""
         self.prepare()
-        total, weight = summed(self.over("Averaging")(partial(self._weighted_sums, planes)))
+        total, weight = summed(self.over("Averaging")(self._weighted_sums, planes))
         return (total / weight).to(self.guide.dtype)
 
-    def _weighted_sums(self, planes: Planes, block: Block) -> tuple[Tensor, Tensor]:
+    def _weighted_sums(self, block: Block, planes: Planes) -> tuple[Tensor, Tensor]:
         """Weighted sums (1, C) of planes over a block, and the sum of the weights."""
         values = planes(self.pixels(block)).flatten(2) * block.weights.unsqueeze(1)
         return values.double().sum(2), block.weights.double().sum()
@@ -404,7 +410,7 @@ def _planes_of_block(planes: Planes, block: Block, columns: Columns) -> Tensor:
     return planes(BlockPixels(block.image.unsqueeze(2), columns)).flatten(2)
 
 
-def _draw_and_sum(guess: Guess, draws: Draws, block: Block) -> tuple[Block, tuple[Tensor, ...]]:
+def _draw_and_sum(block: Block, guess: Guess, draws: Draws) -> tuple[Block, tuple[Tensor, ...]]:
     """The pixels that are drawn from a block, and its sums at a guess."""
     columns, totals = guess.totals(block)
     return draws(block, columns), totals

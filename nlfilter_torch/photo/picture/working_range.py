@@ -6,8 +6,6 @@ by them with its range stretched to [0, 1], and what they change is added to the
 that of a sample of the pixels, so that a few very bright ones do not count. What lies far outside keeps its distance.
 """
 
-from functools import partial
-
 import torch
 from torch import Tensor
 
@@ -35,10 +33,10 @@ def range_of(source: Source[M]) -> WorkingRange | None:
     if source.channels not in (1, 3) or source.batch == 0:
         return None
     source = source.in_range(None)
-    crossings = source.measured(partial(_used_at, _crossings(source.size)))
+    crossings = source.measured(_used_at, _crossings(source.size))
     if is_unreadable(crossings) or not bool(_is_unusual(crossings).any()):
         return None
-    used = source.measured(partial(_used_at, sampled_places(source.size)))
+    used = source.measured(_used_at, sampled_places(source.size))
     unusual = _is_unusual(used)
     if not bool(unusual.any()):
         return None
@@ -59,7 +57,7 @@ def _crossings(size: tuple[int, int]) -> Tensor:
     return mirrored(pairs[:, 0], pairs[:, 1], size).unique()
 
 
-def _used_at(places: Tensor, source: Source[M]) -> Tensor:
+def _used_at(source: Source[M], places: Tensor) -> Tensor:
     """Range that the values of some pixels comprise, and the step of their depth or 0: (3, B)."""
     colours, weights = at(source, places)
     colours = colours.detach().to(torch.promote_types(colours.dtype, torch.float32))

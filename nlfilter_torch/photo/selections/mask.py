@@ -378,8 +378,8 @@ def _computed_regions(
         image = small.image.clamp(0.0, 1.0)  # a far brighter pixel of a float file would upset the linear functions
         masks = torch.cat([rough.mask(number, drawn) for number, drawn in enumerate(reduced)], dim=1)
         front, back = torch.stack([drawn.planes(small) for drawn in reduced], dim=2).unbind(1)
-        fit = partial(_fit_borders, small, image, masks, front, back)
-        functions = kept(small, "borders", [masks, front, back], fit)
+        drawn = [masks, front, back]
+        functions = kept(small, "borders", drawn, _fit_borders, small, image, *drawn)
     if marked is not None:
         functions = functions * marked[:, :, None, None, None]
     regions = Regions(image, steps, functions, scribbles, boxes=boxes)
@@ -411,7 +411,7 @@ def _reduced(source: Source[M], floats: int) -> tuple[Reduced, tuple[float, floa
 
 def _fit_borders(small: Reduced, image: Tensor, rough: Tensor, front: Tensor, back: Tensor) -> Tensor:
     """:func:`fit_borders` of an image; the reduced picture that it is of keeps its models."""
-    return fit_borders(image, kept(small, "models", [], partial(linear_models, image)), rough, front, back)
+    return fit_borders(image, kept(small, "models", [], linear_models, image), rough, front, back)
 
 
 def _nearness(

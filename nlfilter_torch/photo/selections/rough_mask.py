@@ -152,7 +152,7 @@ class RoughMasks:
     @cached_property
     def evenness(self) -> Tensor:
         """:func:`evenness` of the picture."""
-        return kept(self.picture, "evenness", [], partial(evenness, self.picture.image))
+        return kept(self.picture, "evenness", [], evenness, self.picture.image)
 
     def mask(self, number: int, scribbles: Scribbles) -> Tensor:
         """The rough mask (B, 1, H, W) of a region with that number, from scribbles on it and on its background.
@@ -181,7 +181,11 @@ class RoughMasks:
             self.picture,
             ("likelihood", number),
             [*sides[0], *sides[1], *sides[2], self.photometric_bandwidth, trimap],
-            partial(colour_likelihood, self.picture.image, *sides, self.photometric_bandwidth, trimap),
+            colour_likelihood,
+            self.picture.image,
+            *sides,
+            self.photometric_bandwidth,
+            trimap,
         )
         share = by_trimap(COLOUR_SHARE, trimap).view(-1, 1, 1, 1)
         nearby = 1.0 if self.everywhere else (around(likely) / ENOUGH_AROUND).clamp(max=1.0)
@@ -250,10 +254,10 @@ class RoughMasks:
             (self.frame.columns, outside * max(1.0, self.pixels / FRAME_PIXELS), frame_links),
             (self.grid.columns, grid_links, torch.ones_like(grid_links)),
         ]
-        return self.operator.of_columns(partial(_of_columns, self.fit(points, strength=1.0)))
+        return self.operator.of_columns(_of_columns, self.fit(points, strength=1.0))
 
 
-def _of_columns(regression: Callable[[Tensor], Tensor], columns: Columns) -> Tensor:
+def _of_columns(columns: Columns, regression: Callable[[Tensor], Tensor]) -> Tensor:
     """A regression at the pixels of these columns."""
     return regression(columns.factor)
 
