@@ -129,14 +129,21 @@ def cached_constants(function: Callable[P, R]) -> Callable[P, R]:
     """Cache tensors that a function computes from hashable arguments, for later calls in any mode.
 
     Tensors are created on the CPU and are ordinary ones, even in inference mode or with another default device. Fake
-    tensors are not cached.
+    tensors are not cached, and neither are constants of a compiled program. Nobody may change a cached tensor.
     """
-    cached = cast(Callable[P, R], lru_cache(maxsize=8)(function))
+
+    @wraps(function)
+    def made(*args: P.args, **kwargs: P.kwargs) -> R:
+        with torch.inference_mode(False), torch.device("cpu"):
+            return function(*args, **kwargs)
+
+    cached = cast(Callable[P, R], lru_cache(maxsize=8)(made))
 
     @wraps(function)
     def wrapper(*args: P.args, **kwargs: P.kwargs) -> R:
-        with torch.inference_mode(False), torch.device("cpu"):
-            return (function if in_fake_mode() else cached)(*args, **kwargs)
+        if torch.compiler.is_compiling():
+            return function(*args, **kwargs)
+        return (made if in_fake_mode() else cached)(*args, **kwargs)
 
     return wrapper
 

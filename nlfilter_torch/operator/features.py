@@ -7,7 +7,6 @@ import math
 from dataclasses import dataclass
 from functools import reduce
 from itertools import product
-from types import EllipsisType
 from typing import Any, cast
 
 import torch
@@ -27,7 +26,7 @@ from nlfilter_torch.core.checks import (
 from nlfilter_torch.core.communicator import Communicator, all_gather_shapes
 from nlfilter_torch.core.kernels.columns import large_empty
 from nlfilter_torch.core.precision import Gradients, full_precision, once_differentiable, per_image, working_dtype
-from nlfilter_torch.core.torch_internals import for_each_gradient, is_hidden
+from nlfilter_torch.core.torch_internals import cached_constants, for_each_gradient, is_hidden
 from nlfilter_torch.operator.assignment import Layout
 from nlfilter_torch.operator.hidden import fill_hidden
 from nlfilter_torch.operator.options import FilterOptions, GuideChannels, SpatialBandwidth, bandwidths_of
@@ -36,6 +35,7 @@ LUMINANCE = (0.299, 0.587, 0.114)  # shares of red, green and blue
 FAINT_WEIGHT = 1e-12  # in place of patch weights of 0
 
 
+@cached_constants
 def patch_window(patch_size: int, axes: int = 2) -> Tensor:
     """Gaussian patch weights of unit sum, (p, p) for images and (p, p, p) for volumes, with sigma = p / 4.
 
@@ -229,23 +229,24 @@ class _ScaledPatches(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> Gradients:
         padded, scale = ctx.saved_tensors
-        size = _inner_size(padded, scale)
-        grad_padded, grad_scale = torch.zeros_like(padded), torch.zeros_like(scale)
-        planes = grad.unflatten(2, size)
+        size, (of_padded, of_scale) = _inner_size(padded, scale), ctx.needs_input_grad
         axes = len(size)
-        planes = planes.unflatten(1, (padded.shape[1], *scale.shape[1:]))  # (B, C, p, p, H, W)
-        for place in product(*map(range, scale.shape[1:])):
-            window: tuple[EllipsisType | slice, ...] = (..., *map(_interval, place, size))
-            weight: tuple[int | slice, ...] = (slice(None), *place)
-            moved = planes[(slice(None), slice(None), *place)]  # (B, C, H, W)
-            grad_padded[window] += moved * for_planes(scale[weight].unsqueeze(1), axes)
-            total = (moved * padded[window]).flatten(2).sum(2).sum(1)  # (B,)
-            grad_scale[weight] += total if scale.shape[0] == total.shape[0] else total.sum()
+        grad_padded = torch.zeros_like(padded) if of_padded else None
+        grad_scale = torch.zeros_like(scale) if of_scale else None
+        planes = grad.unflatten(2, size).unflatten(1, (padded.shape[1], *scale.shape[1:]))  # (B, C, p, p, H, W)
+        # A row of the patch at a time: a number of planes that stays in the cache, and few calls for small images.
+        for place in product(*map(range, scale.shape[1:-1])):
+            window = (..., *(slice(start, start + length) for start, length in zip(place, size, strict=False)), slice(None))
+            moved, factors = planes[:, :, *place], scale[:, *place]  # (B, C, p, H, W), (1 or B, p)
+            if grad_padded is not None:
+                weighted = moved * for_planes(factors.unsqueeze(1), axes)
+                for start, part in enumerate(weighted.unbind(2)):
+                    grad_padded[window].narrow(-1, start, size[-1]).add_(part)
+            if grad_scale is not None:
+                shifted = padded[window].unfold(-1, size[-1], 1).movedim(-2, 2)
+                totals = (moved * shifted).flatten(3).sum(3).sum(1)  # (B, p)
+                grad_scale[:, *place] = totals if len(scale) == len(totals) else totals.sum(0)
         return grad_padded, grad_scale
-
-
-def _interval(start: int, length: int) -> slice:
-    return slice(start, start + length)
 
 
 def _inner_size(padded: Tensor, scale: Tensor) -> tuple[int, ...]:

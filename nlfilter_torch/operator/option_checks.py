@@ -28,7 +28,7 @@ def check_options(options: FilterOptions) -> None:
     check_count(options.num_landmarks, "num_landmarks")
     if isinstance(options.landmarks, Tensor):
         check_features(options.landmarks, "landmarks")
-    elif not isinstance(options.landmarks, Assignment | HasLandmarks):
+    elif isinstance(options.landmarks, str) or not isinstance(options.landmarks, Assignment | HasLandmarks):
         check_choice(options.landmarks, "landmarks", ("kmeans", "uniform", "random"), SAMPLINGS)
     check_choice(options.completion, "completion", ("diagonal", "none"))
     if options.tolerance is not None:

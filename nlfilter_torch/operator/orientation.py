@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from nlfilter_torch.core.torch_internals import cached_constants
 from nlfilter_torch.operator.assignment import Layout
 
 LEVELS = 1 << 12  # steps to which values are rounded; sums along a row are then exact in float64
@@ -34,6 +35,7 @@ class Orientation:
     channels: Tensor | None = None
 
 
+@cached_constants
 def canonical_order(layout: Layout, size: int, device: torch.device) -> Tensor:
     """Indices (8, D) of D = ``size`` features of a pixel in the order of each orientation of its patch."""
     area, numbers = layout.patch * layout.patch, torch.arange(ORIENTATIONS, device=device)
@@ -119,16 +121,22 @@ def orientation_of(sums: Tensor, channels: int) -> Orientation:
     mixed = sums[:, 0]
     for number in range(1, sums.shape[1]):
         mixed = mixed + (number + 1) * sums[:, number]
-    gravity, hashes = [], []
-    for number in range(ORIENTATIONS):
-        row, column = number % 2, number // 2 % 2
-        down, across = (1 - 2 * row) * mixed[:, MOMENT, ONES], (1 - 2 * column) * mixed[:, ONES, MOMENT]
-        gravity.append(2 * down + across if number < EXCHANGED else 2 * across + down)
-        first, second = (FIRST, SECOND) if number < EXCHANGED else (SECOND, FIRST)
-        hashes.append(mixed[:, first + row, second + column])
-    heaviest, tied = torch.stack(gravity, dim=1), torch.stack(hashes, dim=1)
-    tied = torch.where(heaviest == heaviest.amax(1, keepdim=True), tied, torch.iinfo(torch.long).min)
+    flips, places = (constant.to(sums.device) for constant in _orientations())
+    moments = torch.stack([mixed[:, MOMENT, ONES], mixed[:, ONES, MOMENT]], dim=1)
+    heaviest, hashes = (moments.unsqueeze(1) * flips).sum(2), mixed[:, places[0], places[1]]  # (B, 8)
+    tied = torch.where(heaviest == heaviest.amax(1, keepdim=True), hashes, torch.iinfo(torch.long).min)
     return Orientation(tied.argmax(1), order)
+
+
+@cached_constants
+def _orientations() -> tuple[Tensor, Tensor]:
+    """For each orientation, weights (8, 2) of the moments down and across, and the place (2, 8) of its hash."""
+    numbers = torch.arange(ORIENTATIONS)
+    upset, turned, exchanged = numbers % 2, numbers // 2 % 2, numbers >= EXCHANGED
+    first, second = torch.where(exchanged, SECOND, FIRST), torch.where(exchanged, FIRST, SECOND)
+    heavier = torch.where(exchanged, 1, 2)  # the axis that counts first
+    flips = torch.stack([(1 - 2 * upset) * heavier, (1 - 2 * turned) * (3 - heavier)], dim=1)
+    return flips, torch.stack([first + upset, second + turned])
 
 
 def whole_sums(shares: Tensor, first_row: int, size: Sequence[int], counted: Tensor | None = None) -> Tensor:
@@ -136,19 +144,21 @@ def whole_sums(shares: Tensor, first_row: int, size: Sequence[int], counted: Ten
 
     Pixels where ``counted`` (B, h, W) is 0 do not count.
     """
-    rows = torch.arange(shares.shape[1], device=shares.device) + first_row
-    down, across = _weights(rows, size[0]), _weights(torch.arange(shares.shape[2], device=shares.device), size[1])
+    down = _weights(first_row, shares.shape[1], size[0]).to(shares.device)
+    across = _weights(0, shares.shape[2], size[1]).to(shares.device)
     levels = (shares * LEVELS).round().double() + 1  # positive: axes differ in length even where all values are equal
     levels = levels if counted is None else levels * counted
     by_row = (levels @ across.mT.double()).long()  # (B, h, 6)
     return (down.mT.unsqueeze(2) * by_row.unsqueeze(2)).sum(1)
 
 
-def _weights(places: Tensor, length: int) -> Tensor:
-    """Weights (6, n) of places (n,) along an axis.
+@cached_constants
+def _weights(first: int, count: int, length: int) -> Tensor:
+    """Weights (6, n) of so many places along an axis, from the ``first`` on.
 
     Ones, distances from the middle, and two pairs of pseudo-random numbers, each pair counted from both ends.
     """
+    places = torch.arange(first, first + count)
     back = length - 1 - places
     hashes = [hashed(ends) for hashed in (_hash_first, _hash_second) for ends in (places, back)]
     return torch.stack([torch.ones_like(places), places - back, *hashes])

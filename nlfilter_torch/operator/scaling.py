@@ -115,9 +115,9 @@ class KernelMatrix:
         """``U (weights * values)`` for values (B, N), summed over the ranks: (B, M, 1) in float64."""
         return self.communicator.sum(moment(self.factor, weighted(values, self.weights).unsqueeze(1)))
 
-    def affinities(self, total: Tensor) -> Tensor:
-        """``U^T total``, (B, N), for a vector of length M, (B, M, 1)."""
-        return spread(total.to(self.factor).mT, self.factor).squeeze(1)
+    def affinities(self, total: Tensor, scaling: Tensor | None = None) -> Tensor:
+        """``diag(scaling) U^T total``, (B, N), for a vector of length M, (B, M, 1), and an optional scaling (B, N)."""
+        return spread(total.to(self.factor).mT, self.factor, scaling).squeeze(1)
 
     def row_sums(self, scaling: Tensor, actual: Tensor) -> Tensor:
         """Row sums (B, N) of W for a scaling d with the moment ``actual``."""
@@ -127,14 +127,10 @@ class KernelMatrix:
         """Largest magnitude of the values (B, N) of each image, (B,); infinite if one of the values is NaN."""
         return self.communicator.max(values.abs().amax(1).nan_to_num(nan=torch.inf))
 
-    def scaling(self, total: Tensor, most: float = LARGEST_ROOT) -> Tensor:
-        """The scaling d(t), (B, N), for t (B, M, 1) in float64, at most ``most``."""
-        return scaling_from_moment(self.factor, self.diagonal, total.to(self.factor)).clamp_(max=most)
-
-    def sweep(self, total: Tensor) -> tuple[Tensor, Tensor]:
-        """The scaling d(t), (B, N), and its moment (B, M, 1), in one read of the factor."""
+    def sweep(self, total: Tensor, most: float = LARGEST_ROOT) -> tuple[Tensor, Tensor]:
+        """The scaling d(t), (B, N), at most ``most``, and its moment (B, M, 1), in one read of the factor."""
         half = (total / 2).squeeze(2).to(self.factor)
-        scaling, actual = sweep(self.factor, self.diagonal, half, LARGEST_ROOT, self.weights)
+        scaling, actual = sweep(self.factor, self.diagonal, half, most, self.weights)
         return scaling, self.communicator.sum(actual.unsqueeze(2))
 
     def at(self, places: Tensor, weights: Tensor) -> "KernelMatrix":
@@ -144,11 +140,10 @@ class KernelMatrix:
 
     def moment_and_slope(self, total: Tensor, most: float) -> tuple[Tensor, Tensor]:
         """The moment of d(t), (B, M, 1), and ``J - I``, (B, M, M), over the points; both in float64."""
-        scaling = self.scaling(total, most)
+        scaling, actual = self.sweep(total, most)
         remainder = scaling * (scaling * self.diagonal)
         root = scaling * weighted(1 / (1 + remainder), self.weights).sqrt()
-        slope = self.communicator.sum(sum_grams(self.factor, root, None, 1)[:, 0])
-        return self.moment(scaling), slope
+        return actual, self.communicator.sum(sum_grams(self.factor, root, None, 1)[:, 0])
 
 
 def newton(
@@ -259,11 +254,14 @@ class Balancing:
     before: tuple[Tensor, ...] = ()
 
 
-def _draw(matrix: KernelMatrix, scaling: Tensor, count: int) -> tuple[KernelMatrix, Tensor]:
-    """Draw a systematic sample in proportion to leverage scores; also return its part of ``scaling``, (B, n)."""
+def _draw(matrix: KernelMatrix, scaling: Tensor, count: int) -> tuple[KernelMatrix, Tensor | None]:
+    """Draw a systematic sample in proportion to leverage scores; also return the numbers (B, n) of its points.
+
+    Of few points all are the sample, and there are no numbers.
+    """
     factor, diagonal, weights = matrix.factor, matrix.diagonal, matrix.weights
     if 2 * count >= factor.shape[2]:
-        return matrix, scaling
+        return matrix, None
     slope = scaling.square()
     leverage = weighted(slope * (1 - diagonal) / (1 + slope * diagonal), weights)  # |u|^2 is 1 - c
     leverage = leverage + leverage.mean(1, keepdim=True) * UNIFORM + torch.finfo(leverage.dtype).tiny
@@ -272,7 +270,7 @@ def _draw(matrix: KernelMatrix, scaling: Tensor, count: int) -> tuple[KernelMatr
     chosen = torch.searchsorted(summed, summed[:, -1:] * ticks).clamp_(max=factor.shape[2] - 1)  # (B, n)
     weight = (summed[:, -1:] / count).to(factor) / leverage.gather(1, chosen)
     weight = weight if weights is None else weight * weights.gather(1, chosen)
-    return matrix.at(chosen, weight), scaling.gather(1, chosen)
+    return matrix.at(chosen, weight), chosen
 
 
 def _guess(matrix: KernelMatrix) -> Tensor:
@@ -292,7 +290,7 @@ def _guess(matrix: KernelMatrix) -> Tensor:
     sums = sample.affinities(sample.moment(torch.ones_like(sample.diagonal))) + sample.diagonal
     total = sample.moment(sums.clamp_(min=1.0).rsqrt_())  # no row of K sums to less than its unit diagonal
     for _ in range(GUESSES):
-        total = (total + sample.moment(sample.scaling(total))) / 2
+        total = (total + sample.sweep(total)[1]) / 2
     return total
 
 
@@ -315,10 +313,10 @@ def sampled_newton(matrix: KernelMatrix, tolerance: float) -> Balancing:
         before, error = total, total - actual
         resampled = gain > RESAMPLED if watched else sweeps < 3
         if resampled:
-            sample, part = _draw(matrix, scaling, count)
+            sample, places = _draw(matrix, scaling, count)
             # The sample predicts how the moment changes with t. Its error at the current t, where the true moment is
-            # known, is subtracted.
-            bias = actual - sample.moment(part)
+            # known, is subtracted; a sample of all points has none.
+            bias = 0.0 if places is None else actual - sample.moment(scaling.gather(1, places))
             total, lower, _ = newton(sample.whole, actual, steps=SAMPLE_STEPS, bias=bias)
             inverse = torch.cholesky_inverse(lower)
         else:
@@ -328,7 +326,9 @@ def sampled_newton(matrix: KernelMatrix, tolerance: float) -> Balancing:
             inverse = _updated(inverse, total - before, total - actual - error)
         if not watched:
             continue
-        previous, worst = worst, _deficit(sample, total, actual)
+        # As d is the root for the given total, row sums are 1 - d u . (total - actual).
+        part = scaling if places is None else scaling.gather(1, places)
+        previous, worst = worst, float(sample.largest(sample.affinities(total - actual, part)).max())
         gain = worst / previous
         slow = slow + 1 if not gain <= 0.5 else 0
         if worst <= tolerance or slow > 1:
@@ -338,13 +338,6 @@ def sampled_newton(matrix: KernelMatrix, tolerance: float) -> Balancing:
     else:
         measured = _measure(matrix, scaling, total, actual)
     return Balancing(matrix, scaling, actual, measured[0], sweeps, inverse)
-
-
-def _deficit(sample: KernelMatrix, total: Tensor, actual: Tensor) -> float:
-    """Largest deviation of a row sum of a sample from 1, if d(total) has the moment ``actual``."""
-    # As d is the root for the given total, row sums are 1 - d u . (total - actual).
-    deficit = spread((total - actual).to(sample.factor).mT, sample.factor, sample.scaling(total))
-    return float(sample.communicator.max(deficit.abs().amax((1, 2))).max())
 
 
 def _refined(matrix: KernelMatrix, tolerance: float) -> Balancing:
@@ -357,8 +350,7 @@ def _refined(matrix: KernelMatrix, tolerance: float) -> Balancing:
         scaling, actual = matrix.sweep(total)
         sweeps += 1
         error, d = total - actual, scaling.float()
-        deficit = spread(error.to(single.factor).mT, single.factor, d).squeeze(1)
-        if bool((single.largest(deficit) <= tolerance / 2).all()):
+        if bool((single.largest(single.affinities(error, d)) <= tolerance / 2).all()):
             break
         weight = weighted(d.square() / (1 + d.square() * single.diagonal), weights)
         total = total - conjugate_gradients(single, weight, error, rough.inverse)
@@ -409,8 +401,7 @@ def damped(matrix: KernelMatrix, start: Balancing, goal: float) -> Balancing:
         if bool(residual.max() <= best.residual.max()):
             best = candidate
         right = matrix.moment(scaling * (share * deficit))
-        affinity = spread(torch.cholesky_solve(right, lower).to(factor).mT, factor, scaling).squeeze(1)
-        step = share * (deficit - affinity)
+        step = share * (deficit - matrix.affinities(torch.cholesky_solve(right, lower), scaling))
         small = bool(matrix.largest(step).max() < SMALL_STEP)
         if bool((residual <= goal).all()) or (small and slow > 2) or not bool(torch.isfinite(step).all()):
             break

@@ -103,7 +103,7 @@ def test_filter_in_patch_weights_residual_and_sliders_of_every_pixel(completion:
     def call(weights: Tensor, residual: Tensor, alpha: Tensor) -> Tensor:
         return polynomial_filter(build(guide, completion, patch_weights=weights), image, alpha, residual=residual)
 
-    weights = patch_window(3).requires_grad_()
+    weights = patch_window(3).clone().requires_grad_()
     assert gradcheck(
         call, (weights, scalar(0.7), noise(1, 4, *SIZE, seed=2).requires_grad_()), fast_mode=completion == "none"
     )
