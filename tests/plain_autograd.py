@@ -13,6 +13,7 @@ from nlfilter_torch.core.kernels.columns import SMALLEST_EXPONENT
 from nlfilter_torch.operator.features import GuideFeatures, patch_window
 from nlfilter_torch.operator.landmarks import assign_landmarks
 from nlfilter_torch.operator.nystrom import JITTER
+from nlfilter_torch.operator.options import FilterOptions
 
 RELAXATION = 2.0 / 3.0
 
@@ -61,7 +62,7 @@ def plain_filter(
     recipe = GuideFeatures(weights, photometric_bandwidth, spatial_bandwidth, "all")
     features = recipe(guide)
     size = (guide.shape[2], guide.shape[3])
-    landmarks, _ = assign_landmarks(features, size, num_landmarks, "kmeans", None, layout=recipe.layout)
+    landmarks, _ = assign_landmarks(features, size, FilterOptions(num_landmarks=num_landmarks), layout=recipe.layout)
     between = affinity(landmarks.double(), landmarks.double())  # (B, M, M), in float64 as it is badly conditioned
     identity = torch.eye(num_landmarks, dtype=torch.float64)
     lower = torch.linalg.cholesky(between + JITTER * identity)

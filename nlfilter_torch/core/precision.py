@@ -75,6 +75,11 @@ class _WithoutTF32:
 WITHOUT_TF32 = _WithoutTF32()
 
 
+def _is_rounded(device: str) -> bool:
+    """Whether autocast is on. Entering a context without it, before every call, would take as long as a product."""
+    return torch.is_autocast_enabled("cpu") or torch.is_autocast_enabled(device)
+
+
 def full_precision(function: Callable[P, R]) -> Callable[P, R]:
     """Run ``function`` without autocast and, where a CUDA device exists, without TF32."""
 
@@ -82,9 +87,8 @@ def full_precision(function: Callable[P, R]) -> Callable[P, R]:
     def wrapper(*args: P.args, **kwargs: P.kwargs) -> R:
         devices = [a.device.type for a in args if isinstance(a, Tensor)]  # Dynamo of PyTorch 2.8 lacks `next`
         device = devices[0] if devices and devices[0] != "meta" else "cuda"
-        if not (torch.cuda.is_available() or torch.compiler.is_compiling() or torch.is_autocast_enabled("cpu")):
-            if not torch.is_autocast_enabled(device):  # there is nothing to leave, as in most calls
-                return function(*args, **kwargs)
+        if not torch.cuda.is_available() and not torch.compiler.is_compiling() and not _is_rounded(device):
+            return function(*args, **kwargs)
         with torch.autocast("cpu", enabled=False), torch.autocast(device, enabled=False):
             if torch.cuda.is_available() and not torch.compiler.is_compiling():
                 with WITHOUT_TF32:

@@ -8,18 +8,16 @@ of three terms alone loses orthogonality. The derivative in W uses the spaces of
 function using Krylov subspace methods", 2021).
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from nlfilter_torch.core.blocks import weighted
 from nlfilter_torch.core.checks import Response
-from nlfilter_torch.core.communicator import Communicator
-from nlfilter_torch.core.precision import once_differentiable
+from nlfilter_torch.core.precision import Gradients
 from nlfilter_torch.core.symmetric_matrix import MEETING, divided_differences
-from nlfilter_torch.core.torch_internals import for_each_gradient
 from nlfilter_torch.operator.pixel_matrix import PixelMatrix
 
 CHUNK = 16  # steps between two estimates of the error
@@ -150,40 +148,29 @@ def ritz_space(matrix: PixelMatrix, planes: Tensor, response: Response, toleranc
 def krylov_product(matrix: PixelMatrix, planes: Tensor, response: Response, space: RitzSpace) -> Tensor:
     """``f(W) y`` in a Krylov space of the planes, (B, C, N); differentiable once in y, f and W."""
     gains = matrix.communicator.copy_to_group(gains_of(response, space.values))
-    result: Tensor = _KrylovProduct.apply(  # type: ignore[no-untyped-call]
-        *matrix.parts, planes, gains, space, response
-    )
-    return result
+    return matrix.apply(_Krylov(space, response), planes, gains)
 
 
-class _KrylovProduct(torch.autograd.Function):
-    @staticmethod
-    def forward(
-        ctx: Any,
-        factor: Tensor,
-        scaling: Tensor,
-        remainder: Tensor,
-        weights: Tensor | None,
-        communicator: Communicator,
-        planes: Tensor,
-        gains: Tensor,
-        space: RitzSpace,
-        response: Response,
-    ) -> Tensor:
-        ctx.save_for_backward(factor, scaling, remainder, weights, planes, gains)
-        ctx.space, ctx.response, ctx.communicator = space, response, communicator
-        return space.combine(gains).to(planes)
+@dataclass(frozen=True, eq=False)
+class _Krylov:
+    """The function of W with a response f in a Krylov space of the planes; gains are those of the values of W."""
 
-    @staticmethod
-    @for_each_gradient
-    @once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-        factor, scaling, remainder, weights, planes, gains = ctx.saved_tensors
-        matrix, space = PixelMatrix(factor, scaling, remainder, weights, ctx.communicator), ctx.space
+    space: RitzSpace
+    response: Response
+
+    def value(self, matrix: PixelMatrix, planes: Tensor, gains: Tensor) -> Tensor:
+        """The product with planes."""
+        return self.space.combine(gains).to(planes)
+
+    def gradients(
+        self, matrix: PixelMatrix, planes: Tensor, gains: Tensor, grad: Tensor, needed: Sequence[bool]
+    ) -> Gradients:
+        """Those of W and planes from the Krylov space of the gradient, with as many steps."""
+        space, weights, nothing = self.space, matrix.weights, (None, None, None)
         inner = (space.basis @ grad.unsqueeze(3)).squeeze(3).double()  # (B, C, k)
         grad_gains = (space.vectors.mT @ inner.unsqueeze(3)).squeeze(3) * space.start
-        if not any(ctx.needs_input_grad[:6]):
-            return *[None] * 6, grad_gains, None, None
+        if not any(needed[:4]):
+            return *nothing, None, grad_gains
         # W is symmetric in the sum over points with their weights, in which the gradient is grad / weights.
         pulled = (
             grad
@@ -196,15 +183,14 @@ class _KrylovProduct(torch.autograd.Function):
         iteration.extend(space.values.shape[2])
         adjoint = iteration.space()
         with torch.no_grad():
-            answers = gains_of(ctx.response, adjoint.values)
+            answers = gains_of(self.response, adjoint.values)
         grad_planes = weighted(adjoint.combine(answers).to(planes), weights)
-        if not any(ctx.needs_input_grad[:3]):
-            return *[None] * 5, grad_planes, grad_gains, None, None
+        if not any(needed[:3]):
+            return *nothing, grad_planes, grad_gains
         differences = divided_differences(
-            ctx.response, (adjoint.values, answers), (space.values, gains), meeting=MEETING[answers.dtype]
+            self.response, (adjoint.values, answers), (space.values, gains), meeting=MEETING[answers.dtype]
         )
         inner = adjoint.start.unsqueeze(3) * differences * space.start.unsqueeze(2)
         core = adjoint.vectors @ inner @ space.vectors.mT
         left = weighted((core.mT.to(planes) @ adjoint.basis).flatten(1, 2), weights)
-        grads = matrix.gradient(left, space.basis.flatten(1, 2))
-        return *grads, None, None, grad_planes, grad_gains, None, None
+        return *matrix.gradient(left, space.basis.flatten(1, 2)), grad_planes, grad_gains

@@ -12,22 +12,21 @@ The first that keeps the tolerance is taken. The derivative of the first two is 
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from nlfilter_torch.core.blocks import fold_batch, unfold_batch
 from nlfilter_torch.core.checks import check_fits, check_instance, check_values, checked_response
-from nlfilter_torch.core.communicator import Communicator
-from nlfilter_torch.core.precision import full_precision, once_differentiable, trainable, uncompiled, working_dtype
+from nlfilter_torch.core.precision import Gradients, full_precision, trainable, uncompiled, working_dtype
 from nlfilter_torch.core.rational import DECADES, RationalForm, best_form, interval_nodes, pole_forms
-from nlfilter_torch.core.torch_internals import for_each_gradient, in_format_of, is_unreadable
+from nlfilter_torch.core.torch_internals import in_format_of, is_unreadable
 from nlfilter_torch.core.warning import warn
 from nlfilter_torch.filtering.lanczos import STEPS, krylov_product, ritz_space
 from nlfilter_torch.operator.operator import NonlocalOperator
-from nlfilter_torch.operator.pixel_matrix import PixelMatrix
+from nlfilter_torch.operator.pixel_matrix import ROWS, PixelMatrix
 from nlfilter_torch.operator.spectrum import Response
 
 
@@ -45,26 +44,10 @@ def rational_product(matrix: PixelMatrix, planes: Tensor, form: RationalForm, co
         differentiable any number of times, also in forward mode.
     """
     shifts = form.shifts.to(planes)
+    function = _Rational(form.degree, shifts, matrix.capacitances(shifts))
     if not matrix.needs_gradient:
-        return _product(matrix, planes, shifts, matrix.capacitances(shifts), coefficients.to(planes))
-    result: Tensor = _RationalProduct.apply(  # type: ignore[no-untyped-call]
-        *matrix.parts, planes, coefficients.to(planes), shifts
-    )
-    return result
-
-
-def _product(matrix: PixelMatrix, planes: Tensor, shifts: Tensor, inverses: Tensor, coefficients: Tensor) -> Tensor:
-    degree = coefficients.shape[1] - len(shifts) - 1
-    coefficients = coefficients.unsqueeze(2).unsqueeze(3)  # (B, K, 1, 1)
-    total = coefficients[:, 0] * planes
-    for k, term in enumerate(_chebyshev(matrix, planes, degree)):
-        total = torch.addcmul(total, coefficients[:, k], term) if k else total
-    step = max(1, 8 // planes.shape[1])
-    for first in range(0, len(shifts), step):  # a few at a time, to save memory
-        part = slice(first, first + step)
-        solutions = matrix.solve(planes, shifts[part], inverses[:, part])
-        total = total + (coefficients[:, degree + 1 :][:, part] * solutions).sum(1)
-    return total
+        return function.value(matrix, planes, coefficients.to(planes))
+    return matrix.apply(function, planes, coefficients.to(planes))
 
 
 def pole_terms(matrix: PixelMatrix, planes: Tensor, form: RationalForm) -> Tensor:
@@ -91,52 +74,55 @@ def _chebyshev(matrix: PixelMatrix, planes: Tensor, degree: int) -> list[Tensor]
     return terms
 
 
-class _RationalProduct(torch.autograd.Function):
-    """The product, with the derivative of poles: ``d (W + t)^-1 = -(W + t)^-1 dW (W + t)^-1``."""
+@dataclass(frozen=True, eq=False)
+class _Rational:
+    """The rational function, with the derivative of poles: ``d (W + t)^-1 = -(W + t)^-1 dW (W + t)^-1``.
 
-    @staticmethod
-    def forward(
-        ctx: Any,
-        factor: Tensor,
-        scaling: Tensor,
-        remainder: Tensor,
-        weights: Tensor | None,
-        communicator: Communicator,
-        planes: Tensor,
-        coefficients: Tensor,
-        shifts: Tensor,
-    ) -> Tensor:
-        matrix = PixelMatrix(factor, scaling, remainder, weights, communicator)
-        inverses, ctx.communicator = matrix.capacitances(shifts), communicator
-        ctx.save_for_backward(factor, scaling, remainder, weights, planes, coefficients, shifts, inverses)
-        return _product(matrix, planes, shifts, inverses, coefficients)
+    Attributes:
+        degree: of its polynomial.
+        shifts: t, (J,).
+        inverses: :meth:`PixelMatrix.capacitances` of these.
+    """
 
-    @staticmethod
-    @for_each_gradient
-    @once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-        factor, scaling, remainder, weights, planes, coefficients, shifts, inverses = ctx.saved_tensors
-        matrix = PixelMatrix(factor, scaling, remainder, weights, ctx.communicator)
-        degree = coefficients.shape[1] - len(shifts) - 1
-        parts = coefficients[:, :, None, None]
+    degree: int
+    shifts: Tensor
+    inverses: Tensor
+
+    def value(self, matrix: PixelMatrix, planes: Tensor, gains: Tensor) -> Tensor:
+        """The product with planes; gains are the coefficients of the form."""
+        gains = gains[:, :, None, None]
+        total = gains[:, 0] * planes
+        for k, term in enumerate(_chebyshev(matrix, planes, self.degree)):
+            total = torch.addcmul(total, gains[:, k], term) if k else total
+        step = max(1, ROWS // planes.shape[1])
+        for first in range(0, len(self.shifts), step):  # a few at a time, to save memory
+            part = slice(first, first + step)
+            solutions = matrix.solve(planes, self.shifts[part], self.inverses[:, part])
+            total = total + (gains[:, self.degree + 1 :][:, part] * solutions).sum(1)
+        return total
+
+    def gradients(
+        self, matrix: PixelMatrix, planes: Tensor, gains: Tensor, grad: Tensor, needed: Sequence[bool]
+    ) -> Gradients:
+        """All of them, since the terms of all are shared."""
+        degree, parts = self.degree, gains[:, :, None, None]
         terms, adjoints = _chebyshev(matrix, planes, degree), _adjoints(matrix.transpose, grad, parts, degree)
-        grad_coefficients = [(grad * term).sum((1, 2)) for term in terms]
+        grad_gains = [(grad * term).sum((1, 2)) for term in terms]
         # v_1 = (2 W - 1) v_0 and v_(k+1) = 2 (2 W - 1) v_k - v_(k-1)
         left = [(2 if k == 1 else 4) * adjoints[k] for k in range(1, degree + 1)]
         right, grad_planes = terms[:-1], adjoints[0]
-        for j in range(len(shifts)):
-            shift = shifts[j : j + 1]
-            part, inverse = parts[:, degree + 1 + j], inverses[:, j : j + 1]
+        for j in range(len(self.shifts)):
+            shift, inverse = self.shifts[j : j + 1], self.inverses[:, j : j + 1]
             solution = matrix.solve(planes, shift, inverse)[:, 0]
-            adjoint = matrix.transpose.solve(part * grad, shift, inverse)[:, 0]
-            grad_coefficients.append((grad * solution).sum((1, 2)))
+            adjoint = matrix.transpose.solve(parts[:, degree + 1 + j] * grad, shift, inverse)[:, 0]
+            grad_gains.append((grad * solution).sum((1, 2)))
             grad_planes = grad_planes + adjoint
             left.append(-adjoint / shift)
             right.append(solution)
-        grads: tuple[Tensor | None, ...] = (None, None, None)
+        grads: Gradients = (None, None, None)
         if left:
             grads = matrix.gradient(torch.cat(left, dim=1), torch.cat(right, dim=1))
-        return (*grads, None, None, grad_planes, torch.stack(grad_coefficients, dim=1), None)
+        return *grads, grad_planes, torch.stack(grad_gains, dim=1)
 
 
 def _adjoints(matrix: PixelMatrix, grad: Tensor, coefficients: Tensor, degree: int) -> list[Tensor]:

@@ -11,21 +11,21 @@ from nlfilter_torch.core.checks import check_choice, check_image, check_pixel_we
 from nlfilter_torch.core.communicator import check_group
 from nlfilter_torch.core.precision import working_dtype
 from nlfilter_torch.nn.parameters import Learnable, UnitWindow, check_learn, positive_option
-from nlfilter_torch.operator.assignment import Assignment
 from nlfilter_torch.operator.build import checked_operator
 from nlfilter_torch.operator.features import GuideFeatures, estimate_bandwidth, unit_window
 from nlfilter_torch.operator.landmarks import assign_landmarks
 from nlfilter_torch.operator.operator import NonlocalOperator
-from nlfilter_torch.operator.option_checks import check_options
 from nlfilter_torch.operator.options import (
     AUTO,
     SAMPLING,
+    Assignment,
     Completion,
     FilterOptions,
     GuideChannels,
     HasLandmarks,
     Landmarks,
     Sampling,
+    check_options,
 )
 
 Hold = Literal["assignment", "features"]
@@ -267,11 +267,11 @@ class NonlocalAffinity(Learnable):
             counts = counts.flatten()
             kept = counts.nonzero().squeeze(1)
             features, counts, size = features[:, :, kept], counts[kept].unsqueeze(0), (1, len(kept))
-        count = min(self.num_landmarks, features.shape[2])
-        layout = recipe.layout if len(guide) == 1 and counts is None else None  # then as those of its operator
-        chosen, _ = assign_landmarks(
-            features, size, count, self.landmarks, self.generator, weights=counts, layout=layout
+        options = FilterOptions(
+            num_landmarks=min(self.num_landmarks, features.shape[2]), landmarks=self.landmarks, generator=self.generator
         )
+        layout = recipe.layout if len(guide) == 1 and counts is None else None  # then as those of its operator
+        chosen, _ = assign_landmarks(features, size, options, weights=counts, layout=layout)
         self.held.keep(chosen, recipe)
 
     def _held(self, hold: Hold | None, landmarks: Landmarks) -> HeldAssignment | HeldFeatures | None:
@@ -281,15 +281,9 @@ class NonlocalAffinity(Learnable):
         if hold is None:
             return None
         check_choice(hold, "hold", ("assignment", "features"), "choose one of these, or None")
-        if hold == "assignment":
-            return self._held_assignment(landmarks)
-        held = HeldFeatures()
-        if not isinstance(landmarks, str):
-            self._keep_features(held, landmarks)
-        return held
-
-    def _held_assignment(self, landmarks: Landmarks) -> HeldAssignment:
-        """Hold the assignment of an operator, if there is one; otherwise that of the first call."""
+        if hold == "features":
+            return HeldFeatures() if isinstance(landmarks, str) else self._held_features(landmarks)
+        # The assignment of an operator, if there is one; otherwise that of the first call.
         assignment = landmarks if isinstance(landmarks, str | Tensor | Assignment) else landmarks.assignment
         if assignment is None or isinstance(assignment, Tensor):
             raise ValueError(
@@ -298,8 +292,8 @@ class NonlocalAffinity(Learnable):
             )
         return HeldAssignment(None if isinstance(assignment, str) else assignment)
 
-    def _keep_features(self, held: HeldFeatures, landmarks: Tensor | Assignment | HasLandmarks) -> None:
-        """Keep landmarks in units of the guide, given those divided by the initial bandwidths."""
+    def _held_features(self, landmarks: Tensor | Assignment | HasLandmarks) -> HeldFeatures:
+        """Hold landmarks in units of the guide, given those divided by the initial bandwidths."""
         if isinstance(landmarks, Assignment):
             raise ValueError(
                 "hold must be 'assignment' if landmarks are an assignment, got 'features'; pass the operator itself"
@@ -314,7 +308,9 @@ class NonlocalAffinity(Learnable):
                     "'auto'; pass a number, or an operator of a guide"
                 )
             recipe = self._recipe(bandwidth, features)
+        held = HeldFeatures()
         held.keep(features, recipe)
+        return held
 
     def _recipe(self, bandwidth: float | Tensor, like: Tensor) -> GuideFeatures:
         """The function that computes features of a guide, in the precision of ``like``."""

@@ -12,8 +12,7 @@ from nlfilter_torch.core.checks import check_choice, check_count, check_dtype, c
 from nlfilter_torch.core.precision import full_precision, working_dtype
 from nlfilter_torch.nn.parameters import Learnable, check_learn, positive_option
 from nlfilter_torch.operator.build import operator_from_points
-from nlfilter_torch.operator.option_checks import check_options
-from nlfilter_torch.operator.options import SAMPLING, FilterOptions, Sampling
+from nlfilter_torch.operator.options import SAMPLING, FilterOptions, Sampling, check_options
 
 Norm = Literal["batch", "none"]
 BlockOption = Literal["temperature", "spatial_bandwidth"]

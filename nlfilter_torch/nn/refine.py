@@ -12,8 +12,15 @@ from nlfilter_torch.core.checks import check_choice, check_count, check_positive
 from nlfilter_torch.filtering.refine import FILTER, KINDS, MARGIN, STRENGTH, Kind, MeanField, refined
 from nlfilter_torch.nn.parameters import Learnable, check_learn, positive_option
 from nlfilter_torch.operator.operator import NonlocalOperator
-from nlfilter_torch.operator.option_checks import check_bandwidths, check_options
-from nlfilter_torch.operator.options import AUTO, SAMPLING, FilterOptions, GuideChannels, Sampling
+from nlfilter_torch.operator.options import (
+    AUTO,
+    SAMPLING,
+    FilterOptions,
+    GuideChannels,
+    Sampling,
+    check_bandwidths,
+    check_options,
+)
 
 RefineOption = Literal["strength", "margin", "compatibility", "photometric_bandwidth", "spatial_bandwidth"]
 LEARNABLE: tuple[RefineOption, ...] = get_args(RefineOption)

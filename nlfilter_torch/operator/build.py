@@ -21,7 +21,6 @@ from nlfilter_torch.core.communicator import ALONE, Communicator, all_gather_sha
 from nlfilter_torch.core.precision import full_precision, trainable, uncompiled, working_dtype
 from nlfilter_torch.core.torch_internals import is_hidden, outside_transforms, refuse_transforms
 from nlfilter_torch.core.warning import warn
-from nlfilter_torch.operator.assignment import Assignment, Layout
 from nlfilter_torch.operator.counting import assign_among_counted, extended, hidden_points
 from nlfilter_torch.operator.eigenvalue_bound import exceeds, is_bounded, limiter, slack
 from nlfilter_torch.operator.features import (
@@ -35,16 +34,20 @@ from nlfilter_torch.operator.features import (
 from nlfilter_torch.operator.landmarks import landmarks_by
 from nlfilter_torch.operator.nystrom import inverse_cholesky
 from nlfilter_torch.operator.operator import Kernel, NonlocalOperator
-from nlfilter_torch.operator.option_checks import check_bandwidths, check_options, landmark_count
 from nlfilter_torch.operator.options import (
     AUTO,
+    Assignment,
     Completion,
     FilterOptions,
     GuideChannels,
     Landmarks,
     SpatialBandwidth,
     bandwidths_of,
+    check_bandwidths,
+    check_options,
+    landmark_count,
 )
+from nlfilter_torch.operator.orientation import Layout
 from nlfilter_torch.operator.pixel_matrix import PixelMatrix
 from nlfilter_torch.operator.scaling import KernelMatrix, PixelScaling
 from nlfilter_torch.operator.sinkhorn import (
@@ -409,7 +412,7 @@ def sampled_operator(
     bandwidth = options.bandwidth_or(lambda: estimate_bandwidth(guide))
     recipe = GuideFeatures.of(options, bandwidth, guide.dtype, guide.device)
     features, size = recipe(guide), (guide.shape[2], guide.shape[3])
-    chosen, _ = landmarks_by(options, features, size, options.num_landmarks, layout=recipe.layout)
+    chosen, _ = landmarks_by(features, size, options, layout=recipe.layout)
     count = len(places)
     weights = guide.new_full((1, count), features.shape[2] / count)
     return _assemble(features[:, :, places], (1, count), options, recipe=recipe, weights=weights, chosen=chosen)
@@ -440,7 +443,8 @@ def _assemble(
     assignment = None
     if chosen is None:
         layout = None if recipe is None else recipe.layout
-        chosen, assignment = _landmarks(options, features, whole, count, communicator, weights, layout)
+        wanted = options if count == options.num_landmarks else replace(options, num_landmarks=count)
+        chosen, assignment = _landmarks(features, whole, wanted, communicator, weights, layout)
     inverse = inverse_cholesky(chosen)
     alone = (
         not torch.compiler.is_compiling() and communicator.size == 1
@@ -488,20 +492,18 @@ def _assemble(
 
 
 def _landmarks(
-    options: FilterOptions,
     features: Tensor,
     size: tuple[int, ...],
-    count: int,
+    options: FilterOptions,
     communicator: Communicator,
     weights: Tensor | None,
     layout: Layout | None,
 ) -> tuple[Tensor, Assignment | None]:
     """:func:`landmarks_by`, from the points that count alone where weights are 0."""
-    if weights is None or communicator.size > 1 or not isinstance(options.landmarks, str):
-        return landmarks_by(options, features, size, count, communicator, weights, layout)
-    if layout is None and hidden_points(weights) is None:
-        return landmarks_by(options, features, size, count, communicator, weights)
-    return assign_among_counted(features, size, count, options.landmarks, options.generator, weights, layout)
+    chosen = isinstance(options.landmarks, str)
+    if weights is None or communicator.size > 1 or not chosen or (layout is None and hidden_points(weights) is None):
+        return landmarks_by(features, size, options, communicator, weights, layout)
+    return assign_among_counted(features, size, options, weights, layout)
 
 
 def _places(points: int, features: Tensor) -> Tensor:

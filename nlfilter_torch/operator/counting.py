@@ -13,7 +13,6 @@ from torch import Tensor
 
 from nlfilter_torch.core.kernels.clusters import pick
 from nlfilter_torch.core.kernels.tall_skinny import spread
-from nlfilter_torch.operator.assignment import Assignment, Layout
 from nlfilter_torch.operator.landmarks import (
     assign_landmarks,
     canonical_candidates,
@@ -21,8 +20,8 @@ from nlfilter_torch.operator.landmarks import (
     drawn_candidates,
     orientations,
 )
-from nlfilter_torch.operator.options import Sampling
-from nlfilter_torch.operator.orientation import source_pixels
+from nlfilter_torch.operator.options import Assignment, FilterOptions
+from nlfilter_torch.operator.orientation import Layout, source_pixels
 from nlfilter_torch.operator.scaling import KernelMatrix
 
 # Share of the diagonal correction that a point of weight 0 keeps: its own value counts where little else does.
@@ -41,9 +40,7 @@ def hidden_points(weights: Tensor | None) -> Tensor | None:
 def assign_among_counted(
     features: Tensor,
     size: tuple[int, ...],
-    count: int,
-    sampling: Sampling,
-    generator: torch.Generator | None,
+    options: FilterOptions,
     weights: Tensor,
     layout: Layout | None = None,
 ) -> tuple[Tensor, Assignment | None]:
@@ -52,20 +49,17 @@ def assign_among_counted(
     The landmarks are those of an image without its padding. ``weights`` (B, N) may be 0. The assignment is None if the
     images differ in their numbers of candidates.
     """
-    state = None if generator is None else generator.get_state()
+    generator = torch.Generator().manual_seed(0) if options.generator is None else options.generator
+    options, state, count = replace(options, generator=generator), generator.get_state(), options.num_landmarks
     parts = []
     for image, row in zip(features.split(1), weights, strict=True):
-        if generator is not None and state is not None:
-            generator.set_state(state)  # all images of a batch use the same random numbers
-        source = torch.Generator().manual_seed(0) if generator is None else generator
+        generator.set_state(state)  # all images of a batch use the same random numbers
         kept = row.nonzero().squeeze(1)
-        if layout is not None and sampling == "kmeans" and count < len(kept):
-            landmarks, assignment = _in_canonical_order(image, size, count, source, row, kept, layout)
+        if layout is not None and options.landmarks == "kmeans" and count < len(kept):
+            landmarks, assignment = _in_canonical_order(image, size, count, generator, row, kept, layout)
         else:
             counted = _uneven(row[kept].unsqueeze(0))
-            landmarks, assignment = assign_landmarks(
-                image[:, :, kept], _size_of(kept, size), count, sampling, source, weights=counted
-            )
+            landmarks, assignment = assign_landmarks(image[:, :, kept], _size_of(kept, size), options, weights=counted)
             assignment = replace(assignment, candidates=kept[assignment.candidates])
         parts.append((landmarks, replace(assignment, points=math.prod(size))))
     return torch.cat([landmarks for landmarks, _ in parts]), _joined([assignment for _, assignment in parts])

@@ -7,6 +7,7 @@ import math
 from dataclasses import dataclass
 from functools import reduce
 from itertools import product
+from types import EllipsisType
 from typing import Any, cast
 
 import torch
@@ -27,9 +28,9 @@ from nlfilter_torch.core.communicator import Communicator, all_gather_shapes
 from nlfilter_torch.core.kernels.columns import large_empty
 from nlfilter_torch.core.precision import Gradients, full_precision, once_differentiable, per_image, working_dtype
 from nlfilter_torch.core.torch_internals import cached_constants, for_each_gradient, is_hidden
-from nlfilter_torch.operator.assignment import Layout
 from nlfilter_torch.operator.hidden import fill_hidden
 from nlfilter_torch.operator.options import FilterOptions, GuideChannels, SpatialBandwidth, bandwidths_of
+from nlfilter_torch.operator.orientation import Layout
 
 LUMINANCE = (0.299, 0.587, 0.114)  # shares of red, green and blue
 FAINT_WEIGHT = 1e-12  # in place of patch weights of 0
@@ -236,16 +237,18 @@ class _ScaledPatches(torch.autograd.Function):
         planes = grad.unflatten(2, size).unflatten(1, (padded.shape[1], *scale.shape[1:]))  # (B, C, p, p, H, W)
         # A row of the patch at a time: a number of planes that stays in the cache, and few calls for small images.
         for place in product(*map(range, scale.shape[1:-1])):
-            window = (..., *(slice(start, start + length) for start, length in zip(place, size, strict=False)), slice(None))
-            moved, factors = planes[:, :, *place], scale[:, *place]  # (B, C, p, H, W), (1 or B, p)
+            rows = [slice(start, start + length) for start, length in zip(place, size, strict=False)]
+            window: tuple[EllipsisType | slice, ...] = (..., *rows, slice(None))
+            row: tuple[int | slice, ...] = (slice(None), *place)
+            moved, factors = planes[(slice(None), *row)], scale[row]  # (B, C, p, H, W), (1 or B, p)
             if grad_padded is not None:
                 weighted = moved * for_planes(factors.unsqueeze(1), axes)
                 for start, part in enumerate(weighted.unbind(2)):
                     grad_padded[window].narrow(-1, start, size[-1]).add_(part)
             if grad_scale is not None:
-                shifted = padded[window].unfold(-1, size[-1], 1).movedim(-2, 2)
+                shifted = padded[window].unfold(-1, scale.shape[-1], 1).movedim(-1, 2)
                 totals = (moved * shifted).flatten(3).sum(3).sum(1)  # (B, p)
-                grad_scale[:, *place] = totals if len(scale) == len(totals) else totals.sum(0)
+                grad_scale[row] = totals if len(scale) == len(totals) else totals.sum(0)
         return grad_padded, grad_scale
 
 

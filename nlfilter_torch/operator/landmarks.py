@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import cast
 
 import torch
 from torch import Tensor
@@ -21,10 +22,10 @@ from nlfilter_torch.core.kernels.clusters import (
     squared_distances,
 )
 from nlfilter_torch.core.torch_internals import register
-from nlfilter_torch.operator.assignment import Assignment, Layout
-from nlfilter_torch.operator.options import FilterOptions, Sampling
+from nlfilter_torch.operator.options import Assignment, FilterOptions, Sampling
 from nlfilter_torch.operator.orientation import (
     MOST_CHANNELS,
+    Layout,
     Orientation,
     canonical_points,
     orientation_of,
@@ -55,22 +56,20 @@ MANY = 1 << 24  # a permutation of more pixels than this would take more memory 
 def assign_landmarks(
     features: Tensor,
     size: tuple[int, ...],
-    count: int,
-    sampling: Sampling,
-    generator: torch.Generator | None,
+    options: FilterOptions,
     communicator: Communicator = ALONE,
     weights: Tensor | None = None,
     layout: Layout | None = None,
 ) -> tuple[Tensor, Assignment]:
-    """Choose or compute ``count`` landmarks; also return of which points they are made.
+    """Choose or compute landmarks; also return of which points they are made.
 
     Args:
         features: (B, D, N).
         size: (H, W), or any other whose product is N.
-        count: M, at most N. With M = N the landmarks are the pixels themselves.
-        sampling: ``"kmeans"``: Lloyd centroids of a random subset; ``"uniform"``: the paper's spatial grid;
-            ``"random"``: distinct random pixels.
-        generator: source of randomness; None means a new one with seed 0, so that equal calls give equal landmarks.
+        options: their number M, at most N, with which the landmarks are the pixels themselves; how they are chosen,
+            ``"kmeans"``: Lloyd centroids of a random subset, ``"uniform"``: the paper's spatial grid, ``"random"``:
+            distinct random pixels; and the generator: None means a new one with seed 0, so that equal calls give equal
+            landmarks.
         communicator: ranks that the rows of the image are distributed over; N is then the number of pixels of this
             rank, and all ranks use what the first one draws.
         weights: (B, N), number of pixels that each point represents; k-means candidates are drawn in proportion to it.
@@ -82,7 +81,8 @@ def assign_landmarks(
         same pixels are drawn for all images of a batch, but for their orientations, so that a batch without weights
         gives the same results as single calls.
     """
-    generator = torch.Generator().manual_seed(0) if generator is None else generator
+    count, sampling = options.num_landmarks, cast(Sampling, options.landmarks)
+    generator = torch.Generator().manual_seed(0) if options.generator is None else options.generator
     points = math.prod(size)
     if count == features.shape[-1] and communicator.size == 1:
         return features.clone(), Assignment(torch.arange(points, device=features.device)[None], None, None, points)
@@ -205,15 +205,13 @@ def candidate_pixels(size: tuple[int, ...], count: int, sampling: Sampling, gene
 def drawn_candidates(
     size: tuple[int, ...], count: int, sampling: Sampling, generator: torch.Generator, weights: Tensor | None
 ) -> Tensor:
-    """:func:`candidate_pixels`, those of k-means in proportion to weights (B, N) if there are any."""
+    """:func:`candidate_pixels`, those of k-means in proportion to weights (B, N) if there are any.
+
+    They are drawn by :func:`stratified` sampling of the pixels that the points represent.
+    """
     if weights is None or sampling != "kmeans":
         return candidate_pixels(size, count, sampling, generator)
-    return _candidates_by_weight(weights.mean(0), count, generator)
-
-
-def _candidates_by_weight(weights: Tensor, count: int, generator: torch.Generator) -> Tensor:
-    """Draw k-means candidates by :func:`stratified` sampling of the pixels represented by points of weights (N,)."""
-    summed = weights.double().cumsum(0).cpu()
+    summed = weights.mean(0).double().cumsum(0).cpu()
     summed = summed * (len(summed) / summed[-1]).clamp(min=1.0)  # a point may represent less than a pixel
     draws = weighted_draws(round(float(summed[-1])), count, generator)
     return torch.searchsorted(summed, draws.double(), right=True).clamp_(max=len(summed) - 1)
@@ -401,7 +399,8 @@ def choose(
             "hold='features'"
         )
     layout = Layout(patch, coordinates) if patch else None
-    assignment = assign_landmarks(features, tuple(size), count, sampling, None, layout=layout)[1]
+    options = FilterOptions(num_landmarks=count, landmarks=sampling)
+    assignment = assign_landmarks(features, tuple(size), options, layout=layout)[1]
     batch = (len(features), -1)
     candidates = assignment.candidates.expand(*batch).contiguous()
     if assignment.clusters is None or assignment.start is None:  # each is a cluster of its own
@@ -423,15 +422,14 @@ def choose_in_graph(
 
 
 def landmarks_by(
-    options: FilterOptions,
     features: Tensor,
     size: tuple[int, ...],
-    count: int,
+    options: FilterOptions,
     communicator: Communicator = ALONE,
     weights: Tensor | None = None,
     layout: Layout | None = None,
 ) -> tuple[Tensor, Assignment | None]:
-    """Landmarks (B, D, M) for features (B, D, N) of an image of ``size``, by the ``landmarks`` of some options.
+    """Landmarks (B, D, M) for features (B, D, N) of an image of ``size``, by some options, if they are to be chosen.
 
     Also returns of which points they are made; None for landmarks that were passed as features.
 
@@ -441,8 +439,8 @@ def landmarks_by(
     landmarks = options.landmarks
     if isinstance(landmarks, str):
         if torch.compiler.is_compiling():  # never with a generator, weights or a group
-            return choose_in_graph(features, size, count, landmarks, layout)
-        return assign_landmarks(features, size, count, landmarks, options.generator, communicator, weights, layout)
+            return choose_in_graph(features, size, options.num_landmarks, landmarks, layout)
+        return assign_landmarks(features, size, options, communicator, weights, layout)
     batch, points = features.shape[0], math.prod(size)
     if isinstance(landmarks, Assignment):
         _check_assignment(landmarks, batch, points)

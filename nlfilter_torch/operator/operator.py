@@ -20,11 +20,10 @@ from nlfilter_torch.core.containers import Batch, loadable
 from nlfilter_torch.core.kernels.tall_skinny import moment, spread
 from nlfilter_torch.core.precision import full_precision, trainable, uncompiled
 from nlfilter_torch.core.torch_internals import in_format_of, outside_transforms, refuse_transforms
-from nlfilter_torch.operator.assignment import Assignment
 from nlfilter_torch.operator.eigenvalue_bound import largest_eigenvalue
 from nlfilter_torch.operator.features import GuideFeatures
 from nlfilter_torch.operator.nystrom import nystrom_factor
-from nlfilter_torch.operator.options import Completion
+from nlfilter_torch.operator.options import Assignment, Completion
 from nlfilter_torch.operator.pixel_matrix import Columns, PixelMatrix
 from nlfilter_torch.operator.scaling import KernelMatrix, PixelScaling
 from nlfilter_torch.operator.spectrum import Spectrum, compute_spectrum
@@ -372,10 +371,8 @@ class NonlocalOperator(Batch):
         """
         if rank is not None:
             check_count(rank, "rank")
-        remainder = self.remainder if self.kernel.completion == "diagonal" else None
-        return compute_spectrum(
-            self.factor, self.scaling, remainder, self.size, rank, self.residual, self.communicator, self.weights
-        )
+        completed = self.kernel.completion == "diagonal"
+        return compute_spectrum(self.matrix, self.size, rank, self.residual, completed=completed)
 
     @full_precision
     @torch.no_grad()

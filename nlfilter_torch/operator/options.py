@@ -7,8 +7,67 @@ from typing import Any, Literal, Protocol, Self, runtime_checkable
 import torch
 from torch import Tensor
 
+from nlfilter_torch.core.checks import (
+    check_choice,
+    check_count,
+    check_features,
+    check_instance,
+    check_number,
+    check_positive,
+    check_values,
+    described,
+)
 from nlfilter_torch.core.torch_internals import with_tensors
-from nlfilter_torch.operator.assignment import Assignment
+from nlfilter_torch.core.warning import warn
+
+
+@dataclass(frozen=True, eq=False)
+class Assignment:
+    """Which points the landmarks of an operator are made of, without their features.
+
+    With an assignment that is held, landmarks are a smooth function of the features, and so are W and all that is
+    computed from it. Choosing landmarks anew is not: k-means starts from other points after the smallest change.
+
+    Attributes:
+        candidates: (B, S), numbers of the points from which landmarks are computed, counted over the whole image. Here
+            and below, a batch size of 1 serves for all images.
+        clusters: (B, S), number of the landmark that each candidate belongs to, which is the mean of its candidates;
+            None if the candidates themselves are the landmarks.
+        start: (B, 1, M), the candidate that replaces the mean of an empty cluster, or None.
+        points: N, number of points of the whole image.
+    """
+
+    candidates: Tensor
+    clusters: Tensor | None
+    start: Tensor | None
+    points: int
+
+    @property
+    def num_landmarks(self) -> int:
+        """M."""
+        return self.candidates.shape[-1] if self.start is None else self.start.shape[2]
+
+    @property
+    def batch(self) -> int:
+        """Number of images that have an assignment of their own, or 1 if all share one."""
+        own = self.candidates if self.clusters is None else self.clusters
+        return own.shape[0]
+
+    @property
+    def kind(self) -> tuple[int, int, int, bool]:
+        """What assignments have in common that can be joined to one of several images."""
+        return self.points, self.candidates.shape[1], self.num_landmarks, self.clusters is None
+
+    def serves(self, batch: int, points: int) -> bool:
+        """Whether landmarks can be computed from the features of ``batch`` images of so many points."""
+        return points == self.points and self.batch in (1, batch)
+
+    def on(self, device: torch.device) -> "Assignment":
+        """The assignment on a device."""
+        if self.candidates.device == device:
+            return self
+        clusters, start = (None if tensor is None else tensor.to(device) for tensor in (self.clusters, self.start))
+        return Assignment(self.candidates.to(device), clusters, start, self.points)
 
 
 @runtime_checkable
@@ -32,6 +91,9 @@ Completion = Literal["diagonal", "none"]
 
 AUTO: Literal["auto"] = "auto"  # photometric bandwidth: estimate it from the guide
 SAMPLING: Sampling = "kmeans"  # how landmarks are chosen by default
+SAMPLINGS = (
+    "choose one of these, or pass features (B, D, M) or an operator, and pass the number of landmarks as num_landmarks"
+)
 
 
 @with_tensors
@@ -85,3 +147,46 @@ class FilterOptions:
 def bandwidths_of(spatial: SpatialBandwidth | str | None) -> tuple[Any, ...]:
     """The bandwidth of all distances, or those along each axis."""
     return tuple(spatial) if isinstance(spatial, tuple | list) else (spatial,)
+
+
+def check_options(options: FilterOptions) -> None:
+    """Raise an error for an invalid option, except for bandwidths and patches, whose shape depends on the guide."""
+    check_choice(options.guide_channels, "guide_channels", ("luminance", "all"))
+    check_count(options.num_landmarks, "num_landmarks")
+    if isinstance(options.landmarks, Tensor):
+        check_features(options.landmarks, "landmarks")
+    elif isinstance(options.landmarks, str) or not isinstance(options.landmarks, Assignment | HasLandmarks):
+        check_choice(options.landmarks, "landmarks", ("kmeans", "uniform", "random"), SAMPLINGS)
+    check_choice(options.completion, "completion", ("diagonal", "none"))
+    if options.tolerance is not None:
+        check_number(options.tolerance, "tolerance", "pass a float or None")
+        check_positive(options.tolerance, "tolerance")
+    if options.generator is not None:
+        check_instance(options.generator, torch.Generator, "generator", "create one with torch.Generator()")
+
+
+def check_bandwidths(options: FilterOptions, batch: int | None = None, axes: int = 2) -> None:
+    """Raise unless the bandwidths are those of a guide with so many axes, for all images or for each of a batch."""
+    photometric, spatial = options.photometric_bandwidth, options.spatial_bandwidth
+    if isinstance(photometric, str):
+        check_choice(photometric, "photometric_bandwidth", (AUTO,), "pass it or a number")
+    else:
+        check_values(photometric, "photometric_bandwidth", "positive", batch)
+    if isinstance(spatial, tuple | list) and len(spatial) != axes:
+        count, distances = ("two", "") if axes == 2 else ("three", "depth, ")
+        raise ValueError(
+            f"spatial_bandwidth must be a number, or {count} for {distances}vertical and horizontal distances, got "
+            f"{len(spatial)} in a {type(spatial).__name__}; pass {count} numbers"
+        )
+    if spatial is not None:
+        for bandwidth in bandwidths_of(spatial):
+            check_positive(bandwidth, "spatial_bandwidth", batch)
+
+
+def landmark_count(options: FilterOptions, points: int) -> int:
+    """Number of landmarks, reduced with a warning where there are fewer points to choose from."""
+    if not isinstance(options.landmarks, str) or options.num_landmarks <= points:
+        return options.landmark_count
+    got = described(options.num_landmarks)
+    warn(f"num_landmarks must be at most the number of pixels, {points}, got {got}; using every pixel")
+    return points

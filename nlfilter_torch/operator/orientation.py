@@ -13,13 +13,25 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.core.torch_internals import cached_constants
-from nlfilter_torch.operator.assignment import Layout
 
 LEVELS = 1 << 12  # steps to which values are rounded; sums along a row are then exact in float64
 HASHED = 1 << 12  # number of different pseudo-random weights
 ORIENTATIONS, EXCHANGED = 8, 4  # number 1 flips the rows, 2 the columns, 4 exchanges the axes afterwards
 MOST_CHANNELS = 16  # of the guide that are looked at; more keep their order
 ONES, MOMENT, FIRST, SECOND = 0, 1, 2, 4  # rows of the weights along an axis
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Which features of a pixel belong to which place of its patch.
+
+    Attributes:
+        patch: width p of a patch; the features are C patches, row by row.
+        coordinates: whether row and column of the pixel follow.
+    """
+
+    patch: int
+    coordinates: bool
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,8 +9,9 @@ sums of :class:`Columns` are those over a block, such as a tile, and are added u
 over all points.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
@@ -18,7 +19,7 @@ from torch import Tensor
 from nlfilter_torch.core.blocks import root_weighted, weighted
 from nlfilter_torch.core.communicator import ALONE, Communicator
 from nlfilter_torch.core.kernels.tall_skinny import compute_grams, moment, spread, sum_grams
-from nlfilter_torch.core.precision import once_differentiable
+from nlfilter_torch.core.precision import Gradients, once_differentiable
 from nlfilter_torch.core.torch_internals import for_each_gradient, in_transform, is_hidden, outer_product
 
 SUMMED_EXACTLY = 1 << 17  # pixels up to which Gram matrices are summed in float64 throughout
@@ -197,6 +198,14 @@ class PixelMatrix(Columns):
         ]
         return torch.cat(solutions, dim=1)
 
+    def apply(self, function: "MatrixFunction", planes: Tensor, gains: Tensor) -> Tensor:
+        """``f(W) y`` for planes y, (B, C, N), and the gains of f; differentiable once in W and both."""
+        tensors = self.factor, self.scaling, self.remainder
+        factor, scaling, remainder = (tensor.detach() for tensor in tensors)
+        constant = replace(self, factor=factor, scaling=scaling, remainder=remainder)
+        result: Tensor = _Application.apply(*tensors, planes, gains, constant, function)  # type: ignore[no-untyped-call]
+        return result
+
     def gradient(self, left: Tensor, right: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Gradient of ``sum_k left_k^T W right_k`` for planes (B, K, N): those of factor, scaling and remainder.
 
@@ -209,6 +218,44 @@ class PixelMatrix(Columns):
         grad_scaling = (left * spread(moments.mT, self.factor) + summed * spread(totals.mT, self.factor)).sum(1)
         grad_factor = outer_product(torch.cat([moments, totals], dim=2), torch.cat([d * left, d * summed], dim=1))
         return grad_factor, grad_scaling, (left * right).sum(1)
+
+
+class MatrixFunction(Protocol):
+    """A function f of W whose derivative is written by hand."""
+
+    def value(self, matrix: PixelMatrix, planes: Tensor, gains: Tensor) -> Tensor:
+        """``f(W) y`` for planes y, (B, C, N), and gains that determine f."""
+
+    def gradients(
+        self, matrix: PixelMatrix, planes: Tensor, gains: Tensor, grad: Tensor, needed: Sequence[bool]
+    ) -> Gradients:
+        """Those of factor, scaling, remainder, planes and gains; None where none is ``needed``, in this order."""
+
+
+class _Application(torch.autograd.Function):
+    """``f(W) y`` by a :class:`MatrixFunction`."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        factor: Tensor,
+        scaling: Tensor,
+        remainder: Tensor,
+        planes: Tensor,
+        gains: Tensor,
+        constant: PixelMatrix,
+        function: MatrixFunction,
+    ) -> Tensor:
+        ctx.save_for_backward(factor, scaling, remainder, planes, gains)
+        ctx.constant, ctx.function = constant, function
+        return function.value(constant, planes, gains)
+
+    @staticmethod
+    @for_each_gradient
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> Gradients:
+        *_, planes, gains = ctx.saved_tensors
+        return *ctx.function.gradients(ctx.constant, planes, gains, grad, ctx.needs_input_grad), None, None
 
 
 class _Powers(torch.autograd.Function):

@@ -22,7 +22,7 @@ from nlfilter_torch.core.kernels.tall_skinny import compute_grams, moment, sprea
 from nlfilter_torch.core.precision import full_precision, trainable
 from nlfilter_torch.core.symmetric_matrix import SymmetricMatrix
 from nlfilter_torch.core.torch_internals import is_hidden
-from nlfilter_torch.operator.pixel_matrix import Columns
+from nlfilter_torch.operator.pixel_matrix import Columns, PixelMatrix
 
 # Eigenvalues of G below this, relative to the largest, are rounding errors.
 CUT = {torch.float32: 1e-5, torch.float64: 1e-9}
@@ -298,19 +298,13 @@ loadable(Spectrum, SymmetricMatrix, Communicator)
 
 
 def compute_spectrum(
-    factor: Tensor,
-    scaling: Tensor,
-    remainder: Tensor | None,
-    size: tuple[int, ...],
-    rank: int | None,
-    residual: Tensor,
-    communicator: Communicator = ALONE,
-    weights: Tensor | None = None,
+    matrix: PixelMatrix, size: tuple[int, ...], rank: int | None, residual: Tensor, *, completed: bool
 ) -> Spectrum:
-    """Compute the spectrum of ``W``; ``remainder`` is its diagonal part r, or None if it has none."""
+    """Compute the spectrum of ``W``, whose kernel has a diagonal part r only if it was ``completed``."""
+    factor, communicator, remainder = matrix.factor, matrix.communicator, matrix.remainder if completed else None
     # F F^T and F diag(r) F^T, (B, J, M, M)
     count = 1 if remainder is None else 2
-    root_scaling = root_weighted(scaling, weights)
+    root_scaling = root_weighted(matrix.scaling, matrix.weights)
     pairs = RitzPairs.of_sums(communicator.sum(compute_grams(factor, root_scaling, remainder, count)), factor.dtype)
     seen = factor.shape[0] > 0 and not is_hidden(factor)
     checked = factor.dtype == torch.float32 and seen
@@ -324,18 +318,17 @@ def compute_spectrum(
     vectors = pairs.ritz.vectors
     values = (vectors * (pairs.ritz.matrix @ vectors)).sum(1)
     eigenvalues = (values.clamp(0.0, 1.0) * support)[:, :shown].to(factor)
-    largest = values[:, 0].detach()
     return Spectrum(
         pairs.ritz,
         pairs.root,
         support,
         eigenvalues,
         factor,
-        scaling,
+        matrix.scaling,
         size,
-        largest,
-        residual,
-        weights,
-        communicator,
-        remainder,
+        largest=values[:, 0].detach(),
+        residual=residual,
+        weights=matrix.weights,
+        communicator=communicator,
+        remainder=remainder,
     )

@@ -13,7 +13,6 @@ from torch import Tensor
 
 from nlfilter_torch import NonlocalOperator, nonlocal_operator, operator_from_features, polynomial_filter
 from nlfilter_torch.operator import landmarks
-from nlfilter_torch.operator.assignment import Assignment
 from nlfilter_torch.operator.landmarks import (
     _pivots,
     _sums_by_product,
@@ -24,6 +23,7 @@ from nlfilter_torch.operator.landmarks import (
     condense,
 )
 from nlfilter_torch.operator.nystrom import inverse_cholesky, nystrom_factor
+from nlfilter_torch.operator.options import Assignment, FilterOptions
 from tests import reference
 from tests.images import hard_images, photograph
 from tests.pairwise import each_value, pairwise
@@ -32,8 +32,11 @@ from tests.problems import SAMPLINGS, noise, picture, seeded
 HEIGHT, WIDTH = 20, 30
 
 
-def choose_landmarks(*arguments: Any) -> torch.Tensor:
-    return assign_landmarks(*arguments)[0]
+def choose_landmarks(
+    features: torch.Tensor, size: tuple[int, ...], count: int, sampling: Any, generator: torch.Generator | None
+) -> torch.Tensor:
+    options = FilterOptions(num_landmarks=count, landmarks=sampling, generator=generator)
+    return assign_landmarks(features, size, options)[0]
 
 
 def cloud(batch: int = 1, pixels: int = HEIGHT * WIDTH, seed: int = 0) -> torch.Tensor:

@@ -7,11 +7,11 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from nlfilter_torch import NonlocalFilter, nonlocal_operator
-from nlfilter_torch.operator.assignment import Layout
 from nlfilter_torch.operator.features import GuideFeatures, unit_window
 from nlfilter_torch.operator.landmarks import canonical_candidates, orientations
 from nlfilter_torch.operator.orientation import (
     ORIENTATIONS,
+    Layout,
     orientation_of,
     orientation_sums,
     source_pixels,

@@ -205,7 +205,7 @@ def learn_filter(pictures: Sequence[Picture], guide: Guide) -> LearntFilter:
     weights = torch.full((1, points.shape[2]), pictures[0].pixels / points.shape[2], dtype=points.dtype)
     options = replace(options, num_landmarks=min(options.num_landmarks, points.shape[2]), generator=generator)
     if len(pictures) == 1 and count == pictures[0].pixels and options.landmarks == "kmeans":  # as for any picture
-        chosen, _ = landmarks_by(options, points, pictures[0].size, options.num_landmarks, layout=recipe.layout)
+        chosen, _ = landmarks_by(points, pictures[0].size, options, layout=recipe.layout)
         options = replace(options, landmarks=chosen)
     built = operator_from_points(points, (points.shape[2],), options, weights[0])
     pixels = (built.factor, built.diagonal, colours, weights)

@@ -15,7 +15,6 @@ from torch import Tensor
 
 from nlfilter_torch.core.blocks import stratified
 from nlfilter_torch.core.workers import in_order, single_threaded
-from nlfilter_torch.operator.assignment import Layout
 from nlfilter_torch.operator.features import (
     GuideFeatures,
     bandwidth_of_gradient,
@@ -27,10 +26,17 @@ from nlfilter_torch.operator.features import (
 from nlfilter_torch.operator.landmarks import candidate_pixels, condense
 from nlfilter_torch.operator.nystrom import inverse_cholesky
 from nlfilter_torch.operator.operator import Kernel
-from nlfilter_torch.operator.option_checks import check_bandwidths, check_options, landmark_count
-from nlfilter_torch.operator.options import FilterOptions, GuideChannels, Sampling
+from nlfilter_torch.operator.options import (
+    FilterOptions,
+    GuideChannels,
+    Sampling,
+    check_bandwidths,
+    check_options,
+    landmark_count,
+)
 from nlfilter_torch.operator.orientation import (
     ORIENTATIONS,
+    Layout,
     Orientation,
     canonical_points,
     orientation_of,
