@@ -1,26 +1,33 @@
 """How well selections follow outlines of objects drawn by hand on photographs: ``python -m benchmarks.outlines``.
 
-The outlines of ``outlines.json`` are of objects in :mod:`benchmarks.keepers`, as polygons whose points are fractions of
-width and height, with holes; they were drawn without looking at results. Parts that may or may not be meant, such as
-the orange tips of red legs or a shadow that hides feet, are "either" and do not count. The mask of each job is computed
-from its strokes, with the settings of its edit; that of ``recolor`` is the one before hues are compared. "IoU" is the
-intersection over union of the pixels above 0.5 and the object, "missed" the share of the object that is not selected,
-and "outside" what is selected beside it, as a share of the object; pixels within 1 % of the short side of an outline do
-not count.
+The outlines are polygons whose points are fractions of width and height, with holes; they and all strokes were drawn
+without looking at results. Parts that may or may not be meant, such as the orange tips of red legs or a shadow that
+hides feet, are "either" and do not count. There are four sets:
+
+- "choosing" and "reporting": the outlines of ``outlines.json`` are of objects in :mod:`benchmarks.keepers`. Each is
+  selected from the strokes of its job, with the settings of its edit; that of ``recolor`` before hues are compared.
+  Those of the choosing set may guide changes of masks.
+- "short" and "generous": ``selections.json`` has objects of 25 other photographs of the reporting set, each with about
+  four short strokes inside and four outside, and with longer ones that visit its main parts and go around it.
+
+"IoU" is the intersection over union of the pixels above 0.5 and the object, "missed" the share of the object that is
+not selected, and "outside" what is selected beside it, as a share of the object; pixels within 1 % of the short side of
+an outline do not count. Further columns are the IoU of the same with a rectangle that has a margin of 2 % around the
+object, from the strokes inside alone, and from these with the rectangle.
 
 ``--pictures`` is the folder of :mod:`benchmarks.free_photographs`; without it only scikit-image's
-photographs are measured. ``--peers`` adds GrabCut and closed-form matting, with the same strokes and, as they cannot do
-without a background, everything outside a rectangle around the object. Those see photographs of at most 240 pixels of
-short side, as closed-form matting takes long. ``--out FOLDER`` writes the photographs with what is selected, missed in
-red and beside the object in blue. The outlines of the choosing set may guide changes of masks.
+photographs are measured. ``--peers`` adds GrabCut, from the same strokes where there are some outside, and with the
+rectangle, and closed-form matting with the rectangle on at most 240 pixels of short side, as it takes long. ``--out
+FOLDER`` writes the photographs with what is selected, missed in red and beside the object in blue.
 """
 
 import json
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import mean
+from typing import Any
 
 import cv2
 import numpy as np
@@ -34,7 +41,10 @@ from benchmarks.keepers import Job, jobs, mask_of
 from benchmarks.mask_peers import PEERS
 from benchmarks.photographs import reduced_to
 from nlfilter_torch.photo import region_mask
+from nlfilter_torch.photo.declared.presets import Recipe
+from nlfilter_torch.photo.declared.strokes import Mark
 from nlfilter_torch.photo.edits.applying import edit_of, scribbles_of
+from nlfilter_torch.photo.picture.boxes import Box
 from nlfilter_torch.photo.picture.drawn import Drawn
 from nlfilter_torch.photo.picture.in_memory import edit_image
 from nlfilter_torch.photo.picture.painting import TensorPainter
@@ -42,11 +52,13 @@ from nlfilter_torch.photo.picture.resizing import resize
 from nlfilter_torch.photo.selections.mask import ObjectEdit
 
 STORED = Path(__file__).with_suffix(".json")
-OURS = "ours"
+SELECTIONS = Path(__file__).with_name("selections.json")
+SETS = "choosing", "reporting", "short", "generous"
+RADIUS = 0.01  # of the strokes of selections.json, as a share of the short side
 BAND = 0.01  # on either side of an outline, as a share of the short side
-MARGIN = 0.05  # between an object and the rectangle around it, as a share of the short side
-COMPARED = ("GrabCut", "closed form")
-PEER_SIDE, QUICK_SIDE = 240, 64
+MARGIN = 0.02  # between an object and the rectangle around it, as a share of the short side
+OURS, BOXED, INNER, INNER_BOXED = "ours", "rectangle", "inside", "ins., rect."
+PEER_SIDE, QUICK_SIDE = 240, 64  # of photographs for closed-form matting, and with --quick
 MISSED, BESIDE = (1.0, 0.1, 0.1), (0.1, 0.3, 1.0)
 
 Mask = NDArray[np.bool_]
@@ -61,10 +73,21 @@ class Outline:
     outlines: tuple[Polygon, ...]  # the object is their union
     holes: tuple[Polygon, ...] = ()  # not part of it
     either: tuple[Polygon, ...] = ()  # parts that do not count
+    set: str = ""  # one of SETS
 
     def object(self, size: tuple[int, int]) -> Mask:
         """The object in a picture (H, W)."""
         return filled(self.outlines, size) & ~filled(self.holes, size)
+
+    def box(self, size: tuple[int, int]) -> tuple[int, int, int, int]:
+        """The rectangle around the object in a picture (H, W): left, top, right and bottom in pixels."""
+        margin = round(MARGIN * min(size))
+        rows, columns = (np.flatnonzero(self.object(size).any(axis)) for axis in (1, 0))
+        left, top = (max(0, int(places[0]) - margin) for places in (columns, rows))
+        right, bottom = (
+            min(most, int(places[-1]) + 1 + margin) for places, most in ((columns, size[1]), (rows, size[0]))
+        )
+        return left, top, right, bottom
 
 
 def filled(polygons: Sequence[Polygon], size: tuple[int, int]) -> Mask:
@@ -85,16 +108,25 @@ class Score:
     outside: float
 
 
-def outlines(file: Path = STORED) -> list[Outline]:
-    """The outlines that are stored."""
+def outlines() -> list[Outline]:
+    """The outlines that are stored; those with strokes of their own once with the short and once with the generous."""
     by_name = {(job.photograph, job.what): job for job in jobs()}
-    return [
-        Outline(
-            by_name[entry["photograph"], entry["what"]],
-            *(tuple(entry.get(name, ())) for name in ("outlines", "holes", "either")),
-        )
-        for entry in json.loads(file.read_text(encoding="utf-8"))
-    ]
+    stored = list[Outline]()
+    for entry in json.loads(STORED.read_text(encoding="utf-8")):
+        job = by_name[entry["photograph"], entry["what"]]
+        stored.append(Outline(job, *_polygons(entry), job.set))
+    entries = json.loads(SELECTIONS.read_text(encoding="utf-8"))
+    for kind in ("short", "generous"):
+        for number, entry in enumerate(entries, 1):
+            drawn = [{"radius": RADIUS} | stroke for stroke in entry["strokes"][kind]]
+            named = {name: entry[name] for name in ("photograph", "what")}
+            job = Job.of(number, named | {"edit": "mask", "strokes": drawn})
+            stored.append(Outline(job, *_polygons(entry), kind))
+    return stored
+
+
+def _polygons(entry: dict[str, Any]) -> tuple[tuple[Polygon, ...], ...]:
+    return tuple(tuple(entry.get(name, ())) for name in ("outlines", "holes", "either"))
 
 
 def score(selected: Mask, wanted: Mask, either: Mask | None = None) -> Score:
@@ -110,44 +142,62 @@ def score(selected: Mask, wanted: Mask, either: Mask | None = None) -> Score:
     return Score(float(covered / (total + beside)), float(1 - covered / total), float(beside / total))
 
 
-def selected(job: Job, image: Tensor) -> Tensor:
+def selected(job: Job, image: Tensor, box: Box | None = None) -> Tensor:
     """The mask (1, 1, H, W) that the edit of a job uses; that of ``recolor`` before it is corrected by hue."""
     size = (image.shape[-2], image.shape[-1])
     if job.edit == "mask":
-        return region_mask(image, *_strokes(job, size))
+        return region_mask(image, *separated(job.strokes, size), box=box)
     (step,) = job.recipe.steps
     edit = edit_of(step, size)
     selection = edit.selection_in(size) if isinstance(edit, ObjectEdit) else edit.selection()
     assert selection is not None, job.name
     marks = edit.marks(scribbles_of(step, size, TensorPainter())).masks
     # The last plane of what has colours is its mask.
-    return edit_image(selection, image, Drawn({name: mask[:, -1:] for name, mask in marks.items()}))
+    return edit_image(selection, image, Drawn({name: mask[:, -1:] for name, mask in marks.items()}, box=box))
 
 
-def _strokes(job: Job, size: tuple[int, int]) -> tuple[Tensor, Tensor | None]:
+def from_inside(job: Job) -> Job:
+    """A job without its strokes on the background."""
+    inside = tuple(stroke for stroke in job.strokes if stroke.role != "background")
+    return replace(job, strokes=inside, recipe=Recipe(tuple(step.changed(strokes=inside) for step in job.recipe.steps)))
+
+
+def separated(strokes: Sequence[Mark], size: tuple[int, int]) -> tuple[Tensor, Tensor | None]:
     """Masks (1, 1, H, W) of the strokes on the object and, if there are any, on its background."""
-    sides = [
-        [stroke for stroke in job.strokes if (stroke.role == "background") == opposed] for opposed in (False, True)
-    ]
-    inside, background = (mask_of(strokes, size) for strokes in sides)
+    sides = [[stroke for stroke in strokes if (stroke.role == "background") == opposed] for opposed in (False, True)]
+    inside, background = (mask_of(side, size) for side in sides)
     return inside, background * (1 - inside) if sides[1] else None
 
 
-def by_peer(name: str, outline: Outline, image: Tensor) -> Tensor:
-    """The mask (1, 1, H, W) of another method, which is told a rectangle around the object."""
-    small = reduced_to(image, PEER_SIDE)
-    size = (small.shape[-2], small.shape[-1])
-    inside, background = _strokes(outline.job, size)
-    margin = round(MARGIN * min(size))
-    rows, columns = (np.flatnonzero(outline.object(size).any(axis)) for axis in (1, 0))
-    beyond = torch.ones_like(inside)
-    beyond[
-        ..., max(0, rows[0] - margin) : rows[-1] + margin + 1, max(0, columns[0] - margin) : columns[-1] + margin + 1
-    ] = 0
-    beyond = (beyond if background is None else torch.maximum(beyond, background)) * (1 - inside)
-    if not bool(beyond.any()):
-        beyond[..., 0, :] = 1 - inside[..., 0, :]
-    return resize(PEERS[name](small, inside, beyond), (image.shape[-2], image.shape[-1]))
+def by_peer(name: str, job: Job, image: Tensor, box: Box | None = None) -> Tensor:
+    """The mask (1, 1, H, W) of another method, for which a rectangle around the object adds to its background."""
+    inside, background = separated(job.strokes, (image.shape[-2], image.shape[-1]))
+    outside = torch.zeros_like(inside) if background is None else background
+    if box is not None:
+        left, top, right, bottom = box
+        beyond = torch.ones_like(inside)
+        beyond[..., top:bottom, left:right] = 0
+        outside = torch.maximum(outside, beyond * (1 - inside))
+    if not bool(outside.any()):  # the object reaches all borders
+        outside[..., 0, :] = 1 - inside[..., 0, :]
+    return PEERS[name](image, inside, outside)
+
+
+def methods(outline: Outline, image: Tensor, *, peers: bool) -> dict[str, Tensor]:
+    """Masks (1, 1, H, W) of an object by what is told of it and, if asked for, by other methods, by their names."""
+    job, box = outline.job, outline.box((image.shape[-2], image.shape[-1]))
+    masks = {OURS: selected(job, image), BOXED: selected(job, image, box)}
+    inner = from_inside(job)
+    if inner != job:
+        masks |= {INNER: selected(inner, image), INNER_BOXED: selected(inner, image, box)}
+    if peers:
+        small = reduced_to(image, PEER_SIDE)
+        matted = by_peer("closed form", job, small, outline.box((small.shape[-2], small.shape[-1])))
+        if inner != job:
+            masks["GrabCut"] = by_peer("GrabCut", job, image)
+        masks["GrabCut, r."] = by_peer("GrabCut", job, image, box)
+        masks["matting, r."] = resize(matted, (image.shape[-2], image.shape[-1]))
+    return masks
 
 
 def overlay(image: Tensor, mask: Mask, wanted: Mask) -> Tensor:
@@ -159,46 +209,55 @@ def overlay(image: Tensor, mask: Mask, wanted: Mask) -> Tensor:
     return shown
 
 
-def measure(outline: Outline, image: Tensor, peers: Sequence[str], out: Path | None) -> dict[str, Score]:
-    """Scores of the methods, by name."""
+def measure(outline: Outline, image: Tensor, out: Path | None = None, *, peers: bool = False) -> dict[str, Score]:
+    """Scores of the masks of an object, by the names of :func:`methods`."""
     size = (image.shape[-2], image.shape[-1])
     wanted, either = outline.object(size), filled(outline.either, size)
-    masks = {OURS: selected(outline.job, image)} | {name: by_peer(name, outline, image) for name in peers}
+    masks = {name: mask[0, 0].numpy() > 0.5 for name, mask in methods(outline, image, peers=peers).items()}
     if out is not None:
-        save_picture(out / f"{outline.job.name}.png", overlay(image, masks[OURS][0, 0].numpy() > 0.5, wanted))
-    return {name: score(mask[0, 0].numpy() > 0.5, wanted, either) for name, mask in masks.items()}
+        save_picture(out / f"{outline.job.name}-{outline.set}.png", overlay(image, masks[OURS], wanted))
+    return {name: score(mask, wanted, either) for name, mask in masks.items()}
 
 
-def line(name: str, scores: dict[str, Score]) -> str:
-    """A line of the table: IoU, missed and outside of each method."""
-    figures = (f"{score.overlap:8.3f}{score.missed:8.1%}{score.outside:9.1%}" for score in scores.values())
-    return f"{name:44}" + "  ".join(figures)
+def means(rows: Sequence[dict[str, Score]]) -> dict[str, Score]:
+    """Mean scores of the methods that all objects have."""
+    shared = [name for name in rows[0] if all(name in row for row in rows)]
+    return {
+        name: Score(*(mean(getattr(row[name], part) for row in rows) for part in ("overlap", "missed", "outside")))
+        for name in shared
+    }
+
+
+def line(name: str, scores: dict[str, Score], columns: Sequence[str]) -> str:
+    """A line of the table: IoU, missed and outside of ours, and the IoU of the others."""
+    ours = scores[OURS]
+    figures = (f"{scores[column].overlap:12.3f}" if column in scores else f"{'-':>12}" for column in columns[1:])
+    return f"{name:44}{ours.overlap:8.3f}{ours.missed:8.1%}{ours.outside:9.1%}" + "".join(figures)
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Measure and print a table."""
+    """Measure and print a table, with the means of each set."""
     parser = options("outlines", __doc__, "one small photograph")
     add = parser.add_argument
     add("--pictures", type=Path, help="folder of free photographs; default: only scikit-image's")
-    add("--set", choices=("choosing", "reporting"), help="measure photographs of this set only")
+    add("--set", choices=SETS, help="measure this set only")
     add("--peers", action="store_true", help="compare with other methods")
     add("--out", type=Path, help="folder for pictures")
     chosen = parser.parse_args(arguments)
-    listed = [outline for outline in outlines() if chosen.set in (None, outline.job.set)]
+    listed = [outline for outline in outlines() if chosen.set in (None, outline.set)]
     if chosen.pictures is None:
         listed = [outline for outline in listed if edited_photographs()[outline.job.photograph].is_shipped]
-    peers = COMPARED if chosen.peers else ()
-    print(f"{'':44}" + "  ".join(f"{name:>25}" for name in (OURS, *peers)))
-    print(f"{'':44}" + "  ".join(["     IoU  missed  outside"] * (1 + len(peers))))
-    rows = list[dict[str, Score]]()
+    columns = [OURS, BOXED, INNER, INNER_BOXED] + (["GrabCut", "GrabCut, r.", "matting, r."] if chosen.peers else [])
+    print(f"{'':44}     IoU  missed  outside" + "".join(f"{column:>12}" for column in columns[1:]))
+    rows: dict[str, list[dict[str, Score]]] = {}
     for outline in listed[:1] if chosen.quick else listed:
         image = outline.job.before(chosen.pictures)
-        rows.append(measure(outline, reduced_to(image, QUICK_SIDE) if chosen.quick else image, peers, chosen.out))
-        print(line(f"{outline.job.name}: {outline.job.what}"[:43], rows[-1]), flush=True)
-    if rows:
-        fields = ("overlap", "missed", "outside")
-        means = {name: Score(*(mean(getattr(row[name], f) for row in rows) for f in fields)) for name in (OURS, *peers)}
-        print(line(f"mean of {len(rows)}", means))
+        seen = reduced_to(image, QUICK_SIDE) if chosen.quick else image
+        scores = measure(outline, seen, chosen.out, peers=chosen.peers)
+        rows.setdefault(outline.set, []).append(scores)
+        print(line(f"{outline.job.name}: {outline.job.what}"[:43], scores, columns), flush=True)
+    for name, own in rows.items():
+        print(line(f"mean of {len(own)}, {name}", means(own), columns))
     return 0
 
 

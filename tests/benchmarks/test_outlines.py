@@ -1,11 +1,34 @@
 """Outlines of objects drawn by hand: what is stored, and how selections are scored by them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
+from benchmarks.free_photographs import edited_photographs
 from benchmarks.keepers import Job
-from benchmarks.outlines import Outline, Score, by_peer, outlines, overlay, score, selected
+from benchmarks.outlines import (
+    BOXED,
+    INNER,
+    INNER_BOXED,
+    OURS,
+    RADIUS,
+    SETS,
+    Outline,
+    Score,
+    by_peer,
+    filled,
+    line,
+    main,
+    means,
+    measure,
+    outlines,
+    overlay,
+    score,
+    selected,
+    separated,
+)
 
 SQUARE = ((0.25, 0.25), (0.75, 0.25), (0.75, 0.75), (0.25, 0.75))
 STROKE = {"paint": "in", "points": [[0.4, 0.5], [0.6, 0.5]], "radius": 0.05}
@@ -23,13 +46,31 @@ def scene() -> torch.Tensor:
 
 def test_stored_outlines_are_of_different_jobs_and_of_polygons_inside_their_pictures():
     stored = outlines()
-    assert len({outline.job.name for outline in stored}) == len(stored) >= 10
+    assert {outline.set for outline in stored} == set(SETS)
+    assert len({(outline.set, outline.job.name) for outline in stored}) == len(stored) == 22 + 2 * 25
     for outline in stored:
         assert outline.job.edit in ("recolor", "mask", "defocus", "detail")
         for polygon in (*outline.outlines, *outline.holes, *outline.either):
             assert len(polygon) > 3
             assert all(0 <= coordinate <= 1 for point in polygon for coordinate in point)
         assert 0.005 < outline.object((90, 120)).mean() < 0.7
+
+
+def test_strokes_drawn_for_outlines_are_of_other_photographs_of_the_reporting_set_and_on_their_sides():
+    stored = outlines()
+    own = [outline for outline in stored if outline.set in ("short", "generous")]
+    of_jobs = {outline.job.photograph for outline in stored if outline not in own}
+    for outline in own:
+        assert edited_photographs()[outline.job.photograph].set == "reporting"
+        assert outline.job.photograph not in of_jobs
+        assert all(stroke.radius == RADIUS for stroke in outline.job.strokes)
+        size = (400, 600)
+        sides = separated(outline.job.strokes, size)
+        assert sides[1] is not None
+        counted = ~filled(outline.either, size)
+        for side, wanted in zip(sides, (outline.object(size), ~outline.object(size)), strict=True):
+            drawn = (side[0, 0].numpy() > 0) & counted
+            assert (drawn & wanted).sum() > 0.9 * drawn.sum() > 0
 
 
 def test_object_is_the_union_of_its_outlines_without_its_holes():
@@ -62,16 +103,41 @@ def test_score_does_not_count_a_band_around_the_outline():
     assert score(half, wanted, half & ~wanted).outside == 0
 
 
+def test_box_is_that_of_the_object_with_a_margin_inside_the_picture():
+    assert Outline(job("mask"), (SQUARE,)).box((100, 200)) == pytest.approx((48, 23, 152, 77), abs=1)
+    whole = (((0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)),)
+    assert Outline(job("mask"), whole).box((100, 200)) == (0, 0, 200, 100)
+
+
 def test_masks_of_every_kind_of_job_and_of_peers_select_the_object():
     image, wanted = scene(), Outline(job("mask"), (SQUARE,))
     recoloured = job(
         "recolor", strokes=[STROKE | {"paint": "#0040c0"}, STROKE | {"paint": "out", "points": [[0.1, 0.5]]}]
     )
-    masks = [selected(each, image) for each in (job("mask"), job("defocus"), recoloured)]
-    masks += [by_peer("GrabCut", wanted, image)]
+    box = wanted.box((40, 60))
+    masks = [selected(each, image, box) for each in (job("mask"), job("defocus"), recoloured)]
+    masks += [selected(each, image) for each in (job("mask"), job("defocus"), recoloured)]
+    masks += [by_peer("GrabCut", wanted.job, image, box)]
     for mask in masks:
         assert mask.shape == (1, 1, 40, 60)
         assert score(mask[0, 0].numpy() > 0.5, wanted.object((40, 60))).overlap > 0.95
+    scores = measure(replace(wanted, job=recoloured), image, peers=True)
+    assert list(scores) == [OURS, BOXED, INNER, INNER_BOXED, "GrabCut", "GrabCut, r.", "matting, r."]
+    assert all(found.overlap > 0.95 for found in scores.values())
+    assert list(measure(wanted, image)) == [OURS, BOXED]
+
+
+def test_means_are_of_the_methods_that_all_objects_have():
+    rows = [{OURS: Score(1.0, 0.0, 0.0), INNER: Score(0.5, 0.0, 1.0)}, {OURS: Score(0.5, 0.5, 0.0)}]
+    assert means(rows) == {OURS: Score(0.75, 0.25, 0.0)}
+    assert line("mean", means(rows), [OURS, INNER]).split() == ["mean", "0.750", "25.0%", "0.0%", "-"]
+
+
+def test_only_the_set_that_is_asked_for_is_measured(capsys):
+    assert main(["--quick", "--set", "choosing"]) == 0
+    assert "mean of 1, choosing" in capsys.readouterr().out
+    assert main(["--set", "short"]) == 0  # whose photographs are not there
+    assert "mean" not in capsys.readouterr().out
 
 
 def test_overlay_tints_what_is_missed_and_what_is_beside_the_object():
