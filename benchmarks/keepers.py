@@ -36,7 +36,8 @@ from nlfilter_torch.photo.declared.presets import Recipe, find_recipe
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.declared.strokes import Mark
 from nlfilter_torch.photo.edits.applying import apply_recipe
-from nlfilter_torch.photo.picture.painting import colour_of, cover
+from nlfilter_torch.photo.picture.drawn import colour_of
+from nlfilter_torch.photo.picture.painting import cover
 from nlfilter_torch.photo.picture.resizing import resize
 
 STORED = Path(__file__).with_suffix(".json")

@@ -85,7 +85,7 @@ class Developed:
 
         See :func:`left_by_crop`, which paints at full size; its results are kept.
         """
-        objects = step.painted_as("object", "added")
+        objects = step.objects
         if not objects or self.frame.is_whole:
             return step
         if objects not in self._counted:

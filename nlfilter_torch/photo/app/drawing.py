@@ -26,6 +26,7 @@ ROLES: dict[ScribbleRole, str] = {
     "background": "#ef4444",
     "added": "#38bdf8",
     "removed": "#a855f7",
+    "box": "#f59e0b",
 }
 KEPT_STROKE = "#9ca3af"  # colour of strokes on what keeps its colour
 OUTLINE = 2  # width in pixels of a preview of the border of a region

@@ -1,5 +1,7 @@
 """What the canvas lays over a picture: what the scribbles of a step select, and which parts of them do not count."""
 
+from dataclasses import replace
+
 from torch import Tensor
 
 from nlfilter_torch.photo.declared.steps import Step
@@ -43,7 +45,7 @@ def _selected(step: Step, image: Tensor, stride: float) -> Tensor | None:
     selection = edit.selection() if step.marks_object() else None
     if selection is None:
         return None
-    return edit_image(selection, image.clamp(0, 1), Drawn(_masks(step, edit, size)))
+    return edit_image(selection, image.clamp(0, 1), _marks(step, edit, size))
 
 
 def _ignored(step: Step, image: Tensor) -> Tensor | None:
@@ -51,15 +53,16 @@ def _ignored(step: Step, image: Tensor) -> Tensor | None:
     edit = edit_of(step, size)
     if not step.painted_as("object") or edit.selection() is None:
         return None
-    masks = _masks(step, edit, size)
+    masks = _marks(step, edit, size).masks
     names = [name for name in ("scribbles", "background") if name in masks]
     parts = [stray_parts(InMemory(image.clamp(0, 1)), masks[name].amax(1, keepdim=True).ceil()) for name in names]
     stray: Tensor = sum(parts[1:], parts[0])
     return stray.clamp(max=1) if bool(stray.any()) else None
 
 
-def _masks(step: Step, edit: PhotoEdit, size: tuple[int, int]) -> dict[str, Tensor]:
-    """The masks of the scribbles of a step, under the names that the edit of its selection takes."""
-    marks = edit.marks(scribbles_of(step, size, TensorPainter())).masks
-    coloured = {MARKS[scribble.role] for scribble in step.declared.scribbles if scribble.kind == "colours"}
-    return {name: mask[:, -1:] if name in coloured else mask for name, mask in marks.items()}
+def _marks(step: Step, edit: PhotoEdit, size: tuple[int, int]) -> Drawn[Tensor]:
+    """The scribbles of a step, under the names that the edit of its selection takes, without colours."""
+    marks = edit.marks(scribbles_of(step, size, TensorPainter()))
+    kinds = step.declared.with_role("object", "added")
+    coloured = {MARKS[scribble.role] for scribble in kinds if scribble.kind == "colours"}
+    return replace(marks, masks={n: mask[:, -1:] if n in coloured else mask for n, mask in marks.masks.items()})

@@ -108,7 +108,10 @@ def scribble_options(edit: Edit) -> dict[str, object]:
         annotations |= {"strokes": options.StrokesFile, "region": REGION_OPTIONS[kind]}
     for scribble in edit.with_options:
         name = scribble.option.removeprefix("--")
-        annotations[name] = options.rectangles(scribble.option, METAVARS[scribble.kind], scribble.option_help)
+        metavar = METAVARS[scribble.kind]
+        if scribble.role == "box":  # which need not say a colour
+            metavar = metavar.replace(":COLOUR", "[:COLOUR]")
+        annotations[name] = options.rectangles(scribble.option, metavar, scribble.option_help)
     if kinds:
         annotations["mask"] = options.MaskFile
     if "colours" in kinds:

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +14,7 @@ from nlfilter_torch.photo.cli.options import parse_sliders, split_region
 from nlfilter_torch.photo.declared.declaration import Edit, Scribble
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.declared.rows import RowSource
-from nlfilter_torch.photo.declared.strokes import WORDS, Mark, Region, ScribbleRole, Shape, noted
+from nlfilter_torch.photo.declared.strokes import WORDS, Mark, Region, ScribbleRole, Shape, is_rectangle, noted
 from nlfilter_torch.photo.files.formats import check_depth
 from nlfilter_torch.photo.files.rows import StoredPicture
 from nlfilter_torch.photo.picture.drawn import Drawn, Painter, Size, drawn_by
@@ -55,7 +55,7 @@ class ScribbleOptions:
 
     def marks_objects(self, edit: Edit) -> bool:
         """Whether an object is marked, or its mask painted."""
-        return bool(self.region or self.of(edit, "added")) or self.mask is not None or self.strokes is not None
+        return bool(self.region or self.of(edit, *edit.object_roles)) or (self.mask or self.strokes) is not None
 
     @property
     def called(self) -> str:
@@ -85,7 +85,7 @@ class ScribbleOptions:
             is_object = scribble.role == "object"
             texts = self.region if is_object else self.rectangles.get(scribble.option)
             marks += [reader.of_text(text, scribble) for text in texts or []]
-        if edit.requires_strokes and not any(mark.role in ("object", "added") for mark in marks):
+        if edit.requires_strokes and not edit.marks_object(marks):
             raise ValueError(next(scribble.advice for scribble in edit.with_role("object")))
         return MarkedPhotograph(edit, size, tuple(marks), pictures, alpha)
 
@@ -95,7 +95,7 @@ class ScribbleOptions:
             return
         for scribble in edit.with_options:
             if self.rectangles.get(scribble.option):
-                added = "".join(f", {other.option}" for other in edit.with_role("added"))
+                added = "".join(f", {other.option}" for other in edit.with_role("box", "added"))
                 raise ValueError(
                     f"{scribble.option} must come with --region{added} or --mask, got none of them; mark the region to "
                     "edit, such as by --region 190,60,60,60"
@@ -159,14 +159,20 @@ class _Reader:
         """The region of a text, for scribbles of an edit."""
         option = scribble.option or "--region"
         region, note = parse_region(text, option, self.size, WORDS[scribble.role])
+        if scribble.role == "box" and (not is_rectangle(region) or split_region(text)[1].count(",") != 3):
+            raise ValueError(f"{option} must be a rectangle X,Y,W,H around the object, got {text!r}; give four numbers")
         if scribble.kind == "mask":
             if note is not None:
                 raise ValueError(f"{option} must be X,Y,W,H only, got {text!r}; drop the colon and what follows it")
             return region
         if scribble.kind == "colours":
+            if scribble.role == "box" and note is None and self.colour is None:
+                return region
             if note is None and self.colour is None:
                 raise ValueError(f"{option} must end in a colour, such as {text}:red, got {text!r}")
             return noted(region, self._default if note is None else _colour(note, option, text))
+        if scribble.role == "box" and note is None:
+            return region  # that holds all regions
         own = self.alpha if note is None else parse_sliders(note, option)
         if len(own) != len(self.alpha):
             raise ValueError(
@@ -197,8 +203,8 @@ class _Reader:
 
     def _with_note(self, mark: Mark, name: str) -> Mark:
         """A mark with a colour if the edit needs one and it says none, or with sliders."""
-        needs_colour = any(scribble.kind == "colours" for scribble in self.edit.with_role(mark.role))
-        if needs_colour and mark.colour is None:
+        takes_colour = any(scribble.kind == "colours" for scribble in self.edit.with_role(mark.role))
+        if takes_colour and mark.colour is None and (mark.role != "box" or self.colour is not None):
             if self.colour is None:
                 raise ValueError(f"{name} must come with --colour, such as --colour red, got none; add it")
             return noted(mark, self._default)
@@ -209,7 +215,9 @@ class _Reader:
         if not any(scribble.kind == "sliders" for scribble in self.edit.with_role(mark.role)):
             return mark
         own = mark.meaning.sliders
-        return mark if own is not None and len(own) == len(self.alpha) else noted(mark, _listed(self.alpha))
+        if own is not None and len(own) == len(self.alpha):
+            return mark
+        return replace(mark, paint=WORDS["box"]) if mark.role == "box" else noted(mark, _listed(self.alpha))
 
     @property
     def _default(self) -> str:

@@ -20,6 +20,7 @@ from nlfilter_torch.photo.cli.options import note
 from nlfilter_torch.photo.cli.scribbles import MarkedPhotograph
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.declared.rows import RowSource
+from nlfilter_torch.photo.picture.boxes import held, scaled
 from nlfilter_torch.photo.picture.colour import hundredths_of_lab
 from nlfilter_torch.photo.picture.drawn import Drawn
 from nlfilter_torch.photo.picture.edit import MARKS, PhotoEdit, Rows
@@ -81,21 +82,29 @@ class Scribbled:
         size = self.rows.size
         stride = math.ceil(math.sqrt(max(1.0, size[0] * size[1] / MAX_PIXELS)))
         image = _reduced(self.rows.read, size, stride, F.avg_pool2d).float().clamp(0, 1).expand(-1, 3, -1, -1)
-        marks, colours = self._marks(stride)
+        drawn = self.marked.rows()
+        marks, colours = self._marks(drawn, stride)
+        small = (image.shape[-2], image.shape[-1])
+        boxes = None
+        if drawn.box is not None:  # one around all
+            boxes = scaled(torch.as_tensor(drawn.box), size, small)
+            boxes = torch.cat([boxes[..., :2].amin(1, True), boxes[..., 2:].amax(1, True)], dim=2)
         painted, kept = marks.get("scribbles", torch.zeros_like(image[:, :1])), marks.get("background")
-        selection = edit_at((image.shape[-2], image.shape[-1]), stride).selection()
+        selection = edit_at(small, stride).selection()
         mask = torch.ones_like(image[:, :1])  # all pixels are changed
         if selection is not None:
-            mask = edit_image(selection, image, Drawn(marks))
+            mask = edit_image(selection, image, Drawn(marks, box=boxes))
         shown = drawn_over(image, mask, colours, painted, kept)
-        for drawn in (marks.get("scribbles"), kept):
-            shown = shown if drawn is None else hatched(shown, stray_parts(InMemory(image), drawn))
+        for plane in (marks.get("scribbles"), kept):
+            shown = shown if plane is None else hatched(shown, stray_parts(InMemory(image), plane))
+        if boxes is not None:
+            inside = held(boxes, small).any(1, keepdim=True).float()
+            shown = torch.where(F.max_pool2d(inside, 3, 1, 1) > inside, torch.ones_like(shown), shown)
         write_photograph(Photograph(shown), target)
 
-    def _marks(self, stride: int) -> tuple[dict[str, Tensor], Tensor | None]:
+    def _marks(self, drawn: Drawn[RowSource], stride: int) -> tuple[dict[str, Tensor], Tensor | None]:
         """The scribbles at a reduced size, under the names that the edit of their mask takes, and their colours."""
         marks, colours = dict[str, Tensor](), None
-        drawn = self.marked.rows()
         for scribble in self.marked.edit.scribbles:
             coloured, is_object = scribble.kind == "colours", scribble.role == "object"
             source = drawn.colours if coloured and is_object else drawn.masks.get(scribble.argument)

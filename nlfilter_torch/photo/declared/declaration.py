@@ -4,14 +4,14 @@ Does not import torch, so that the command line prints help and lists without de
 """
 
 import reprlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from types import EllipsisType
 from typing import TYPE_CHECKING, Any, Literal, TypeGuard, cast
 
 from nlfilter_torch.photo.declared.json_values import Value, is_within
-from nlfilter_torch.photo.declared.strokes import WORDS, Mark, ScribbleRole, is_layer, mark_of, meaning_of
+from nlfilter_torch.photo.declared.strokes import WORDS, Mark, ScribbleRole, is_layer, is_rectangle, mark_of, meaning_of
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -295,7 +295,8 @@ class Scribble:
             of several regions that have sliders of their own.
         role: ``"object"`` marks what the edit changes, or keeps sharp; ``"background"`` marks what it leaves out.
             Scribbles on the object cover those on the background. ``"added"`` and ``"removed"`` are what a brush and
-            an eraser paint on the mask that is computed from these, the later over the earlier.
+            an eraser paint on the mask that is computed from these, the later over the earlier. ``"box"`` is a
+            rectangle that holds the object; one that says no colour or sliders holds all objects.
         needed: whether the edit has no effect without them, or without what is added.
         option: except for the object, the option of the command that takes a rectangle; without one, the command does
             not offer these scribbles.
@@ -429,12 +430,27 @@ class Edit:
         kinds = set() if meaning is None else {scribble.kind for scribble in self.with_role(meaning.role)}
         coloured = is_layer(mark) or (meaning is not None and meaning.colour is not None)
         sliders = None if meaning is None else meaning.sliders
-        if "mask" in kinds or ("colours" in kinds and coloured):
+        is_box = meaning is not None and meaning.role == "box"
+        if is_box and not is_rectangle(mark):
+            kind = getattr(mark, "shape", "line")
+            raise ValueError(
+                f"paint of {place} must be box for rectangles only, got a different shape, {kind}; correct it"
+            )
+        if "mask" in kinds or ("colours" in kinds and (coloured or is_box)):
             return
         if "sliders" in kinds and (sliders is None or self["alpha"].is_valid(sliders)):
             return
         wanted = ", ".join(map(_described, self.words))
         raise ValueError(f"paint of {place} must be one of {wanted}, got {reprlib.repr(mark.paint)}; correct it")
+
+    @property
+    def object_roles(self) -> tuple[ScribbleRole, ...]:
+        """The roles of marks that say what an object is: additions and boxes, too, if the edit computes masks."""
+        return ("object", "added", "box") if self.with_role("added") else ("object",)
+
+    def marks_object(self, marks: Iterable[Mark]) -> bool:
+        """Whether one of the marks says what an object is."""
+        return any(mark.role in self.object_roles for mark in marks)
 
     @property
     def regional(self) -> Scribble | None:

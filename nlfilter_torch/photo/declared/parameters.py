@@ -55,6 +55,8 @@ REMOVE = Scribble(
     option="--remove",
     option_help="A rectangle that is not selected, as by an eraser, whatever is found or added. May be repeated.",
 )
+BOX_HELP = "A rectangle around the whole object, outside which nothing is selected; --region may be left out then."
+BOX = Scribble("box", "Around it", role="box", option="--box", option_help=BOX_HELP)
 
 DETAIL = Edit(
     "detail",
@@ -132,6 +134,7 @@ DETAIL = Edit(
     scribbles=(
         Scribble("regions", "Edit this", "sliders"),
         Scribble("negative", "Not this", role="background", option="--background", option_help=BACKGROUND_HELP),
+        replace(BOX, kind="sliders"),
         replace(ADD, kind="sliders"),
         REMOVE,
     ),
@@ -315,6 +318,7 @@ RECOLOR = Edit(
             option="--keep",
             option_help="A rectangle; everything that resembles it stays unchanged. May be repeated.",
         ),
+        replace(BOX, kind="colours"),
         replace(ADD, kind="colours"),
         REMOVE,
     ),
@@ -352,7 +356,10 @@ COLORIZE = Edit(
         *filter_parameters(bandwidth=40.0, share=0.7, patch_size=1)[:4],
     ),
     hint="For grey photographs: paint some colours, and they spread over similar areas nearby.",
-    scribbles=(PAINT,),
+    scribbles=(
+        PAINT,
+        replace(BOX, option_help="A rectangle around what is coloured; outside it the photograph stays grey."),
+    ),
     coloured=True,
 )
 
@@ -393,9 +400,11 @@ DEFOCUS = Edit(
             "focus_region",
             "Keep sharp",
             needed=True,
-            advice="give --region X,Y,W,H or --mask FILE to mark what stays sharp, such as --region 190,60,60,60",
+            advice="give --region X,Y,W,H, --box X,Y,W,H or --mask FILE to mark what stays sharp, such as "
+            "--region 190,60,60,60",
         ),
         Scribble("background", "Blur this", role="background", option="--background", option_help=BACKGROUND_HELP),
+        BOX,
         ADD,
         REMOVE,
     ),
@@ -425,9 +434,11 @@ MASK = Edit(
             "scribbles",
             "Select this",
             needed=True,
-            advice="give --region X,Y,W,H or --mask FILE to mark part of the object, such as --region 190,60,60,60",
+            advice="give --region X,Y,W,H, --box X,Y,W,H or --mask FILE to mark the object, such as "
+            "--region 190,60,60,60",
         ),
         Scribble("background", "Not this", role="background", option="--background", option_help=BACKGROUND_HELP),
+        BOX,
         ADD,
         REMOVE,
     ),

@@ -235,7 +235,7 @@ def on_frame(step: Step, frame: Frame, seen: tuple[int, int] | None = None) -> S
     """
     if frame.is_whole or not step.strokes:
         return step
-    objects = step.painted_as("object", "added")
+    objects = step.objects
     misses = bool(objects) and not any(mark.reaches(frame.original) for mark in objects)
     strokes = map(frame.mark_inward, step.strokes)
     return step.changed(strokes=tuple(stroke for stroke in strokes if misses or stroke.reaches(seen or frame.size)))

@@ -97,9 +97,14 @@ class Step:
         """Return the marks that have one of these roles."""
         return tuple(mark for mark in self.strokes if mark.role in roles)
 
+    @property
+    def objects(self) -> tuple[Mark, ...]:
+        """The marks that say what the objects are, see :attr:`Edit.object_roles`."""
+        return self.painted_as(*self.declared.object_roles)
+
     def marks_object(self) -> bool:
-        """Whether a stroke marks an object, or adds to its mask."""
-        return bool(self.painted_as("object", "added"))
+        """Whether a mark says what an object is."""
+        return bool(self.objects)
 
     @property
     def sliders_inside(self) -> tuple[float, ...]:

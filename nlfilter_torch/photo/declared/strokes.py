@@ -14,9 +14,16 @@ from typing import Literal, NamedTuple, TypeGuard, cast, get_args
 
 from nlfilter_torch.photo.declared.json_values import is_within, shown
 
-ScribbleRole = Literal["object", "background", "added", "removed"]
+ScribbleRole = Literal["object", "background", "added", "removed", "box"]
 #: The word for each role in the paint of a mark, the same for all edits.
-WORDS: dict[ScribbleRole, str] = {"object": "in", "background": "out", "added": "add", "removed": "remove"}
+WORDS: dict[ScribbleRole, str] = {
+    "object": "in",
+    "background": "out",
+    "added": "add",
+    "removed": "remove",
+    "box": "box",
+}
+NOTED: tuple[ScribbleRole, ...] = ("object", "added", "box")  # roles whose marks may say a colour or sliders
 
 COLOUR = re.compile("#[0-9a-f]{6}", re.IGNORECASE)
 MIN_RADIUS = 0.75  # minimum radius in pixels, at which a dot always covers a pixel
@@ -40,8 +47,8 @@ class Meaning(NamedTuple):
 def meaning_of(paint: str) -> Meaning | None:
     """The meaning of a paint, or None if it has none.
 
-    It is one of the words in, out, add and remove; after in and add, a colour or sliders may follow. A colour alone
-    stands for an object of that colour.
+    It is one of the words in, out, add, remove and box; after in, add and box, a colour or sliders may follow. A colour
+    alone stands for an object of that colour.
 
     >>> meaning_of("add #2040e0"), meaning_of("in 3,2,1").sliders, meaning_of("blue")
     (Meaning(role='added', colour='#2040e0', sliders=None), (3.0, 2.0, 1.0), None)
@@ -52,7 +59,7 @@ def meaning_of(paint: str) -> Meaning | None:
     role = next((role for role, name in WORDS.items() if name == word.lower()), None)
     if role is None or not space:
         return None if role is None else Meaning(role)
-    if role not in ("object", "added"):
+    if role not in NOTED:
         return None
     if COLOUR.fullmatch(note):
         return Meaning(role, note)
@@ -84,7 +91,7 @@ class Marking:
 
     @property
     def role(self) -> ScribbleRole:
-        """What is marked: an object, its background, or what is added to its mask or removed from it."""
+        """What is marked: an object, its background, an addition to its mask, what is removed from it, or a box."""
         return self.meaning.role
 
     @property
@@ -140,7 +147,7 @@ class Region(Marking):
         points: corners of a polygon; for other shapes those at the upper left, the upper right and the lower left of
             the parallelogram that they fill.
         shape: what it is.
-        paint: its meaning: in, out, add or remove; after in and add, a colour or sliders may follow.
+        paint: its meaning: in, out, add, remove or box; after in, add and box, a colour or sliders may follow.
         file: path of the picture in a file.
     """
 
@@ -216,7 +223,7 @@ Mark = Stroke | Region
 
 
 def noted(mark: Mark, note: str) -> Mark:
-    """A mark of an object, or of what is added to its mask, with a colour or sliders in its meaning."""
+    """A mark whose role is one of :data:`NOTED`, with a colour or sliders in its meaning."""
     return replace(mark, paint=f"{WORDS[mark.role]} {note}")
 
 
@@ -227,9 +234,42 @@ def _length(start: float, end: float) -> float:
 
 
 def sliders_of(marks: Sequence[Mark], inside: tuple[float, ...]) -> tuple[tuple[float, ...], ...]:
-    """The sliders of each region that marks make up: those of the marks, or ``inside`` where they say none."""
+    """The sliders of each region that marks make up: those of the marks, or ``inside`` where they say none.
+
+    A box that says none makes up a region only where no other mark does; it belongs to all of them.
+    """
     own = [mark.meaning.sliders or inside for role in ("object", "added") for mark in marks if mark.role == role]
-    return tuple(dict.fromkeys(own))
+    boxes = [mark.meaning.sliders for mark in marks if mark.role == "box"]
+    own += [sliders for sliders in boxes if sliders is not None]
+    return tuple(dict.fromkeys(own or [inside] * len(boxes)))
+
+
+def is_rectangle(mark: Mark) -> TypeGuard[Region]:
+    """Whether a mark is a rectangle, which may be turned, as the paint of a box requires."""
+    return isinstance(mark, Region) and mark.shape == "rectangle"
+
+
+def box_in(mark: Region, size: tuple[int, int]) -> tuple[float, float, float, float]:
+    """Left, top, right and bottom edge, in pixels of a picture (H, W), of the upright rectangle around a region.
+
+    It is limited to the picture, in which it is at least a pixel wide and high.
+
+    Raises:
+        ValueError: if it lies outside the picture.
+
+    >>> box_in(Region.upright((0.25, 0.5, 0.5, 0.75), "rectangle", "box"), (40, 80))
+    (20.0, 20.0, 60.0, 40.0)
+    """
+    edges = []
+    for axis, length in enumerate((size[1], size[0])):
+        places = [point[axis] * length for point in mark.outline]
+        if min(places) >= length or max(places) <= 0:
+            raise ValueError(f"a box must meet the photograph, got one outside it, {mark.text(size)}; move it")
+        first, last = max(min(places), 0.0), min(max(places), float(length))
+        first = min(first - max(1 - (last - first), 0.0) / 2, length - 1.0)
+        edges.append((max(first, 0.0), max(last, max(first, 0.0) + 1)))
+    (left, right), (top, bottom) = edges
+    return left, top, right, bottom
 
 
 def mark_of(value: object, place: str) -> Mark:

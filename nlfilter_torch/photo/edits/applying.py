@@ -74,8 +74,8 @@ def left_by_crop(step: Step, source: Source[M], painter: Painter[M]) -> Step:
 
     These do as little as strokes outside the crop, see :meth:`Recipe.on_developed`.
     """
-    objects = step.painted_as("object", "added")
-    if not objects:
+    objects = step.objects
+    if not objects or any(mark.role == "box" for mark in objects):
         return step
     mask = painter.planes([tuple((mark, True) for mark in objects)], source.size)
     is_seen = not painter.covers(mask) or len(source.scribbles(mask, None, "strokes", needed=False).places) > 0

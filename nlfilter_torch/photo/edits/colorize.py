@@ -34,6 +34,14 @@ from nlfilter_torch.operator.pixel_matrix import Columns
 from nlfilter_torch.operator.spectrum import Spectrum
 from nlfilter_torch.photo.declared.declaration import Edit
 from nlfilter_torch.photo.declared.parameters import COLORIZE
+from nlfilter_torch.photo.picture.boxes import (
+    boxes_of,
+    check_scribbles_in,
+    held,
+    in_boxes,
+    just_outside,
+    scaled,
+)
 from nlfilter_torch.photo.picture.colour import (
     group_colours,
     merge_luminance,
@@ -45,7 +53,7 @@ from nlfilter_torch.photo.picture.drawn import Drawn
 from nlfilter_torch.photo.picture.edit import PhotoEdit, Rows
 from nlfilter_torch.photo.picture.in_memory import edited
 from nlfilter_torch.photo.picture.measuring import check_in_memory, everywhere, reduced
-from nlfilter_torch.photo.picture.pixels import M, part_of
+from nlfilter_torch.photo.picture.pixels import Box, M, part_of
 from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles, scribbled_blocks
 from nlfilter_torch.photo.picture.source import (
     Fitted,
@@ -54,6 +62,7 @@ from nlfilter_torch.photo.picture.source import (
     Pixels,
     Planes,
     Source,
+    at,
     kept,
     luminance,
 )
@@ -122,6 +131,7 @@ def colorize(
     strokes: Tensor,
     stroke_mask: Tensor,
     *,
+    box: Box | None = None,
     method: Method = COLORIZE.defaults["method"],
     strength: float | Tensor = COLORIZE.defaults["strength"],
     time: float | Tensor = 1.0,
@@ -144,6 +154,8 @@ def colorize(
         grey: (B, 1, H, W) in [0, 1].
         strokes: (B, 3, H, W), RGB, of which only the chroma is used.
         stroke_mask: (B, 1, H, W) in [0, 1], above 0 where painted. Grey strokes keep similar pixels grey.
+        box: ``(left, top, right, bottom)`` in pixels, a rectangle that holds all that is coloured, or a tensor
+            (B, 1, 4): what lies outside stays grey, and pixels just outside count as grey strokes.
         method: ``"regression"`` or ``"kmeans"``.
         strength: for the regression, in [0, 1]: at 1 every pixel is coloured, at 0 pixels similar to no stroke stay
             grey.
@@ -165,7 +177,8 @@ def colorize(
         ``"kmeans"``.
 
     Raises:
-        TypeError, ValueError: if a tensor has another size, the mask leaves [0, 1], or nothing is painted.
+        TypeError, ValueError: if a tensor has another size, the mask leaves [0, 1], or nothing is painted; if the box
+            does not lie in the picture, or most of the strokes do not lie in it.
 
     Example:
         >>> grey = torch.rand(1, 1, 24, 24, generator=torch.Generator().manual_seed(0)) * 0.2 + 0.1
@@ -204,12 +217,17 @@ class Colorize(PhotoEdit):
     def fit(self, source: Source[M], drawn: Drawn[M]) -> Fitted:
         """Fit the colours to strokes."""
         self._check(source)
-        scribbles = source.scribbles(drawn.masks.get("stroke_mask"), drawn.colours, "stroke_mask")
+        strokes = scribbles = source.scribbles(drawn.masks.get("stroke_mask"), drawn.colours, "stroke_mask")
         small = viewed_size(source.size, self.viewing_size)
         viewed = source if small == source.size else source.resized(small)
         if viewed is not source:
             steps = (source.size[0] / small[0], source.size[1] / small[1])
             scribbles = blocks_of(scribbles, viewed, source.size, steps)
+        boxes = None
+        if drawn.box is not None:
+            boxes = boxes_of(drawn.box, source.size, source.batch, 1)
+            check_scribbles_in(boxes, [strokes], source.size, "strokes")
+            scribbles = grey_outside(viewed, scribbles, scaled(boxes, source.size, small))
         ratio = viewed.measured(bandwidth_ratio)
         options = self.filter_options(small, fewer_landmarks=True)
         # Not None, whose place a share of the size takes, and a single one.
@@ -218,8 +236,10 @@ class Colorize(PhotoEdit):
         operators = Operators(options, viewed, bandwidths)
         wanted = squarable(split_luminance(scribbles.shown.unsqueeze(2))[1]).squeeze(2)  # (B, 3, n)
         if self.method == "kmeans":
-            return _coloured(source, viewed, self._segments(operators, scribbles, wanted))
-        return _coloured(source, viewed, Estimates.of(operators, scribbles, wanted[:, ::2], self.strength))
+            fitted = _coloured(source, viewed, self._segments(operators, scribbles, wanted))
+        else:
+            fitted = _coloured(source, viewed, Estimates.of(operators, scribbles, wanted[:, ::2], self.strength))
+        return fitted if boxes is None else replace(fitted, pixels=partial(_grey_beyond, boxes, fitted.pixels))
 
     def _check(self, source: Source[M]) -> None:
         """Raise an error for an invalid setting."""
@@ -500,6 +520,24 @@ def _coloured(source: Source[M], viewed: Source[M], chroma: Planes) -> Fitted:
     before = everywhere(viewed, Fitted(_luminance_twice))
     changes = Coarse.of(before, everywhere(viewed, Fitted(chroma)), None, "none").changes(source, _luminance_twice)
     return Fitted(partial(_in_changed_chroma, changes))
+
+
+def grey_outside(viewed: Source[M], scribbles: Scribbles, boxes: Tensor) -> Scribbles:
+    """Coloured scribbles in boxes (B, 1, 4) of a picture, and grey ones just outside."""
+    inside, outside = (planes.flatten(2) for planes in (held(boxes, viewed.size), just_outside(boxes, viewed.size)))
+    grey = outside.any(0).flatten().nonzero().squeeze(1).to(scribbles.places)
+    places, back = torch.cat([scribbles.places, grey]).unique(return_inverse=True)
+    own = back[: len(scribbles.places)]
+    weights = outside[..., places].to(scribbles.weights)
+    weights[..., own] = torch.where(inside[..., scribbles.places], scribbles.weights, weights[..., own])
+    image = at(viewed, places)[0]
+    shown = reduce_channels(image.unsqueeze(2), "luminance").squeeze(2).expand(-1, 3, -1).clone()
+    shown[..., own] = torch.where(inside[..., scribbles.places], scribbles.shown, shown[..., own])
+    return Scribbles(places, weights, image, shown)
+
+
+def _grey_beyond(boxes: Tensor, coloured: Planes, pixels: Pixels) -> Tensor:
+    return torch.where(in_boxes(boxes, pixels), coloured(pixels), luminance(pixels))
 
 
 def _in_chroma(chroma: Planes, pixels: Pixels) -> Tensor:

@@ -12,10 +12,9 @@ from nlfilter_torch.core.checks import check_reach
 from nlfilter_torch.operator.options import Completion, Sampling
 from nlfilter_torch.photo.declared.declaration import Edit
 from nlfilter_torch.photo.declared.parameters import DEFOCUS
-from nlfilter_torch.photo.picture.boxes import Box
 from nlfilter_torch.photo.picture.drawn import Drawn
 from nlfilter_torch.photo.picture.in_memory import edited
-from nlfilter_torch.photo.picture.pixels import M
+from nlfilter_torch.photo.picture.pixels import Box, M
 from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles
 from nlfilter_torch.photo.picture.source import Fitted, Source
 from nlfilter_torch.photo.selections.by_hand import ByHand, check_drawn

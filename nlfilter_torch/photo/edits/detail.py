@@ -20,7 +20,7 @@ from nlfilter_torch.operator.features import blur_margin
 from nlfilter_torch.operator.options import Completion, GuideChannels, Sampling
 from nlfilter_torch.photo.declared.declaration import Arguments, Edit
 from nlfilter_torch.photo.declared.parameters import DETAIL, MASK
-from nlfilter_torch.photo.picture.boxes import Box, boxes_of, scaled
+from nlfilter_torch.photo.picture.boxes import boxes_of, scaled
 from nlfilter_torch.photo.picture.changes import (
     VARIANCE_SIGMA,
     DetailChange,
@@ -34,7 +34,7 @@ from nlfilter_torch.photo.picture.edit import PhotoEdit
 from nlfilter_torch.photo.picture.in_memory import edited
 from nlfilter_torch.photo.picture.limits import Limits
 from nlfilter_torch.photo.picture.measuring import everywhere
-from nlfilter_torch.photo.picture.pixels import M, corner, whole_image
+from nlfilter_torch.photo.picture.pixels import Box, M, corner, whole_image
 from nlfilter_torch.photo.picture.resizing import enlarged
 from nlfilter_torch.photo.picture.source import Fitted, Guide, Pixels, Planes, Source, luminance
 from nlfilter_torch.photo.picture.tiled_scribbles import num_regions, resized_masks

@@ -8,27 +8,28 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from nlfilter_torch.core.checks import check_image
+from nlfilter_torch.core.checks import check_image, check_photograph, check_same_size
 from nlfilter_torch.core.precision import per_image, squarable
 from nlfilter_torch.operator.options import Completion, Sampling
 from nlfilter_torch.photo.declared.declaration import Edit
 from nlfilter_torch.photo.declared.parameters import RECOLOR
 from nlfilter_torch.photo.looks.look_filter import acts
-from nlfilter_torch.photo.picture.boxes import Box, boxes_of, check_scribbles_in
+from nlfilter_torch.photo.picture.boxes import boxes_of, check_scribbles_in, held
 from nlfilter_torch.photo.picture.colour import dot, merge_luminance, split_luminance
 from nlfilter_torch.photo.picture.drawn import Drawn
 from nlfilter_torch.photo.picture.in_memory import edited
-from nlfilter_torch.photo.picture.pixels import M, whole_image
-from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles
-from nlfilter_torch.photo.picture.source import Fitted, Pixels, Source
+from nlfilter_torch.photo.picture.pixels import Box, M, whole_image
+from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles, middles_of
+from nlfilter_torch.photo.picture.source import Fitted, Pixels, Source, at
 from nlfilter_torch.photo.selections.border_colours import Sides, colours_beside, refine_mask
 from nlfilter_torch.photo.selections.connected import Extent
 from nlfilter_torch.photo.selections.hues import shade
-from nlfilter_torch.photo.selections.mask import ObjectEdit, Regions, background_of, fit_regions
+from nlfilter_torch.photo.selections.mask import ObjectEdit, Regions, background_of, boxed, fit_regions
 from nlfilter_torch.photo.selections.painted import Painted
 
 EPSILON = 1e-12  # keeps the derivative of a root finite
 END_MARGIN = 0.1  # masks closer to 0 or 1 are set to 0 or 1: a faint tint far away is visible, a less soft edge is not
+CERTAIN = 0.9  # share of the highest mask in a box from which on pixels surely belong to the object
 ROOM = 0.8  # share of the chroma at which a channel reaches 1 that the mean of an object may have
 DARKEST, LIGHTEST = 0.08, 0.92  # least share of its luminance that an object keeps, and most luminance that it gets
 MOST_GAIN = 4.0  # of the shading of a dark object that becomes light: of noise, too
@@ -70,7 +71,8 @@ def recolor(
         keep: (B, 1, H, W) in [0, 1], background scribbles, above 0 on pixels that stay unchanged together with similar
             ones. Strokes take precedence over it.
         box: ``(left, top, right, bottom)`` in pixels, a rectangle that holds all that takes a new colour, or a tensor
-            (B, 1, 4); outside it nothing changes, see :func:`region_mask`.
+            (B, 1, 4); outside it nothing changes, see :func:`region_mask`. Without ``stroke_mask``, the object in it
+            takes the mean of ``strokes`` there, which may be (B, 3, 1, 1).
         added: (B, 4, H, W), RGB and, in [0, 1], how much of it: painted by hand, takes that colour whatever is
             computed. Without other strokes, these are None.
         removed: (B, 1, H, W) in [0, 1], likewise: 1 stays unchanged. It takes precedence over ``added``.
@@ -126,7 +128,7 @@ class Recolor(ObjectEdit):
     def fit(self, source: Source[M], drawn: Drawn[M]) -> Fitted:
         """Fit the new colours of the objects under the strokes."""
         RECOLOR.check(source.batch, reach=self.reach, brightness=self.brightness)
-        painted = Painted.of(source, drawn)
+        painted = Painted.of(source, drawn, self._strokes_in_box(source, drawn))
         if painted is None:
             return Fitted(whole_image)
         matches = acts(torch.as_tensor(self.brightness), 0.0)
@@ -143,13 +145,42 @@ class Recolor(ObjectEdit):
         if drawn.box is not None and painted.strokes is not None:
             boxes = boxes_of(drawn.box, source.size, source.batch, 1).expand(-1, len(groups.inside), -1)
             check_scribbles_in(boxes[:, :1], [painted.strokes], source.size, "strokes")
-        objects = fit_regions(source, groups.inside, kept, self.selection_in(source.size), by_hand, boxes)
+        selection = self.selection_in(source.size)
+        objects = fit_regions(source, groups.inside, kept, selection, by_hand, boxes, alone=False)
         change = Recoloring(colours, old, valid, under, brightening)
         reduced, masks = change.compared(objects.reduced), objects.reduced_masks()
         shares = [refine_mask(reduced, share) for share in change.shares(masks).split(1, dim=1)]
         beside = [colours_beside(reduced, share).planes for share in shares]
         by_hue = groups.corrected_by_hue(source.size, objects.reduced, masks, shares, kept)
         return Fitted(RecoloredPixels(change, objects, beside, by_hue))
+
+    def _strokes_in_box(self, source: Source[M], drawn: Drawn[M]) -> Scribbles | None:
+        """Strokes on all that surely belongs to the object in a box, in the colour for it; None if it is painted.
+
+        The colour is that of a mark, or the mean of ``strokes`` without a mask in the box.
+        """
+        shown = drawn.colours if isinstance(drawn.colours, Tensor) and drawn.colours.shape[1:2] == (3,) else None
+        if drawn.box is None or "stroke_mask" in drawn.masks or (drawn.colour is None and shown is None):
+            return None
+        boxes = boxes_of(drawn.box, source.size, source.batch, 1)
+        colour = drawn.colour
+        if shown is not None:
+            check_photograph(shown, "strokes", channels=3, batch=source.batch)
+            if shown.shape[2:] != (1, 1):
+                check_same_size(shown, source.size, "strokes", "image")
+            inner = held(boxes, source.size).to(shown)
+            colour = (shown * inner).sum((2, 3)) / inner.sum((2, 3))
+        assert colour is not None  # for mypy
+        nothing, _ = boxed(source, boxes, [], 1, "strokes")
+        kept = background_of(source, drawn.masks.get("keep"), nothing[0], "keep")
+        objects = fit_regions(source, nothing, kept, self.selection_in(source.size), None, boxes)
+        masks = objects.reduced_masks().detach()
+        certain = (masks >= CERTAIN * masks.amax((2, 3), keepdim=True)) & (masks > 0)
+        places = middles_of(certain.any(0).squeeze(0), source.size)
+        image, opacity = at(source, places)
+        weights = certain[:, :, certain.any(0).squeeze(0)].to(image)
+        colours = colour.to(image).view(-1, 3, 1).expand(source.batch, -1, len(places))
+        return Scribbles(places, weights if opacity is None else weights * opacity, image, colours)
 
 
 @dataclass(frozen=True, eq=False)

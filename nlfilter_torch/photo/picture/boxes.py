@@ -8,12 +8,11 @@ from torch import Tensor
 
 from nlfilter_torch.core.checks import check_finite
 from nlfilter_torch.core.torch_internals import is_hidden
-from nlfilter_torch.photo.picture.pixels import Pixels, corner
+from nlfilter_torch.photo.picture.pixels import Box, Pixels, corner
 from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles, Size
 
-#: ``(left, top, right, bottom)`` in pixels for all regions, or a tensor (B, K, 4) for each of them.
-Box = Sequence[float] | Tensor
 ORDER = "give left, top, right and bottom in this order"
+AROUND = 0.1  # width of what tells the background around a box, as a share of the side of a square of its area
 ROUNDING = 1e-3  # pixels that a box may lie outside a picture: float32 coordinates of large pictures are this exact
 
 
@@ -81,14 +80,25 @@ def scaled(boxes: Tensor, size: Size, other: Size) -> Tensor:
 
 def in_boxes(boxes: Tensor, pixels: Pixels) -> Tensor:
     """Which pixels have their centre in each box, (B, K, h, w) of bool."""
-    (top, left), (height, width), boxes = corner(pixels), pixels.image.shape[-2:], boxes.to(pixels.image.device)
-    x, y = (
-        torch.arange(first, first + count, device=boxes.device) + 0.5 for first, count in ((left, width), (top, height))
+    return held(boxes.to(pixels.image.device), pixels.image.shape[-2:], corner(pixels))
+
+
+def held(boxes: Tensor, size: Sequence[int], first: tuple[int, int] = (0, 0)) -> Tensor:
+    """Which of (h, w) pixels, the first of which is in that row and column, have their centre in boxes."""
+    y, x = (
+        torch.arange(start, start + count, device=boxes.device) + 0.5 for start, count in zip(first, size, strict=True)
     )
     across, down = (
         (boxes[..., axis, None] <= places) & (places < boxes[..., axis + 2, None]) for axis, places in ((0, x), (1, y))
     )
     return down.unsqueeze(3) & across.unsqueeze(2)
+
+
+def just_outside(boxes: Tensor, size: Size) -> Tensor:
+    """Which pixels of a picture (H, W) lie just outside each box, (B, K, H, W) of bool: they tell its background."""
+    sides = boxes[..., 2:] - boxes[..., :2]
+    margin = (AROUND * sides.prod(-1, keepdim=True).sqrt()).clamp(min=1.0)
+    return held(torch.cat([boxes[..., :2] - margin, boxes[..., 2:] + margin], dim=-1), size) & ~held(boxes, size)
 
 
 def check_scribbles_in(boxes: Tensor, inside: Sequence[Scribbles], size: Size, name: str) -> None:

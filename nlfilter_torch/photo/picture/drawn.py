@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.photo.declared.declaration import Edit
-from nlfilter_torch.photo.declared.strokes import Mark, ScribbleRole, sliders_of
-from nlfilter_torch.photo.picture.boxes import Box
+from nlfilter_torch.photo.declared.strokes import Mark, Region, ScribbleRole, box_in, sliders_of
+from nlfilter_torch.photo.picture.pixels import Box
 from nlfilter_torch.photo.picture.pixels import M as M
 
 M_co = TypeVar("M_co", covariant=True)  # as M, of values that are only read
@@ -30,6 +30,7 @@ class Drawn(Generic[M_co]):
         sliders: (K, k+1), a row for each region that has sliders of its own; None if none has.
         outside: sliders (k+1,) outside these regions; None leaves the other pixels unchanged.
         box: rectangles that hold the objects, in pixels, see :func:`~nlfilter_torch.photo.picture.boxes.boxes_of`.
+        colour: RGB (3,) that an object without scribbles takes, which only a box marks.
     """
 
     masks: Mapping[str, M_co] = field(default_factory=dict)
@@ -37,6 +38,7 @@ class Drawn(Generic[M_co]):
     sliders: Tensor | None = None
     outside: Tensor | None = None
     box: Box | None = None
+    colour: Tensor | None = None
 
     @staticmethod
     def of(masks: Mapping[str, M | None], colours: M | None = None, box: Box | None = None) -> "Drawn[M]":
@@ -64,18 +66,19 @@ def drawn_by(
     takes such.
 
     Raises:
-        ValueError: if the edit does not take a mark, or those of objects are needed and cover no pixel.
+        ValueError: if the edit does not take a mark, there are several boxes for an object, or those of objects are
+            needed and cover no pixel.
     """
     for mark in marks:
         edit.check_mark(mark, f"strokes of {edit.name}")
-    _check_covered(edit, not edit.requires_strokes or any(mark.role in ("object", "added") for mark in marks))
+    _check_covered(edit, not edit.requires_strokes or edit.marks_object(marks))
     masks: dict[str, M] = {}
     colours: M | None = None
     sliders = sliders_of(marks, inside) if inside else ()
     for scribble in edit.scribbles:
         role, coloured = scribble.role, scribble.kind == "colours"
         own = [mark for mark in marks if mark.role == role]
-        if not own:
+        if not own or role == "box":
             continue
         groups = [own]
         if scribble.kind == "sliders":
@@ -88,7 +91,52 @@ def drawn_by(
             colours = planes
         elif role != "background" or painter.covers(planes):
             masks[scribble.argument] = planes
-    return Drawn(masks, colours, torch.tensor(sliders) if sliders else None)
+    box = _boxes(edit, marks, size, sliders, inside)
+    return Drawn(masks, colours, torch.tensor(sliders) if sliders else None, box=box, colour=_colour(edit, marks))
+
+
+def _boxes(
+    edit: Edit, marks: Sequence[Mark], size: Size, sliders: Sequence[tuple[float, ...]], inside: tuple[float, ...]
+) -> Tensor | None:
+    """Boxes (1, K, 4) in pixels of a picture (H, W), of the regions with these sliders, or of the only object.
+
+    Those without sliders hold the regions that have none of their own; there may be one of either. A region without a
+    box has one that is the whole picture.
+    """
+    boxes = [mark for mark in marks if mark.role == "box" and isinstance(mark, Region)]
+    if not boxes:
+        return None
+    own = {row: [mark for mark in boxes if mark.meaning.sliders == row] for row in sliders}
+    others = [mark for mark in boxes if mark.meaning.sliders not in own]
+    if any(len(alike) > 1 for alike in (*own.values(), others)):
+        raise ValueError(
+            f"strokes of {edit.name} must hold one box for each object, got {len(boxes)}; keep the one that holds it"
+        )
+    scribbled = {mark.meaning.sliders or inside for mark in marks if mark.role == "object"}
+    whole = (0.0, 0.0, float(size[1]), float(size[0]))
+    rows = []
+    for row in sliders or (inside,):
+        held = own.get(row) or (others if row in scribbled or not scribbled or not sliders else [])
+        rows.append(box_in(held[0], size) if held else whole)
+    return torch.tensor([rows])
+
+
+def _colour(edit: Edit, marks: Sequence[Mark]) -> Tensor | None:
+    """The colour of an object that only a box marks, for edits whose objects take colours.
+
+    Raises:
+        ValueError: if it says none, and no other mark does.
+    """
+    roles = {mark.role for mark in marks}
+    takes_colours = any(scribble.kind == "colours" for scribble in edit.with_role("box"))
+    if not takes_colours or "box" not in roles or "object" in roles:
+        return None
+    colour = next(mark.colour for mark in marks if mark.role == "box")
+    if colour is None and "added" not in roles:
+        raise ValueError(
+            f"strokes of {edit.name} must be in a colour, or its box must say one, got neither; choose a colour"
+        )
+    return None if colour is None else colour_of(colour)
 
 
 def _check_covered(edit: Edit, covered: bool) -> None:
@@ -104,3 +152,12 @@ def _plane(group: Sequence[Mark], role: ScribbleRole, marks: Sequence[Mark]) -> 
         return (*((mark, True) for mark in group), *((mark, False) for mark in marks if mark.role == "object"))
     others = ("removed",) if role == "added" else ("added",)
     return tuple((mark, mark.role == role) for mark in marks if mark in group or mark.role in others)
+
+
+def colour_of(paint: str) -> Tensor:
+    """Parse ``#rrggbb`` to RGB (3,) in [0, 1].
+
+    >>> colour_of("#ff0033")
+    tensor([1.0000, 0.0000, 0.2000])
+    """
+    return torch.tensor([int(paint[i : i + 2], 16) for i in (1, 3, 5)]) / 255

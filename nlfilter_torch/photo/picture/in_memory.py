@@ -318,7 +318,8 @@ def edited(edit: type[PhotoEdit], arguments: Arguments) -> Tensor:
         arguments: of its function: ``locals()`` before it has other variables.
     """
     name, image = next(iter(arguments.items()))
-    masks = {scribble.argument: arguments[scribble.argument] for scribble in edit.declared.scribbles}
+    kinds = edit.declared.with_role("object", "background", "added", "removed")
+    masks = {scribble.argument: arguments[scribble.argument] for scribble in kinds}
     drawn = Drawn.of(masks, arguments.get("strokes"), arguments.get("box"))
     return edit_image(edit.of(arguments), image, drawn, name=name, channels=edit.image_channels)
 

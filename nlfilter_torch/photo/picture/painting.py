@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.photo.declared.strokes import Mark, Region, Stroke
-from nlfilter_torch.photo.picture.drawn import Plane, Size
+from nlfilter_torch.photo.picture.drawn import Plane, Size, colour_of
 from nlfilter_torch.photo.picture.pictures import Picture, mask_of, transparency
 
 Part = tuple[slice, slice]  # rows and columns of a picture
@@ -241,15 +241,6 @@ def _marked(region: Region, picture: Picture, start: int, stop: int) -> tuple[Te
         return torch.where(weights < SELECTED_FROM, 0.0, weights), None
     opacity = torch.from_numpy(transparency(tile, "float32")).prod(2)
     return opacity, tile.pixels[0].expand(3, -1, -1).float()  # a grey picture has one channel
-
-
-def colour_of(paint: str) -> Tensor:
-    """Parse ``#rrggbb`` to RGB (3,) in [0, 1].
-
-    >>> colour_of("#ff0033")
-    tensor([1.0000, 0.0000, 0.2000])
-    """
-    return torch.tensor([int(paint[i : i + 2], 16) for i in (1, 3, 5)]) / 255
 
 
 class TensorPainter:

@@ -1,6 +1,6 @@
 """Pixels of a picture, the range in which an edit sees them, and an edit as a function of pixels."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol, TypeVar
 
@@ -10,6 +10,8 @@ from torch import Tensor
 from nlfilter_torch.core.blocks import Inner, block_length
 
 STRIP = 1 << 18  # pixels that a core computes at a time; with fewer, cores wait for each other if other programs run
+#: Rectangles around objects: ``(left, top, right, bottom)`` in pixels for all regions, or a tensor (B, K, 4) for each.
+Box = Sequence[float] | Tensor
 M = TypeVar("M")  # masks and colours of pixels as a source takes them: tensors in memory, rows in tiles
 
 

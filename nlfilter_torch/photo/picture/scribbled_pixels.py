@@ -128,6 +128,19 @@ def blocks_at(places: Tensor, size: Size, shape: Size) -> Tensor:
     return row * shape[1] + column
 
 
+def middles_of(chosen: Tensor, size: Size) -> Tensor:
+    """Row-major indices (n,) of the pixels of a picture (H, W) in the middle of blocks that are chosen, (h, w) of bool.
+
+    >>> middles_of(torch.tensor([[False, True]]), (3, 6))
+    tensor([10])
+    """
+    rows, columns = (
+        (2 * part + 1) * length // (2 * count)
+        for part, length, count in zip(chosen.nonzero().unbind(1), size, chosen.shape, strict=True)
+    )
+    return rows * size[1] + columns
+
+
 def parts_in_blocks(places: Tensor, size: Size, shape: Size) -> list[tuple[Tensor, Tensor]]:
     """Blocks (n,) that pixels lie in, and the parts (n,) in float64 of the pixels that do.
 

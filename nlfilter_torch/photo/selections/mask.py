@@ -24,12 +24,12 @@ from nlfilter_torch.operator.options import Completion, FilterOptions, Sampling,
 from nlfilter_torch.photo.declared.declaration import Edit
 from nlfilter_torch.photo.declared.parameters import MASK
 from nlfilter_torch.photo.declared.shared_parameters import VIEWING_SIZE
-from nlfilter_torch.photo.picture.boxes import Box, boxes_of, check_scribbles_in, in_boxes, scaled
+from nlfilter_torch.photo.picture.boxes import boxes_of, check_scribbles_in, held, in_boxes, just_outside, scaled
 from nlfilter_torch.photo.picture.drawn import Drawn
 from nlfilter_torch.photo.picture.edit import PhotoEdit
-from nlfilter_torch.photo.picture.in_memory import InMemory, edited, in_blocks
+from nlfilter_torch.photo.picture.in_memory import edited, in_blocks
 from nlfilter_torch.photo.picture.measuring import shrunk
-from nlfilter_torch.photo.picture.pixels import M, Pixels, corner
+from nlfilter_torch.photo.picture.pixels import Box, M, Pixels, corner
 from nlfilter_torch.photo.picture.resizing import enlarged
 from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles, parts_in_blocks
 from nlfilter_torch.photo.picture.source import Fitted, Reduced, Source, at, kept
@@ -46,7 +46,6 @@ VIEWED = VIEWING_SIZE.default_number  # megapixels; larger pictures are first re
 FLOATS_PER_PIXEL = 80  # estimated working memory per pixel of the reduced picture, in addition to its operator
 ROUGH_CONFIDENCE, SCRIBBLE_CONFIDENCE = 0.02, 1000.0  # confidence in the rough mask, and in scribbles
 ODDS, STEEPNESS = 1.5, 1.4  # of the curve from the solution along borders, too low halfway, to masks
-AROUND_BOX = 0.1  # width of what tells the background around a box, as a share of the side of a square of its area
 MOST_WAITING = 2  # threads: operations on so few pixels are not worth dividing between two
 
 
@@ -258,8 +257,8 @@ class Regions:
             return torch.cat(masks, dim=1)
         rows, columns = self.reduced.shape[-2:]
         size = round(rows * self.steps[0]), round(columns * self.steps[1])
-        held = in_boxes(scaled(self.boxes, size, (rows, columns)), InMemory(self.reduced))
-        return torch.where(held, torch.cat(masks, dim=1), 0.0)
+        boxes = scaled(self.boxes, size, (rows, columns)).to(self.reduced.device)
+        return torch.where(held(boxes, (rows, columns)), torch.cat(masks, dim=1), 0.0)
 
 
 def background_of(source: Source[M], mask: M | None, inside: Scribbles, name: str) -> list[Scribbles]:
@@ -312,22 +311,30 @@ def fit_regions(
     settings: RegionMask,
     by_hand: ByHand | None = None,
     boxes: Tensor | None = None,
+    *,
+    alone: bool = True,
 ) -> Regions:
     """Compute the masks of regions from scribbles on each, and on the background: none, for all, or for each.
 
     With ``boxes`` (B, K, 4), in pixels of the picture, there may be no scribbles on a region; see :func:`boxed`.
-    Without either, its masks are 0, except for what is painted by hand.
+    Without either, its masks are 0, except for what is painted by hand; also with a box, if this is the whole picture
+    or does not count ``alone``.
     """
     MASK.check(source.batch, reach=settings.reach, extent=settings.extent)
-    if by_hand is None or boxes is not None:
-        return replace(_computed_regions(source, inside, background, settings, boxes=boxes), by_hand=by_hand)
+    if by_hand is None:
+        return _computed_regions(source, inside, background, settings, boxes=boxes)
     count = by_hand.count
     marked = [drawn.painted for drawn in inside]
+    if boxes is not None and alone:
+        whole = boxes.new_tensor([0, 0, source.size[1], source.size[0]])
+        by_box = (boxes != whole).any(2) | torch.tensor(by_hand.added is None)
+        marked = [painted | own.to(painted.device) for painted, own in zip(marked, by_box.unbind(1), strict=True)]
     numbers = [k for k, images in enumerate(marked) if bool(images.any())]
     if numbers:
         opposed = [background[k] for k in numbers] if len(background) > 1 else background
         images = torch.stack([marked[k] for k in numbers], dim=1)
-        regions = _computed_regions(source, [inside[k] for k in numbers], opposed, settings, images)
+        own = None if boxes is None else boxes[:, numbers]
+        regions = _computed_regions(source, [inside[k] for k in numbers], opposed, settings, images, own)
         reduced, steps = regions.reduced, regions.steps
     else:
         small, steps = _reduced(source, FLOATS_PER_PIXEL)
@@ -337,7 +344,7 @@ def fit_regions(
     functions = list(reduced.new_zeros(count, len(reduced), reduced.shape[1] + 1, *reduced.shape[2:]))
     for place, number in enumerate(numbers):
         functions[number], scribbles[number] = regions.functions[:, place], regions.scribbles[place]
-    return Regions(reduced, steps, torch.stack(functions, dim=1), scribbles, by_hand)
+    return Regions(reduced, steps, torch.stack(functions, dim=1), scribbles, by_hand, boxes)
 
 
 def _computed_regions(
@@ -369,12 +376,12 @@ def _computed_regions(
     )
     threads = threads_for(small.image)
     with single_threaded(threads if threads <= MOST_WAITING else 1):
-        held = None if boxes is None else scaled(boxes, source.size, small.size).to(small.image)
-        rough = RoughMasks.of(small, options, settings.reach, everywhere, held)
-        counted = scribbles if marked is None else list(map(_filled, scribbles, marked.unbind(1)))
+        limits = None if boxes is None else scaled(boxes, source.size, small.size).to(small.image)
+        rough = RoughMasks.of(small, options, settings.reach, everywhere, limits)
+        counted = scribbles if marked is None or boxes is not None else list(map(_filled, scribbles, marked.unbind(1)))
         reduced = [blocks_of(drawn, small, source.size, steps) for drawn in counted]
-        if held is not None:
-            reduced = [opposed_outside(drawn, held[:, k : k + 1], small) for k, drawn in enumerate(reduced)]
+        if limits is not None:
+            reduced = [opposed_outside(drawn, limits[:, k : k + 1], small) for k, drawn in enumerate(reduced)]
         image = small.image.clamp(0.0, 1.0)  # a far brighter pixel of a float file would upset the linear functions
         masks = torch.cat([rough.mask(number, drawn) for number, drawn in enumerate(reduced)], dim=1)
         front, back = torch.stack([drawn.planes(small) for drawn in reduced], dim=2).unbind(1)
@@ -385,8 +392,8 @@ def _computed_regions(
     regions = Regions(image, steps, functions, scribbles, boxes=boxes)
     if settings.extent != "object":
         return regions
-    if held is not None:  # without a scribble, all that is found in a box belongs to the object
-        front = torch.where(front.amax((2, 3), keepdim=True) > 0, front, in_boxes(held, small).to(front))
+    if limits is not None:  # without a scribble, all that is found in a box belongs to the object
+        front = torch.where(front.amax((2, 3), keepdim=True) > 0, front, held(limits, small.size).to(front))
     return replace(regions, functions=functions * connected(regions.reduced_masks(), front).unsqueeze(2))
 
 
@@ -457,12 +464,9 @@ def opposed_outside(scribbles: Scribbles, boxes: Tensor, small: Reduced) -> Scri
         boxes: (B, 1, 4), in its pixels.
         small: the reduced picture.
     """
-    sides = boxes[..., 2:] - boxes[..., :2]
-    margin = (AROUND_BOX * sides.prod(2, keepdim=True).sqrt()).clamp(min=1.0).expand(-1, -1, 2)
-    wider = torch.cat([boxes[..., :2] - margin, boxes[..., 2:] + margin], dim=2)
-    inside = in_boxes(boxes, small)
+    inside, outside = held(boxes, small.size), just_outside(boxes, small.size)
     front, back = scribbles.planes(small).split(1, dim=1)
-    back = torch.where(inside, back, in_boxes(wider, small).to(back))
+    back = torch.where(inside, back, outside.to(back))
     return scribbles.repainted(torch.cat([torch.where(inside, front, 0.0), back], dim=1), small.image)
 
 

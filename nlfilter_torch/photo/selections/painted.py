@@ -29,21 +29,21 @@ class Painted:
     on_mask: Scribbles | None
 
     @staticmethod
-    def of(source: Source[M], drawn: Drawn[M]) -> "Painted | None":
+    def of(source: Source[M], drawn: Drawn[M], strokes: Scribbles | None = None) -> "Painted | None":
         """Read what is painted; None if nothing is left of what was added by hand.
 
-        Images without any of it have colours that are not valid.
+        Images without any of it have colours that are not valid. ``strokes`` are known ones in place of painted ones.
 
         Raises:
             TypeError, ValueError: if it does not suit the picture, or there are no strokes and nothing is added.
         """
         mask, added = drawn.masks.get("stroke_mask"), drawn.masks.get("added")
         if drawn.colours is None:
-            check_drawn(mask, added, "stroke_mask")
-        strokes, on_mask = None, None
+            check_drawn(mask, added, "stroke_mask", strokes)
+        on_mask = None
         if added is not None:
             on_mask = opaque(source, source.scribbles(None, added, "added", needed=False))
-        if added is None or mask is not None or drawn.colours is not None:
+        if strokes is None and (added is None or mask is not None or drawn.colours is not None):
             strokes = source.scribbles(mask, drawn.colours, "stroke_mask", needed=added is None)
         painted = Painted(*(_if_any(scribbles) for scribbles in (strokes, on_mask)))
         return painted if painted.marks else None

@@ -78,7 +78,7 @@ def test_strokes(session: Session) -> None:
     assert session.recipe.current("recolor") == Step("recolor", (Stroke(stroke.points, 0.03, "#2040e0"),))
     with pytest.raises(ValueError, match="abstract takes no strokes"):
         session.add_stroke("abstract", LINE, 0.03, "in")
-    with pytest.raises(ValueError, match="must be one of in, out, add, remove, got 'red'"):
+    with pytest.raises(ValueError, match="must be one of in, out, box, add, remove, got 'red'"):
         session.add_stroke("defocus", LINE, 0.03, "red")
 
 

@@ -17,7 +17,7 @@ def test_help_of_the_mask_says_what_is_written(capsys: pytest.CaptureFixture[str
 
 
 REFUSED = [
-    ([], "give --region X,Y,W,H or --mask FILE to mark part of the object"),
+    ([], "give --region X,Y,W,H, --box X,Y,W,H or --mask FILE to mark the object"),
     (["--region", "80,50,20,20"], "--region must lie within the photograph"),
     (["--region", REGION, "--background", REGION], "background must hold a painted pixel outside the scribbles"),
     (["--region", REGION, "--depth", "float"], "cannot hold this picture: PNG has no floats per channel"),

@@ -149,7 +149,7 @@ def test_strokes_that_cover_the_photograph_are_refused(
 WRONG_RECTANGLES = [
     ("recolor", [], "give --strokes FILE or --region X,Y,W,H:COLOUR"),
     ("colorize", [], "give --strokes FILE or --region X,Y,W,H:COLOUR"),
-    ("defocus", [], "give --region X,Y,W,H or --mask FILE"),
+    ("defocus", [], "give --region X,Y,W,H, --box X,Y,W,H or --mask FILE"),
     (
         "recolor",
         ["--region", "1,2,3"],
@@ -173,7 +173,7 @@ WRONG_RECTANGLES = [
     (
         "detail",
         ["--remove", "1,2,5,4"],
-        "--remove must come with --region, --add or --mask, got none of them; mark",
+        "--remove must come with --region, --box, --add or --mask, got none of them; mark",
     ),
     ("detail", ["--region", "1,2,5,4:1,x,1,1"], "--region must be numbers separated by commas"),
 ]
@@ -321,6 +321,39 @@ def test_masks_are_painted_by_rectangles() -> None:
         marked(EDITS["recolor"], ScribbleOptions(rectangles={"--add": ["2,3,4,5"]}))
 
 
+@pytest.mark.parametrize(
+    ("verb", "text", "sentence"),
+    [
+        ("mask", "10,20", "--box must be a rectangle X,Y,W,H around the object, got '10,20'; give four numbers"),
+        ("mask", "ellipse:1,1,9,9", "--box must be a rectangle X,Y,W,H around the object, got 'ellipse:1,1,9,9'; give"),
+        ("defocus", "10,20,200,9", "--box must lie within the photograph, which is 90 pixels wide and 60 high, got"),
+        ("defocus", "10,20,0,9", "--box must be at least 1 pixel wide and high, got 0x9"),
+        ("defocus", "10,20,9,9:red", "--box must be X,Y,W,H only, got '10,20,9,9:red'; drop the colon"),
+        ("recolor", "10,20,9,9", "strokes of recolor must be in a colour, or its box must say one, got neither"),
+        ("recolor", "10,20,9,9:reddish", "--box must end in a colour, such as red"),
+        ("detail", "10,20,9,9:1,2", "--box must have as many sliders as --alpha, 4, got 2"),
+    ],
+)
+def test_wrong_boxes(
+    photo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], verb: str, text: str, sentence: str
+) -> None:
+    out = tmp_path / "out.png"
+    assert sentence in refusal(capsys, verb, photo, out, "--box", text)
+    assert not out.exists()
+
+
+@pytest.mark.usefixtures("tiled")
+def test_a_box_alone_marks_an_object(photo: Path, tmp_path: Path) -> None:
+    before = rgb(photo)
+    for verb, more in (("defocus", ""), ("recolor", ":blue"), ("detail", ":3,3,3,1")):
+        assert main([verb, str(photo), str(tmp_path / "out.png"), "--box", f"20,10,50,40{more}"]) == 0
+        changed = (rgb(tmp_path / "out.png") != before).any(2)
+        assert changed.any()
+        if verb != "defocus":
+            changed[10:50, 20:70] = False
+            assert not changed.any()
+
+
 def test_colours_and_their_mask() -> None:
     both = marked(EDITS["colorize"], ScribbleOptions(["2,3,4,5:#0000ff", "4,3,4,5:red"]))
     drawn = both.tensors()
@@ -344,8 +377,9 @@ SAVED = (
     Region.upright((30 / 90, 20 / 60, 10 / 90, 12 / 60), "rectangle", "in"),
     Region.upright((50 / 90, 20 / 60, 10 / 90, 12 / 60), "ellipse", "in"),
     Region(((5 / 90, 5 / 60), (20 / 90, 5 / 60), (5 / 90, 20 / 60)), "polygon", "out"),
+    Region.upright((9 / 90, 12 / 60, 70 / 90, 40 / 60), "rectangle", "box"),
 )
-TYPED = ("30,20,10,12", "ellipse:50,20,10,12", "5,5,20,5,5,20")
+TYPED = ("30,20,10,12", "ellipse:50,20,10,12", "5,5,20,5,5,20", "9,12,70,40")
 
 
 @pytest.mark.parametrize(
@@ -364,7 +398,7 @@ def test_strokes_saved_for_one_edit_are_those_of_every_command(
     saved, one, other = (tmp_path / name for name in ("edit.json", "one.png", "other.png"))
     saved.write_text(Recipe((Step("tone"), Step("defocus", SAVED))).to_json())
     assert main([verb, str(photo), str(one), "--strokes", str(saved), *further]) == 0
-    typed = ["--region", TYPED[0], "--region", TYPED[1], background, TYPED[2]]
+    typed = ["--region", TYPED[0], "--region", TYPED[1], background, TYPED[2], "--box", TYPED[3]]
     assert main([verb, str(photo), str(other), *typed, *further]) == 0
     np.testing.assert_array_equal(rgb(one), rgb(other))
 
@@ -388,6 +422,8 @@ def test_a_step_of_a_file_does_what_its_command_does(photo: Path, tmp_path: Path
         TYPED[1],
         "--background",
         TYPED[2],
+        "--box",
+        TYPED[3],
     ]
     assert main(["defocus", str(photo), str(other), *by_mask]) == 0
     np.testing.assert_array_equal(rgb(one), rgb(other))
@@ -417,7 +453,7 @@ def test_files_of_strokes_that_do_not_suit_are_refused(
     for verb, options, sentence in (
         ("recolor", (), "must come with --colour, such as --colour red, got none; add it"),
         ("recolor", ("--colour", "reddish"), "--colour must end in a colour, such as red"),
-        ("colorize", ("--colour", "red"), "must be one of a colour such as #c04020, got 'out'"),
+        ("colorize", ("--colour", "red"), "must be one of a colour such as #c04020, box, got 'out'"),
     ):
         assert sentence in refusal(capsys, verb, photo, out, "--strokes", saved, *options)
     saved.write_text(Recipe((Step("tone"),)).to_json())

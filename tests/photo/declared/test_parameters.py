@@ -79,6 +79,7 @@ def test_every_argument_of_a_function_reaches_its_edit(edit: type[PhotoEdit], mo
 
     def received(made: PhotoEdit, image: object, drawn: Drawn[object], **_: object) -> None:
         reached.update(vars(made) | vars(made.options) | {"image": image, "grey": image, "strokes": drawn.colours})
+        reached["box"] = drawn.box
         reached.update(drawn.masks)
 
     monkeypatch.setattr("nlfilter_torch.photo.picture.in_memory.edit_image", received)

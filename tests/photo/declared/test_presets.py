@@ -201,7 +201,7 @@ NO_EDITS = [
     ),
     (
         step_file("recolor", '"strokes": [{"points": [[0, 0]], "radius": 0.1, "paint": "blue"}]'),
-        "must be one of a colour such as #c04020, out, add with a colour such as add #c04020, remove, got 'blue'",
+        "must be one of a colour such as #c04020, out, box with a colour such as box #c04020, add .*, got 'blue'",
     ),
 ]
 

@@ -7,10 +7,11 @@ from pathlib import Path
 import pytest
 import torch
 
-from nlfilter_torch.photo.declared.parameters import COLORIZE, DEFOCUS, DETAIL, RECOLOR
-from nlfilter_torch.photo.declared.presets import Recipe
+from nlfilter_torch.photo.declared.development import Development
+from nlfilter_torch.photo.declared.parameters import COLORIZE, DEFOCUS, DETAIL, EDITS, MASK, RECOLOR
+from nlfilter_torch.photo.declared.presets import Recipe, on_frame
 from nlfilter_torch.photo.declared.steps import Step
-from nlfilter_torch.photo.declared.strokes import Region, Stroke, meaning_of, thin
+from nlfilter_torch.photo.declared.strokes import Region, Stroke, box_in, meaning_of, thin
 from nlfilter_torch.photo.picture.painting import cover
 from tests.recipes import BLUE
 from tests.strokes import paint
@@ -63,7 +64,7 @@ BAD_STROKES = [
     ({"points": [[0.5, True]]}, "points of a stroke in tone must be pairs of numbers"),
     ({"radius": 0}, r"radius of a stroke in tone must be in \(0, 1\], got 0"),
     ({"radius": None}, r"radius of a stroke in tone must be in \(0, 1\], got null"),
-    ({"paint": "colour"}, "paint of a stroke in tone must be one of a colour such as #c04020, out, add with"),
+    ({"paint": "colour"}, "paint of a stroke in tone must be one of a colour such as #c04020, out, box with"),
     ({"paint": "#12345"}, "paint of a stroke in tone must be one of"),
     ({"width": 1}, "strokes of tone must have the entries points, radius and paint"),
 ]
@@ -90,6 +91,8 @@ def test_thinning_keeps_single_points_and_rounds() -> None:
         ("#2040E0", "object", "#2040E0", None),
         ("in #2040e0", "object", "#2040e0", None),
         ("add 3,2.5,-1", "added", None, (3.0, 2.5, -1.0)),
+        ("box", "box", None, None),
+        ("box #2040e0", "box", "#2040e0", None),
     ],
 )
 def test_a_paint_has_a_role_and_may_say_a_colour_or_sliders(
@@ -101,7 +104,7 @@ def test_a_paint_has_a_role_and_may_say_a_colour_or_sliders(
 @pytest.mark.parametrize("paint", ["", "keep", "in ", "out #2040e0", "in blue", "in 3", "in 3,nan"])
 def test_other_paints_mean_nothing(paint: str) -> None:
     assert meaning_of(paint) is None
-    with pytest.raises(ValueError, match="paint of a mark must be in, out, add, remove or a colour, got"):
+    with pytest.raises(ValueError, match="paint of a mark must be in, out, add, remove, box or a colour, got"):
         _ = Stroke(((0.5, 0.5),), 0.1, paint).role
 
 
@@ -112,6 +115,7 @@ def test_other_paints_mean_nothing(paint: str) -> None:
         {"paint": "out", "ellipse": [0.1, 0.2, 0.7, 0.1]},
         {"paint": "add", "polygon": [[0.1, 0.2], [0.5, 0.25], [0.3, 0.9], [-0.5, 0.5]]},
         {"paint": "in", "rectangle": [[0.5, 0.0], [1.0, 0.5], [0.0, 0.5]]},
+        {"paint": "box", "rectangle": [0.1, 0.2, 0.3, 0.4]},
         {"paint": "in", "mask": "mask.png"},
         {"paint": "in", "layer": "paint.png"},
     ],
@@ -144,8 +148,16 @@ def test_a_region_is_the_same_after_a_file(entries: dict[str, object]) -> None:
             {"paint": "in", "mask": "a.png", "radius": 0.1},
             "strokes of tone must have the entries points, ",
         ),
-        ({"paint": 3, "mask": "a.png"}, "paint of a stroke in tone must be one of in, out, add, remove, got 3"),
+        ({"paint": 3, "mask": "a.png"}, "paint of a stroke in tone must be one of in, out, box, add, remove, got 3"),
         ("in", "strokes of tone must have the entries"),
+        (
+            {"paint": "box", "ellipse": [0.1, 0.2, 0.3, 0.3]},
+            "paint of a stroke in tone must be box for rectangles only, got a different shape, ellipse",
+        ),
+        (
+            {"paint": "box", "points": [[0.1, 0.2]], "radius": 0.1},
+            "paint of a stroke in tone must be box for rectangles only, got a different shape, line",
+        ),
     ],
 )
 def test_bad_regions_are_refused(entries: object, sentence: str) -> None:
@@ -162,12 +174,36 @@ def test_an_edit_takes_what_was_drawn_for_another() -> None:
         COLORIZE.mark_of(entries | {"paint": "out"}, "colorize")
 
 
+def test_a_box_is_the_upright_rectangle_around_a_region_within_the_photograph() -> None:
+    region = Region.upright((0.25, 0.5, 0.5, 0.25), "rectangle", "box")
+    assert box_in(region, (40, 80)) == (20.0, 20.0, 60.0, 30.0)
+    turned = replace(region, points=((0.5, 0.25), (0.75, 0.5), (0.25, 0.5)))
+    assert box_in(turned, (40, 80)) == (20.0, 10.0, 60.0, 30.0)
+    assert box_in(Region.upright((-0.5, 0.5, 1.0, 1.0), "rectangle", "box"), (40, 80)) == (0.0, 20.0, 40.0, 40.0)
+    left, top, right, bottom = box_in(Region.upright((0.99, 0.0, 0.005, 0.001), "rectangle", "box"), (40, 80))
+    assert 79 >= left >= 78
+    assert (right - left, top, bottom) == (1.0, 0.0, 1.0)
+    with pytest.raises(ValueError, match=r"a box must meet the photograph, got one outside it, 96,.*; move it"):
+        box_in(Region.upright((1.2, 0.5, 0.2, 0.2), "rectangle", "box"), (40, 80))
+
+
+def test_a_box_marks_an_object_of_edits_that_compute_masks() -> None:
+    box = Region.upright((0.25, 0.5, 0.5, 0.25), "rectangle", "box")
+    for edit in ("mask", "defocus", "recolor", "detail", "colorize"):
+        declared = MASK if edit == "mask" else EDITS[edit]
+        assert declared.marks_object([box]) == (edit != "colorize")
+        declared.check_mark(box, "a stroke")
+        declared.check_mark(replace(box, paint="box #2040e0"), "a stroke")
+    assert Step("defocus", (box,)).changes()
+    assert not Step("colorize", (box,)).changes()
+
+
 def test_sliders_of_regions_in_files_are_those_of_the_step() -> None:
     entries = {"alpha": [1.0, 1.0, 1.0], "strokes": [{"paint": "in 3,2,1", "rectangle": [0.1, 0.2, 0.3, 0.4]}]}
     step = Step.from_entries("detail", entries, "detail")
     assert step.changes()
     assert not step.changed(strokes=(replace(step.strokes[0], paint="in"),)).changes()
-    with pytest.raises(ValueError, match="must be one of in, out, add, remove, got 'in 3,1e9'"):
+    with pytest.raises(ValueError, match="must be one of in, out, box, add, remove, got 'in 3,1e9'"):
         DETAIL.mark_of({"paint": "in 3,1e9", "mask": "a.png"}, "detail")
     with pytest.raises(ValueError, match="sliders in paint of detail must be as many numbers as alpha"):
         Step.from_entries("detail", entries | {"alpha": [1.0, 1.0]}, "detail")
@@ -187,3 +223,20 @@ def test_pictures_of_marks_lie_beside_their_file() -> None:
     recipe = Recipe.from_json(text, "folder/edit.json")
     assert recipe.steps[0].strokes == (Region.of_file(str(Path("folder/mask.png").absolute()), "mask", "in"),)
     assert Recipe.from_json(recipe.to_json(), "folder/edit.json") == recipe
+
+
+def test_a_box_moves_with_a_crop_and_a_turned_picture() -> None:
+    box = Region.upright((0.25, 0.5, 0.5, 0.25), "rectangle", "box")
+    frame = Development(crop=(0.1, 0.0, 0.6, 0.9)).frame((40, 80))
+    (moved,) = on_frame(Step("defocus", (box,)), frame).strokes
+    assert isinstance(moved, Region)
+    assert box_in(moved, frame.size) == pytest.approx((12.0, 20.0, 40.0, 30.0))
+    turned = Development(straighten=10.0).frame((40, 80))
+    (moved,) = on_frame(Step("defocus", (box,)), turned).strokes
+    assert isinstance(moved, Region)
+    left, top, right, bottom = box_in(moved, turned.size)
+    corners = [turned.inward(*corner) for corner in box.outline]
+    inside = [(min(max(x, 0), 1) * turned.size[1], min(max(y, 0), 1) * turned.size[0]) for x, y in corners]
+    assert all(left - 1e-6 <= x <= right + 1e-6 and top - 1e-6 <= y <= bottom + 1e-6 for x, y in inside)
+    gone = Development(crop=(0.0, 0.0, 0.2, 0.4)).frame((40, 80))
+    assert on_frame(Step("defocus", (box,)), gone).strokes == ()

@@ -1,5 +1,7 @@
 """Colours from strokes: propagation, saturation, and the comparison of both estimates."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
@@ -9,6 +11,7 @@ from torch import Tensor
 from nlfilter_torch.operator.options import FilterOptions
 from nlfilter_torch.photo import colorize
 from nlfilter_torch.photo.edits.colorize import (
+    Method,
     Operators,
     bandwidth_ratio,
     colorize_guide,
@@ -173,6 +176,20 @@ def test_one_pixel_and_all_pixels_may_be_painted() -> None:
     torch.testing.assert_close(coloured[..., 20:21, 30:31], wanted, atol=0.02, rtol=0)
     full = colorize(luminance(image), image, torch.ones(1, 1, 40, 60))
     assert (full - image).abs().mean() < 0.01
+
+
+@pytest.mark.parametrize("method", ["regression", "kmeans"])
+def test_what_lies_outside_a_box_stays_grey(method: Method) -> None:
+    grey = 0.1 * noise(1, 1, 40, 48, dtype=torch.float32) + 0.4
+    strokes, painted = paint(0.9, 0.2, 0.1, box(16, 18, 4, 8, size=(40, 48))), box(16, 18, 4, 8, size=(40, 48))
+    options: dict[str, Any] = {"method": method, "num_landmarks": 50}
+    limited, everywhere = (colorize(grey, strokes, painted, box=b, **options) for b in ((10, 8, 38, 30), None))
+    outside = 1 - box(8, 10, 22, 28, size=(40, 48))
+    torch.testing.assert_close(limited * outside, (grey * outside).expand(-1, 3, -1, -1))
+    assert ((limited[:, 0] - limited[:, 2])[..., 16:20, 18:26] > 0.05).all()
+    assert ((everywhere[:, 0] - everywhere[:, 2])[..., 2:6, 2:6] > 0.05).any()
+    with pytest.raises(ValueError, match=r"^box must hold most of the strokes on its object"):
+        colorize(grey, strokes, painted, box=(0, 0, 9, 9), **options)
 
 
 def test_a_colour_too_strong_for_its_luminance_is_weakened() -> None:

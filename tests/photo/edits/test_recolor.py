@@ -135,6 +135,24 @@ def test_a_batch_is_recoloured_like_its_images_where_only_one_has_a_background()
         torch.testing.assert_close(together[1:], alone)
 
 
+def test_a_box_in_a_colour_recolours_its_object_alone() -> None:
+    image = 0.1 * noise(1, 3, 40, 48, dtype=torch.float32) + 0.2
+    objects = box(10, 8, 16, 12, size=(40, 48)) + box(10, 30, 16, 12, size=(40, 48))
+    image[:, :1] += 0.5 * objects
+    blue = torch.tensor([0.1, 0.2, 0.9]).view(1, 3, 1, 1)
+    results = [
+        recolor(image, strokes, None, box=(5, 6, 24, 30), num_landmarks=50)
+        for strokes in (blue, blue.expand(-1, -1, 40, 48))
+    ]
+    torch.testing.assert_close(*results)
+    changed = (results[0] - image).abs().amax(1, keepdim=True) > 0.05
+    assert changed[..., 12:24, 10:18].float().mean() > 0.9
+    assert torch.equal(results[0][..., 24:], image[..., 24:])
+    assert torch.equal(results[0][..., :6, :], image[..., :6, :])
+    with pytest.raises(TypeError, match=r"stroke_mask must be a torch.Tensor, got NoneType"):
+        recolor(image, None, None, box=(5, 6, 24, 30))
+
+
 def test_a_background_under_the_strokes_is_refused() -> None:
     image, stroke = noise(2, 3, 20, 24), box(4, 4, 8, 8, size=(20, 24)).expand(2, 1, -1, -1)
     strokes = paint(0.1, 0.3, 0.9, stroke)

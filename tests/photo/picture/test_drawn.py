@@ -7,8 +7,8 @@ import torch
 
 from nlfilter_torch.photo.declared.parameters import COLORIZE, DEFOCUS, DETAIL, MASK, RECOLOR
 from nlfilter_torch.photo.declared.strokes import Region, Stroke
-from nlfilter_torch.photo.picture.drawn import drawn_by
-from nlfilter_torch.photo.picture.painting import TensorPainter, colour_of, rasterised
+from nlfilter_torch.photo.picture.drawn import colour_of, drawn_by
+from nlfilter_torch.photo.picture.painting import TensorPainter, rasterised
 from tests.strokes import mask_of
 
 SIZE = (40, 60)
@@ -45,9 +45,48 @@ def test_every_edit_takes_every_mark() -> None:
     with pytest.raises(ValueError, match="paint of strokes of recolor must be one of a colour such as #c04020, out, "):
         drawn_by(RECOLOR, [LINE], SIZE, TensorPainter())
     with pytest.raises(
-        ValueError, match="paint of strokes of colorize must be one of a colour such as #c04020, got 'out'"
+        ValueError, match="paint of strokes of colorize must be one of a colour such as #c04020, box, got 'out'"
     ):
         drawn_by(COLORIZE, marks, SIZE, TensorPainter())
+
+
+AROUND = Region.upright((0.1, 0.2, 0.5, 0.6), "rectangle", "box")
+PIXELS = [6.0, 8.0, 36.0, 32.0]  # of SIZE
+
+
+def test_a_box_takes_the_place_of_scribbles() -> None:
+    for edit in (MASK, DEFOCUS):
+        drawn = drawn_by(edit, [AROUND], SIZE, TensorPainter())
+        assert torch.as_tensor(drawn.box).tolist() == [[PIXELS]]
+        assert (dict(drawn.masks), drawn.colour) == ({}, None)
+    coloured = drawn_by(RECOLOR, [replace(AROUND, paint="box #ff0033")], SIZE, TensorPainter())
+    assert coloured.colour is not None
+    torch.testing.assert_close(coloured.colour, colour_of("#ff0033"))
+    with pytest.raises(ValueError, match="strokes of recolor must be in a colour, or its box must say one, got"):
+        drawn_by(RECOLOR, [AROUND], SIZE, TensorPainter())
+    assert drawn_by(RECOLOR, [AROUND, replace(LINE, paint="#ff0033")], SIZE, TensorPainter()).colour is None
+    with pytest.raises(ValueError, match="strokes of colorize must cover a pixel"):
+        drawn_by(COLORIZE, [AROUND], SIZE, TensorPainter())
+
+
+def test_each_region_has_a_box_and_there_is_one_for_each() -> None:
+    other = Region.upright((0.5, 0.5, 0.5, 0.5), "rectangle", "box 3,1")
+    second = replace(HORIZONTAL, paint="in 3,1")
+    whole = [0.0, 0.0, 60.0, 40.0]
+    for marks, wanted in (
+        ((AROUND,), [PIXELS]),
+        ((other,), [[30.0, 20.0, 60.0, 40.0]]),
+        ((LINE, second, AROUND), [PIXELS, PIXELS]),
+        ((LINE, second, AROUND, other), [PIXELS, [30.0, 20.0, 60.0, 40.0]]),
+        ((LINE, other), [whole, [30.0, 20.0, 60.0, 40.0]]),
+    ):
+        drawn = drawn_by(DETAIL, marks, SIZE, TensorPainter(), (2.0, 1.0))
+        assert drawn.sliders is not None
+        assert len(drawn.sliders) == len(wanted)
+        assert torch.as_tensor(drawn.box).tolist() == [wanted]
+    for edit in (MASK, DETAIL):
+        with pytest.raises(ValueError, match=r"strokes of \w+ must hold one box for each object, got 2; keep the one"):
+            drawn_by(edit, [AROUND, replace(AROUND)], SIZE, TensorPainter(), (2.0, 1.0) if edit is DETAIL else ())
 
 
 def test_marks_of_the_same_sliders_are_one_region() -> None:

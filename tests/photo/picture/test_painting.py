@@ -11,7 +11,8 @@ import torch
 from PIL import Image
 
 from nlfilter_torch.photo.declared.strokes import Region, Stroke
-from nlfilter_torch.photo.picture.painting import colour_of, cover, opened_picture, rasterised
+from nlfilter_torch.photo.picture.drawn import colour_of
+from nlfilter_torch.photo.picture.painting import cover, opened_picture, rasterised
 from tests.strokes import mask_of, paint
 
 SIZE = (40, 60)
