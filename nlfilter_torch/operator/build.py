@@ -446,10 +446,9 @@ def _assemble(
         wanted = options if count == options.num_landmarks else replace(options, num_landmarks=count)
         chosen, assignment = _landmarks(features, whole, wanted, communicator, weights, layout)
     inverse = inverse_cholesky(chosen)
-    alone = (
-        not torch.compiler.is_compiling() and communicator.size == 1
-    )  # ranks send each other nothing that only diagnostics need
-    sample = communicator.columns(features.detach(), _places(math.prod(whole), features)) if alone else None
+    sample = None
+    if communicator.size == 1 and not torch.compiler.is_compiling():  # ranks send nothing that only diagnostics need
+        sample = communicator.columns(features.detach(), sampled_points(math.prod(whole)).to(features.device))
     kernel = Kernel(chosen, inverse, options.completion, features=recipe, assignment=assignment, sample=sample)
     factor, diagonal = whole_kernel = kernel.factor(features)
     if hidden is not None:  # set aside, with row sums of 1
@@ -504,11 +503,6 @@ def _landmarks(
     if weights is None or communicator.size > 1 or not chosen or (layout is None and hidden_points(weights) is None):
         return landmarks_by(features, size, options, communicator, weights, layout)
     return assign_among_counted(features, size, options, weights, layout)
-
-
-def _places(points: int, features: Tensor) -> Tensor:
-    """Numbers of the points whose features are kept, on the device of features."""
-    return sampled_points(points).to(features.device)
 
 
 def _least(weights: Tensor | None, communicator: Communicator) -> Tensor | None:

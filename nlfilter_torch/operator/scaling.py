@@ -24,7 +24,6 @@ a uniform sample misses, converge last. On photographs of a megapixel each sweep
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from functools import partial
 from typing import Protocol, TypeVar, TypeVarTuple
 
 import torch
@@ -132,6 +131,10 @@ class KernelMatrix:
         half = (total / 2).squeeze(2).to(self.factor)
         scaling, actual = sweep(self.factor, self.diagonal, half, most, self.weights)
         return scaling, self.communicator.sum(actual.unsqueeze(2))
+
+    def total(self, values: Tensor) -> Tensor:
+        """Sum (B, 1) of values (B, N) over the pixels that the points represent."""
+        return self.communicator.sum(weighted(values, self.weights).sum(1, keepdim=True))
 
     def at(self, places: Tensor, weights: Tensor) -> "KernelMatrix":
         """A sample of the points, with the numbers (B, n) and their own weights; each rank samples its own rows."""
@@ -405,19 +408,18 @@ def damped(matrix: KernelMatrix, start: Balancing, goal: float) -> Balancing:
         small = bool(matrix.largest(step).max() < SMALL_STEP)
         if bool((residual <= goal).all()) or (small and slow > 2) or not bool(torch.isfinite(step).all()):
             break
-        length = 1.0 if small else _line_search(step.double(), deficit.double(), communicator, weights)
+        length = 1.0 if small else _line_search(matrix, step.double(), deficit.double())
         scaling = (scaling * (1 + length * step)).clamp(min=tiny).to(factor)
     return best
 
 
-def _line_search(step: Tensor, deficit: Tensor, communicator: Communicator, weights: Tensor | None) -> Tensor:
+def _line_search(matrix: KernelMatrix, step: Tensor, deficit: Tensor) -> Tensor:
     """Find s (B, 1) that minimises ``(1 + s x)^T W (1 + s x) / 2 - sum log(1 + s x)``, given x and 1 - W 1 (B, N)."""
-    total = partial(_total, weights=weights, communicator=communicator)
+    total = matrix.total
     # W 1 = 1 - deficit and W x = deficit - x determine the quadratic.
     linear, square = total(step * (1 - deficit)), total(step * (deficit - step))
-    longest = (
-        communicator.max((-step).amax(1, keepdim=True)).clamp(min=1e-12).reciprocal()
-    )  # here the first d reaches zero
+    # Here the first d reaches zero.
+    longest = matrix.communicator.max((-step).amax(1, keepdim=True)).clamp(min=1e-12).reciprocal()
     low, high = torch.zeros_like(longest), 0.999 * longest
     length = torch.minimum(torch.ones_like(high), 0.5 * high)
     for _ in range(40):
@@ -429,11 +431,6 @@ def _line_search(step: Tensor, deficit: Tensor, communicator: Communicator, weig
         inside = (following > low) & (following < high)
         length = torch.where(inside, following, (low + high) / 2)
     return length
-
-
-def _total(values: Tensor, *, weights: Tensor | None, communicator: Communicator) -> Tensor:
-    """Sum (B, 1) of values (B, N) over the pixels that the points represent."""
-    return communicator.sum(weighted(values, weights).sum(1, keepdim=True))
 
 
 def conjugate_gradients(matrix: KernelMatrix, weight: Tensor, right: Tensor, inverse: Tensor) -> Tensor:
@@ -461,14 +458,9 @@ def conjugate_gradients(matrix: KernelMatrix, weight: Tensor, right: Tensor, inv
             break
         direction = preconditioned + size / before.clamp(min=tiny) * direction
     else:
-        _warn_of_unsolved(size, goal * (UNSOLVED / SOLVED[factor.dtype]) ** 2)
+        if not is_hidden(size) and not bool((size <= goal * (UNSOLVED / SOLVED[factor.dtype]) ** 2).all()):
+            warn(
+                "balancing left a linear system unsolved, so that a gradient may be inexact; raise "
+                "photometric_bandwidth or num_landmarks"
+            )
     return solution
-
-
-def _warn_of_unsolved(size: Tensor, allowed: Tensor) -> None:
-    """Warn, on CPUs, if conjugate gradients left more than the allowed squared residual, (B, 1, 1)."""
-    if not is_hidden(size) and not bool((size <= allowed).all()):
-        warn(
-            "balancing left a linear system unsolved, so that a gradient may be inexact; raise photometric_bandwidth "
-            "or num_landmarks"
-        )
