@@ -1,8 +1,10 @@
 """One edit for all frames of a film, without flicker."""
 
-from collections.abc import Callable, Iterable
-from functools import partial
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol
 
 import torch
 
@@ -13,13 +15,27 @@ from nlfilter_torch.photo.cli.progress import steps
 from nlfilter_torch.photo.cli.showing import notes_if_idle
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.edits.film import FilmEdit, FrameArray, film_steps
-from nlfilter_torch.photo.files.films import check_film_output, is_film, open_film, write_film
+from nlfilter_torch.photo.files.films import check_film_output, is_film, open_film
 from nlfilter_torch.photo.files.rows import TILED_MEMORY
 from nlfilter_torch.photo.files.writing import check_folder
 from nlfilter_torch.photo.picture.photographs import Photograph, check_output, read_photograph, write_photograph
 from nlfilter_torch.photo.picture.tiles import Passes
 
 BYTES_PER_PIXEL = 100  # bytes per pixel of a frame, besides those of the edit, which is tiled
+
+
+class Frames(Protocol):
+    """The frames of a film, or of a folder."""
+
+    @property
+    def count(self) -> int:
+        """Number of frames; that of a film is approximate."""
+
+    def sample(self, count: int) -> list[FrameArray]:
+        """Some of the frames (H, W, C), spread over all."""
+
+    def write(self, path: Path, edit: Callable[[FrameArray], FrameArray], begin: Callable[[str], None], /) -> int:
+        """Write every frame edited to a film or folder, after telling ``begin`` which; return their number."""
 
 
 def edit_frames(
@@ -32,47 +48,27 @@ def edit_frames(
     film_steps(recipe.steps)
     film = is_film(source) and not source.is_dir()
     what = "the film is encoded again" if film else "the photographs are written"
-    notes = notes_if_idle(recipe, name, what)
     passes = Passes("float32", memory=allowed_memory(memory, TILED_MEMORY))
-    work = edit_film if film else edit_stills
-    return work(source, target, references, partial(fitted, recipe, passes, seed, notes))
+    with _film(source, target) if film else _stills(source, target) as frames, steps(frames.count + 1) as begin:
+        begin("Fitting to sample frames")
+        samples = frames.sample(references)
+        for note in notes_if_idle(recipe, name, what):
+            options.note(note)
+        return frames.write(target, FilmEdit(recipe.steps, samples, passes=passes, seed=seed), begin)
 
 
-def fitted(recipe: Recipe, passes: Passes, seed: int, notes: Iterable[str], samples: list[FrameArray]) -> FilmEdit:
-    """Print the notes on the options, and fit an edit to frames that have been read."""
-    for note in notes:
-        options.note(note)
-    return FilmEdit(recipe.steps, samples, passes=passes, seed=seed)
-
-
-def edit_film(source: Path, target: Path, references: int, fit: Callable[[list[FrameArray]], FilmEdit]) -> int:
-    """Edit a film, and return the number of its frames."""
+@contextmanager
+def _film(source: Path, target: Path) -> Iterator[Frames]:
+    """The frames of a film that is edited to another one."""
     if target.exists() and target.samefile(source):
         raise ValueError(f"OUT must be another file than the film, got {target}; choose another name")
     check_film_output(target)
-    with open_film(source) as film, steps(film.count + 1) as begin:
-        begin("Fitting to sample frames")
-        edit = fit(film.sample(references))
-        return write_film(film, target, edit, lambda number: begin(f"Frame {number + 1} of {film.count}"))
+    with open_film(source) as film:
+        yield film
 
 
-def edit_stills(source: Path, target: Path, references: int, fit: Callable[[list[FrameArray]], FilmEdit]) -> int:
-    """Edit the photographs in a folder, and return their number."""
-    paths = frames_of(source, target)
-    folder, reader = EditedFrames(target, check_replaced(paths, target)), FrameReader()
-    with steps(len(paths) + 1) as begin:
-        begin("Fitting to sample frames")
-        spread = torch.linspace(0, len(paths) - 1, min(references, len(paths))).round().long().tolist()
-        edit = fit([reader(paths[i])[1] for i in spread])
-        for path in paths:
-            begin(path.name)
-            photograph, rows = reader(path)
-            folder.prepare(photograph, path.name, paths)
-            folder.write(photograph, edit(rows), path.name)
-    return len(paths)
-
-
-def frames_of(source: Path, target: Path) -> list[Path]:
+@contextmanager
+def _stills(source: Path, target: Path) -> Iterator[Frames]:
     """The photographs in a folder, of which edited ones can be written to another folder."""
     if source.is_file():
         raise ValueError(f"{source} must be a film (.mp4, .m4v or .mov) or a folder; convert it")
@@ -82,50 +78,63 @@ def frames_of(source: Path, target: Path) -> list[Path]:
     if is_film(target) and not target.is_dir():
         raise ValueError(f"OUT must be a folder, as FRAMES is one, got {target}; choose the name of a folder")
     check_folder(target)
-    return paths
+    yield Stills(paths, check_replaced(paths, target))
 
 
-class FrameReader:
-    """Reads photographs, which must have the size and channels of the first of them."""
+@dataclass
+class Stills:
+    """Photographs, which must have the size and channels of the first of them that is read.
 
-    def __init__(self) -> None:
-        self._shape: tuple[int, ...] = ()
+    Attributes:
+        paths: their files.
+        written: names of files that an earlier run wrote to the folder of the edited ones.
+        shape: (H, W, C) of the first; empty before it is read.
+    """
 
-    def __call__(self, path: Path) -> tuple[Photograph, FrameArray]:
+    paths: list[Path]
+    written: set[str]
+    shape: tuple[int, ...] = ()
+
+    @property
+    def count(self) -> int:
+        """Number of photographs."""
+        return len(self.paths)
+
+    def sample(self, count: int) -> list[FrameArray]:
+        """Some of the photographs, spread over all."""
+        spread = torch.linspace(0, self.count - 1, min(count, self.count)).round().long().tolist()
+        return [self._read(self.paths[i])[1] for i in spread]
+
+    def write(self, folder: Path, edit: Callable[[FrameArray], FrameArray], begin: Callable[[str], None]) -> int:
+        """Write every photograph edited to a folder, which is made when it is known that it can hold the first."""
+        is_new, is_begun = not folder.exists(), False
+        for path in self.paths:
+            begin(path.name)
+            photograph, rows = self._read(path)
+            folder.mkdir(exist_ok=True)
+            try:
+                check_output(folder / path.name, photograph)
+            except ValueError:
+                if is_new and not is_begun:
+                    folder.rmdir()
+                raise
+            if not is_begun:
+                record_written(folder, self.written | {path.name for path in self.paths})
+            is_begun = True
+            pixels = torch.from_numpy(edit(rows)).permute(2, 0, 1)[None]
+            write_photograph(photograph.with_pixels(pixels), folder / path.name)
+        return self.count
+
+    def _read(self, path: Path) -> tuple[Photograph, FrameArray]:
         """A photograph, and its pixels (H, W, C)."""
         photograph = read_photograph(path, bytes_per_pixel=BYTES_PER_PIXEL)
         rows = photograph.pixels[0].permute(1, 2, 0).float().contiguous().numpy()
-        self._shape = self._shape or rows.shape
-        if rows.shape != self._shape:
+        self.shape = self.shape or rows.shape
+        if rows.shape != self.shape:
             expected, actual = (
-                f"{height}x{width} and {colours} channel(s)" for height, width, colours in (self._shape, rows.shape)
+                f"{height}x{width} and {colours} channel(s)" for height, width, colours in (self.shape, rows.shape)
             )
             raise ValueError(
                 f"{path} must have the size and channels of the first frame, {expected}, got {actual}; convert it"
             )
         return photograph, rows
-
-
-class EditedFrames:
-    """The folder of the edited frames; ``written`` are the names of files that an earlier run wrote there."""
-
-    def __init__(self, folder: Path, written: set[str]) -> None:
-        self._folder, self._written = folder, written
-        self._is_new, self._is_begun = not folder.exists(), False
-
-    def prepare(self, photograph: Photograph, name: str, paths: list[Path]) -> None:
-        """Create the folder, record the names of all frames there, and check that it can hold a photograph."""
-        self._folder.mkdir(exist_ok=True)
-        try:
-            check_output(self._folder / name, photograph)
-        except ValueError:
-            if self._is_new and not self._is_begun:
-                self._folder.rmdir()
-            raise
-        if not self._is_begun:
-            record_written(self._folder, self._written | {path.name for path in paths})
-        self._is_begun = True
-
-    def write(self, photograph: Photograph, rows: FrameArray, name: str) -> None:
-        """Write a photograph with other pixels (H, W, C)."""
-        write_photograph(photograph.with_pixels(torch.from_numpy(rows).permute(2, 0, 1)[None]), self._folder / name)

@@ -165,6 +165,41 @@ class Film:
         start = self.stream.start_time or 0
         return start, self.stream.duration or (entries[-1].timestamp - start + 1 if len(entries) else 1)
 
+    def write(self, path: Path, edit: Callable[[Floats], Floats], begin: Callable[[str], None]) -> int:
+        """Write the film, which is read from its start, with every frame edited; it appears complete or not at all.
+
+        Args:
+            path: path of an mp4 or mov file.
+            edit: function from a frame (H, W, 3) in [0, 1] to one of the same size; values may leave [0, 1].
+            begin: called with the number of each frame, in words, before it is edited.
+
+        Returns:
+            The number of frames.
+
+        Raises:
+            ValueError: if the film cannot be decoded, or ``path`` cannot hold its codecs.
+            OSError: if the file cannot be written.
+        """
+        kind = check_film_output(path)
+        av = _av()
+        path = link_target(path)
+        with part_beside(path) as beside:
+            beside.touch(exist_ok=False)
+            with claimed(beside):
+                options = {"movflags": "+faststart" + ("+use_metadata_tags" if kind == "mov" else "")}
+                try:
+                    with av.open(str(beside), "w", format=kind, options=options) as output:
+                        count = _Transcoder(self, output, path, _encoder(self, output, path)).run(edit, begin)
+                except av.error.FFmpegError as error:
+                    if isinstance(error, OSError) and error.filename:
+                        raise
+                    raise OSError(
+                        f"{path} cannot be written: {error.strerror}; free some space there, or choose another file "
+                        "type"
+                    ) from error
+                beside.replace(path)
+        return count
+
 
 @contextmanager
 def open_film(path: Path) -> Iterator[Film]:
@@ -205,42 +240,6 @@ def _has_alpha(pix_fmt: str) -> bool:
     return pix_fmt.startswith(("yuva", "rgba", "bgra", "argb", "abgr", "gbrap", "ya"))
 
 
-def write_film(film: Film, path: Path, edit: Callable[[Floats], Floats], begin: Callable[[int], None]) -> int:
-    """Write a film with every frame edited; the file appears complete or not at all.
-
-    Args:
-        film: the film, read from its start.
-        path: path of an mp4 or mov file.
-        edit: function from a frame (H, W, 3) in [0, 1] to one of the same size; values may leave [0, 1].
-        begin: called with the number of each frame before it is edited.
-
-    Returns:
-        The number of frames.
-
-    Raises:
-        ValueError: if the film cannot be decoded, or ``path`` cannot hold its codecs.
-        OSError: if the file cannot be written.
-    """
-    kind = check_film_output(path)
-    av = _av()
-    path = link_target(path)
-    with part_beside(path) as beside:
-        beside.touch(exist_ok=False)
-        with claimed(beside):
-            options = {"movflags": "+faststart" + ("+use_metadata_tags" if kind == "mov" else "")}
-            try:
-                with av.open(str(beside), "w", format=kind, options=options) as output:
-                    count = _Transcoder(film, output, path, _encoder(film, output, path)).run(edit, begin)
-            except av.error.FFmpegError as error:
-                if isinstance(error, OSError) and error.filename:
-                    raise
-                raise OSError(
-                    f"{path} cannot be written: {error.strerror}; free some space there, or choose another file type"
-                ) from error
-            beside.replace(path)
-    return count
-
-
 @dataclass(frozen=True)
 class _Transcoder:
     """Writes the edited frames and the other streams of a film to an open container.
@@ -261,8 +260,8 @@ class _Transcoder:
     copied: dict[int, "Stream"] = field(default_factory=dict)
     durations: dict[int | None, int] = field(default_factory=dict)
 
-    def run(self, edit: Callable[[Floats], Floats], begin: Callable[[int], None]) -> int:
-        """Write everything, see :func:`write_film`; return the number of frames."""
+    def run(self, edit: Callable[[Floats], Floats], begin: Callable[[str], None]) -> int:
+        """Write everything, see :meth:`Film.write`; return the number of frames."""
         source = self.film.container
         self._add_copies()
         entries = {key: text for key, text in source.metadata.items() if key not in CONTAINER_METADATA}
@@ -276,8 +275,8 @@ class _Transcoder:
                 self._copy(packet)
                 continue
             for frame in self.film.decoded(cast("Packet[VideoStream]", packet), count):
-                begin(count)
                 count += 1
+                begin(f"Frame {count} of {self.film.count}")
                 self.durations[frame.pts] = frame.duration
                 edited = _stored(self.film, frame, edit(self.film.pixels(frame)), self.target)
                 self._write(self.target.encode(edited))
@@ -317,31 +316,17 @@ class _Transcoder:
 def stored_format(wanted: "VideoFormat", name: str) -> tuple[str, "VideoFormat"]:
     """The format nearest to that of a film which an encoder offers, or its relative for RGB, and the encoder's name.
 
-    Chroma of the same resolution counts more than RGB, and that more than the depth.
+    RGB, or YCbCr, counts more than the resolution of chroma, and that more than the depth.
     """
     av = _av()
     names = [name, *([OF_RGB[name]] if name in OF_RGB and wanted.is_rgb else [])]
-    offered = [(encoder, form) for encoder in names for form in av.codec.Codec(encoder, "w").video_formats or ()]
-    plain = [(encoder, form) for encoder, form in offered if len(form.components) in (1, 3)]
-    return min(plain, key=lambda pair: _distance(wanted, pair[1]))
-
-
-def _distance(wanted: "VideoFormat", stored: "VideoFormat") -> tuple[object, ...]:
-    """What a format lacks of another one, most important first, and then what it has more."""
-    (across, down), (stored_across, stored_down) = chroma_block(wanted), chroma_block(stored)
-    bits, stored_bits = wanted.components[0].bits, stored.components[0].bits
-    return (
-        len(stored.components) < len(wanted.components),
-        stored_across > across or stored_down > down,
-        stored.is_rgb != wanted.is_rgb,
-        stored_bits < bits,
-        stored.name != wanted.name,
-        across + down - stored_across - stored_down,
-        len(stored.components),
-        stored_bits,
-        stored.name.startswith("yuvj"),
-        stored.padded_bits_per_pixel - stored.bits_per_pixel,
-    )
+    offered = [(form, encoder) for encoder in names for form in av.codec.Codec(encoder, "w").video_formats or ()]
+    plain = [(form, encoder) for form, encoder in offered if len(form.components) in (1, 3)]
+    encoders = {form.name: encoder for form, encoder in plain if form.is_rgb == wanted.is_rgb} or {
+        form.name: encoder for form, encoder in plain
+    }
+    best, _ = av.codec.codec.find_best_pix_fmt_of_list(list(encoders), wanted)
+    return encoders[best.name], best
 
 
 def chroma_block(form: "VideoFormat") -> tuple[int, int]:

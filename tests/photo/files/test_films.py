@@ -8,13 +8,13 @@ import av
 import numpy as np
 import pytest
 
-from nlfilter_torch.photo.files.films import changes_between, open_film, stored_format, write_film
+from nlfilter_torch.photo.files.films import changes_between, open_film, stored_format
 from tests.films import crop, facts, write
 
 
 def copy(source: Path, target: Path, edit: Any = lambda frame: frame) -> int:
     with open_film(source) as film:
-        return write_film(film, target, edit, lambda number: None)
+        return film.write(target, edit, lambda number: None)
 
 
 @pytest.mark.parametrize(
@@ -82,6 +82,7 @@ def test_what_an_encoder_lacks_is_named(tmp_path: Path) -> None:
         ("yuv440p", "libx264"): "yuv444p",
         ("yuyv422", "libx264"): "yuv422p",
         ("p010le", "libx265"): "yuv420p10le",
+        ("yuv444p12le", "libx264"): "yuv444p10le",
         ("gray", "libx264"): "gray",
         ("gbrp", "libx265"): "gbrp",
         ("rgb48le", "libx264"): "bgr24",
@@ -140,7 +141,7 @@ def test_samples_are_spread_over_the_film(tmp_path: Path) -> None:
         places = [next(i for i, frame in enumerate(frames) if np.array_equal(frame, sample)) for sample in samples]
         assert places[0] < 4 < places[1] < 8 < places[2]
         assert 1 <= len(film.sample(100)) <= 12
-        count = write_film(film, tmp_path / "out.mp4", lambda frame: frame, lambda number: None)  # again from the start
+        count = film.write(tmp_path / "out.mp4", lambda frame: frame, lambda number: None)  # again from the start
     assert count == 12
 
 
