@@ -9,7 +9,7 @@ from dataclasses import replace
 from functools import partial
 from mmap import ACCESS_READ, mmap
 from pathlib import Path
-from typing import BinaryIO, Literal
+from typing import Literal
 
 import numpy as np
 import psutil
@@ -20,7 +20,7 @@ from nlfilter_torch.photo.files import codecs, jpeg, png, tiff
 from nlfilter_torch.photo.files import exif as exif_tags
 from nlfilter_torch.photo.files.decoded import CheckSize, Decoded, Header, decoding
 from nlfilter_torch.photo.files.exif_in_tiff import shortened
-from nlfilter_torch.photo.files.metadata import Metadata, UnhandledImage
+from nlfilter_torch.photo.files.metadata import Metadata, UnhandledImage, note_left_out
 from nlfilter_torch.photo.files.writing import check_file, open_beside
 
 Depth = Literal["uint8", "uint16", "float16", "float32", "float64"]
@@ -129,43 +129,38 @@ def _check_size(
     check_memory(path, *size, bytes_per_pixel * (1 + double), memory)
 
 
-def encode(
-    stream: BinaryIO,
-    kind: str,
-    rows: Iterable[Stored],
-    header: Header,
-    quality: int | None = None,
-) -> list[str]:
-    """Write rows (h, W, S) of a picture as an image file of a type in :data:`DEPTHS`.
+def write_file(path: Path, picture: Stored | Iterable[Stored], header: Header, quality: int | None = None) -> None:
+    """Write a picture (H, W, S), or its rows as they are computed, to a file of a type in :data:`SUFFIXES`.
 
-    ``quality`` is that of JPEG files; None is the default.
-    Returns the names of metadata that are left out.
+    The file appears complete or not at all. ``quality`` is that of JPEG files; None is the default. A thumbnail shows
+    the picture, or is left out where rows are written, and in TIFF. Warns of metadata that are left out.
     """
-    extras = header.metadata.extras
-    left_out = [*extras.left_out, *(part.name for part in extras.parts if part.kind != kind)]
-    if kind == "TIFF":
-        return left_out + tiff.write(stream, np.concatenate(list(rows)), header)
-    left_out += extras.lacking_tags()
-    if kind == "PNG":
-        png.write_png(stream, rows, header)
-    elif kind == "JPEG":
-        metadata, lacking = fitting_jpeg(header.metadata)
+    kind = SUFFIXES[path.suffix.lower()]
+    metadata, extras, left_out = header.metadata, header.metadata.extras, list[str]()
+    if metadata.exif is not None and exif_tags.has_thumbnail(metadata.exif):
+        shown = picture if isinstance(picture, np.ndarray) and kind != "TIFF" else None
+        metadata = replace(metadata, exif=exif_tags.refreshed(metadata.exif, shown))
+        left_out += [] if exif_tags.has_thumbnail(metadata.exif) else ["the thumbnail"]
+    left_out += [*extras.left_out, *(part.name for part in extras.parts if part.kind != kind)]
+    left_out += [] if kind == "TIFF" else extras.lacking_tags()
+    if kind == "JPEG":
+        metadata, lacking = fitting_jpeg(metadata)
         left_out += lacking
-        jpeg.write_jpeg(stream, rows, replace(header, metadata=metadata), quality or jpeg.USUAL_QUALITY)
-    else:
-        if extras.dpi is not None and exif_tags.resolution(header.metadata.exif) is None:
-            left_out.append("the print resolution")
-        whole = np.concatenate(list(rows))
-        codecs.write_by_pillow(stream, kind, whole[..., 0] if header.shape[2] == 1 else whole, header.metadata)
-    return left_out
-
-
-def with_thumbnail(metadata: Metadata, channels: Stored | None) -> tuple[Metadata, list[str]]:
-    """Metadata whose thumbnail, if they have any, shows channels (H, W, S), or is left out and named."""
-    if metadata.exif is None or not exif_tags.has_thumbnail(metadata.exif):
-        return metadata, []
-    block = exif_tags.refreshed(metadata.exif, channels)
-    return replace(metadata, exif=block), [] if exif_tags.has_thumbnail(block) else ["the thumbnail"]
+    header = replace(header, metadata=metadata)
+    rows = [picture] if isinstance(picture, np.ndarray) else picture
+    with open_beside(path) as stream:
+        if kind == "TIFF":
+            left_out += tiff.write(stream, picture, header)
+        elif kind == "PNG":
+            png.write_png(stream, rows, header)
+        elif kind == "JPEG":
+            jpeg.write_jpeg(stream, rows, header, quality or jpeg.USUAL_QUALITY)
+        else:
+            if extras.dpi is not None and exif_tags.resolution(metadata.exif) is None:
+                left_out.append("the print resolution")
+            whole = np.concatenate(list(rows))
+            codecs.write_by_pillow(stream, kind, whole[..., 0] if header.shape[2] == 1 else whole, metadata)
+    note_left_out(path, left_out)
 
 
 def fitting_jpeg(metadata: Metadata) -> tuple[Metadata, list[str]]:

@@ -27,17 +27,16 @@ from nlfilter_torch.photo.files.exif import of_part, upright
 from nlfilter_torch.photo.files.formats import (
     TooLarge,
     check_type,
-    encode,
     first_bytes,
     is_jpeg,
     is_png,
     read_channels,
-    with_thumbnail,
+    write_file,
 )
-from nlfilter_torch.photo.files.metadata import NO_METADATA, Metadata, note_left_out
+from nlfilter_torch.photo.files.metadata import NO_METADATA, Metadata
 from nlfilter_torch.photo.files.scratch import Scratch
 from nlfilter_torch.photo.files.tiff import TiffRows
-from nlfilter_torch.photo.files.writing import check_file, claimed, link_target, name_beside, open_beside, part_beside
+from nlfilter_torch.photo.files.writing import check_file, claimed, link_target, name_beside, part_beside
 
 ZARR = ".zarr"
 CHUNK_SIDE = 256  # side of the chunks of a new zarr array
@@ -182,16 +181,8 @@ def write_picture(
     if path.suffix.lower() == ZARR:
         _write_zarr(path, rows, dtype, like, fill)
         return
-    kind = check_type(path, depth, like.alpha)
-    with open_beside(path) as stream:
-        values = (part for _, part in rows)
-        metadata, left_out = with_thumbnail(like.metadata, None)
-        header = Header(shape, dtype, like.alpha, metadata)
-        if kind == "TIFF":
-            left_out += tiff.write_rows(stream, values, header)
-        else:
-            left_out += encode(stream, kind, values, header, quality)
-    note_left_out(path, left_out)
+    check_type(path, depth, like.alpha)
+    write_file(path, (part for _, part in rows), Header(shape, dtype, like.alpha, like.metadata), quality)
 
 
 def free_memory() -> int:

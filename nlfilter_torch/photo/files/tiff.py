@@ -7,7 +7,7 @@ import struct
 from collections.abc import Iterable, Iterator
 from mmap import ACCESS_READ, mmap
 from pathlib import Path
-from typing import BinaryIO, TypedDict, Unpack
+from typing import BinaryIO
 
 import numpy as np
 import tifffile
@@ -37,23 +37,9 @@ XMP, SUB_FILES = 700, 330  # tags
 TILE_SIZE = 256  # side of the tiles that are written
 MAX_CLASSIC_BYTES = 4_000_000_000  # bytes of pixels above which a BigTIFF is written
 _ASSOCIATED = tifffile.EXTRASAMPLE.ASSOCALPHA
+Resolution = tuple[float | tuple[int, int], float | tuple[int, int]]  # across and down
 MOST_PAGES = 100  # that are counted
 CACHED_BANDS = 2  # cached bands of strips or tiles: rows shared by two tiles of a picture span at most two
-
-
-class _Resolution(TypedDict, total=False):
-    """Options of tifffile for the print resolution."""
-
-    resolution: tuple[float | tuple[int, int], float | tuple[int, int]]
-    resolutionunit: int
-
-
-class _Options(TypedDict, total=False):
-    """Further options of tifffile."""
-
-    tile: tuple[int, int]
-    maxworkers: int
-    buffersize: int
 
 
 def is_tiff(head: bytes) -> bool:
@@ -168,23 +154,6 @@ def read_metadata(file: tifffile.TiffFile, stream: BinaryIO, depth: str) -> tupl
     return orientation, Metadata(icc, exif, extras)
 
 
-def write_rows(
-    stream: BinaryIO,
-    rows: Iterable[Stored],
-    header: Header,
-) -> list[str]:
-    """Write rows (h, W, S) of a picture as they arrive, in tiles; large files become BigTIFF.
-
-    Returns what is left out, see :func:`write`.
-    """
-    _, width, samples = header.shape
-    big = math.prod(header.shape) * header.dtype.itemsize > MAX_CLASSIC_BYTES
-    # Compressing ahead in threads would queue hundreds of megabytes.
-    size = TILE_SIZE * TILE_SIZE * samples * header.dtype.itemsize
-    options = _Options(maxworkers=1, buffersize=size, tile=(TILE_SIZE, TILE_SIZE))
-    return write(stream, _tiles(rows, width), header, big, **options)
-
-
 def _tiles(rows: Iterable[Stored], width: int) -> Iterator[Stored]:
     """Cut rows (h, W, S) into square tiles, padded with zeros, without the last axis if S = 1."""
     for band in bands(rows, TILE_SIZE):
@@ -194,34 +163,35 @@ def _tiles(rows: Iterable[Stored], width: int) -> Iterator[Stored]:
             yield padded[..., 0] if padded.shape[2] == 1 else padded
 
 
-def write(
-    stream: BinaryIO,
-    data: Stored | Iterator[Stored],
-    header: Header,
-    big: bool = False,
-    **options: Unpack[_Options],
-) -> list[str]:
-    """Write a picture (H, W, S), or an iterator over its tiles, compressed without loss.
+def write(stream: BinaryIO, picture: Stored | Iterable[Stored], header: Header) -> list[str]:
+    """Write a picture (H, W, S), or its rows (h, W, S) as they arrive, in tiles, compressed without loss.
 
-    ``options`` are those of :func:`tifffile.imwrite`. Returns the names of metadata that are left out.
+    Large files become BigTIFF. Returns the names of metadata that are left out.
     """
     metadata, dtype = header.metadata, header.dtype
     shape = header.shape[:2] if header.shape[2] == 1 else header.shape
+    big = math.prod(header.shape) * dtype.itemsize > MAX_CLASSIC_BYTES
+    is_whole = isinstance(picture, np.ndarray)
     extras = metadata.extras
     kept = extras.tags_for(header.shape[:2], dtype.name)
     head = exif_in_tiff.opening(metadata.exif, kept[0].order if kept else "<", big)
     tags = [tag.stored(head.order) for tag in (*head.tags, *kept) if tag.code not in RESOLUTION]
     if extras.xmp is not None:
         tags.append((XMP, 1, 0, extras.xmp, True))
+    resolution, unit = _resolution(extras, kept)
     # tifffile does not write nested tables, so a placeholder tag with the next lower number reserves space for each.
     places = [(code - 1, LONG, 1, 0, True) for code in head.nested]
     start = stream.tell()
     with tifffile.TiffWriter(stream, bigtiff=big, byteorder=head.order) as file:  # type: ignore[arg-type]
         stream.write(head.body)
         file.write(
-            data.reshape(shape) if isinstance(data, np.ndarray) else data,
+            picture.reshape(shape) if isinstance(picture, np.ndarray) else _tiles(picture, header.shape[1]),
             shape=shape,
-            dtype=None if isinstance(data, np.ndarray) else dtype,
+            dtype=None if is_whole else dtype,
+            tile=None if is_whole else (TILE_SIZE, TILE_SIZE),
+            # Compressing tiles ahead in threads would queue hundreds of megabytes.
+            maxworkers=None if is_whole else 1,
+            buffersize=None if is_whole else TILE_SIZE * TILE_SIZE * header.shape[2] * dtype.itemsize,
             photometric="rgb" if len(shape) == 3 and shape[2] >= 3 else "minisblack",
             planarconfig="contig" if len(shape) == 3 else None,
             extrasamples=["unassalpha"] if header.alpha else None,
@@ -231,8 +201,8 @@ def write(
             extratags=[(ORIENTATION, SHORT, 1, 1, True), *tags, *places],
             metadata=None,
             software=False,
-            **_resolution(extras, kept),
-            **options,
+            resolution=resolution,
+            resolutionunit=unit,
         )
     stream.seek(start)
     with tifffile.TiffFile(stream) as written:
@@ -242,16 +212,16 @@ def write(
     return extras.lacking_tags(kept) + [exif_in_tiff.MOVED] * head.moved
 
 
-def _resolution(extras: Extras, tags: Iterable[Tag]) -> _Resolution:
-    """The resolution as stored in a TIFF file, or else in dpi."""
+def _resolution(extras: Extras, tags: Iterable[Tag]) -> tuple[Resolution | None, int | None]:
+    """The resolution and its unit as stored in a TIFF file, or else in dpi."""
     kinds: dict[int, int] = dict(zip(RESOLUTION, (RATIONAL, RATIONAL, SHORT), strict=True))
     stored = {tag.code: tag for tag in tags if tag.kind == kinds.get(tag.code) and tag.count == 1}
     values = [struct.unpack(stored[code].order + "II", stored[code].data) for code in RESOLUTION[:2] if code in stored]
     unit = stored.get(RESOLUTION[2])
     if len(values) == 2:
         number = tifffile.RESUNIT.INCH if unit is None else struct.unpack(unit.order + "H", unit.data)[0]
-        return _Resolution(resolution=(values[0], values[1]), resolutionunit=number)
-    return {} if extras.dpi is None else _Resolution(resolution=extras.dpi, resolutionunit=tifffile.RESUNIT.INCH)
+        return (values[0], values[1]), number
+    return extras.dpi, None if extras.dpi is None else tifffile.RESUNIT.INCH
 
 
 def _unmultiplied(channels: Stored) -> Stored:

@@ -17,9 +17,8 @@ from nlfilter_torch.photo.declared.development import Development, Frame
 from nlfilter_torch.photo.declared.rows import NodataRows, Stored, is_hidden, keep_apart
 from nlfilter_torch.photo.files.decoded import Header
 from nlfilter_torch.photo.files.exif import of_part
-from nlfilter_torch.photo.files.formats import Depth, check_depth, check_type, encode, read_channels, with_thumbnail
-from nlfilter_torch.photo.files.metadata import NO_EXTRAS, Extras, Metadata, note_left_out
-from nlfilter_torch.photo.files.writing import open_beside
+from nlfilter_torch.photo.files.formats import Depth, check_depth, check_type, read_channels, write_file
+from nlfilter_torch.photo.files.metadata import NO_EXTRAS, Extras, Metadata
 from nlfilter_torch.photo.picture.developing import develop_planes, finished, in_light, limits_of
 from nlfilter_torch.photo.picture.pictures import Picture, put_back, stored_as, transparency
 
@@ -169,20 +168,16 @@ def write_photograph(photograph: Photograph, path: str | Path, *, quality: int |
     if quality is not None:
         check_count(quality, "quality", most=100)
     path = Path(path)
-    kind = check_output(path, photograph)
+    check_output(path, photograph)
     planes = [photograph.pixels] if photograph.alpha is None else [photograph.pixels, photograph.alpha]
     rows = max(1, CONVERTED // photograph.size[1])
     parts = zip(*(plane.split(rows, dim=2) for plane in planes), strict=True)
     channels = np.concatenate([stored_as(torch.cat(part, dim=1), photograph.depth) for part in parts])  # (H, W, S)
     if photograph.hidden is not None:
         photograph.hidden.put_back(channels)
-    alpha = photograph.alpha is not None
-    with open_beside(path) as stream:
-        metadata, left_out = with_thumbnail(photograph.metadata, None if kind == "TIFF" else channels)
-        height, width, samples = channels.shape
-        header = Header((height, width, samples), channels.dtype, alpha, metadata)
-        left_out += encode(stream, kind, [channels], header, quality)
-    note_left_out(path, left_out)
+    height, width, samples = channels.shape
+    header = Header((height, width, samples), channels.dtype, photograph.alpha is not None, photograph.metadata)
+    write_file(path, channels, header, quality)
 
 
 def check_output(path: str | Path, photograph: Photograph) -> str:
