@@ -13,20 +13,23 @@ from typing import BinaryIO
 
 import imagecodecs
 import numpy as np
-from PIL import AvifImagePlugin, Image, ImageFile
+from PIL import AvifImagePlugin, Image
 
 from nlfilter_torch.photo.declared.rows import Stored
 from nlfilter_torch.photo.files import exif as exif_tags
 from nlfilter_torch.photo.files import exif_in_tiff, jpeg
-from nlfilter_torch.photo.files.decoded import CheckSize, Decoded, decoding, quiet
 from nlfilter_torch.photo.files.metadata import (
     DEPTH,
     FURTHER_PICTURES,
     GAIN_MAP,
+    CheckSize,
+    Decoded,
     Extras,
     Metadata,
     UnhandledImage,
     check_colour_numbers,
+    decoding,
+    quiet,
     upright_packet,
 )
 from nlfilter_torch.photo.files.tables import EXIF, TiffTables
@@ -58,11 +61,18 @@ def read_webp(path: Path, data: bytes | mmap, check_size: CheckSize) -> Decoded:
         raise UnhandledImage(f"{path} is an animation of {frames} frames; save one of them as a picture")
     by_name = dict(chunks)
     check_size(_webp_size(by_name))
+    left_out = [f"the chunk {name.decode('latin-1').strip()}" for name in by_name if name not in WEBP_CHUNKS]
     upright = exif_tags.read_upright(by_name.get(b"EXIF"))
-    packet, left_out = upright_packet(by_name.get(b"XMP "), upright.orientation)
-    left_out += [f"the chunk {name.decode('latin-1').strip()}" for name in by_name if name not in WEBP_CHUNKS]
     channels = np.asarray(imagecodecs.webp_decode(data))
-    metadata = Metadata(by_name.get(b"ICCP"), upright.block, Extras(packet, left_out=(*left_out, *upright.left_out)))
+    return _decoded(channels, by_name.get(b"ICCP"), upright, by_name.get(b"XMP "), left_out)
+
+
+def _decoded(
+    channels: Stored, icc: bytes | None, upright: exif_tags.Upright, xmp: bytes | None, left_out: list[str]
+) -> Decoded:
+    """Decoded channels (H, W) or (H, W, S), with a profile, an EXIF block and a packet of XMP."""
+    packet, stated = upright_packet(xmp, upright.orientation)
+    metadata = Metadata(icc, upright.block, Extras(packet, left_out=(*stated, *left_out, *upright.left_out)))
     return Decoded(channels.reshape(*channels.shape[:2], -1), upright.orientation, metadata)
 
 
@@ -103,20 +113,12 @@ def read_avif(path: Path, data: bytes | mmap, check_size: CheckSize) -> Decoded:
         # The block as stored: image.info may hold one that Pillow wrote anew.
         block, orientation = image._decoder.get_info()[4:6]
         upright = exif_tags.read_upright(block, orientation)
-        packet, left_out = upright_packet(image.info.get("xmp"), upright.orientation)
-        left_out += [GAIN_MAP] * (b"tmap" in data[:HEAD])
-        channels = _decoded(image, data)
-        extras = Extras(packet, left_out=(*left_out, *upright.left_out))
-        metadata = Metadata(image.info.get("icc_profile"), upright.block, extras)
-        return Decoded(channels.reshape(*channels.shape[:2], -1), upright.orientation, metadata)
-
-
-def _decoded(image: ImageFile.ImageFile, data: bytes | mmap) -> Stored:
-    """The pixels (H, W) or (H, W, S) of an open AVIF file, as 16 bits if it has 10 or 12."""
-    if (bits := _bits_of_avif(data)) > 8:  # Pillow would reduce them to 8
-        levels = imagecodecs.avif_decode(data)
-        return np.rint(levels * (65535 / (2**bits - 1))).astype(np.uint16)
-    return np.asarray(image)
+        left_out = [GAIN_MAP] * (b"tmap" in data[:HEAD])
+        if (bits := _bits_of_avif(data)) > 8:  # Pillow would reduce them to 8
+            channels = np.rint(imagecodecs.avif_decode(data) * (65535 / (2**bits - 1))).astype(np.uint16)
+        else:
+            channels = np.asarray(image)
+        return _decoded(channels, image.info.get("icc_profile"), upright, image.info.get("xmp"), left_out)
 
 
 def _check_avif_size(path: Path, data: bytes | mmap) -> None:
@@ -242,9 +244,6 @@ def read_heic(path: Path, check_size: CheckSize) -> Decoded:
             channels = np.rint(channels * (65535 / (65536 - (1 << (16 - info["bit_depth"]))))).astype(np.uint16)
         # The pixels are upright already.
         upright = exif_tags.read_upright(info.get("exif"), 1)
-        packet, left_out = upright_packet(info.get("xmp"))
-        left_out += [FURTHER_PICTURES] * (len(picture) > 1) + [DEPTH] * bool(info.get("depth_images"))
+        left_out = [FURTHER_PICTURES] * (len(picture) > 1) + [DEPTH] * bool(info.get("depth_images"))
         left_out += [FURTHER_PICTURES] * bool(info.get("aux"))
-        extras = Extras(packet, left_out=(*left_out, *upright.left_out))
-        metadata = Metadata(info.get("icc_profile"), upright.block, extras)
-        return Decoded(channels.reshape(*channels.shape[:2], -1), 1, metadata)
+        return _decoded(channels, info.get("icc_profile"), upright, info.get("xmp"), left_out)

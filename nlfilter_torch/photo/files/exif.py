@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from PIL.ExifTags import Base
 
+from nlfilter_torch.photo.files.metadata import CENTIMETRES
 from nlfilter_torch.photo.files.tables import (
     EXIF,
     INTEGERS,
@@ -39,7 +40,7 @@ IN_PIXELS = (Base.ImageWidth, Base.ExifImageWidth)
 FOCAL_PLANE = (Base.FocalPlaneXResolution, Base.FocalPlaneYResolution)
 #: Horizontal and vertical; swapped by a quarter turn.
 SIZES = ((Base.ImageWidth, Base.ImageLength), IN_EXIF, RESOLUTION[:2], FOCAL_PLANE)
-IN_INCHES: dict[int, float] = {tifffile.RESUNIT.INCH: 1.0, tifffile.RESUNIT.CENTIMETER: 2.54}
+IN_INCHES: dict[int, float] = {tifffile.RESUNIT.INCH: 1.0, tifffile.RESUNIT.CENTIMETER: CENTIMETRES}
 AREAS = (37396, Base.SubjectLocation)  # places of the main subject: centre, and perhaps diameter, or width and height
 NO_TAG = 0xFFFE  # the number of no tag
 COMPRESSION, PLACE, LENGTH = Base.Compression, Base.JpegIFOffset, Base.JpegIFByteCount  # of a thumbnail

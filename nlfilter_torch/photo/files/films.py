@@ -44,7 +44,6 @@ LIMITED, FULL = 1, 2  # colour ranges
 HD_ROWS = 720  # rows from which on players assume BT.709 for untagged films
 CONTAINER_METADATA = ("major_brand", "minor_version", "compatible_brands", "encoder")  # metadata of the file itself
 COPIED_STREAMS = ("audio", "subtitle")
-PLANES = [2, 0, 1]  # order of red, green and blue in the planes green, blue, red
 
 
 def is_film(path: Path) -> bool:
@@ -142,7 +141,9 @@ class Film:
 
     def sample(self, count: int) -> list[Floats]:
         """Decode the middle frames of ``count`` equal parts of the film, or all frames of a shorter film."""
-        start, length = self.span()
+        entries = self.stream.index_entries
+        start = self.stream.start_time or 0
+        length = self.stream.duration or (entries[-1].timestamp - start + 1 if len(entries) else 1)
         frames: list[Floats] = []
         last: int | None = None
         for part in range(count):
@@ -158,12 +159,6 @@ class Film:
         if not frames:
             raise ValueError(f"{self.path} holds no frame that can be decoded; copy it again from its source")
         return frames
-
-    def span(self) -> tuple[int, int]:
-        """Return the first time stamp, and the duration in the same units."""
-        entries = self.stream.index_entries
-        start = self.stream.start_time or 0
-        return start, self.stream.duration or (entries[-1].timestamp - start + 1 if len(entries) else 1)
 
     def write(self, path: Path, edit: Callable[[Floats], Floats], begin: Callable[[str], None]) -> int:
         """Write the film, which is read from its start, with every frame edited; it appears complete or not at all.
@@ -231,13 +226,10 @@ def open_film(path: Path) -> Iterator[Film]:
             )
         stream = streams[0]
         stream.thread_type = "AUTO"
-        if stream.codec_context.format.has_palette or _has_alpha(stream.codec_context.pix_fmt):
+        form = stream.codec_context.format
+        if form.has_palette or any(component.is_alpha for component in form.components):
             raise ValueError(f"{path} has transparency or a palette, which are not supported; convert it to yuv420p")
         yield Film(path, container, stream)
-
-
-def _has_alpha(pix_fmt: str) -> bool:
-    return pix_fmt.startswith(("yuva", "rgba", "bgra", "argb", "abgr", "gbrap", "ya"))
 
 
 @dataclass(frozen=True)

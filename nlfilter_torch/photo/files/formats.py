@@ -18,9 +18,16 @@ from numpy.typing import NDArray
 from nlfilter_torch.photo.declared.rows import Stored
 from nlfilter_torch.photo.files import codecs, jpeg, png, tiff
 from nlfilter_torch.photo.files import exif as exif_tags
-from nlfilter_torch.photo.files.decoded import CheckSize, Decoded, Header, decoding
 from nlfilter_torch.photo.files.exif_in_tiff import shortened
-from nlfilter_torch.photo.files.metadata import Metadata, UnhandledImage, note_left_out
+from nlfilter_torch.photo.files.metadata import (
+    CheckSize,
+    Decoded,
+    Header,
+    Metadata,
+    UnhandledImage,
+    decoding,
+    note_left_out,
+)
 from nlfilter_torch.photo.files.writing import check_file, open_beside
 
 Depth = Literal["uint8", "uint16", "float16", "float32", "float64"]
@@ -37,7 +44,6 @@ DEPTHS: dict[str, tuple[str, ...]] = {
 # Pixels. Those of libpng and libavif are what they decode.
 LONGEST_SIDE = {"WebP": 16383, "JPEG": 65500, "PNG": png.LONGEST_PNG, "AVIF": codecs.LONGEST_AVIF}
 MOST_PIXELS = {"AVIF": codecs.MOST_AVIF}
-LONGEST_EXIF = jpeg.LONGEST  # bytes, in JPEG
 SUFFIXES = {".png": "PNG", ".jpg": "JPEG", ".jpeg": "JPEG", ".webp": "WebP", ".avif": "AVIF"}
 SUFFIXES |= {".tif": "TIFF", ".tiff": "TIFF"}
 PFM = ".pfm"  # of masks
@@ -96,15 +102,11 @@ def read_channels(path: Path, *, bytes_per_pixel: int, memory: int | None) -> De
 
 def _read_mapped(path: Path, data: mmap, check_size: CheckSize) -> Decoded:
     """Read a PNG, JPEG, WebP or AVIF file that is mapped into memory."""
-    head = data[:32]
-    if is_png(head):
-        picture = png.open_png(path, data)
+    if (picture := open_mapped(path, data)) is not None:
         check_size(picture.size)
-        return Decoded(picture.decode(data), picture.orientation, picture.metadata)
-    if is_jpeg(head):
-        photo = jpeg.open_jpeg(path, data)
-        check_size(photo.size)
-        return Decoded(photo.decode(path), photo.orientation, photo.metadata)
+        channels = picture.decode(data) if isinstance(picture, png.Png) else picture.decode(path)
+        return Decoded(channels, picture.orientation, picture.metadata)
+    head = data[:32]
     if codecs.is_webp(head):
         return codecs.read_webp(path, data, check_size)
     if codecs.is_avif(head):
@@ -112,14 +114,11 @@ def _read_mapped(path: Path, data: mmap, check_size: CheckSize) -> Decoded:
     raise UnhandledImage(f"{path} is not a PNG, JPEG, TIFF, WebP or AVIF image; convert it to one of these")
 
 
-def is_png(head: bytes) -> bool:
-    """Whether a file with these first bytes is PNG."""
-    return head.startswith(png.SIGNATURE)
-
-
-def is_jpeg(head: bytes) -> bool:
-    """Whether a file with these first bytes is JPEG."""
-    return head.startswith(b"\xff\xd8\xff")
+def open_mapped(path: Path, data: mmap) -> png.Png | jpeg.Jpeg | None:
+    """Read everything but the pixels of a PNG or JPEG file that is mapped into memory; None for other files."""
+    if data[: len(png.SIGNATURE)] == png.SIGNATURE:
+        return png.open_png(path, data)
+    return jpeg.open_jpeg(path, data) if data[:3] == jpeg.START else None
 
 
 def _check_size(
@@ -137,10 +136,10 @@ def write_file(path: Path, picture: Stored | Iterable[Stored], header: Header, q
     """
     kind = SUFFIXES[path.suffix.lower()]
     metadata, extras, left_out = header.metadata, header.metadata.extras, list[str]()
-    if metadata.exif is not None and exif_tags.has_thumbnail(metadata.exif):
-        shown = picture if isinstance(picture, np.ndarray) and kind != "TIFF" else None
-        metadata = replace(metadata, exif=exif_tags.refreshed(metadata.exif, shown))
-        left_out += [] if exif_tags.has_thumbnail(metadata.exif) else ["the thumbnail"]
+    if (block := metadata.exif) is not None and exif_tags.has_thumbnail(block):
+        block = exif_tags.refreshed(block, picture if isinstance(picture, np.ndarray) and kind != "TIFF" else None)
+        metadata = replace(metadata, exif=block)
+        left_out += [] if exif_tags.has_thumbnail(block) else ["the thumbnail"]
     left_out += [*extras.left_out, *(part.name for part in extras.parts if part.kind != kind)]
     left_out += [] if kind == "TIFF" else extras.lacking_tags()
     if kind == "JPEG":
@@ -166,8 +165,8 @@ def write_file(path: Path, picture: Stored | Iterable[Stored], header: Header, q
 def fitting_jpeg(metadata: Metadata) -> tuple[Metadata, list[str]]:
     """Metadata that a JPEG file can hold, and what it cannot."""
     left_out = []
-    if metadata.exif is not None and len(metadata.exif) > LONGEST_EXIF:
-        metadata = replace(metadata, exif=shortened(metadata.exif, LONGEST_EXIF))
+    if metadata.exif is not None and len(metadata.exif) > jpeg.LONGEST:
+        metadata = replace(metadata, exif=shortened(metadata.exif, jpeg.LONGEST))
         left_out.append("the maker note, as JPEG holds at most 65533 bytes of EXIF data")
     packet = metadata.extras.xmp
     if packet is not None and len(packet) > jpeg.LONGEST_XMP:
@@ -213,7 +212,7 @@ def check_type(
 
 def _check_jpeg_metadata(path: Path, metadata: Metadata) -> None:
     """Raise ValueError if a JPEG file cannot hold the EXIF block, without the maker note, or the profile."""
-    pieces = {"EXIF data": (metadata.exif, LONGEST_EXIF), "colour profile": (metadata.icc, jpeg.LONGEST_ICC)}
+    pieces = {"EXIF data": (metadata.exif, jpeg.LONGEST), "colour profile": (metadata.icc, jpeg.LONGEST_ICC)}
     for name, (content, longest) in pieces.items():
         if content is None or len(content) <= longest:
             continue

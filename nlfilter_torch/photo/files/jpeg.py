@@ -14,15 +14,18 @@ from PIL import JpegImagePlugin
 
 from nlfilter_torch.photo.declared.rows import Stored
 from nlfilter_torch.photo.files import exif as exif_tags
-from nlfilter_torch.photo.files.decoded import Header, bands, quiet
 from nlfilter_torch.photo.files.metadata import (
+    CENTIMETRES,
     FURTHER_PICTURES,
     GAIN_MAP,
     MOTION,
     Extras,
     FilePart,
+    Header,
     Metadata,
     UnhandledImage,
+    bands,
+    quiet,
     sound,
     turned_pair,
     upright_packet,
@@ -35,12 +38,12 @@ ICC_KEY = b"ICC_PROFILE\0"
 LONGEST = 65_533  # bytes in a segment
 ICC_PIECE = LONGEST - len(ICC_KEY) - 2
 LONGEST_ICC = 255 * ICC_PIECE
+START = b"\xff\xd8\xff"  # of a file
 SOI, EOI, SOS, APP, COM, DRI = 0xD8, 0xD9, 0xDA, 0xE0, 0xFE, 0xDD
-PLAIN_FRAMES, PROGRESSIVE = (0xC0, 0xC1), 0xC2
+PLAIN_FRAMES = (0xC0, 0xC1)
 FRAMES = (*range(0xC0, 0xC4), *range(0xC5, 0xC8), *range(0xC9, 0xCC), *range(0xCD, 0xD0))
 ADOBE = APP + 14  # says how the colours are coded
 LONGEST_XMP = 65_000  # bytes; longer packets are not written
-LONGEST_SCAN = 64  # bytes of the header of a scan, at most
 BEHIND = 1 << 26  # bytes behind the first picture that are looked at
 THUMBNAILS = (b"8BIM\x04\x0c", b"8BIM\x04\x09")  # of Photoshop
 SEGMENT_NAMES = {
@@ -54,8 +57,8 @@ SEGMENT_NAMES = {
 BARE = (0x01, *range(0xD0, 0xD8))  # markers without content
 MARKER = re.compile(rb"\xff+[^\0\xd0-\xd7\xff]")  # in the pixels: not a byte of 255, nor a restart
 CODED_SIDE = 8  # side of the squares of pixels that are coded
-INCH, CENTIMETRE = 1, 2  # units of the density
-CODED_ROWS = 64  # rows that are coded at a time; a multiple of BLOCK
+IN_INCHES = {1: 1.0, 2: CENTIMETRES}  # units of the density
+CODED_ROWS = 64  # rows that are coded at a time; a multiple of CODED_SIDE
 
 
 class Segment(NamedTuple):
@@ -187,10 +190,10 @@ def _metadata(contents: list[tuple[int, bytes]], behind: bytes) -> tuple[int, Me
 
 def _density(content: bytes) -> tuple[float, float] | None:
     """The pixels per inch in the header of JFIF, or None."""
-    if len(content) < 12 or content[7] not in (INCH, CENTIMETRE):
+    if len(content) < 12 or content[7] not in IN_INCHES:
         return None
     across, down = struct.unpack_from(">HH", content, 8)
-    scale = 2.54 if content[7] == CENTIMETRE else 1.0
+    scale = IN_INCHES[content[7]]
     return across * scale, down * scale
 
 
@@ -206,7 +209,7 @@ def _behind(content: bytes) -> Iterator[str]:
     """What follows the first picture of a file."""
     if not content.strip(b"\0\xff"):
         return
-    further, film = b"\xff\xd8\xff" in content, b"ftyp" in content
+    further, film = START in content, b"ftyp" in content
     if further:
         yield FURTHER_PICTURES
     if film:
@@ -229,7 +232,7 @@ def write_jpeg(
     for number, strip in enumerate(bands(rows, CODED_ROWS)):
         picture = strip[..., 0] if strip.shape[2] == 1 else strip
         encoded = bytes(imagecodecs.jpeg8_encode(np.ascontiguousarray(picture), level=quality, subsampling="444"))
-        parts = list(segments(encoded[: encoded.index(b"\xff\xda") + LONGEST_SCAN] + b"\xff\xd9"))
+        parts = list(segments(encoded))
         scan = next(part for part in parts if part.marker == SOS)
         if number:
             stream.write(bytes((0xFF, 0xD0 + (number - 1) % 8)))
@@ -269,12 +272,12 @@ def _stored_density(dpi: tuple[float, float] | None) -> bytes:
     """Unit and density of JFIF, whole numbers, in the unit that rounds less."""
     if dpi is None:
         return struct.pack(">BHH", 0, 1, 1)
-    scales = {INCH: 1.0, CENTIMETRE: 2.54}
     lost = {
-        unit: sum(abs(value / scale - round(value / scale)) * scale for value in dpi) for unit, scale in scales.items()
+        unit: sum(abs(value / scale - round(value / scale)) * scale for value in dpi)
+        for unit, scale in IN_INCHES.items()
     }
     unit = min(lost, key=lost.__getitem__)
-    return struct.pack(">BHH", unit, *(max(1, round(value / scales[unit])) for value in dpi))
+    return struct.pack(">BHH", unit, *(max(1, round(value / IN_INCHES[unit])) for value in dpi))
 
 
 def _write_segment(stream: BinaryIO, marker: int, content: bytes) -> None:

@@ -1,18 +1,28 @@
-"""Metadata of image files: colour profile, EXIF, XMP, print resolution, tags of TIFF, and what is not copied."""
+"""What readers of image files return and writers take: pixels as they are stored, and what the file says of them.
+
+That is colour profile, EXIF, XMP, print resolution, tags of TIFF, and what is not copied.
+"""
 
 import re
-from collections.abc import Iterable, Sequence
-from contextlib import suppress
+import sys
+import warnings
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
+from mmap import mmap
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from PIL.ExifTags import Base
 from tifffile import DATATYPE, TIFF
 
 from nlfilter_torch.core.warning import warn
+from nlfilter_torch.photo.declared.rows import Stored
 from nlfilter_torch.photo.files.tables import LENGTHS, RESOLUTION
+
+if sys.platform == "linux":
+    from mmap import MADV_DONTNEED
 
 SWAPPED: dict[int, int] = {Base.XResolution: Base.YResolution, Base.YResolution: Base.XResolution}
 # Tags that say how a TIFF file stores its pixels. The output has its own.
@@ -29,6 +39,7 @@ OF_A_DEPTH = (
     *(NODATA, Base.MinSampleValue, Base.MaxSampleValue, Base.SMinSampleValue, Base.SMaxSampleValue),
     *(Base.GrayResponseUnit, Base.GrayResponseCurve, Base.TransferFunction),
 )
+CENTIMETRES = 2.54  # in an inch
 FRACTIONS = (DATATYPE.RATIONAL, DATATYPE.SRATIONAL)  # types of two numbers
 
 
@@ -167,6 +178,88 @@ NO_METADATA = Metadata()
 
 class UnhandledImage(ValueError):
     """A valid image file of an unsupported kind."""
+
+
+class Decoded(NamedTuple):
+    """The content of an image file.
+
+    Attributes:
+        channels: (H, W, S), as stored, so perhaps not upright.
+        orientation: EXIF orientation, 1 to 8; 1 is upright.
+        metadata: what the file says about them once they are upright.
+    """
+
+    channels: Stored
+    orientation: int
+    metadata: Metadata
+
+
+@dataclass(frozen=True)
+class Header:
+    """What a file to write says of its picture.
+
+    Attributes:
+        shape: (H, W, S).
+        dtype: of the channels.
+        alpha: whether the last channel is transparency.
+        metadata: the rest.
+    """
+
+    shape: tuple[int, int, int]
+    dtype: np.dtype[np.generic]
+    alpha: bool
+    metadata: Metadata
+
+
+class CheckSize(Protocol):
+    """Raises TooLarge if a picture of that size needs more memory than may be used."""
+
+    def __call__(self, size: tuple[int, int], /, *, double: bool = False) -> None:
+        """Check the size (width, height); ``double`` if the pixels are 64-bit floats."""
+
+
+@contextmanager
+def decoding(path: Path) -> Iterator[None]:
+    """Report any error in the block as a damaged file, since decoders have no common base class for errors."""
+    try:
+        yield
+    except (MemoryError, UnhandledImage):
+        raise
+    except Exception as error:
+        reason = str(error) or type(error).__name__
+        raise ValueError(f"{path} is damaged or cut short ({reason}); copy it again from its source") from error
+
+
+@contextmanager
+def quiet() -> Iterator[None]:
+    """Suppress the warnings of Pillow about damaged EXIF blocks, which it does not read for us."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        yield
+
+
+def release(data: bytes | mmap) -> None:
+    """Give back the memory for what was read of a file that is mapped to be read; it is read again when needed."""
+    if sys.platform == "linux" and isinstance(data, mmap):
+        data.madvise(MADV_DONTNEED)
+
+
+def bands(rows: Iterable[Stored], height: int) -> Iterator[Stored]:
+    """Regroup rows (h, W, S) into pieces of the same ``height``, the last one possibly shorter.
+
+    >>> [len(band) for band in bands([np.zeros((3, 1, 1)), np.zeros((4, 1, 1))], 2)]
+    [2, 2, 2, 1]
+    """
+    waiting: list[Stored] = []
+    for piece in rows:
+        waiting.append(piece)
+        while sum(map(len, waiting)) >= height:
+            # A single piece may be the whole picture, which is not copied.
+            whole = waiting[0] if len(waiting) == 1 else np.concatenate(waiting)
+            waiting = [whole[height:]]
+            yield whole[:height]
+    if waiting and sum(map(len, waiting)):
+        yield np.concatenate(waiting)
 
 
 # --- XMP packets

@@ -18,14 +18,17 @@ import numpy as np
 
 from nlfilter_torch.photo.declared.rows import Stored
 from nlfilter_torch.photo.files import exif as exif_tags
-from nlfilter_torch.photo.files.decoded import Header, bands, release
 from nlfilter_torch.photo.files.metadata import (
+    CENTIMETRES,
     Extras,
     FilePart,
+    Header,
     Metadata,
     UnhandledImage,
+    bands,
     check_colour_numbers,
     check_png_colours,
+    release,
     sound,
     turned_pair,
     upright_packet,
@@ -45,7 +48,7 @@ ADAM7 = (
     (0, 1, 2, 2),
     (1, 0, 2, 1),
 )  # y, x, steps
-# Chunks that describe the pixels of the file. Colours are checked, see colours.py.
+# Chunks that describe the pixels of the file. Colours are checked, see _check_colours.
 STORAGE_CHUNKS = (b"IHDR", b"PLTE", b"tRNS", b"IDAT", b"IEND", b"gAMA", b"cHRM", b"sRGB", b"cICP")
 PIXEL_CHUNKS = (b"IHDR", b"PLTE", b"tRNS", b"IDAT", b"IEND")
 TEXTS = (b"tEXt", b"zTXt", b"iTXt")
@@ -54,7 +57,7 @@ KEYS = (XMP_TEXT, RAW_KEY + b"exif", RAW_KEY + b"xmp")  # of texts that are read
 LONGEST_TEXT = 1 << 28  # bytes of a text or profile
 BAND = 1 << 22  # bytes that are compressed at a time
 CHUNK_ROOM = 1 << 16  # bytes for chunks
-INCH = 0.0254  # metres
+INCH = CENTIMETRES / 100  # metres
 LONGEST_PNG = 1_000_000  # pixels; a limit of libpng
 
 

@@ -15,31 +15,38 @@ from dataclasses import dataclass, replace
 from mmap import ACCESS_READ, mmap
 from pathlib import Path
 from types import ModuleType
-from typing import Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import psutil
 
 from nlfilter_torch.photo.declared.rows import NodataRows, RowSource, Stored
-from nlfilter_torch.photo.files import jpeg, png, tiff
-from nlfilter_torch.photo.files.decoded import Header, bands, decoding
+from nlfilter_torch.photo.files import tiff
 from nlfilter_torch.photo.files.exif import of_part, upright
 from nlfilter_torch.photo.files.formats import (
     TooLarge,
     check_type,
     first_bytes,
-    is_jpeg,
-    is_png,
+    open_mapped,
     read_channels,
     write_file,
 )
-from nlfilter_torch.photo.files.metadata import NO_METADATA, Metadata
-from nlfilter_torch.photo.files.scratch import Scratch
+from nlfilter_torch.photo.files.metadata import NO_METADATA, Header, Metadata, bands, decoding
 from nlfilter_torch.photo.files.tiff import TiffRows
-from nlfilter_torch.photo.files.writing import check_file, claimed, link_target, name_beside, part_beside
+from nlfilter_torch.photo.files.writing import (
+    FileRows,
+    check_file,
+    claimed,
+    link_target,
+    name_beside,
+    part_beside,
+    temporary_rows,
+)
+
+if TYPE_CHECKING:
+    from zarr import Array
 
 ZARR = ".zarr"
-CHUNK_SIDE = 256  # side of the chunks of a new zarr array
 # Bytes that a command may use if no limit is given.
 FIFTH = psutil.virtual_memory().total // 5
 WHOLE_MEMORY = min(FIFTH, 2_000_000_000)  # a photograph that needs more is edited in tiles
@@ -220,13 +227,10 @@ def _open_codec(path: Path, memory: int, stack: ExitStack) -> StoredPicture:
 def _unpacked(path: Path, stack: ExitStack) -> StoredPicture | None:
     """Decode a PNG file without interlacing, or a baseline JPEG file, into a temporary file; None for others."""
     with path.open("rb") as stream, mmap(stream.fileno(), 0, access=ACCESS_READ) as data, decoding(path):
-        head = data[:32]
-        if not is_png(head) and not is_jpeg(head):
+        picture = open_mapped(path, data)
+        if picture is None or picture.in_passes:
             return None
-        picture = png.open_png(path, data) if is_png(head) else jpeg.open_jpeg(path, data)
-        if picture.in_passes:
-            return None
-        scratch = Scratch((picture.size[1], picture.size[0], picture.samples), picture.dtype, stack)
+        scratch = temporary_rows((picture.size[1], picture.size[0], picture.samples), picture.dtype, stack)
         with scratch.array() as out:
             picture.decode_into(data, out)
     if picture.orientation > 1:
@@ -234,11 +238,11 @@ def _unpacked(path: Path, stack: ExitStack) -> StoredPicture | None:
     return StoredPicture(scratch, picture.samples in (2, 4), 0, picture.metadata)
 
 
-def upright_copy(rows: TiffRows | Scratch, orientation: int, step: int, stack: ExitStack) -> Scratch:
+def upright_copy(rows: TiffRows | FileRows, orientation: int, step: int, stack: ExitStack) -> FileRows:
     """The upright picture of rows with an EXIF orientation, of which ``step`` are read at a time."""
     height, width, samples = rows.shape
     turned = orientation >= 5
-    scratch = Scratch((width, height, samples) if turned else rows.shape, rows.dtype, stack)
+    scratch = temporary_rows((width, height, samples) if turned else rows.shape, rows.dtype, stack)
     with scratch.array() as copy:
         for start in range(0, height, step):
             stop = min(start + step, height)
@@ -259,32 +263,6 @@ def zarr_package() -> ModuleType:
     return zarr
 
 
-class ZarrArray(Protocol):
-    """What is used of an array of the package zarr."""
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """(H, W) or (H, W, S)."""
-
-    @property
-    def chunks(self) -> tuple[int, ...]:
-        """The shape of a chunk."""
-
-    @property
-    def dtype(self) -> np.dtype[np.generic]:
-        """The stored dtype."""
-
-    @property
-    def attrs(self) -> Mapping[str, object]:
-        """Attributes, as in JSON."""
-
-    def __getitem__(self, rows: slice, /) -> Stored:
-        """Read rows."""
-
-    def __setitem__(self, place: tuple[slice, slice], values: Stored, /) -> None:
-        """Write rows and columns."""
-
-
 class ZarrRows:
     """A zarr array that detects a change of its shape; another process opens it again."""
 
@@ -297,7 +275,7 @@ class ZarrRows:
     def __reduce__(self) -> tuple[type["ZarrRows"], tuple[Path]]:
         return ZarrRows, (self.path.absolute(),)
 
-    def _open(self) -> ZarrArray:
+    def _open(self) -> "Array[Any]":
         try:
             return zarr_package().open_array(self.path, mode="r")
         except (FileNotFoundError, KeyError, TypeError) as error:
@@ -325,7 +303,7 @@ def _open_zarr(path: Path) -> StoredPicture:
     return StoredPicture(rows, alpha, cached, attributes=dict(rows.array.attrs))
 
 
-def write_band(array: ZarrArray, start: int, rows: Stored) -> None:
+def write_band(array: "Array[Any]", start: int, rows: Stored) -> None:
     """Write rows (h, W, S) to a zarr array from row ``start`` on, where a chunk begins."""
     values, width = rows.reshape(len(rows), *array.shape[1:]), array.chunks[1]
     # One chunk per call: zarr writes several in parallel and continues with the others after one fails.
@@ -344,7 +322,7 @@ def _write_zarr(
     shape = tuple(like.rows.shape)
     path = link_target(path)
     replaced = name_beside(path)
-    chunks = (min(CHUNK_SIDE, shape[0]), min(CHUNK_SIDE, shape[1]), *shape[2:])
+    chunks = (min(tiff.TILE_SIZE, shape[0]), min(tiff.TILE_SIZE, shape[1]), *shape[2:])
     with part_beside(path) as beside:
         array = zarr_package().create_array(
             store=beside, shape=shape, chunks=chunks, dtype=dtype, attributes=like.attributes or {}
@@ -354,7 +332,7 @@ def _write_zarr(
                 fill(beside)
             else:
                 start = 0
-                for band in bands((part for _, part in rows), CHUNK_SIDE):
+                for band in bands((part for _, part in rows), tiff.TILE_SIZE):
                     write_band(array, start, band)
                     start += len(band)
             if path.exists():

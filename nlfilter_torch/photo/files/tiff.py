@@ -16,14 +16,18 @@ from nlfilter_torch.core.warning import warn
 from nlfilter_torch.photo.declared.rows import Stored
 from nlfilter_torch.photo.files import exif as exif_tags
 from nlfilter_torch.photo.files import exif_in_tiff
-from nlfilter_torch.photo.files.decoded import CheckSize, Decoded, Header, bands, decoding
 from nlfilter_torch.photo.files.metadata import (
     GROUND,
     STORAGE_TAGS,
+    CheckSize,
+    Decoded,
     Extras,
+    Header,
     Metadata,
     Tag,
     UnhandledImage,
+    bands,
+    decoding,
     sound,
     turned_pair,
     turned_tag,
@@ -34,7 +38,7 @@ from nlfilter_torch.photo.files.tables import LONG, ORIENTATION, RATIONAL, RESOL
 # tifffile logs problems with a file. Without a handler Python would print them beside our error message.
 logging.getLogger("tifffile").addHandler(logging.NullHandler())
 XMP, SUB_FILES = 700, 330  # tags
-TILE_SIZE = 256  # side of the tiles that are written
+TILE_SIZE = 256  # side of the tiles that are written, and of the chunks of zarr arrays
 MAX_CLASSIC_BYTES = 4_000_000_000  # bytes of pixels above which a BigTIFF is written
 _ASSOCIATED = tifffile.EXTRASAMPLE.ASSOCALPHA
 Resolution = tuple[float | tuple[int, int], float | tuple[int, int]]  # across and down

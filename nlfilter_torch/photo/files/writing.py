@@ -1,15 +1,26 @@
-"""Files that appear under their name only when they are complete, and checks of where they are to be written."""
+"""Files that appear under their name only when they are complete, and checks of where they are to be written.
 
+Also rows in temporary files, which take space on the disk rather than memory.
+"""
+
+import math
 import os
 import re
 import secrets
 import shutil
 import sys
+import tempfile
 import time
 from collections.abc import Container, Iterator
 from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass, field
 from pathlib import Path
+from threading import Lock
 from typing import BinaryIO
+
+import numpy as np
+
+from nlfilter_torch.photo.declared.rows import Stored
 
 if sys.platform != "win32":
     import fcntl
@@ -145,3 +156,60 @@ def _remove(part: Path) -> None:
                 shutil.rmtree(part, ignore_errors=True)
         else:
             part.unlink()
+
+
+@dataclass(frozen=True)
+class FileRows:
+    """Rows in an open file, which are read when they are needed.
+
+    They are not mapped into memory: the system counts what was read of a mapped file as memory of the process.
+
+    Attributes:
+        stream: the file, which holds nothing else.
+        shape: (H, W) or (H, W, S).
+        dtype: of the rows.
+        lock: held while the place in the file matters.
+    """
+
+    stream: BinaryIO
+    shape: tuple[int, ...]
+    dtype: np.dtype[np.generic]
+    lock: Lock = field(default_factory=Lock)
+
+    def __getitem__(self, rows: slice) -> Stored:
+        """The rows from ``rows.start`` to ``rows.stop``."""
+        start, stop, _ = rows.indices(self.shape[0])
+        length = math.prod(self.shape[1:]) * self.dtype.itemsize
+        with self.lock:
+            self.stream.seek(start * length)
+            data = self.stream.read((stop - start) * length)
+        return np.frombuffer(data, self.dtype).reshape(-1, *self.shape[1:])
+
+    def part(self, rows: range, columns: range) -> Stored:
+        """Some rows and columns (h, w, S) of (H, W, S), without reading the others."""
+        pixel = math.prod(self.shape[2:]) * self.dtype.itemsize
+        data = bytearray()
+        with self.lock:
+            for row in rows:
+                self.stream.seek((row * self.shape[1] + columns.start) * pixel)
+                data += self.stream.read(len(columns) * pixel)
+        return np.frombuffer(data, self.dtype).reshape(len(rows), len(columns), *self.shape[2:])
+
+    @contextmanager
+    def array(self) -> Iterator[Stored]:
+        """The file as an array to write to, which is not in memory after the block."""
+        yield np.memmap(self.stream, dtype=self.dtype, mode="r+", shape=self.shape)
+
+
+def temporary_rows(shape: tuple[int, ...], dtype: np.dtype[np.generic], stack: ExitStack) -> FileRows:
+    """Rows (H, W, S) in a temporary file that ``stack`` removes; raises MemoryError if the disk has no room for it."""
+    needed, folder = math.prod(shape) * dtype.itemsize, tempfile.gettempdir()
+    free = shutil.disk_usage(folder).free
+    if needed > free:  # writing to mapped memory would end the process
+        raise MemoryError(
+            f"a temporary file of {needed / 1e6:.0f} MB is needed for the pixels, but only {free / 1e6:.0f} MB are "
+            f"free in {folder}; free some, or set TMPDIR to a folder with more"
+        )
+    stream = stack.enter_context(tempfile.TemporaryFile())  # noqa: SIM115 - the stack closes it
+    stream.truncate(needed)
+    return FileRows(stream, shape, dtype)

@@ -15,10 +15,9 @@ from nlfilter_torch.core.checks import check_count
 from nlfilter_torch.operator.hidden import REACH
 from nlfilter_torch.photo.declared.development import Development, Frame
 from nlfilter_torch.photo.declared.rows import NodataRows, Stored, is_hidden, keep_apart
-from nlfilter_torch.photo.files.decoded import Header
 from nlfilter_torch.photo.files.exif import of_part
 from nlfilter_torch.photo.files.formats import Depth, check_depth, check_type, read_channels, write_file
-from nlfilter_torch.photo.files.metadata import NO_EXTRAS, Extras, Metadata
+from nlfilter_torch.photo.files.metadata import NO_EXTRAS, Extras, Header, Metadata
 from nlfilter_torch.photo.picture.developing import develop_planes, finished, in_light, limits_of
 from nlfilter_torch.photo.picture.pictures import Picture, put_back, stored_as, transparency
 

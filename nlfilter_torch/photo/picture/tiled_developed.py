@@ -15,7 +15,7 @@ from torch import Tensor
 from nlfilter_torch.core.workers import in_order
 from nlfilter_torch.photo.declared.development import Development, Frame
 from nlfilter_torch.photo.declared.rows import WHITE, RowSource, Stored
-from nlfilter_torch.photo.files.scratch import FileRows
+from nlfilter_torch.photo.files.writing import FileRows
 from nlfilter_torch.photo.picture.developing import bands_of, finished, in_light, turned_band
 from nlfilter_torch.photo.picture.pictures import Picture, Rows, Tile, transparency
 from nlfilter_torch.photo.picture.tiles import TILE_PIXELS, Passes, Tiling, between_steps, intermediate, tile_by_tile

@@ -16,7 +16,7 @@ from torch import Tensor
 from nlfilter_torch.core.checks import check_choice, check_count
 from nlfilter_torch.core.workers import in_order
 from nlfilter_torch.photo.declared.rows import RowSource, Stored, is_hidden, keep_apart
-from nlfilter_torch.photo.files.scratch import FileRows
+from nlfilter_torch.photo.files.writing import FileRows
 from nlfilter_torch.photo.picture import sampling
 from nlfilter_torch.photo.picture.pictures import (
     FLOAT32,

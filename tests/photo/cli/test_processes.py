@@ -41,7 +41,7 @@ def picture(tmp_path: Path) -> Path:
 
 @pytest.fixture(autouse=True)
 def small_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("nlfilter_torch.photo.files.rows.CHUNK_SIDE", 32)
+    monkeypatch.setattr("nlfilter_torch.photo.files.tiff.TILE_SIZE", 32)
     monkeypatch.setattr(
         "nlfilter_torch.photo.picture.tiles.CHUNK_PIXELS", 7 * 50
     )  # such that chunks begin in the midst of one

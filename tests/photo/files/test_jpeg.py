@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from nlfilter_torch.photo.files.decoded import Header
 from nlfilter_torch.photo.files.jpeg import open_jpeg, write_jpeg
-from nlfilter_torch.photo.files.metadata import Extras, Metadata
+from nlfilter_torch.photo.files.metadata import Extras, Header, Metadata
 from nlfilter_torch.photo.picture.photographs import read_photograph, write_photograph
 from tests.files import cat
 from tests.pairwise import each_value

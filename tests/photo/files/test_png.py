@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image, PngImagePlugin
 
-from nlfilter_torch.photo.files.decoded import Header
-from nlfilter_torch.photo.files.metadata import Metadata
+from nlfilter_torch.photo.files.metadata import Header, Metadata
 from nlfilter_torch.photo.files.png import ADAM7, SAMPLES, SIGNATURE, chunks, write_chunk, write_png
 from nlfilter_torch.photo.picture.photographs import read_photograph, write_photograph
 from tests.files import cat

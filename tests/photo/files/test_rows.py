@@ -1,5 +1,6 @@
-"""Memory that commands may use to read pictures in parts, and where arrays are written."""
+"""Memory and temporary files that commands may use to read pictures in parts, and where arrays are written."""
 
+from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
@@ -12,11 +13,14 @@ from PIL import ExifTags, Image
 from nlfilter_torch.photo.cli import editing
 from nlfilter_torch.photo.files import rows, tiff
 from nlfilter_torch.photo.files import rows as streaming_files
+from nlfilter_torch.photo.files.exif import upright
+from nlfilter_torch.photo.files.formats import read_channels
 from nlfilter_torch.photo.files.metadata import Metadata
-from nlfilter_torch.photo.files.rows import StoredPicture, open_picture, write_picture
+from nlfilter_torch.photo.files.rows import StoredPicture, open_picture, upright_copy, write_picture
+from nlfilter_torch.photo.files.writing import FileRows, temporary_rows
 from tests.commands import refused, small_photo
 from tests.files import PLENTY, PROFILE, cat, rows_of
-from tests.pairwise import each_value
+from tests.pairwise import each_value, pairwise
 
 
 @pytest.fixture
@@ -97,3 +101,49 @@ def test_free_memory_leaves_some(monkeypatch: pytest.MonkeyPatch) -> None:
     free = psutil.virtual_memory()._replace(available=1000)
     monkeypatch.setattr(psutil, "virtual_memory", lambda: free)
     assert streaming_files.free_memory() == 800
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_copies_are_upright(orientation: int) -> None:
+    with ExitStack() as stack:
+        stored = temporary_rows((200, 150, 3), np.dtype(np.uint8), stack)
+        with stored.array() as out:
+            out[...] = cat()
+        copy = upright_copy(stored, orientation, 37, stack)
+        wanted = upright(cat(), orientation)
+        assert copy.shape == wanted.shape
+        np.testing.assert_array_equal(copy[slice(10, 90)], wanted[10:90])
+
+
+@pytest.mark.parametrize(("channels", "suffix", "orientation"), pairwise([1, 3, 4], [".png", ".jpg"], [1, 3, 6]))
+def test_large_files(
+    tmp_path: Path, channels: int, suffix: str, orientation: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if suffix == ".jpg" and channels == 4:
+        pytest.skip("JPEG has no alpha channel")
+    exif = Image.Exif()
+    exif[274], exif[271] = orientation, "Maker"
+    picture = cat(channels=channels)
+    path = tmp_path / f"in{suffix}"
+    Image.fromarray(picture[..., 0] if channels == 1 else picture).save(path, exif=exif)
+    whole = read_channels(path, bytes_per_pixel=0, memory=None)
+    monkeypatch.setattr(rows, "UNPACKED", 1000)
+    np.testing.assert_array_equal(rows_of(path), whole.channels)
+    with open_picture(path, PLENTY) as stored:
+        assert isinstance(stored.rows, FileRows)
+        assert stored.metadata == whole.metadata
+        assert stored.alpha == (channels == 4)
+    path.write_bytes(path.read_bytes()[:-3000])
+    with pytest.raises(ValueError, match="is damaged or cut short"):
+        rows_of(path)
+
+
+@pytest.mark.parametrize(("name", "options"), [("in.jpg", {"progressive": True}), ("in.webp", {})])
+def test_others_need_memory(
+    tmp_path: Path, name: str, options: dict[str, bool], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    Image.fromarray(cat()).save(tmp_path / name, **options)
+    monkeypatch.setattr(rows, "UNPACKED", 1000)
+    assert rows_of(tmp_path / name).shape == (200, 150, 3)
+    with pytest.raises(MemoryError, match="has 150x200 pixels and needs about 0 MB"):
+        open_picture(tmp_path / name, 1000).__enter__()

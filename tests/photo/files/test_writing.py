@@ -4,13 +4,15 @@ import fcntl
 import io
 import os
 import stat
+from contextlib import ExitStack
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from nlfilter_torch.photo.cli import main
 from nlfilter_torch.photo.files import writing as files
-from nlfilter_torch.photo.files.writing import check_folder, open_beside
+from nlfilter_torch.photo.files.writing import check_folder, open_beside, temporary_rows
 from nlfilter_torch.photo.picture.photographs import write_photograph
 from tests.commands import refused, small_photo
 from tests.files import photograph, stored_values
@@ -121,3 +123,10 @@ def test_the_longest_names_can_be_written(letter: str, photo: Path, tmp_path: Pa
 def test_names_too_long_are_told(photo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     told = refused(capsys, "detail", photo, tmp_path / f"{'x' * 252}.png")
     assert told.endswith(": File name too long; check the name and the permissions\n")
+
+
+def test_a_full_disk_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    usage = files.shutil.disk_usage("/")._replace(free=1000)
+    monkeypatch.setattr(files.shutil, "disk_usage", lambda folder: usage)
+    with ExitStack() as stack, pytest.raises(MemoryError, match=r"temporary file of 3 MB .* set TMPDIR to a folder"):
+        temporary_rows((1000, 1000, 3), np.dtype(np.uint8), stack)

@@ -5,7 +5,7 @@ import io
 import numpy as np
 import pytest
 
-from nlfilter_torch.photo.files.scratch import FileRows
+from nlfilter_torch.photo.files.writing import FileRows
 from tests.streams import stream_detail
 from tests.tiles import ALPHA, FEW, PLAIN, Rows, Shrinking, cat, streamed
 
