@@ -32,7 +32,7 @@ def test_signals_while_a_file_is_written(
         assert len(list(tmp_path.glob(".*.part"))) == 1
         os.kill(os.getpid(), number)
 
-    monkeypatch.setattr("nlfilter_torch.photo.picture.photographs.encode", interrupted)
+    monkeypatch.setattr("nlfilter_torch.photo.files.png.write_png", interrupted)
     try:
         signal.signal(signal.SIGINT, signal.default_int_handler)
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
