@@ -17,11 +17,11 @@ from typing import Any
 
 import typer
 
+from nlfilter_torch.photo.cli import INTERRUPTED
 from nlfilter_torch.photo.cli.editing import allowed_memory, check_quality_of, check_workers, has_jpeg_suffix
 from nlfilter_torch.photo.cli.edits import edit_photograph
 from nlfilter_torch.photo.cli.folders import left_out, pictures, prepare, subfolders
 from nlfilter_torch.photo.cli.options import NOTE, FolderOptions, PhotographOptions
-from nlfilter_torch.photo.cli.process import INTERRUPTED
 from nlfilter_torch.photo.cli.progress import steps
 from nlfilter_torch.photo.cli.recipe_job import apply_files
 from nlfilter_torch.photo.cli.workers import Crew, worker_pool
@@ -168,12 +168,11 @@ def edit_folder(
     tally.left += len(jobs)
     if not jobs:
         return
-    calls = {path: partial(_edit_file, edit, path, target / path.name) for path in jobs}
     deaths = 0
     with (
         contextlib.ExitStack() as afterwards,
         worker_pool(replace(crew, number=min(crew.number, len(jobs)))) as pool,
-        contextlib.closing(pool.outcomes(calls)) as ended,
+        contextlib.closing(pool.outcomes(partial(_edit_file, edit, target), jobs)) as ended,
     ):
         afterwards.callback(remove_stale, target, names)  # of workers that were ended by an interrupt
         for path, outcome in ended:
@@ -193,13 +192,13 @@ def edit_folder(
                 return
 
 
-def _edit_file(edit: Edit, source: Path, target: Path) -> Outcome:
-    """Edit one file in a worker; return its notes and warnings or why it failed."""
+def _edit_file(edit: Edit, target: Path, source: Path) -> Outcome:
+    """Edit one file in a worker to a folder; return its notes and warnings or why it failed."""
     printed = io.StringIO()
     with warnings.catch_warnings(record=True) as caught, contextlib.redirect_stderr(printed):
         warnings.simplefilter("always", UserWarning)
         try:
-            edit(str(source), str(target))
+            edit(str(source), str(target / source.name))
         except Exception as error:
             return _sentence(error)
     notes = [line.removeprefix(NOTE) for line in printed.getvalue().splitlines() if line.startswith(NOTE)]

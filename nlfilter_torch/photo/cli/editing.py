@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.photo.cli import options
+from nlfilter_torch.photo.cli.processes import zarr_processes
 from nlfilter_torch.photo.cli.progress import stages, steps
 from nlfilter_torch.photo.declared.development import Development
 from nlfilter_torch.photo.declared.steps import Step, working_bytes
@@ -212,15 +213,6 @@ def check_processes(source: str, target: str, workers: int | None, cluster: str 
         )
 
 
-def processes_for(workers: int | None, cluster: str | None, stack: ExitStack) -> Processes | None:
-    """The worker processes that are asked for, until ``stack`` is closed, or None."""
-    if workers is None and cluster is None:
-        return None
-    from nlfilter_torch.photo.cli.processes import zarr_processes
-
-    return stack.enter_context(zarr_processes(workers, cluster))
-
-
 def pixels_of(picture: Picture, rows: slice) -> Tensor:
     """Some rows (1, C, h, W) of a picture that is read by rows."""
     return picture.tile(rows.start, rows.stop, 0).pixels
@@ -315,7 +307,7 @@ def edit_file(edit: FileEdit, source: str, target: str, files: options.Photograp
         like = part.in_colour() if edit.coloured else part
         check_place(Path(target), stored, like, allowed)
         note_developing(edit, source, size, picture.shape[2])
-        processes = processes_for(files.workers, files.cluster, stack)
+        processes = stack.enter_context(zarr_processes(files.workers, files.cluster))
         report = stack.enter_context(stages())
         job = Job(
             picture,

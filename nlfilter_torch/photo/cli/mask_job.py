@@ -10,6 +10,7 @@ from nlfilter_torch.core.workers import single_threaded
 from nlfilter_torch.photo.cli import editing, options
 from nlfilter_torch.photo.cli.edit_job import PictureOpener
 from nlfilter_torch.photo.cli.editing import pixels_of, rows_in_memory
+from nlfilter_torch.photo.cli.processes import zarr_processes
 from nlfilter_torch.photo.cli.progress import stages, steps
 from nlfilter_torch.photo.cli.scribbles import MarkedPhotograph, Opener, ScribbleOptions
 from nlfilter_torch.photo.cli.showing import Scribbled, tell_selected
@@ -105,7 +106,7 @@ class MaskJob:
         with open_picture(Path(self.source), allowed) as picture, ExitStack() as files:
             report = files.enter_context(stages())
             plain = self._check_rows(picture, allowed)
-            processes = editing.processes_for(workers, cluster, files)
+            processes = files.enter_context(zarr_processes(workers, cluster))
             limit = editing.allowed_memory(self.memory, TILED_MEMORY)
             job = editing.Job(picture, self.kind, allowed - picture.cached, limit, report, files, processes)
             self._by_rows(job, plain)

@@ -14,7 +14,7 @@ from functools import partial
 from pathlib import Path
 from tempfile import gettempdir
 
-from nlfilter_torch.photo.cli.workers import Crew, Workers, worker_pool
+from nlfilter_torch.photo.cli.workers import Crew, worker_pool
 from nlfilter_torch.photo.declared.rows import RowSource
 from nlfilter_torch.photo.files.rows import ZarrRows, write_band, zarr_package
 from nlfilter_torch.photo.files.writing import claimed, part_beside
@@ -28,20 +28,18 @@ JOB = "tiling.pickle"  # in the folder of an array that is being written
 
 @dataclass(frozen=True)
 class ZarrProcesses:
-    """Worker processes of joblib.
+    """Worker processes that compute tiles.
 
     Attributes:
-        workers: processes of joblib.
-        cluster: address of their cluster; None is this machine.
+        crew: these processes.
     """
 
-    workers: Workers
-    cluster: str | None = None
+    crew: Crew
 
     @property
     def on_this_machine(self) -> int:
         """Number of processes that share the memory of this machine."""
-        return self.workers.number if self.cluster is None else 0
+        return self.crew.number if self.crew.cluster is None else 0
 
     def fill(self, tiling: Tiling, path: Path) -> None:
         """Compute rows and write them to the zarr array in a folder.
@@ -56,12 +54,12 @@ class ZarrProcesses:
         with (path / JOB).open("wb") as stream:
             cloudpickle.dump(tiling, stream)
         height, chunk = tiling.picture.size[0], zarr_package().open_array(path, mode="r").chunks[0]
-        shares = min(TASK_PIXELS // (chunk * tiling.picture.size[1]), height // (chunk * TASKS * self.workers.number))
+        shares = min(TASK_PIXELS // (chunk * tiling.picture.size[1]), height // (chunk * TASKS * self.crew.number))
         rows = chunk * max(1, shares)
         done, report = 0, tiling.passes.report
         report(tiling.stage, 0, height)
         parts = [range(start, min(start + rows, height)) for start in range(0, height, rows)]
-        for part, comparisons in self.workers.outcomes({part: partial(compute, path, part) for part in parts}):
+        for part, comparisons in self.crew.outcomes(partial(compute, path), parts):
             if comparisons is None:
                 raise ChildProcessError(
                     f"the processes that worked on the rows from {part.start} on died, one after the other; leave them "
@@ -108,7 +106,10 @@ def compute(path: Path, rows: range) -> list[Comparison]:
 
 
 @contextmanager
-def zarr_processes(workers: int | None, cluster: str | None) -> Iterator[ZarrProcesses]:
-    """Processes on this machine, or those of a cluster."""
-    with worker_pool(Crew(workers or 1, cluster=cluster)) as pool:
-        yield ZarrProcesses(pool, cluster)
+def zarr_processes(workers: int | None, cluster: str | None) -> Iterator[ZarrProcesses | None]:
+    """So many processes on this machine, or those of a cluster; None if neither is asked for."""
+    if workers is None and cluster is None:
+        yield None
+        return
+    with worker_pool(Crew(workers or 1, cluster=cluster)) as crew:
+        yield ZarrProcesses(crew)

@@ -9,7 +9,7 @@ import signal
 import threading
 import time
 import warnings
-from collections.abc import Callable, Generator, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from typing import TypeVar
@@ -24,59 +24,12 @@ Result = TypeVar("Result")
 
 
 @dataclass(frozen=True)
-class Workers:
-    """Worker processes of joblib; ``number`` is how many there are."""
-
-    number: int
-
-    def outcomes(self, calls: Mapping[Key, Callable[[], Result]]) -> Generator[tuple[Key, Result | None]]:
-        """Yield each key with the result of its call, as they end; None if workers die of it.
-
-        When a worker dies, joblib ends the others, too. Calls are begun in their order, so that one of the first that
-        have not ended is the cause. Each of these is then made once more while no worker does anything else.
-        """
-        waiting = dict(calls)
-        while waiting:
-            try:
-                with contextlib.closing(_made(waiting, self.number)) as ended:
-                    for key, result in ended:
-                        del waiting[key]
-                        yield key, result
-            except Exception as error:
-                if not _is_death(error):
-                    raise
-                for key in list(waiting)[: self.number]:
-                    yield key, self._alone(key, waiting.pop(key))
-
-    def _alone(self, key: Key, call: Callable[[], Result]) -> Result | None:
-        try:
-            ((_, result),) = _made({key: call}, self.number)
-        except Exception as error:
-            if not _is_death(error):
-                raise
-            return None
-        return result
-
-
-def _made(calls: Mapping[Key, Callable[[], Result]], number: int) -> Generator[tuple[Key, Result]]:
-    """Keys and results of calls in the workers, as they end."""
-    from joblib import Parallel, delayed
-
-    parallel = Parallel(return_as="generator_unordered", pre_dispatch=number, batch_size=1)
-    yield from parallel([delayed(_with_key)(key, call) for key, call in calls.items()])
-
-
-def _with_key(key: Key, call: Callable[[], Result]) -> tuple[Key, Result]:
-    return key, call()
-
-
-@dataclass(frozen=True)
 class Crew:
-    """Which worker processes are wanted.
+    """Worker processes of joblib.
 
     Attributes:
-        number: of processes on this machine.
-        threads: of each of these.
+        number: of processes; those of a cluster are counted when it answers.
+        threads: of each of these on this machine.
         cluster: address of the scheduler of a Dask cluster, whose workers have one thread each; None is this machine.
     """
 
@@ -84,21 +37,61 @@ class Crew:
     threads: int = 1
     cluster: str | None = None
 
+    def outcomes(self, work: Callable[[Key], Result], keys: Iterable[Key]) -> Generator[tuple[Key, Result | None]]:
+        """Yield each key with what the work on it returns, as it ends; None if workers die of it.
+
+        When a worker dies, joblib ends the others, too. Work is begun in the order of keys, so that one of the first
+        that have not ended is the cause. Each of these is then begun once more while no worker does anything else.
+        """
+        waiting = dict.fromkeys(keys)
+        while waiting:
+            try:
+                with contextlib.closing(self._done(work, list(waiting))) as ended:
+                    for key, result in ended:
+                        del waiting[key]
+                        yield key, result
+            except Exception as error:
+                if not _is_death(error):
+                    raise
+                for key in list(waiting)[: self.number]:
+                    del waiting[key]
+                    yield key, self._alone(work, key)
+
+    def _alone(self, work: Callable[[Key], Result], key: Key) -> Result | None:
+        try:
+            ((_, result),) = self._done(work, [key])
+        except Exception as error:
+            if not _is_death(error):
+                raise
+            return None
+        return result
+
+    def _done(self, work: Callable[[Key], Result], keys: list[Key]) -> Generator[tuple[Key, Result]]:
+        """Keys and results of work, as it ends."""
+        from joblib import Parallel, delayed
+
+        parallel = Parallel(return_as="generator_unordered", pre_dispatch=self.number, batch_size=1)
+        yield from parallel([delayed(_with_key)(work, key) for key in keys])
+
+
+def _with_key(work: Callable[[Key], Result], key: Key) -> tuple[Key, Result]:
+    return key, work(key)
+
 
 @contextlib.contextmanager
-def worker_pool(crew: Crew) -> Iterator[Workers]:
-    """Have joblib work in processes of this machine, or in those of a cluster.
+def worker_pool(crew: Crew) -> Iterator[Crew]:
+    """Have joblib work in processes of this machine, or in those of a cluster; yield these.
 
     Raises:
         ValueError: if there is no cluster at that address.
     """
     if crew.cluster is None:
-        yield from _of_this_machine(crew.number, crew.threads)
+        yield from _of_this_machine(crew)
     else:
         yield from _of_dask(crew.cluster)
 
 
-def _of_this_machine(workers: int, threads: int) -> Iterator[Workers]:
+def _of_this_machine(crew: Crew) -> Iterator[Crew]:
     import joblib
     from joblib.externals.loky import get_reusable_executor
 
@@ -108,22 +101,22 @@ def _of_this_machine(workers: int, threads: int) -> Iterator[Workers]:
         with (
             joblib.parallel_config(
                 "loky",
-                n_jobs=max(2, workers),
-                inner_max_num_threads=threads,
+                n_jobs=max(2, crew.number),
+                inner_max_num_threads=crew.threads,
                 initializer=be_worker,
                 initargs=(os.getpid(),),
             ),
             warnings.catch_warnings(),
         ):
             warnings.filterwarnings("ignore", "A worker stopped")  # joblib replaces those that grew by 300 MB
-            yield Workers(workers)
+            yield crew
         done = True
     finally:
         # After an interrupt, which reaches us as other errors too, workers would go on, and be waited for.
         get_reusable_executor().shutdown(kill_workers=not done)
 
 
-def _of_dask(address: str) -> Iterator[Workers]:
+def _of_dask(address: str) -> Iterator[Crew]:
     import joblib
 
     try:
@@ -135,7 +128,7 @@ def _of_dask(address: str) -> Iterator[Workers]:
     except (OSError, ValueError) as error:
         raise ValueError(f"--cluster must be the address of a Dask scheduler, got {address}; {error}") from error
     with client, joblib.parallel_config("dask", client=client, wait_for_workers_timeout=CONNECTING):
-        yield Workers(joblib.effective_n_jobs())
+        yield Crew(joblib.effective_n_jobs(), cluster=address)
 
 
 def _is_death(error: Exception) -> bool:

@@ -7,8 +7,7 @@ import typer
 from typer.core import TyperGroup
 
 from nlfilter_torch.photo.app.command import app
-from nlfilter_torch.photo.cli.application import assembled
-from nlfilter_torch.photo.cli.hints import OTHER_COMMANDS, OTHER_NAMES, SHORT, explained
+from nlfilter_torch.photo.cli.application import OTHER_COMMANDS, OTHER_NAMES, SHORT, assembled, explained
 from tests.commands import refusal
 
 DETAIL = ["--alpha", "--bandwidth", "--region", "--force", "--quality"]

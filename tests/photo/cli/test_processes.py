@@ -17,7 +17,7 @@ from torch import Tensor
 
 from nlfilter_torch.photo.cli import main, processes
 from nlfilter_torch.photo.cli.processes import ZarrProcesses, zarr_processes
-from nlfilter_torch.photo.cli.workers import Workers
+from nlfilter_torch.photo.cli.workers import Crew
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.declared.strokes import Stroke
@@ -53,9 +53,9 @@ def in_this_process(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     begun = []
 
     @contextmanager
-    def worker_pool(*_: object) -> Iterator[Workers]:
+    def worker_pool(*_: object) -> Iterator[Crew]:
         with joblib.parallel_config("sequential"):
-            yield Workers(2)
+            yield Crew(2)
 
     def compute(path: Path, rows: range) -> Any:
         begun.append(rows.start)
@@ -159,7 +159,7 @@ def test_workers_that_all_die_leave_nothing(picture: Path, monkeypatch: pytest.M
 
     monkeypatch.setattr(processes, "compute", die)
     with pytest.raises(ChildProcessError, match="the rows from 0 on died, one after the other; leave them more memory"):
-        write_negative(picture, ZarrProcesses(Workers(2)))
+        write_negative(picture, ZarrProcesses(Crew(2)))
     assert begun == [0, 0]  # with others, and alone
     assert [path.name for path in picture.parent.iterdir()] == ["in.zarr"]
 
@@ -172,7 +172,7 @@ def test_a_worker_of_a_cluster_that_dies_is_replaced(picture: Path) -> None:
         distributed.LocalCluster(2, threads_per_worker=1, dashboard_address=None) as cluster,
         zarr_processes(None, cluster.scheduler_address) as workers,
     ):
-        assert workers.workers.number == 2
+        assert workers.crew.number == 2
         write_negative(picture, workers)
     check_negative(picture)
 
