@@ -21,9 +21,9 @@ from nlfilter_torch.photo.cli import INTERRUPTED
 from nlfilter_torch.photo.cli.editing import allowed_memory, check_quality_of, check_workers, has_jpeg_suffix
 from nlfilter_torch.photo.cli.edits import edit_photograph
 from nlfilter_torch.photo.cli.folders import left_out, pictures, prepare, subfolders
+from nlfilter_torch.photo.cli.jobs import apply_files
 from nlfilter_torch.photo.cli.options import NOTE, FolderOptions, PhotographOptions
 from nlfilter_torch.photo.cli.progress import steps
-from nlfilter_torch.photo.cli.recipe_job import apply_files
 from nlfilter_torch.photo.cli.workers import Crew, worker_pool
 from nlfilter_torch.photo.declared.parameters import DETAIL
 from nlfilter_torch.photo.declared.presets import Recipe, named_recipe

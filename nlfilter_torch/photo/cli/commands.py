@@ -49,7 +49,7 @@ def develop(
     recipe = Recipe((), Development(**values | {"crop": options.parse_crop(values["crop"])}))
     sides = None if aspect is None else options.parse_aspect(aspect)
 
-    from nlfilter_torch.photo.cli.recipe_job import develop_file
+    from nlfilter_torch.photo.cli.jobs import develop_file
 
     develop_file(recipe, sides, source, target, files)
 
@@ -85,7 +85,7 @@ def apply(
     Two looks that `nlfilter-torch fit` found for regions: `nlfilter-torch apply in.jpg out.jpg --preset look-1.json
     --mask sky.png --preset look-2.json --mask ground.png`
     """
-    from nlfilter_torch.photo.cli.recipe_job import apply_files
+    from nlfilter_torch.photo.cli.jobs import apply_files
 
     apply_files(preset, mask or [], source, target, files, full=full)
 

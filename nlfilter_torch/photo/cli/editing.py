@@ -1,12 +1,12 @@
 """The part shared by all commands that edit one photograph: read, check, edit and write, in tiles if necessary."""
 
 import sys
+from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, replace
 from os.path import realpath
 from pathlib import Path
-from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -14,7 +14,7 @@ from torch import Tensor
 from nlfilter_torch.photo.cli import options
 from nlfilter_torch.photo.cli.processes import zarr_processes
 from nlfilter_torch.photo.cli.progress import stages, steps
-from nlfilter_torch.photo.declared.development import Development
+from nlfilter_torch.photo.declared.development import AS_IT_IS, Development
 from nlfilter_torch.photo.declared.steps import Step, working_bytes
 from nlfilter_torch.photo.files.formats import Depth, TooLarge, check_depth, check_memory, check_type
 from nlfilter_torch.photo.files.rows import (
@@ -224,18 +224,6 @@ def rows_in_memory(photograph: Photograph, name: str) -> Rows:
     return Rows(name, photograph.size, pixels.shape[1], lambda rows: pixels[..., rows, :])
 
 
-def note_developing(edit: "FileEdit", source: str, size: tuple[int, int], channels: int) -> None:
-    """Print the notes about how a photograph (H, W) with that number of channels is developed."""
-    note_grey(edit.develop, source, channels)
-    note_cropped(edit.develop, edit.cropped_away(size))
-
-
-def note_grey(develop: Development, name: str, channels: int) -> None:
-    """Print a note if a photograph with that number of channels has no colours to balance."""
-    if develop.balances and channels < 3:
-        options.note(f"{name} is grey: temperature and tint change nothing")
-
-
 def note_cropped(develop: Development, steps: Iterable[tuple[int, Step]]) -> None:
     """Print a note for each step, with its number, whose strokes of objects are all outside the crop."""
     crop = ",".join(f"{edge:g}" for edge in develop.crop)
@@ -244,79 +232,96 @@ def note_cropped(develop: Development, steps: Iterable[tuple[int, Step]]) -> Non
         options.note(f"{step.edit}, step {number}, has no strokes within the crop {crop}: {effect}")
 
 
-class FileEdit(Protocol):
-    """An edit of a photograph in a file, in memory or by rows."""
+@dataclass(frozen=True)
+class FileEdit(ABC):
+    """An edit of a photograph in a file, in memory or by rows.
+
+    Attributes:
+        source: the file to read.
+        target: the file to write.
+        files: how they are read and written.
+        full: whether statistics of tiles are of all pixels.
+    """
+
+    source: str
+    target: str
+    files: options.PhotographOptions
+    full: bool
 
     @property
+    @abstractmethod
     def bytes_per_pixel(self) -> int:
         """Memory that the edit needs per pixel of an image."""
 
     @property
+    @abstractmethod
     def coloured(self) -> bool:
         """Whether the edit adds colours to a grey photograph."""
 
     @property
     def develop(self) -> Development:
         """What comes before the edit."""
+        return AS_IT_IS
 
     def at_size(self, size: tuple[int, int]) -> "FileEdit":
         """The edit of a photograph (H, W), whose crop is known then."""
+        return self
 
     def cropped_away(self, size: tuple[int, int]) -> Iterable[tuple[int, Step]]:
         """The steps, with their numbers, whose objects in a photograph (H, W) are all outside the crop."""
+        return ()
 
     def on_developed(self, size: tuple[int, int]) -> "FileEdit":
         """The edit for a developed photograph that was (H, W) before."""
+        return self
 
+    @abstractmethod
     def edited(self, photograph: Photograph) -> Tensor:
         """New pixels (1, C, H, W) of a photograph in memory that is developed already."""
 
+    @abstractmethod
     def tiling(self, job: Job) -> AbstractContextManager[Tiling]:
         """The edited rows of a photograph that does not fit in memory, which are computed within the block."""
 
+    def run(self) -> None:
+        """Edit the photograph, and write it to the other file, with its metadata."""
+        files, target = self.files, self.target
+        check_not_input(self.source, target, force=files.force)
+        check_quality(target, files.quality)
+        check_processes(self.source, target, files.workers, files.cluster)
+        allowed, kind = allowed_memory(files.memory), None if files.depth is None else options.DTYPES[files.depth]
+        with steps(3) as begin:
+            begin("Reading")
+            photograph = read_if_it_fits(self.source, target, self.bytes_per_pixel, files.memory)
+            if photograph is not None:
+                size = photograph.size
+                edit = self.at_size(size)
+                photograph = develop_photograph(photograph, edit.develop)
+                output = photograph if kind is None else replace(photograph, depth=kind)
+                check_output(target, output)
+                edit.note_developing(size, photograph.pixels.shape[1])
+                begin("Editing")
+                output = output.with_pixels(edit.on_developed(size).edited(photograph))
+                begin("Writing")
+                write_photograph(output, target, quality=files.quality)
+                return
+        with ExitStack() as stack:
+            picture = stack.enter_context(open_picture(Path(self.source), allowed))
+            own_depth = check_depth(self.source, picture.rows.dtype)  # refuses other dtypes whatever the output is
+            stored = kind or own_depth
+            edit = self.at_size(picture.shape[:2])
+            part = picture.of_part(edit.develop.frame(picture.shape[:2]).size)
+            like = part.in_colour() if edit.coloured else part
+            check_place(Path(target), stored, like, allowed)
+            edit.note_developing(picture.shape[:2], picture.shape[2])
+            processes = stack.enter_context(zarr_processes(files.workers, files.cluster))
+            limit, report = allowed_memory(files.memory, TILED_MEMORY), stack.enter_context(stages())
+            job = Job(picture, stored, allowed - picture.cached, limit, report, stack, processes)
+            with edit.tiling(job) as tiling:
+                write_picture(Path(target), tiling, stored, like, files.quality, tiling.fill)
 
-def edit_file(edit: FileEdit, source: str, target: str, files: options.PhotographOptions) -> None:
-    """Edit the photograph in a file, and write it to another file, with its metadata."""
-    check_not_input(source, target, force=files.force)
-    check_quality(target, files.quality)
-    check_processes(source, target, files.workers, files.cluster)
-    allowed, kind = allowed_memory(files.memory), None if files.depth is None else options.DTYPES[files.depth]
-    with steps(3) as begin:
-        begin("Reading")
-        photograph = read_if_it_fits(source, target, edit.bytes_per_pixel, files.memory)
-        if photograph is not None:
-            size = photograph.size
-            edit = edit.at_size(size)
-            photograph = develop_photograph(photograph, edit.develop)
-            output = photograph if kind is None else replace(photograph, depth=kind)
-            check_output(target, output)
-            note_developing(edit, source, size, photograph.pixels.shape[1])
-            begin("Editing")
-            output = output.with_pixels(edit.on_developed(size).edited(photograph))
-            begin("Writing")
-            write_photograph(output, target, quality=files.quality)
-            return
-    with ExitStack() as stack:
-        picture = stack.enter_context(open_picture(Path(source), allowed))
-        own_depth = check_depth(source, picture.rows.dtype)  # refuses other dtypes whatever the output is
-        stored = kind or own_depth
-        size = picture.shape[:2]
-        edit = edit.at_size(size)
-        framed = edit.develop.frame(size).size
-        part = picture.of_part(framed)
-        like = part.in_colour() if edit.coloured else part
-        check_place(Path(target), stored, like, allowed)
-        note_developing(edit, source, size, picture.shape[2])
-        processes = stack.enter_context(zarr_processes(files.workers, files.cluster))
-        report = stack.enter_context(stages())
-        job = Job(
-            picture,
-            stored,
-            allowed - picture.cached,
-            allowed_memory(files.memory, TILED_MEMORY),
-            report,
-            stack,
-            processes,
-        )
-        with edit.tiling(job) as tiling:
-            write_picture(Path(target), tiling, stored, like, files.quality, tiling.fill)
+    def note_developing(self, size: tuple[int, int], channels: int) -> None:
+        """Print the notes about how a photograph (H, W) with that number of channels is developed."""
+        if self.develop.balances and channels < 3:
+            options.note(f"{self.source} is grey: temperature and tint change nothing")
+        note_cropped(self.develop, self.cropped_away(size))

@@ -284,15 +284,15 @@ def edit_photograph(
     if not files.force:
         check_usual(step, typed, [options.split_region(text)[2] or "" for text in region or []])
 
-    from nlfilter_torch.photo.cli.edit_job import EditJob
-    from nlfilter_torch.photo.cli.editing import check_written, edit_file
+    from nlfilter_torch.photo.cli.editing import check_written
+    from nlfilter_torch.photo.cli.jobs import EditJob
     from nlfilter_torch.photo.cli.scribbles import ScribbleOptions
 
     rectangles = {name: texts for name, texts in others.items() if texts is not None}
     drawn = ScribbleOptions(region, strokes, mask, rectangles, colour)
     check_written(source, target, show=show, map=map, mask=mask, strokes=strokes, preset=preset)
     notes = useless_options(step, typed, marked=drawn.marks_objects(edit))
-    edit_file(EditJob(step, source, target, drawn, show, map, files, seed, full, notes), source, target, files)
+    EditJob(source, target, files, full, step, drawn, show, map, seed, notes).run()
 
 
 def check_usual(step: Step, typed: Collection[str], notes: Iterable[str] = ()) -> None:

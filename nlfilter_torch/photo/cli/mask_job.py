@@ -8,8 +8,8 @@ from pathlib import Path
 
 from nlfilter_torch.core.workers import single_threaded
 from nlfilter_torch.photo.cli import editing, options
-from nlfilter_torch.photo.cli.edit_job import PictureOpener
 from nlfilter_torch.photo.cli.editing import pixels_of, rows_in_memory
+from nlfilter_torch.photo.cli.jobs import PictureOpener
 from nlfilter_torch.photo.cli.processes import zarr_processes
 from nlfilter_torch.photo.cli.progress import stages, steps
 from nlfilter_torch.photo.cli.scribbles import MarkedPhotograph, Opener, ScribbleOptions

@@ -106,7 +106,7 @@ def test_errors_of_the_system(photo: Path, monkeypatch: pytest.MonkeyPatch, caps
         def fail(*_: object, error: OSError = error, **__: object) -> None:
             raise error
 
-        monkeypatch.setattr("nlfilter_torch.photo.cli.editing.edit_file", fail)
+        monkeypatch.setattr("nlfilter_torch.photo.cli.editing.FileEdit.run", fail)
         assert refused(capsys, "tone", photo, photo.with_name("out.png")) == f"nlfilter-torch: {sentence}\n"
 
 

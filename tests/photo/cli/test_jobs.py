@@ -12,7 +12,7 @@ from PIL import Image
 
 from nlfilter_torch.photo import abstract, adjust_tone, colorize, defocus, denoise, enhance, recolor, sharpen
 from nlfilter_torch.photo.cli import main
-from nlfilter_torch.photo.cli.edit_job import ChangeMeter, EditJob, squared_difference, write_map
+from nlfilter_torch.photo.cli.jobs import ChangeMeter, EditJob, squared_difference, write_map
 from nlfilter_torch.photo.cli.options import PhotographOptions
 from nlfilter_torch.photo.cli.scribbles import ScribbleOptions
 from nlfilter_torch.photo.declared.steps import Step
@@ -266,7 +266,7 @@ def test_what_cannot_be_done_by_rows_leaves_nothing(scan: Path, capsys: pytest.C
 
 
 def job(step: Step, *, region: list[str] | None = None) -> EditJob:
-    return EditJob(step, "in.png", "out.png", ScribbleOptions(region), None, None, PhotographOptions(), 0, False)
+    return EditJob("in.png", "out.png", PhotographOptions(), False, step, ScribbleOptions(region))
 
 
 def test_what_is_known_before_the_photograph_is_read() -> None:
@@ -281,9 +281,7 @@ def test_what_is_known_before_the_photograph_is_read() -> None:
 
 
 def test_the_same_pixels_in_memory_and_from_a_file(photo: Path, pixels: torch.Tensor) -> None:
-    edit = EditJob(
-        Step("tone", contrast=1.3), str(photo), "", ScribbleOptions(), None, None, PhotographOptions(), 0, False
-    )
+    edit = EditJob(str(photo), "", PhotographOptions(), False, Step("tone", contrast=1.3), ScribbleOptions())
     wanted = adjust_tone(pixels, contrast=1.3, generator=seeded())
     assert (edit.edited(read_photograph(photo)) - wanted).abs().max() < 1e-5
 

@@ -8,7 +8,8 @@ import tifffile
 from PIL import Image
 
 from nlfilter_torch.photo.cli import main
-from nlfilter_torch.photo.cli.recipe_job import RecipeJob
+from nlfilter_torch.photo.cli.jobs import RecipeJob
+from nlfilter_torch.photo.cli.options import PhotographOptions
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.picture.photographs import read_photograph
@@ -85,11 +86,14 @@ def test_steps_keep_values_above_white(tmp_path: Path, tiled: bool) -> None:
 
 def test_what_is_known_before_the_photograph_is_read() -> None:
     detail, tone = Recipe((Step("detail", alpha=(2.0, 1.0)),)), Recipe((Step("tone", contrast=1.5),))
-    single, both = (RecipeJob(r, m, "", "", False) for r, m in (([detail], []), ([detail, tone], [Path(), Path()])))
+    single, both = (
+        RecipeJob("", "", PhotographOptions(), False, recipes, masks)
+        for recipes, masks in (([detail], []), ([detail, tone], [Path(), Path()]))
+    )
     assert single.bytes_per_pixel == detail.bytes_per_pixel
     assert both.bytes_per_pixel > max(detail.bytes_per_pixel, tone.bytes_per_pixel)
     assert not both.coloured
-    assert RecipeJob([tone, Recipe((COLORIZE,))], [], "", "", False).coloured
+    assert RecipeJob("", "", PhotographOptions(), False, [tone, Recipe((COLORIZE,))]).coloured
 
 
 def test_masks_have_the_size_of_the_photograph(tmp_path: Path, tiled: bool, capsys: pytest.CaptureFixture[str]) -> None:
@@ -104,6 +108,6 @@ def test_masks_have_the_size_of_the_photograph(tmp_path: Path, tiled: bool, caps
 def test_notes_of_all_recipes_are_printed_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     source, white = saved(tmp_path / "in.png", cat().mean(2)), saved(tmp_path / "mask.png", np.ones(SIZE))
     sepia = Recipe((Step("look", matrix=SEPIA),))
-    job = RecipeJob([sepia, sepia], [white, white], str(source), str(tmp_path / "out.png"), False)
+    job = RecipeJob(str(source), str(tmp_path / "out.png"), PhotographOptions(), False, [sepia, sepia], [white, white])
     job.edited(read_photograph(source))
     assert capsys.readouterr().err.count("is grey and stays grey") == 1
