@@ -18,9 +18,8 @@ from typer.core import TyperCommand
 
 from nlfilter_torch.core.instruction_sets import NAMES, level, load_library
 from nlfilter_torch.photo.cli import INTERRUPTED, tell
-from nlfilter_torch.photo.cli.commands import apply, batch, demo, develop, frames, inspect, presets
+from nlfilter_torch.photo.cli.commands import apply, batch, demo, develop, fit, frames, inspect, presets
 from nlfilter_torch.photo.cli.edits import command
-from nlfilter_torch.photo.cli.fit import fit
 from nlfilter_torch.photo.cli.mask import mask
 from nlfilter_torch.photo.declared.parameters import EDITS
 from nlfilter_torch.version import __version__

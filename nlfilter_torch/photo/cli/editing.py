@@ -213,9 +213,9 @@ def check_processes(source: str, target: str, workers: int | None, cluster: str 
         )
 
 
-def pixels_of(picture: Picture, rows: slice) -> Tensor:
-    """Some rows (1, C, h, W) of a picture that is read by rows."""
-    return picture.tile(rows.start, rows.stop, 0).pixels
+def rows_by_tiles(picture: Picture) -> Rows:
+    """The rows of a picture that is read by rows."""
+    return Rows(picture.name, picture.size, picture.colours, lambda rows: picture.tile(rows.start, rows.stop, 0).pixels)
 
 
 def rows_in_memory(photograph: Photograph, name: str) -> Rows:

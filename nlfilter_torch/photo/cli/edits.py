@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 import typer
 
 from nlfilter_torch.photo.cli import options
-from nlfilter_torch.photo.declared.declaration import FILTER_PANEL, UNIT_NAMES, Edit, Kind, Parameter, ScribbleKind
+from nlfilter_torch.photo.declared.declaration import FILTER_PANEL, UNIT_NAMES, Edit, Kind, Parameter
 from nlfilter_torch.photo.declared.json_values import Value
 from nlfilter_torch.photo.declared.parameters import DETAIL
 from nlfilter_torch.photo.declared.presets import LOOKS, PRESETS, Recipe, find_recipe
@@ -86,18 +86,6 @@ PresetName = Annotated[
         "look."
     ),
 ]
-#: The placeholder of a rectangle for each kind of scribbles.
-METAVARS: dict[ScribbleKind, str] = {
-    "colours": "X,Y,W,H:COLOUR",
-    "mask": "X,Y,W,H",
-    "sliders": "X,Y,W,H[:SLIDERS]",
-}
-#: The option ``--region`` for each kind of scribbles on an object.
-REGION_OPTIONS: dict[ScribbleKind, object] = {
-    "colours": options.ColourRegions,
-    "mask": options.Regions,
-    "sliders": options.SliderRegions,
-}
 
 
 def scribble_options(edit: Edit) -> dict[str, object]:
@@ -105,10 +93,13 @@ def scribble_options(edit: Edit) -> dict[str, object]:
     kinds = [scribble.kind for scribble in edit.scribbles if scribble.role == "object"]
     annotations: dict[str, object] = {"preset": PresetName} if edit.presets else {}
     for kind in kinds:
-        annotations |= {"strokes": options.StrokesFile, "region": REGION_OPTIONS[kind]}
+        annotations |= {
+            "strokes": options.StrokesFile,
+            "region": options.rectangles("--region", *options.REGIONS[kind]),
+        }
     for scribble in edit.with_options:
         name = scribble.option.removeprefix("--")
-        metavar = METAVARS[scribble.kind]
+        metavar = options.REGIONS[scribble.kind][0]
         if scribble.role == "box":  # which need not say a colour
             metavar = metavar.replace(":COLOUR", "[:COLOUR]")
         annotations[name] = options.rectangles(scribble.option, metavar, scribble.option_help)

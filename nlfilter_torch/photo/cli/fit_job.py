@@ -60,7 +60,8 @@ class FitJob:
         masks: a picture for each region, or a folder of them.
         preview: file for a picture of the first pair, or None.
         left: file for a picture of what the look does not explain of it, or None.
-        tables: colour tables to write.
+        cube: file for a colour table, or None; those of several regions get numbers.
+        hald: file for a picture of such a table, or None.
     """
 
     step: Step
@@ -70,7 +71,8 @@ class FitJob:
     masks: list[Path]
     preview: Path | None
     left: Path | None
-    tables: "Tables"
+    cube: Path | None = None
+    hald: Path | None = None
 
     def run(self, order: int) -> None:
         """Fit the looks, write them, and print what they are worth."""
@@ -94,7 +96,7 @@ class FitJob:
             for look, path in zip(looks, results, strict=True):
                 with open_beside(path) as stream:
                     stream.write(look.to_json().encode())
-            self.tables.write(looks)
+            self._write_tables(looks)
         if self.before.is_dir():
             _note_unpaired(self.before, {path.stem for _, path in paths})
             _note_unpaired(self.after, {path.stem for path, _ in paths})
@@ -102,7 +104,7 @@ class FitJob:
         for look, path in zip(looks, results, strict=True):
             _report(look, look.fitted if share is None else share, path, alone=alone)
         if whole and judged is not None:
-            self.tables.report(looks[0], *judged[:2])
+            self._report_table(looks[0], *judged[:2])
             _tell_where(*judged, stride=pairs.first[0].shape[-1] / judged[0].shape[-1])
 
     def _check(self, results: list[Path], **inputs: list[Path]) -> None:
@@ -117,7 +119,41 @@ class FitJob:
                 check_type(picture, "uint8", alpha=False)
                 check_apart(option, picture, **inputs)
         check_apart("--map", self.left, preview=self.preview)
-        self.tables.check(**inputs)
+        if self.cube is not None:
+            check_file(self.cube)
+            if self.cube.suffix.lower() != ".cube":
+                raise ValueError(f"--cube must end in .cube, got {self.cube}; rename it")
+            check_apart("--cube", self.cube, **inputs)
+        if self.hald is not None:
+            check_type(self.hald, "uint16", alpha=False)
+            check_apart("--hald", self.hald, **inputs)
+
+    def _write_tables(self, looks: Sequence[FittedLook]) -> None:
+        """Write the tables of looks; those of several get numbers."""
+        for number, look in enumerate(looks, 1):
+            ending = f"-{number}" if len(looks) > 1 else ""
+            if self.cube is not None:
+                path = self.cube.with_stem(self.cube.stem + ending)
+                with open_beside(path) as stream:
+                    stream.write(cube_of(colour_table(look.step, CUBE_NODES).numpy(), path.stem).encode())
+            if self.hald is not None:
+                levels = hald_of(colour_table(look.step, HALD_LEVEL**2).numpy())
+                pixels = torch.from_numpy(levels / 65535).permute(2, 0, 1)[None]
+                write_photograph(Photograph(pixels, "uint16"), self.hald.with_stem(self.hald.stem + ending))
+
+    def _report_table(self, look: FittedLook, before: Tensor, after: Tensor) -> None:
+        """Say what a table carries of the change between two pictures, and how exact it is, if there is one."""
+        if self.cube is None and self.hald is None:
+            return
+        share = explained_share(before, after, apply_step(colour_part(look.step), before).clamp(0, 1))
+        error = table_error(look.step, CUBE_NODES, before)
+        carried = f"{self.cube or self.hald} carries {100 * share:.1f} % of the change"
+        typer.echo(f"table: {carried}; {CUBE_NODES}^3 colours are off by {error:.2f} levels of 255")
+        if share < ENOUGH:
+            options.note(
+                f"a table carries less than {100 * ENOUGH:.0f} % of the edit, as the rest depends on the picture; "
+                "use the preset with nlfilter-torch apply"
+            )
 
 
 @dataclass
@@ -300,54 +336,3 @@ def _draw(before: Tensor, after: Tensor, result: Tensor, preview: Path | None, l
     if left is not None:
         rest = (after - result).abs().amax(1, keepdim=True)
         write_photograph(Photograph(rest / rest.amax().clamp(min=1e-6)), left)
-
-
-@dataclass(frozen=True)
-class Tables:
-    """Files of colour tables, of the looks of one or several regions.
-
-    Attributes:
-        cube: a ``.cube`` file, or None.
-        hald: a picture, or None.
-    """
-
-    cube: Path | None
-    hald: Path | None
-
-    def check(self, **inputs: list[Path]) -> None:
-        """Raise ValueError or OSError unless the files can be written and differ from the inputs."""
-        if self.cube is not None:
-            check_file(self.cube)
-            if self.cube.suffix.lower() != ".cube":
-                raise ValueError(f"--cube must end in .cube, got {self.cube}; rename it")
-            check_apart("--cube", self.cube, **inputs)
-        if self.hald is not None:
-            check_type(self.hald, "uint16", alpha=False)
-            check_apart("--hald", self.hald, **inputs)
-
-    def write(self, looks: Sequence[FittedLook]) -> None:
-        """Write the tables of looks; those of several get numbers."""
-        for number, look in enumerate(looks, 1):
-            ending = f"-{number}" if len(looks) > 1 else ""
-            if self.cube is not None:
-                path = self.cube.with_stem(self.cube.stem + ending)
-                with open_beside(path) as stream:
-                    stream.write(cube_of(colour_table(look.step, CUBE_NODES).numpy(), path.stem).encode())
-            if self.hald is not None:
-                levels = hald_of(colour_table(look.step, HALD_LEVEL**2).numpy())
-                pixels = torch.from_numpy(levels / 65535).permute(2, 0, 1)[None]
-                write_photograph(Photograph(pixels, "uint16"), self.hald.with_stem(self.hald.stem + ending))
-
-    def report(self, look: FittedLook, before: Tensor, after: Tensor) -> None:
-        """Say what a table carries of the change between two pictures, and how exact it is, if there is one."""
-        if self.cube is None and self.hald is None:
-            return
-        share = explained_share(before, after, apply_step(colour_part(look.step), before).clamp(0, 1))
-        error = table_error(look.step, CUBE_NODES, before)
-        carried = f"{self.cube or self.hald} carries {100 * share:.1f} % of the change"
-        typer.echo(f"table: {carried}; {CUBE_NODES}^3 colours are off by {error:.2f} levels of 255")
-        if share < ENOUGH:
-            options.note(
-                f"a table carries less than {100 * ENOUGH:.0f} % of the edit, as the rest depends on the picture; "
-                "use the preset with nlfilter-torch apply"
-            )

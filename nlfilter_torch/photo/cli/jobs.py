@@ -6,7 +6,6 @@ Each recipe may be for a region of its own.
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
-from functools import partial
 from itertools import chain
 from pathlib import Path
 
@@ -25,8 +24,8 @@ from nlfilter_torch.photo.cli.editing import (
     allowed_memory,
     check_apart,
     note_cropped,
-    pixels_of,
     read_masks,
+    rows_by_tiles,
     rows_in_memory,
 )
 from nlfilter_torch.photo.cli.scribbles import MarkedPhotograph, Opener, ScribbleOptions
@@ -110,7 +109,7 @@ class EditJob(FileEdit):
         """The edited rows of a photograph that does not fit in memory, which are computed within the block."""
         passes = job.passes(self.full, Path(self.target).parent)
         tiled = Tiled(Picture(job.picture.marked, self.source), passes, self.scribbles.called)
-        rows = Rows(self.source, job.size, tiled.channels, partial(pixels_of, tiled.picture))
+        rows = rows_by_tiles(tiled.picture)
         marked = self._marked(rows, job.open)
         self._tell(rows, marked)
         edit = self._measured(tiled, rows)
@@ -284,8 +283,7 @@ class RecipeJob(FileEdit):
         passes, picture = job.passes(self.full, Path(self.target).parent), job.picture
         masks = self._masks(job)
         with developed_rows(self.develop, passes, picture.marked, self.source, picture.nodata) as source:
-            read = Picture(source, self.source)
-            self._tell(Rows(self.source, read.size, read.colours, partial(pixels_of, read)))
+            self._tell(rows_by_tiles(Picture(source, self.source)))
             if masks:
                 edits = [recipe.steps for recipe in self.recipes]
                 whole = edit_regions(passes, source, edits, [mask.rows for mask in masks], self.source)

@@ -3,12 +3,11 @@
 from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 
 from nlfilter_torch.core.workers import single_threaded
 from nlfilter_torch.photo.cli import editing, options
-from nlfilter_torch.photo.cli.editing import pixels_of, rows_in_memory
+from nlfilter_torch.photo.cli.editing import rows_by_tiles, rows_in_memory
 from nlfilter_torch.photo.cli.jobs import PictureOpener
 from nlfilter_torch.photo.cli.processes import zarr_processes
 from nlfilter_torch.photo.cli.progress import stages, steps
@@ -135,7 +134,7 @@ class MaskJob:
     def _by_rows(self, job: editing.Job, plain: StoredPicture) -> None:
         """Compute the mask in tiles and write it."""
         tiled = Tiled(Picture(job.picture.marked, self.source), job.passes(self.full, self.target.parent), "--region")
-        rows = Rows(self.source, job.size, tiled.channels, partial(pixels_of, tiled.picture))
+        rows = rows_by_tiles(tiled.picture)
         marked = self._marked(rows, job.open)
         with single_threaded(tiled.passes.workers(1)):
             fitted = self._fitted(tiled, marked.rows())

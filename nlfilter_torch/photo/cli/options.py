@@ -11,7 +11,14 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from nlfilter_torch.photo.declared.declaration import FILTER_PANEL, GAINS, MAX_SLIDERS, UNIT_NAMES, Parameter
+from nlfilter_torch.photo.declared.declaration import (
+    FILTER_PANEL,
+    GAINS,
+    MAX_SLIDERS,
+    UNIT_NAMES,
+    Parameter,
+    ScribbleKind,
+)
 from nlfilter_torch.photo.declared.development import Crop, check_value
 from nlfilter_torch.photo.declared.strokes import Shape
 
@@ -203,23 +210,32 @@ def quality(help: str) -> object:
 
 Quality = Annotated[int | None, quality("Quality of a JPEG file.")]
 QualityOfFolder = Annotated[int | None, quality("Quality of the JPEG files; others are not affected.")]
+
+
+def workers(help: str) -> object:
+    """The option ``--workers``."""
+    return typer.Option(min=1, metavar="N", help=help)
+
+
+def cluster(beginning: str, work: str) -> object:
+    """The option ``--cluster``, whose workers do some work."""
+    help = (
+        f"{beginning} address of a Dask cluster, such as tcp://host:8786, whose workers {work}. They have one thread "
+        "each and see the folders under the same names. Needs the extra cluster."
+    )
+    return typer.Option(metavar="ADDRESS", help=help)
+
+
 Workers = Annotated[
     int | None,
-    typer.Option(
-        min=1,
-        metavar="N",
-        help="With zarr arrays as IN and OUT: filter and write their parts by this many processes instead of threads.",
-    ),
+    workers("With zarr arrays as IN and OUT: filter and write their parts by this many processes instead of threads."),
 ]
-ADDRESS = "address of a Dask cluster, such as tcp://host:8786, whose workers"
-ON_CLUSTER = "They have one thread each and see the folders under the same names. Needs the extra cluster."
-Cluster = Annotated[
-    str | None,
-    typer.Option(
-        metavar="ADDRESS",
-        help=f"With zarr arrays as IN and OUT: the {ADDRESS} filter and write their parts. {ON_CLUSTER}",
-    ),
+Cluster = Annotated[str | None, cluster("With zarr arrays as IN and OUT: the", "filter and write their parts")]
+WorkersOfFolder = Annotated[
+    int | None,
+    workers("How many photographs are edited at a time; each takes memory of its own. Default: one per core."),
 ]
+ClusterOfFolder = Annotated[str | None, cluster("The", "edit the photographs in place of this machine")]
 
 
 @dataclass(frozen=True)
@@ -232,24 +248,6 @@ class PhotographOptions:
     memory: Memory = None
     workers: Workers = None
     cluster: Cluster = None
-
-
-WorkersOfFolder = Annotated[
-    int | None,
-    typer.Option(
-        min=1,
-        metavar="N",
-        help="How many photographs are edited at a time; each takes memory of its own. Default: one per core.",
-    ),
-]
-
-ClusterOfFolder = Annotated[
-    str | None,
-    typer.Option(
-        metavar="ADDRESS",
-        help=f"The {ADDRESS} edit the photographs in place of this machine. {ON_CLUSTER}",
-    ),
-]
 
 
 @dataclass(frozen=True)
@@ -283,25 +281,25 @@ Colour = Annotated[
     typer.Option("--colour", metavar="COLOUR", help="Colour of --mask, and of regions and strokes that say none."),
 ]
 _SHAPES = "`ellipse:X,Y,W,H` is the ellipse in a rectangle, and X,Y,X,Y,X,Y and so on are the corners of a polygon. "
-ColourRegions = rectangles(
-    "--region",
-    "X,Y,W,H:COLOUR",
-    "A rectangle of colour, instead of scribbles or on top of them: column and row of its upper left corner, width and "
-    "height, in pixels or in % of the photograph, and a colour such as red or #c04020; X,Y alone is a small square "
-    f"around that point. {_SHAPES}May be repeated; later ones cover earlier ones.",
-)
-Regions = rectangles(
-    "--region",
-    "X,Y,W,H",
-    "A rectangle: column and row of its upper left corner, width and height, in pixels or in % of the photograph; X,Y "
-    f"alone is a small square around that point. {_SHAPES}May be repeated.",
-)
-SliderRegions = rectangles(
-    "--region",
-    "X,Y,W,H[:SLIDERS]",
-    "Edit only what resembles a rectangle: column and row of its upper left corner, its width and height, and its own "
-    f"sliders if they differ from --alpha, such as 60,300,20,20:3,3,4,1. {_SHAPES}May be repeated.",
-)
+#: The placeholder of a rectangle and the help of ``--region``, for each kind of scribbles.
+REGIONS: dict[ScribbleKind, tuple[str, str]] = {
+    "colours": (
+        "X,Y,W,H:COLOUR",
+        "A rectangle of colour, instead of scribbles or on top of them: column and row of its upper left corner, width "
+        "and height, in pixels or in % of the photograph, and a colour such as red or #c04020; X,Y alone is a small "
+        f"square around that point. {_SHAPES}May be repeated; later ones cover earlier ones.",
+    ),
+    "mask": (
+        "X,Y,W,H",
+        "A rectangle: column and row of its upper left corner, width and height, in pixels or in % of the photograph; "
+        f"X,Y alone is a small square around that point. {_SHAPES}May be repeated.",
+    ),
+    "sliders": (
+        "X,Y,W,H[:SLIDERS]",
+        "Edit only what resembles a rectangle: column and row of its upper left corner, its width and height, and its "
+        f"own sliders if they differ from --alpha, such as 60,300,20,20:3,3,4,1. {_SHAPES}May be repeated.",
+    ),
+}
 MaskFile = file(
     "--mask",
     "A picture of the same size as the photograph, white where selected and black elsewhere. Pixels darker than middle "

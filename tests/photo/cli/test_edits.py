@@ -124,8 +124,9 @@ def test_options_of_an_edit_with_two_kinds_of_scribbles() -> None:
     edit = Edit("desaturate", "", (), scribbles=(Scribble("scribbles", "Object", needed=True), keep))
     annotations = scribble_options(edit)
     assert list(annotations) == ["strokes", "region", "keep", "mask", "show"]
-    assert annotations["region"] is options.Regions
-    assert get_args(annotations["keep"])[1].help == "Pixels to keep."
+    region, keep_option = (get_args(annotations[name])[1] for name in ("region", "keep"))
+    assert (region.metavar, region.help) == options.REGIONS["mask"]
+    assert keep_option.help == "Pixels to keep."
     colours = Edit("tint", "", (), scribbles=(Scribble("mask", "Colour", "colours"), keep), map_help="A map.")
     assert list(scribble_options(colours)) == ["strokes", "region", "keep", "mask", "colour", "show", "map"]
     assert not scribble_options(Edit("plain", "", ()))

@@ -358,7 +358,7 @@ def test_large_photographs_are_judged_at_the_viewing_size(
     before: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(
-        "nlfilter_torch.photo.cli.fit.step_of", lambda *_: Step("look", viewing_size=0.003, landmarks=40)
+        "nlfilter_torch.photo.cli.commands.step_of", lambda *_: Step("look", viewing_size=0.003, landmarks=40)
     )
     height, width = CAT.shape[-2:]
     write_photograph(Photograph(CAT**1.3), before.with_name("after.png"))
