@@ -2,7 +2,7 @@
 
 Every edit, the operator, the denoiser and steps of training take turns with one thread and with two, alone and beside
 one and two processes that keep a core busy each. Threads wait for each other as in the program
-(``nlfilter_torch.photo.cli``). With two threads nothing must take more than 1.3 times as long as with one, and
+(``nlfilter_torch.photo.cli.process``). With two threads nothing must take more than 1.3 times as long as with one, and
 alone not more than 1.1 times as long as where threads wait as torch has it, by spinning. Ratios are medians over
 ``--repeats``. ``--spinning`` shows what spinning costs beside busy processes.
 """
@@ -24,7 +24,7 @@ from benchmarks.photographs import photograph
 from benchmarks.streaming import neighbours
 from nlfilter_torch import NonlocalDenoiser, NonlocalFilter, nonlocal_operator, photo, polynomial_filter
 from nlfilter_torch.photo import region_mask
-from nlfilter_torch.photo.cli import VARIABLES, sleep_while_waiting
+from nlfilter_torch.photo.cli.process import VARIABLES, sleep_while_waiting
 
 NEIGHBOURS = (0, 1, 2)
 BESIDE, IDLE = 1.3, 1.1  # limits of the ratios of times

@@ -17,10 +17,10 @@ import typer
 from typer.core import TyperCommand
 
 from nlfilter_torch.core.instruction_sets import NAMES, level, load_library
-from nlfilter_torch.photo.cli import INTERRUPTED, tell
 from nlfilter_torch.photo.cli.commands import apply, batch, demo, develop, fit, frames, inspect, presets
 from nlfilter_torch.photo.cli.edits import command
 from nlfilter_torch.photo.cli.mask import mask
+from nlfilter_torch.photo.cli.process import INTERRUPTED, tell
 from nlfilter_torch.photo.declared.parameters import EDITS
 from nlfilter_torch.version import __version__
 
@@ -206,7 +206,9 @@ def run_program(arguments: list[str] | None, others: Iterable[Callable[..., None
             message = error.format_message()
             if message.startswith("No such option: --preset"):
                 message = "No such option: --preset; use nlfilter-torch detail or apply, which have it"
-            return _refuse(explained(message, arguments, _options_of(error)))
+            context = getattr(error, "ctx", None)  # of the command that the error is about
+            own = [] if context is None else [name for parameter in context.command.params for name in parameter.opts]
+            return _refuse(explained(message, arguments, own))
         except OSError as error:
             return _refuse(_sentence(error))
         except (ValueError, MemoryError) as error:  # a bad file or value, found by the library
@@ -214,12 +216,6 @@ def run_program(arguments: list[str] | None, others: Iterable[Callable[..., None
     if status == INTERRUPTED:
         return tell()
     return status if isinstance(status, int) else 0
-
-
-def _options_of(error: typer.TyperException) -> list[str]:
-    """The options of the command that an error is about."""
-    context = getattr(error, "ctx", None)
-    return [] if context is None else [name for parameter in context.command.params for name in parameter.opts]
 
 
 def _sentence(error: OSError) -> str:

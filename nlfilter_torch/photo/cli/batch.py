@@ -17,16 +17,17 @@ from typing import Any
 
 import typer
 
-from nlfilter_torch.photo.cli import INTERRUPTED
-from nlfilter_torch.photo.cli.editing import allowed_memory, check_quality_of, check_workers, has_jpeg_suffix
+from nlfilter_torch.photo.cli.editing import allowed_memory, check_quality_of, check_workers
 from nlfilter_torch.photo.cli.edits import edit_photograph
 from nlfilter_torch.photo.cli.folders import left_out, pictures, prepare, subfolders
 from nlfilter_torch.photo.cli.jobs import apply_files
 from nlfilter_torch.photo.cli.options import NOTE, FolderOptions, PhotographOptions
+from nlfilter_torch.photo.cli.process import INTERRUPTED
 from nlfilter_torch.photo.cli.progress import steps
 from nlfilter_torch.photo.cli.workers import Crew, worker_pool
 from nlfilter_torch.photo.declared.parameters import DETAIL
 from nlfilter_torch.photo.declared.presets import Recipe, named_recipe
+from nlfilter_torch.photo.files.formats import type_of
 from nlfilter_torch.photo.files.rows import WHOLE_MEMORY, free_memory
 from nlfilter_torch.photo.files.writing import remove_stale
 
@@ -118,7 +119,7 @@ def edit_photographs(
 
 def _edited(edit: FileEdit, files: PhotographOptions, source: str, target: str) -> None:
     """Edit a file, with the quality of these options if it is a JPEG."""
-    edit(source, target, files if has_jpeg_suffix(target) else replace(files, quality=None))
+    edit(source, target, files if type_of(target) == "JPEG" else replace(files, quality=None))
 
 
 def _cores() -> int:

@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from nlfilter_torch.photo.files.formats import SUFFIXES
+from nlfilter_torch.photo.files.formats import type_of
 from nlfilter_torch.photo.files.writing import check_file, check_folder, open_beside
 
 RECORD = ".nlfilter-batch.json"  # in the output folder: the settings of the files there
@@ -29,7 +29,7 @@ def pictures(folder: Path, what: str = "photographs") -> list[Path]:
 
 def is_picture(path: Path) -> bool:
     """Whether a path is an image file by its suffix, and not hidden."""
-    return path.suffix.lower() in SUFFIXES and not path.name.startswith(".") and path.is_file()
+    return type_of(path) is not None and not path.name.startswith(".") and path.is_file()
 
 
 def left_out(folder: Path) -> str:
@@ -37,7 +37,7 @@ def left_out(folder: Path) -> str:
     suffixes = Counter(
         path.suffix.lower() or "without a suffix"
         for path in folder.iterdir()
-        if path.is_file() and path.suffix.lower() not in {*SUFFIXES, ".json"} and not path.name.startswith(".")
+        if path.is_file() and type_of(path) is None and path.suffix.lower() != ".json" and path.name[0] != "."
     )
     return ", ".join(f"{count} {suffix}" for suffix, count in sorted(suffixes.items()))
 

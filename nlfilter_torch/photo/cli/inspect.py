@@ -1,14 +1,12 @@
 """Pictures and diagnostics of the filter of a photograph, and of each of its steps on an example."""
 
 import json
-from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 
 import skimage.data
 import torch
 import typer
-from matplotlib.figure import Figure
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
@@ -73,7 +71,8 @@ def write_diagnostics(source: str, folder: Path, step: Step, seed: int) -> None:
         size = viewed_within_memory(source, photograph.size, step, factors=5)
         guide = reduce_channels(resize(photograph.pixels, size), "luminance")
         begin("Comparing patches")
-        operator = operator_of_step(guide, step, seed)
+        parameters = step.filter_options(size)
+        operator = operator_from_guide(guide, FilterOptions(**parameters, generator=seeded(seed)))
         begin("Finding patterns")
         spectrum = operator.spectrum()
         figures = summarize(operator, spectrum, guide)
@@ -86,12 +85,6 @@ def write_diagnostics(source: str, folder: Path, step: Step, seed: int) -> None:
         with open_beside(folder / "diagnostics.json") as stream:
             stream.write(json.dumps(report, indent=2).encode() + b"\n")
     print_table(figures, f"The filter of {source}")
-
-
-def operator_of_step(guide: Tensor, step: Step, seed: int = 0) -> NonlocalOperator:
-    """The operator of a guide (1, 1, H, W), with the filter parameters of a step."""
-    parameters = step.filter_options((guide.shape[-2], guide.shape[-1]))
-    return operator_from_guide(guide, FilterOptions(**parameters, generator=seeded(seed)))
 
 
 def summarize(operator: NonlocalOperator, spectrum: Spectrum, guide: Tensor) -> dict[str, float]:
@@ -156,22 +149,22 @@ def write_examples(folder: Path) -> None:
 
         begin("Drawing")
         folder.mkdir(exist_ok=True)
-        paths = save_figures(
-            folder,
-            {
-                "1-before-after": show_images(
-                    {
-                        "Before, with one blue stroke": torch.lerp(image, paint, stroke),
-                        "After: recolor": blue,
-                        "After: detail, preset crisp": crisp,
-                    }
-                ),
-                "2-layers": show_layers(detail_layers(operator, luminance)),
-                "3-eigenvectors": show_eigenvectors(spectrum),
-                "4-sliders": plot_response(torch.tensor(EXAMPLE_SLIDERS), spectrum),
-                "5-selection": show_mask(image, select(luminance), mask),
-            },
-        )
+        drawn = {
+            "1-before-after": show_images(
+                {
+                    "Before, with one blue stroke": torch.lerp(image, paint, stroke),
+                    "After: recolor": blue,
+                    "After: detail, preset crisp": crisp,
+                }
+            ),
+            "2-layers": show_layers(detail_layers(operator, luminance)),
+            "3-eigenvectors": show_eigenvectors(spectrum),
+            "4-sliders": plot_response(torch.tensor(EXAMPLE_SLIDERS), spectrum),
+            "5-selection": show_mask(image, select(luminance), mask),
+        }
+        paths = {folder / f"{name}.png": figure for name, figure in drawn.items()}
+        for path, figure in paths.items():
+            save_figure(figure, path)
     print_table(figures, "The filter of the astronaut")
     typer.echo("Pictures: " + ", ".join(map(str, paths)))
 
@@ -181,11 +174,3 @@ def select(luminance: Tensor) -> Tensor:
     region = torch.zeros_like(luminance)
     region[..., SELECTION[0], SELECTION[1]] = 1
     return region
-
-
-def save_figures(folder: Path, figures: Mapping[str, Figure]) -> list[Path]:
-    """Save figures in a folder, under their names, and return their paths."""
-    paths = [folder / f"{name}.png" for name in figures]
-    for path, figure in zip(paths, figures.values(), strict=True):
-        save_figure(figure, path)
-    return paths

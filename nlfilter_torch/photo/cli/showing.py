@@ -69,7 +69,10 @@ class Scribbled:
                 pixels = self.rows.read(rows)[..., cover(region, (height, width), rows)].float().clamp(0, 1)
                 place = f"{option} {region.text((height, width))}"
                 if pixels.shape[2]:
-                    shares[place] = tell_colour(place, pixels)
+                    middle = pixels.median(2).values
+                    red, green, blue = (middle[0].expand(3) * 255).round().int().tolist()
+                    typer.echo(f"{place}: {pixels.shape[2]} pixels, median colour #{red:02x}{green:02x}{blue:02x}")
+                    shares[place] = unlike(pixels, middle)
             note_mixed(shares, option)
 
     def show(self, target: Path, edit_at: Callable[[tuple[int, int], float], PhotoEdit]) -> None:
@@ -123,14 +126,6 @@ class Scribbled:
         if "background" in marks and not bool(marks["background"].any()):
             del marks["background"]
         return marks, colours
-
-
-def tell_colour(place: str, pixels: Tensor) -> float:
-    """Print the colour of the pixels (1, C, n) under a rectangle; return the share that differs strongly from it."""
-    middle = pixels.median(2).values
-    red, green, blue = (middle[0].expand(3) * 255).round().int().tolist()
-    typer.echo(f"{place}: {pixels.shape[2]} pixels, median colour #{red:02x}{green:02x}{blue:02x}")
-    return unlike(pixels, middle)
 
 
 def note_mixed(shares: Mapping[str, float], option: str) -> None:

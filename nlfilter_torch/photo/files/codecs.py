@@ -197,7 +197,9 @@ def read_raw(path: Path, check_size: CheckSize) -> Decoded:
             channels = raw.postprocess(output_bps=16, use_camera_wb=True, no_auto_bright=True)
             exif, moved = _own_exif(path)
             with suppress(rawpy.LibRawError, ValueError, EOFError):  # no preview, or an unreadable one
-                preview = raw.extract_thumb() if exif is None or not _has_details(exif) else None
+                tables = exif_tags.parsed(exif)
+                detailed = tables is not None and any(field.code == EXIF for field in tables.fields(tables.first))
+                preview = None if detailed else raw.extract_thumb()
                 if preview is not None and preview.format == rawpy.ThumbFormat.JPEG:
                     exif = jpeg.open_jpeg(path, bytes(preview.data)).metadata.exif or exif
     except rawpy.LibRawError as error:
@@ -216,11 +218,6 @@ def _own_exif(path: Path) -> tuple[bytes | None, bool]:
             return exif_in_tiff.block_of(TiffTables(data))
     except (ValueError, struct.error):
         return None, False
-
-
-def _has_details(exif: bytes) -> bool:
-    tables = exif_tags.parsed(exif)
-    return tables is not None and any(field.code == EXIF for field in tables.fields(tables.first))
 
 
 def read_heic(path: Path, check_size: CheckSize) -> Decoded:

@@ -5,7 +5,7 @@ the values and the notes of the camera's maker keep their offsets.
 """
 
 import struct
-from collections.abc import Container
+from collections.abc import Container, Sequence
 from dataclasses import dataclass
 from typing import BinaryIO
 
@@ -84,8 +84,7 @@ def _packed_table(
     fields = [
         field for field in fields if field.code not in POINTERS or (field.code in pointers and tables.inner(field))
     ]
-    values = b""
-    entries = struct.pack(tables.order + "H", len(fields))
+    values, entries = b"", []
     for field in fields:
         at = base + 2 + 12 * len(fields) + 4 + len(values)
         kind, count, raw = field.kind, field.count, tables.raw(field)
@@ -96,8 +95,18 @@ def _packed_table(
         elif len(raw) > 4:
             values += raw + bytes(len(raw) % 2)
             raw = tables.packed(LONG, at)
-        entries += struct.pack(tables.order + "HHI", field.code, kind, count) + raw.ljust(4, b"\0")
-    return entries + bytes(4) + values
+        entries.append((field.code, kind, count, raw))
+    return _table(tables.order, False, entries) + values
+
+
+def _table(order: str, big: bool, entries: Sequence[tuple[int, int, int, bytes]]) -> bytes:
+    """A table of fields with their number, type and count, and their values or the offset of these."""
+    room, number = (8, "Q") if big else (4, "I")
+    fields = (
+        struct.pack(f"{order}HH{number}", code, kind, count) + value.ljust(room, b"\0")
+        for code, kind, count, value in entries
+    )
+    return struct.pack(order + ("Q" if big else "H"), len(entries)) + b"".join(fields) + bytes(room)
 
 
 def shortened(block: bytes, longest: int) -> bytes | None:
@@ -169,17 +178,18 @@ def _as_big(tables: TiffTables, fields: list[Field], body: bytes) -> tuple[dict[
 
 
 def _big_table(tables: TiffTables, fields: list[Field], inner: dict[int, int]) -> bytes:
-    table = struct.pack(tables.order + "Q", sum(field.code not in POINTERS or field.code in inner for field in fields))
+    """A table of a BigTIFF, whose longer values stay where they are, with offsets of the tables nested in it."""
+    entries = []
     for field in fields:
-        kind, count, raw = field.kind, field.count, tables.raw(field)
+        kind, raw = field.kind, tables.raw(field)
         if field.code in inner:
             kind, raw = LONG8, tables.packed(LONG8, inner[field.code])
         elif field.code in POINTERS:
             continue
         elif len(raw) > 8:
             raw = tables.packed(LONG8, field.place)
-        table += struct.pack(tables.order + "HHQ", field.code, kind, count) + raw.ljust(8, b"\0")
-    return table + bytes(8)
+        entries.append((field.code, kind, field.count, raw))
+    return _table(tables.order, True, entries)
 
 
 def point(stream: BinaryIO, order: str, big: bool, position: int, code: int, offset: int) -> None:

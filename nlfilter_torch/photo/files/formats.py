@@ -49,6 +49,11 @@ SUFFIXES |= {".tif": "TIFF", ".tiff": "TIFF"}
 PFM = ".pfm"  # of masks
 
 
+def type_of(path: str | Path) -> str | None:
+    """The type of file that the suffix of a path says; None for others than those of :data:`SUFFIXES`."""
+    return SUFFIXES.get(Path(path).suffix.lower())
+
+
 class TooLarge(MemoryError):
     """A picture that needs more memory to be edited whole than is available."""
 
@@ -180,7 +185,7 @@ def check_type(
     """Check, as :func:`check_output`, a picture of that depth and size (H, W), with or without alpha."""
     path = Path(path)
     check_file(path)
-    kind = SUFFIXES.get(path.suffix.lower())
+    kind = type_of(path)
     if kind is None:
         raise ValueError(
             f"{path} must end in .png, .jpg, .webp, .avif or .tif, got {path.suffix!r}; choose one of these"

@@ -15,7 +15,6 @@ from PIL import JpegImagePlugin
 from nlfilter_torch.photo.declared.rows import Stored
 from nlfilter_torch.photo.files import exif as exif_tags
 from nlfilter_torch.photo.files.metadata import (
-    CENTIMETRES,
     FURTHER_PICTURES,
     GAIN_MAP,
     MOTION,
@@ -57,7 +56,6 @@ SEGMENT_NAMES = {
 BARE = (0x01, *range(0xD0, 0xD8))  # markers without content
 MARKER = re.compile(rb"\xff+[^\0\xd0-\xd7\xff]")  # in the pixels: not a byte of 255, nor a restart
 CODED_SIDE = 8  # side of the squares of pixels that are coded
-IN_INCHES = {1: 1.0, 2: CENTIMETRES}  # units of the density
 CODED_ROWS = 64  # rows that are coded at a time; a multiple of CODED_SIDE
 
 
@@ -190,10 +188,9 @@ def _metadata(contents: list[tuple[int, bytes]], behind: bytes) -> tuple[int, Me
 
 def _density(content: bytes) -> tuple[float, float] | None:
     """The pixels per inch in the header of JFIF, or None."""
-    if len(content) < 12 or content[7] not in IN_INCHES:
+    if len(content) < 12 or (scale := exif_tags.IN_INCHES.get(content[7] + 1)) is None:  # TIFF counts from 1
         return None
     across, down = struct.unpack_from(">HH", content, 8)
-    scale = IN_INCHES[content[7]]
     return across * scale, down * scale
 
 
@@ -274,10 +271,10 @@ def _stored_density(dpi: tuple[float, float] | None) -> bytes:
         return struct.pack(">BHH", 0, 1, 1)
     lost = {
         unit: sum(abs(value / scale - round(value / scale)) * scale for value in dpi)
-        for unit, scale in IN_INCHES.items()
+        for unit, scale in exif_tags.IN_INCHES.items()
     }
     unit = min(lost, key=lost.__getitem__)
-    return struct.pack(">BHH", unit, *(max(1, round(value / IN_INCHES[unit])) for value in dpi))
+    return struct.pack(">BHH", unit - 1, *(max(1, round(value / exif_tags.IN_INCHES[unit])) for value in dpi))
 
 
 def _write_segment(stream: BinaryIO, marker: int, content: bytes) -> None:

@@ -337,12 +337,12 @@ def _without_declarations(xmp: bytes) -> bytes:
 
 # --- colours that a file describes by numbers in place of a profile, which the output does not describe
 
-# Numbers of ITU-T H.273 (CICP).
-PRIMARIES = {1: "sRGB", 4: "BT.470", 5: "BT.601", 6: "BT.601", 7: "SMPTE 240M", 9: "BT.2020", 11: "DCI-P3"}
-PRIMARIES |= {12: "Display P3"}
-TRANSFERS = {5: "a gamma of 2.8", 8: "linear light", 16: "PQ", 17: "SMPTE 428", 18: "HLG"}
-USUAL_PRIMARIES = (0, 1, 2)  # reserved, of sRGB, and unspecified
-USUAL_TRANSFERS = (0, 1, 2, 4, 6, 13, 14, 15)  # likewise, and curves close to that of sRGB, which viewers treat alike
+# Numbers of ITU-T H.273 (CICP). None stands for those that are reserved, unspecified, or of sRGB, and for curves close
+# to that of sRGB, which viewers treat alike.
+PRIMARIES: dict[int, str | None] = {**dict.fromkeys((0, 1, 2)), 4: "BT.470", 5: "BT.601", 6: "BT.601"}
+PRIMARIES |= {7: "SMPTE 240M", 9: "BT.2020", 11: "DCI-P3", 12: "Display P3"}
+TRANSFERS: dict[int, str | None] = {**dict.fromkeys((0, 1, 2, 4, 6, 13, 14, 15)), 5: "a gamma of 2.8"}
+TRANSFERS |= {8: "linear light", 16: "PQ", 17: "SMPTE 428", 18: "HLG"}
 HDR = (16, 18)
 
 # Of PNG files.
@@ -363,10 +363,11 @@ def check_colour_numbers(path: Path, primaries: int, transfer: int) -> None:
             f"{path} is an HDR picture ({TRANSFERS[transfer]}), which is not supported; convert it to sRGB, or to a "
             "TIFF file with a colour profile"
         )
-    unusual = [] if primaries in USUAL_PRIMARIES else [PRIMARIES.get(primaries, f"primaries number {primaries}")]
-    if transfer not in USUAL_TRANSFERS:
-        unusual.append(TRANSFERS.get(transfer, f"transfer function number {transfer}"))
-    _warn_of_colours(path, unusual)
+    names = (
+        PRIMARIES.get(primaries, f"primaries number {primaries}"),
+        TRANSFERS.get(transfer, f"transfer function number {transfer}"),
+    )
+    _warn_of_colours(path, [name for name in names if name is not None])
 
 
 def check_png_colours(path: Path, gamma: float | None, chromaticities: Sequence[float] | None) -> None:

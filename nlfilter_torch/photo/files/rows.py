@@ -50,9 +50,8 @@ ZARR = ".zarr"
 # Bytes that a command may use if no limit is given.
 FIFTH = psutil.virtual_memory().total // 5
 WHOLE_MEMORY = min(FIFTH, 2_000_000_000)  # a photograph that needs more is edited in tiles
-TILED_MEMORY = 1_000_000_000  # for tiles; with more they are no faster
-UNPACKED = 1_000_000_000  # to decode a photograph in memory rather than in a temporary file
-COPIED = 64  # rows of that file that are turned at a time
+TILED_MEMORY = 1_000_000_000  # for tiles, and to decode a photograph without a temporary file; more is no faster
+COPIED = 64  # rows that are turned at a time, at least
 CODEC_MEMORY_FACTOR = 8  # memory to decode or encode other formats, as a multiple of the picture's size in bytes
 
 
@@ -208,14 +207,14 @@ def _open_tiff(path: Path, stack: ExitStack) -> StoredPicture:
     tiff.warn_of_pages(path)
     source: RowSource = rows
     if rows.turned:
-        source = upright_copy(rows, rows.orientation, max(rows.segment[0], 64), stack)
+        source = upright_copy(rows, rows.orientation, max(rows.segment[0], COPIED), stack)
     return StoredPicture(source, rows.alpha, rows.cached, rows.metadata)
 
 
 def _open_codec(path: Path, memory: int, stack: ExitStack) -> StoredPicture:
     """Open a file that is decoded whole; large PNG and JPEG files into a temporary file."""
     try:
-        decoded = read_channels(path, bytes_per_pixel=CODEC_MEMORY_FACTOR, memory=min(memory, UNPACKED))
+        decoded = read_channels(path, bytes_per_pixel=CODEC_MEMORY_FACTOR, memory=min(memory, TILED_MEMORY))
     except TooLarge:
         if (unpacked := _unpacked(path, stack)) is not None:
             return unpacked

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from nlfilter_torch.photo.cli import SPINS, THRESHOLDS, VARIABLES, main, sleep_while_waiting
+from nlfilter_torch.photo.cli import main
+from nlfilter_torch.photo.cli.process import SPINS, THRESHOLDS, VARIABLES, sleep_while_waiting
 from tests.commands import small_photo
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from nlfilter_torch.photo.cli import handled, workers
+from nlfilter_torch.photo.cli import process, workers
 from nlfilter_torch.photo.cli.folders import RECORD, pictures
 from nlfilter_torch.photo.files.writing import open_beside
 from tests.folders import fill, plain_files, refused, tally_of
@@ -41,7 +41,7 @@ def wait_for_ever(source: str, target: str) -> None:
 
 def run_for_ever(folder: str, target: str) -> None:
     signal.signal(signal.SIGINT, signal.default_int_handler)  # background jobs of a shell inherit that it is ignored
-    with handled():  # as the command does
+    with process.handled():  # as the command does
         tally_of(pictures(Path(folder)), Path(target), wait_for_ever)
 
 

@@ -127,7 +127,7 @@ def test_large_files(
     path = tmp_path / f"in{suffix}"
     Image.fromarray(picture[..., 0] if channels == 1 else picture).save(path, exif=exif)
     whole = read_channels(path, bytes_per_pixel=0, memory=None)
-    monkeypatch.setattr(rows, "UNPACKED", 1000)
+    monkeypatch.setattr(rows, "TILED_MEMORY", 1000)
     np.testing.assert_array_equal(rows_of(path), whole.channels)
     with open_picture(path, PLENTY) as stored:
         assert isinstance(stored.rows, FileRows)
@@ -143,7 +143,7 @@ def test_others_need_memory(
     tmp_path: Path, name: str, options: dict[str, bool], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     Image.fromarray(cat()).save(tmp_path / name, **options)
-    monkeypatch.setattr(rows, "UNPACKED", 1000)
+    monkeypatch.setattr(rows, "TILED_MEMORY", 1000)
     assert rows_of(tmp_path / name).shape == (200, 150, 3)
     with pytest.raises(MemoryError, match="has 150x200 pixels and needs about 0 MB"):
         open_picture(tmp_path / name, 1000).__enter__()
