@@ -13,20 +13,15 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import typer
 
 from nlfilter_torch.photo.cli.editing import allowed_memory, check_quality_of, check_workers
-from nlfilter_torch.photo.cli.edits import edit_photograph
 from nlfilter_torch.photo.cli.folders import left_out, pictures, prepare, subfolders
-from nlfilter_torch.photo.cli.jobs import apply_files
 from nlfilter_torch.photo.cli.options import NOTE, FolderOptions, PhotographOptions
 from nlfilter_torch.photo.cli.process import INTERRUPTED
 from nlfilter_torch.photo.cli.progress import steps
 from nlfilter_torch.photo.cli.workers import Crew, worker_pool
-from nlfilter_torch.photo.declared.parameters import DETAIL
-from nlfilter_torch.photo.declared.presets import Recipe, named_recipe
 from nlfilter_torch.photo.files.formats import type_of
 from nlfilter_torch.photo.files.rows import WHOLE_MEMORY, free_memory
 from nlfilter_torch.photo.files.writing import remove_stale
@@ -55,17 +50,6 @@ class Tally:
     skipped: int = 0
     failures: dict[str, str] = field(default_factory=dict)
     left: int = 0
-
-
-def batch_of_detail(settings: Mapping[str, Any], folder: Path, target: Path, files: FolderOptions) -> None:
-    """Edit the details of all photographs of a folder, with these values of options."""
-    edit_photographs(partial(edit_photograph, DETAIL, **settings), settings, folder, target, files)
-
-
-def batch_of_recipe(name: str, recipe: Recipe, folder: Path, target: Path, files: FolderOptions) -> None:
-    """Apply the recipe of a preset to all photographs of a folder; ``name`` is that of the preset, or of its file."""
-    absolute = name if named_recipe(name) is not None else str(Path(name).absolute())  # for workers in other folders
-    edit_photographs(partial(apply_files, [absolute], []), {"recipe": recipe.to_json()}, folder, target, files)
 
 
 def edit_photographs(

@@ -1,6 +1,7 @@
 """The commands besides those of single edits: arguments and help. What they do is imported when they are called."""
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -10,6 +11,7 @@ from nlfilter_torch.photo.cli import options
 from nlfilter_torch.photo.cli.edits import (
     DETAIL_OPTIONS,
     check_usual,
+    edit_photograph,
     other_recipe,
     preset_option,
     step_of,
@@ -21,7 +23,15 @@ from nlfilter_torch.photo.declared.colour_tables import CUBE_NODES
 from nlfilter_torch.photo.declared.development import DEVELOP, Development
 from nlfilter_torch.photo.declared.json_values import Value
 from nlfilter_torch.photo.declared.parameters import DETAIL, EDITS
-from nlfilter_torch.photo.declared.presets import CHARACTERS, LOOKS, PRESETS, PURPOSES, Recipe, find_recipe
+from nlfilter_torch.photo.declared.presets import (
+    CHARACTERS,
+    LOOKS,
+    PRESETS,
+    PURPOSES,
+    Recipe,
+    find_recipe,
+    named_recipe,
+)
 from nlfilter_torch.photo.declared.shared_parameters import LOOK
 
 #: Edits without scribbles.
@@ -244,12 +254,14 @@ def batch(
     settings = {**values, "seed": seed}
     recipe = None if preset is None else other_recipe(context, preset, settings)
 
-    from nlfilter_torch.photo.cli.batch import batch_of_detail, batch_of_recipe
+    from nlfilter_torch.photo.cli.batch import FileEdit, edit_photographs
+    from nlfilter_torch.photo.cli.jobs import apply_files
 
-    if preset is None or recipe is None:
-        batch_of_detail(settings, folder, target, files)
-    else:
-        batch_of_recipe(preset, recipe, folder, target, files)
+    edit: FileEdit = partial(edit_photograph, DETAIL, **settings)
+    if preset is not None and recipe is not None:
+        absolute = preset if named_recipe(preset) is not None else str(Path(preset).absolute())  # workers are elsewhere
+        edit, settings = partial(apply_files, [absolute], []), {"recipe": recipe.to_json()}
+    edit_photographs(edit, settings, folder, target, files)
 
 
 Frames = Annotated[
