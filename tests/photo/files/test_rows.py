@@ -147,3 +147,12 @@ def test_others_need_memory(
     assert rows_of(tmp_path / name).shape == (200, 150, 3)
     with pytest.raises(MemoryError, match="has 150x200 pixels and needs about 0 MB"):
         open_picture(tmp_path / name, 1000).__enter__()
+
+
+@pytest.mark.parametrize("name", ["out.png", "out.tif"])
+def test_rows_are_written_with_a_note_on_what_is_left_out(tmp_path: Path, name: str) -> None:
+    Image.fromarray(cat()).save(tmp_path / "in.jpg", comment=b"by hand")
+    with open_picture(tmp_path / "in.jpg", PLENTY) as stored:
+        rows = iter([(slice(0, 200), np.asarray(stored.rows[slice(0, 200)]))])
+        with pytest.warns(UserWarning, match="is written without some metadata of the input: the comment"):
+            write_picture(tmp_path / name, rows, "uint8", stored)
