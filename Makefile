@@ -101,7 +101,6 @@ QUICK := \
 	'denoising --quick --patterns --methods noisy ours' \
 	'real_noise --quick' \
 	'looks --quick' \
-	'look_costs --quick' \
 	'detail --quick' \
 	'detail --quick --scales' \
 	'distributed --ranks 2 --widths 64 --landmarks 20' \
@@ -112,7 +111,7 @@ QUICK := \
 	'colorize --quick' \
 	'colorize --quick --lines' \
 	'compilation --quick --only export' \
-	'layers points block floors refinement clusters --quick' \
+	'layers points block refinement clusters --quick' \
 	'layers functions styles --quick'
 
 # Trains the denoiser further, from the weights of the package, on the pictures of scikit-image and on all of a folder:

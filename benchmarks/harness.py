@@ -32,6 +32,7 @@ class Figure:
         limit: the value promised, or None for a figure that is only reported, such as that of a peer.
         unit: of both; empty for a ratio.
         at_most: whether the value must be at most the limit, or at least.
+        quartiles: of the value, if two calls alternated.
     """
 
     name: str
@@ -39,6 +40,7 @@ class Figure:
     limit: float | None = None
     unit: str = ""
     at_most: bool = True
+    quartiles: tuple[float, float] | None = None
 
     @property
     def holds(self) -> bool:

@@ -15,8 +15,9 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
+from benchmarks import harness
 from benchmarks.harness import markdown
-from benchmarks.speed.claims import Claim, claims
+from benchmarks.speed.claims import claims
 from benchmarks.speed.comparisons import SUITE
 from benchmarks.speed.floor import READS
 from benchmarks.speed.plan import Record, Results, records_of
@@ -34,30 +35,23 @@ SERIES = {
 }
 
 
-def claims_table(entries: Sequence[Claim]) -> str:
+def claims_table(entries: Sequence[harness.Figure]) -> str:
     """A table of claims: limit, measured value, with quartiles where calls alternated, and whether the claim holds."""
-    verdicts = {True: "holds", False: "**falls short**", None: "not measured"}
 
-    def measured(claim: Claim) -> str:
-        quartiles = " ({:.2f} to {:.2f})".format(*claim.quartiles) if claim.quartiles else ""
-        return figure(claim, claim.measured) + quartiles
-
-    def figure(claim: Claim, value: float | None) -> str:
+    def shown(claim: harness.Figure, value: float | None) -> str:
         digits = 0 if claim.unit == "MiB" else 1 if value is not None and value >= 20 else 2
         return "" if value is None else f"{value:.{digits}f} {claim.unit}".rstrip()
 
-    return markdown(
-        ["claim", "limit", "measured", "verdict"],
+    rows = [
         [
-            [
-                claim.text,
-                f"{'at most' if claim.at_most else 'at least'} {figure(claim, claim.limit)}",
-                measured(claim),
-                verdicts[claim.holds],
-            ]
-            for claim in entries
-        ],
-    )
+            claim.name,
+            f"{'at most' if claim.at_most else 'at least'} {shown(claim, claim.limit)}",
+            shown(claim, claim.value) + (" ({:.2f} to {:.2f})".format(*claim.quartiles) if claim.quartiles else ""),
+            "holds" if claim.holds else "**falls short**",
+        ]
+        for claim in entries
+    ]
+    return markdown(["claim", "limit", "measured", "verdict"], rows)
 
 
 def main_table(results: Results) -> str:

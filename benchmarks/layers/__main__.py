@@ -10,7 +10,6 @@ from benchmarks.harness import Figure, options, save_json
 TOPICS: dict[str, str] = {  # name of a module of this package: what it measures
     "points": "a scan beside 3-D nonlocal means, and coordinates of points beside SpectralEmbedding",
     "block": "the non-local block beside the usual one: accuracy of a small task, time and memory",
-    "floors": "operators of small images and of many landmarks, in floors",
     "functions": "f(W) of any response: error, methods, and cost at a megapixel",
     "refinement": "coarse segmentations refined, beside kornia, OpenCV and a dense CRF; bad bandwidths",
     "clusters": "landmarks of clusters and manifolds beside scikit-learn's k-means++, and how well they cover points",
