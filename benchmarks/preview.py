@@ -91,8 +91,7 @@ def errors(picture: Tensor, pixels: int, stride: int, recipes: dict[str, Recipe]
         path = Path(folder) / "photograph.tif"
         photograph = Photograph(sized(picture, pixels, stride))
         write_photograph(replace(photograph, depth="uint16"), path)
-        session = Session(Path(folder), pixels)
-        session.open(path)
+        session = Session(Path(folder), path, pixels=pixels)
         assert round(session.preview.stride) == stride
         for name, recipe in recipes.items():
             session.load(scaled(recipe, pixels))

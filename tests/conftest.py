@@ -46,6 +46,4 @@ def session(tmp_path: Path) -> "Session":
     from tests.problems import cat
 
     write_photograph(Photograph(cat()), tmp_path / "cat.png")
-    session = Session(tmp_path)
-    session.open(tmp_path / "cat.png")
-    return session
+    return Session(tmp_path, tmp_path / "cat.png")

@@ -4,13 +4,13 @@ import ipaddress
 import os
 import secrets
 import socket
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from contextlib import suppress
-from http.cookies import CookieError, SimpleCookie
 from pathlib import Path
-from urllib.parse import parse_qsl, urlencode, urlsplit
+from urllib.parse import urlencode, urlsplit
 
 from starlette.datastructures import Headers, MutableHeaders
+from starlette.requests import HTTPConnection
 from starlette.responses import PlainTextResponse, RedirectResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
@@ -140,28 +140,19 @@ class Guard:
 
     def _answer(self, scope: Scope, *, websocket: bool) -> Response | None:
         """What is answered in place of the application, or None."""
-        headers = Headers(scope=scope)
-        refused = refusal(headers, websocket=websocket, host=self._host, names=self._names)
+        request = HTTPConnection(scope)
+        refused = refusal(request.headers, websocket=websocket, host=self._host, names=self._names)
         if refused is not None:
             return PlainTextResponse(refused[1], status_code=refused[0])
-        query = parse_qsl(scope.get("query_string", b"").decode("latin-1"))
-        if not websocket and is_known(self._token, dict(query).get(TOKEN)):
-            rest = urlencode([(name, value) for name, value in query if name != TOKEN])
+        query = request.query_params
+        if not websocket and is_known(self._token, query.get(TOKEN)):
+            rest = urlencode([(name, value) for name, value in query.multi_items() if name != TOKEN])
             response = RedirectResponse(scope["path"] + (f"?{rest}" if rest else ""), status_code=303)
             response.set_cookie(self._name, self._token, httponly=True, samesite="strict")
             return response
-        cookies: Mapping[str, str] = {name: cookie.value for name, cookie in _cookies(headers).items()}
-        if is_known(self._token, cookies.get(self._name)):
+        if is_known(self._token, request.cookies.get(self._name)):
             return None
         return PlainTextResponse(UNKNOWN, status_code=403)
-
-
-def _cookies(headers: Headers) -> SimpleCookie:
-    """The cookies of a request; none if they cannot be read."""
-    cookies = SimpleCookie()
-    with suppress(CookieError):
-        cookies.load(headers.get("cookie", ""))
-    return cookies
 
 
 class Protected:

@@ -1,47 +1,55 @@
 """The large picture with its overlays, and the brush that draws on it."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from functools import partial
-from typing import Protocol
 
 from nicegui import ui
 from torch import Tensor
 
 from nlfilter_torch.photo.app import drawing
-from nlfilter_torch.photo.app.brush import BRUSHES, Brush
 from nlfilter_torch.photo.app.crop_tool import CropTool
+from nlfilter_torch.photo.app.session import Session
 from nlfilter_torch.photo.declared.parameters import DETAIL, EDITS
-from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.declared.strokes import Mark, Stroke
 
+PALETTE = ("#2f6fde", "#12a15f", "#e0b321", "#dd5c21", "#c8283c", "#8a46c8", "#8b5e3c", "#808080")
+BRUSH_RADIUS = 0.02  # of the brush at the start
+BRUSHES: dict[str, dict[str, str]] = {
+    edit.name: {scribble.word: scribble.label for scribble in edit.scribbles}
+    for edit in EDITS.values()
+    if edit.scribbles
+}
 Draw = Callable[[str, Callable[[], None]], None]  # adds a stroke to a step
 
 
-class PaintedSession(Protocol):
-    """The session of an open photograph, as far as its preview and its strokes are concerned."""
+@dataclass
+class Brush:
+    """The settings of the brush, for each step.
 
-    @property
-    def uncropped(self) -> Tensor:
-        """The photograph straightened and not cropped, (1, C, h, w) in [0, 1]."""
+    Attributes:
+        word: meaning of the strokes; ``colour`` in it stands for :attr:`colour`.
+        radius: as a share of the short side.
+        colour: for all steps that take one.
+        shown: what is called with the colour when it changes: the fields that show it.
+    """
 
-    @property
-    def crop(self) -> Sequence[float]:
-        """Left, top, right and bottom edge of what is kept of it."""
+    word: dict[str, str] = field(default_factory=lambda: {step: next(iter(words)) for step, words in BRUSHES.items()})
+    radius: dict[str, float] = field(default_factory=lambda: dict.fromkeys(BRUSHES, BRUSH_RADIUS))
+    colour: str = PALETTE[0]
+    shown: list[Callable[[str], object]] = field(default_factory=list)
 
-    def step_in_view(self, edit: str) -> Step:
-        """The chosen step of an edit, with its strokes where they are in the preview."""
+    def paint(self, step: str) -> str:
+        """The meaning or colour of a stroke for a step."""
+        return self.word[step].replace("colour", self.colour)
 
-    def render(self, moving: int | None = None) -> Tensor:
-        """The preview under the edit, (1, C, h, w) in [0, 1], quickly while a slider of a step moves."""
-
-    def mask(self, edit: str) -> Tensor | None:
-        """The mask of what the scribbles of an edit select, (1, 1, h, w) in [0, 1]."""
-
-    def ignored(self, edit: str) -> Tensor | None:
-        """Which pixels (1, 1, h, w) under these scribbles do not count."""
-
-    def add_stroke(self, step: str, points: list[tuple[float, float]], radius: float, paint: str) -> None:
-        """Add a stroke to a step: points (x, y) in pixels of the preview."""
+    def choose_colour(self, value: object) -> None:
+        """Set the colour, if the value is one, such as ``#2f6fde``; what is typed may be incomplete."""
+        if not (isinstance(value, str) and len(value) == 7 and value.startswith("#")) or value.lower() == self.colour:
+            return
+        self.colour = value.lower()
+        for show in self.shown:
+            show(self.colour)
 
 
 class Canvas:
@@ -64,7 +72,7 @@ class Canvas:
         self.histogram = ""
         self.clipped = self.clipped_before = (0.0, 0.0)  # shares of white and of black, after and before the edit
         self.pick: Callable[[float, float], None] | None = None
-        self._session: PaintedSession | None = None
+        self._session: Session | None = None
         self._preview_size = self._whole_size = (1, 1)
         self._brush, self._token, self._draw, self._lay = brush, token, draw, lay
         self._frame = 0
@@ -123,22 +131,24 @@ class Canvas:
             ui.space()
             self._size = ui.label("").classes("hint wide")
 
-    def open(self, session: PaintedSession, preview: Tensor, size: tuple[int, int]) -> None:
-        """Show a photograph of ``size`` (height, width) that was opened, first its preview (1, C, h, w)."""
+    def open(self, session: Session) -> None:
+        """Show a photograph that was opened, first its preview."""
         self._session = session
-        self._edited = preview.clamp(0, 1)
+        self._edited = session.developed.before.clamp(0, 1)
         self._mask_shown = None
         self.pictures = {}
-        self.frame(preview, size)
+        self.frame()
         self._show("before", self._photo)
         self._welcome.set_visibility(False)
         self._photo.set_visibility(True)
 
-    def frame(self, before: Tensor, size: tuple[int, int]) -> None:
-        """Show the photograph straightened and cropped to a size, with its preview (1, C, h, w) before the edit."""
-        before = before.clamp(0, 1)
+    def frame(self) -> None:
+        """Show the photograph as it is straightened and cropped now, with its preview before the edit."""
+        if self._session is None:
+            return
+        before = self._session.developed.before.clamp(0, 1)
         self._preview_size = (before.shape[-2], before.shape[-1])
-        (height, width), (preview_height, preview_width) = size, self._preview_size
+        (height, width), (preview_height, preview_width) = self._session.size, self._preview_size
         self._size.set_text(f"{width}\u00d7{height} pixels, shown at {preview_width}\u00d7{preview_height}")
         fitting = f"min(100cqw, calc(100cqh * {preview_width / preview_height:.4f}))"
         self._photo.style(f"width: var(--photo-width, {fitting})")

@@ -110,7 +110,7 @@ class Closeup:
             part = self._part([int(number) for number in place.split(",")])
         except ValueError:
             return None
-        return None if self.session is None or part is None else drawing.lossless(self.session.original(part))
+        return None if self.session is None or part is None else drawing.lossless(self.session.developed.original(part))
 
     def _part(self, view: Sequence[float]) -> Rectangle | None:
         """The part that a page asks for, within the photograph; None if it is empty, too large or not a part."""

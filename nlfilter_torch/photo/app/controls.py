@@ -143,7 +143,6 @@ class Slider:
 
     def __init__(self, control: Control, recipe: Callable[[], Recipe], change: Change, suffix: str = "") -> None:
         self._control, self._recipe, self._change = control, recipe, change
-        self._following = False
         with ui.column().classes("control gap-0"):
             with ui.row().classes("w-full justify-between items-center"):
                 ui.label(control.slider.label).tooltip(control.help)
@@ -161,9 +160,7 @@ class Slider:
     def follow(self) -> None:
         """Show the current edit."""
         value = self._control.read(self._recipe())
-        self._following = True
         self._slider.set_value(value)
-        self._following = False
         self._value.set_text(self._control.show(value))
 
     def set_enabled(self, is_enabled: bool) -> None:
@@ -175,10 +172,10 @@ class Slider:
         self._released(self._control.usual(self._recipe()))
 
     def _moved(self, value: float | None) -> None:
-        if self._following or value is None:
+        if value is None:
             return
         self._value.set_text(self._control.show(value))
-        if self._control.slider.live:
+        if self._control.slider.live and value != self._control.read(self._recipe()):  # otherwise it follows the edit
             self._change(self._control.edit, self._control.entries(self._recipe(), value), False)
 
     def _released(self, value: float) -> None:
@@ -190,7 +187,6 @@ class Choice:
 
     def __init__(self, edit: str, parameter: Parameter, recipe: Callable[[], Recipe], change: Change) -> None:
         self._edit, self._parameter, self._recipe, self._change = edit, parameter, recipe, change
-        self._following = False
         labels = dict(zip(parameter.choices, parameter.labels, strict=True))
         self._select = ui.select(labels, value=self._chosen, label="What takes part")
         self._select.props("dense outlined options-dense").classes("w-full q-mt-xs").tooltip(parameter.help)
@@ -202,12 +198,10 @@ class Choice:
 
     def follow(self) -> None:
         """Show the current edit."""
-        self._following = True
         self._select.set_value(self._chosen)
-        self._following = False
 
     def _choose(self, value: str) -> None:
-        if not self._following:
+        if value != self._chosen:  # otherwise it follows the edit
             self._change(self._edit, {self._parameter.name: value}, True)
 
 

@@ -19,7 +19,6 @@ from nlfilter_torch.photo.picture.developing import (
     limits_of,
     part_of_planes,
     reframed,
-    turned_canvas,
 )
 from nlfilter_torch.photo.picture.in_memory import InMemory
 from nlfilter_torch.photo.picture.painting import TensorPainter
@@ -117,8 +116,3 @@ class Developed:
 def parts_of(photograph: Photograph, name: str) -> Parts:
     """The parts of a photograph, whose file is called ``name``."""
     return Parts(photograph.pixels[0].permute(1, 2, 0).numpy(), name)
-
-
-def uncropped(pixels: Tensor, development: Development) -> Tensor:
-    """A picture (1, C, h, w), turned and in other light but not cropped, with black corners, in [0, 1]."""
-    return turned_canvas(in_light(pixels, development, limits_of(pixels)).clamp(0, 1), development)

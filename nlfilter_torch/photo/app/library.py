@@ -24,12 +24,8 @@ class Library:
         self._latest: Session | None = None  # kept alive while a page is reloaded and nobody shows its photograph
         self._lock = Lock()
 
-    def new(self) -> Session:
-        """A session without a photograph."""
-        return Session(self.folder)
-
     def open(self, path: Path) -> Session:
-        """The session of a file; raises as :meth:`Session.open`."""
+        """The session of a file; raises as :class:`Session`."""
         version = path.stat().st_mtime if path.exists() else 0.0
         inside = path.parent.resolve() == self.photographs.resolve()
         return self._session(path, path.name, path, path.name if inside else str(path.resolve()), version)
@@ -38,7 +34,7 @@ class Library:
         """The session of a file that the browser sent, or of the file of that name in the folder if it is the same.
 
         Raises:
-            ValueError, OSError, MemoryError: as :meth:`Session.open`.
+            ValueError, OSError, MemoryError: as :class:`Session`.
         """
         name = Path(name).name
         original = self.photographs / name
@@ -62,8 +58,7 @@ class Library:
         with self._lock:
             session = self._sessions.get((address, version))
         if session is None:
-            session = self.new()
-            session.open(path, name)
+            session = Session(self.folder, path, name)
             session.address = address
             session.keep_in(Sidecar.of(original, name, _digest(path)))
         else:

@@ -4,6 +4,7 @@ import secrets
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from urllib.parse import quote
 
@@ -15,8 +16,7 @@ from torch import Tensor
 from nlfilter_torch.core.progress import Progress
 from nlfilter_torch.photo.app import drawing
 from nlfilter_torch.photo.app.access import LARGEST_UPLOAD
-from nlfilter_torch.photo.app.brush import Brush
-from nlfilter_torch.photo.app.canvas import Canvas
+from nlfilter_torch.photo.app.canvas import Brush, Canvas
 from nlfilter_torch.photo.app.closeup import AtRest, Closeup
 from nlfilter_torch.photo.app.crop_tool import FREE, Proportions
 from nlfilter_torch.photo.app.developed import DEVELOPING, Developed
@@ -25,9 +25,8 @@ from nlfilter_torch.photo.app.library import Library
 from nlfilter_torch.photo.app.panel import Panel
 from nlfilter_torch.photo.app.server import SCRIPTS, STATIC
 from nlfilter_torch.photo.app.session import Session
-from nlfilter_torch.photo.app.tabs import Link, PhotoLink, thumbnails
+from nlfilter_torch.photo.app.tabs import thumbnails
 from nlfilter_torch.photo.app.tasks import EXPECTED, Arguments, Tasks
-from nlfilter_torch.photo.declared.development import Development
 from nlfilter_torch.photo.declared.json_values import Value
 from nlfilter_torch.photo.declared.parameters import DETAIL, EDITS
 from nlfilter_torch.photo.declared.presets import Recipe
@@ -48,7 +47,8 @@ class Editor:
 
     def __init__(self, photographs: Library) -> None:
         self._photographs = photographs
-        self.session = photographs.new()
+        self.session: Session | None = None
+        self.brush = Brush()
         self._told: str | None = None  # the last trouble of the session that was shown
         self._token = secrets.token_urlsafe(16)
         self._pictured: Developed | None = None  # what thumbnails of looks show
@@ -56,8 +56,8 @@ class Editor:
         self._wanted: list[int | None] = []  # at most one picture to draw next: the place of a step that moves, or None
         self._drawing = False
         self._framed: object = None  # what canvas and closeup show
-        self._is_cropping = False
-        self._proportions = Proportions()
+        self.is_cropping = False
+        self.proportions = Proportions()
 
     def build(self, image: Path | None, address: str = "") -> None:
         """Lay the page out, and open the photograph of an address that the page had before, or an image."""
@@ -69,39 +69,36 @@ class Editor:
         self._build_header()
         self._closeup = Closeup(self._tasks, self._tell)
         self._at_rest = AtRest(self._tasks, self._is_preview, self._take)
-        brush = Brush()
         with ui.element("div").classes("editor"):
             with ui.element("div").classes("viewer"):
-                self._canvas = Canvas(brush, self._token, self._draw, self._lay, self._upload.choosing)
+                self._canvas = Canvas(self.brush, self._token, self._draw, self._lay, self._upload.choosing)
             with ui.column().classes("panel"):
                 handle = ui.button(icon="drag_handle").props('flat dense aria-label="Show or hide the controls"')
                 handle.classes("handle").on("click", js_handler="() => page.fold()")
-                link = Link(
-                    lambda: self.session.recipe,
-                    brush,
-                    self._change,
-                    self._clear_strokes,
-                    self._replace,
-                    self._thumbnail,
-                    PhotoLink(
-                        self._develop,
-                        self._toggle_crop,
-                        lambda: self._is_cropping,
-                        self._hold,
-                        lambda: self._proportions.name,
-                        self._toggle_pick,
-                        lambda: self._canvas.pick is not None,
-                    ),
-                )
-                self._panel = Panel(link, self._switch)
+                self._panel = Panel(self, self._switch)
         ui.keyboard(on_key=self._key)
         ui.on("closeup", lambda event: self._look(event.args))
         ui.on("stroke_dropped", self._canvas.drop_stroke)
         ui.on("save_photo", self._ask_photo_name)
         ui.on("tool", lambda event: self._panel.take(event.args))
         ui.on("crop", lambda event: self._crop(event.args))
-        ui.on("crop_done", lambda: self._toggle_crop() if self._is_cropping else None)
+        ui.on("crop_done", lambda: self.toggle_crop() if self.is_cropping else None)
         self._client.on_connect(lambda: self._begin(image, address))
+
+    def recipe(self) -> Recipe:
+        """The current edit."""
+        return Recipe() if self.session is None else self.session.recipe
+
+    @property
+    def is_picking(self) -> bool:
+        """Whether the next click on the photograph chooses what is grey."""
+        return self._canvas.pick is not None
+
+    def _opened(self, purpose: str) -> Session | None:
+        """The session; None, and an error that names the purpose, if no photograph is open."""
+        if self.session is None:
+            self._tasks.show_error(f"open a photograph first; there is nothing {purpose}")
+        return self.session
 
     def picture(self, kind: str, place: str) -> bytes | None:
         """The file of a picture that the page shows, by its kind; of the original at a place."""
@@ -109,7 +106,7 @@ class Editor:
             return self._closeup.original(place)
         return self._canvas.pictures.get(kind) or self._closeup.file(kind)
 
-    def _thumbnail(self, look: str) -> str:
+    def thumbnail(self, look: str) -> str:
         """The address of a picture of the photograph under a look, or "" if there is none."""
         kind = f"look-{look}"
         return f"/picture/{self._token}/{kind}?{self._picturing}" if kind in self._canvas.pictures else ""
@@ -153,119 +150,117 @@ class Editor:
 
     # Changes
 
-    def _change(self, step: str, values: Mapping[str, Value], complete: bool) -> None:
+    def change(self, step: str, values: Mapping[str, Value], complete: bool) -> None:
         """Change parameters of a step; ``complete`` when the pointer is released."""
-        if self.session.opened is None:  # it would be lost when one is opened
+        if self.session is None:  # it would be lost when one is opened
             self._panel.follow()
             return
         self.session.set(step, strokes=None, **values)
-        self._follow_change(None if complete else self.session.recipe.place_of(step))
+        self._follow_change(self.session, None if complete else self.session.recipe.place_of(step))
 
-    def _replace(self, recipe: Recipe, moving: int | None) -> None:
+    def replace(self, recipe: Recipe, moving: int | None) -> None:
         """Replace the edit; ``moving`` is the place of a step whose slider moves, or None if the change is complete."""
-        self.session.recipe = recipe
-        self._follow_change(moving)
+        if self.session is not None:
+            self.session.recipe = recipe
+            self._follow_change(self.session, moving)
 
-    def _develop(self, values: Mapping[str, Value], complete: bool) -> bool:
+    def develop(self, values: Mapping[str, Value], complete: bool) -> bool:
         """Change how the photograph is developed, and return whether it can be; ``complete`` at the end of a drag."""
         session = self.session
-        if session.opened is None:
+        if session is None:
             self._panel.follow()
             return False
         try:
-            recipe = session.developing(values, self._proportions.aspect(session.whole_size))
+            recipe = session.developing(values, self.proportions.aspect(session.whole_size))
         except ValueError as error:  # the middle of the crop would be outside
             self._tasks.show_error(str(error))
             self._panel.follow()
-            if self._is_cropping:  # and back to the frame of before
+            if self.is_cropping:  # and back to the frame of before
                 self._tasks.start(self._show_crop())
             return False
         if "crop" in values:
-            self._proportions.kept |= {recipe.develop.crop}
-        self._replace(recipe, None if complete else DEVELOPING)
+            self.proportions.kept |= {recipe.develop.crop}
+        self.replace(recipe, None if complete else DEVELOPING)
         return True
 
-    def _toggle_pick(self) -> None:
+    def toggle_pick(self) -> None:
         """Let the next click on the photograph choose what is grey, or no longer."""
-        if self.session.opened is None:
-            self._tasks.show_error("open a photograph first; there is nothing grey to point at")
+        session = self._opened("grey to point at")
+        if session is None:
             return
         self._end_crop()
-        self._canvas.await_click(None if self._canvas.pick is not None else self._balance)
+        self._canvas.await_click(None if self.is_picking else partial(self._balance, session))
         self._panel.follow()
 
-    def _balance(self, x: float, y: float) -> None:
+    def _balance(self, session: Session, x: float, y: float) -> None:
         """Make the photograph grey at a point (x, y) in pixels of the preview."""
         try:
-            values = self.session.balance(x, y)
+            values = session.balance(x, y)
         except ValueError as error:
             self._tasks.show_error(str(error))
             self._panel.follow()
         else:
-            self._develop(values, True)
+            self.develop(values, True)
 
-    def _toggle_crop(self) -> None:
+    def toggle_crop(self) -> None:
         """Show the frame of the crop over the whole photograph, or hide it."""
-        if self.session.opened is None:
-            self._tasks.show_error("open a photograph first; there is nothing to crop")
+        if self._opened("to crop") is None:
             return
-        if self._is_cropping:
+        if self.is_cropping:
             self._end_crop()
         else:
-            self._is_cropping = True
+            self.is_cropping = True
             self._canvas.await_click(None)
             self._tasks.start(self._show_crop())
         self._panel.follow()
 
     def _end_crop(self) -> None:
         """Hide the frame of the crop."""
-        if self._is_cropping:
-            self._is_cropping = False
+        if self.is_cropping:
+            self.is_cropping = False
             self._canvas.hide_crop()
 
     async def _show_crop(self) -> None:
         """Show the frame of the crop as it is now."""
         await self._tasks.run("Working", self._canvas.draw_whole)
-        if self._is_cropping and not self._client.is_deleted:
+        if self.is_cropping and self.session is not None and not self._client.is_deleted:
             height, width = self.session.whole_size
-            aspect = self._proportions.aspect((height, width))
+            aspect = self.proportions.aspect((height, width))
             with self._client:
                 self._canvas.show_crop(None if aspect is None else aspect * height / width)
 
-    def _hold(self, name: str) -> None:
+    def hold(self, name: str) -> None:
         """Let the crop keep proportions from now on, and cut it to them."""
-        session = self.session
-        if session.opened is None:
-            self._tasks.show_error("open a photograph first; there is nothing to crop")
-        else:
-            self._cut(name)
+        session = self._opened("to crop")
+        if session is not None:
+            self._cut(session, name)
         self._panel.follow()
 
-    def _cut(self, name: str) -> None:
+    def _cut(self, session: Session, name: str) -> None:
         """Cut the crop to proportions, and show its frame; with :data:`FREE`, only let its frame be dragged freely."""
-        before, develop = self._proportions, self.session.recipe.develop
+        before = self.proportions
         if name == FREE:
             before.name = FREE
-            if self._is_cropping:
+            if self.is_cropping:
                 self._tasks.start(self._show_crop())
             return
-        self._proportions = replace(before, name=name, kept=frozenset())
-        if not self._develop({"crop": self._proportions.begin(develop.crop)}, True):
-            self._proportions = replace(before, cut=None)  # the next cut begins with the crop as it is
+        self.proportions = replace(before, name=name, kept=frozenset())
+        if not self.develop({"crop": self.proportions.begin(session.recipe.develop.crop)}, True):
+            self.proportions = replace(before, cut=None)  # the next cut begins with the crop as it is
             return
-        self._proportions.cut = self.session.recipe.develop.crop
-        if not self._is_cropping:
-            self._toggle_crop()
+        self.proportions.cut = session.recipe.develop.crop
+        if not self.is_cropping:
+            self.toggle_crop()
 
     def _crop(self, edges: Sequence[float]) -> None:
         """Take the edges that a person has set."""
-        if len(edges) == 4 and self._is_cropping:
-            self._develop({"crop": tuple(float(edge) for edge in edges)}, True)
+        if len(edges) == 4 and self.is_cropping:
+            self.develop({"crop": tuple(float(edge) for edge in edges)}, True)
 
-    def _follow_change(self, moving: int | None) -> None:
+    def _follow_change(self, session: Session, moving: int | None) -> None:
         """Show a changed edit, quickly while a slider of a step moves."""
         if moving is None:
-            self.session.commit()
+            session.commit()
             self._changed()
         else:
             self._closeup.hold()
@@ -273,7 +268,8 @@ class Editor:
 
     def _draw(self, step: str, add: Callable[[], None]) -> None:
         """Add a stroke to a step, after a question if the photograph would lose its colours."""
-        if EDITS[step].coloured and not self.session.recipe.current(step).strokes and self.session.has_colours:
+        is_first = EDITS[step].coloured and not self.recipe().current(step).strokes
+        if is_first and self.session is not None and self.session.has_colours:
             self._tasks.start(self._ask_to_colorize(add))
         else:
             add()
@@ -286,8 +282,9 @@ class Editor:
             add()
             self._changed()
 
-    def _clear_strokes(self, step: str) -> None:
-        if self.session.opened is not None:
+    def clear(self, step: str) -> None:
+        """Remove the strokes of a step."""
+        if self.session is not None:
             self.session.set(step, strokes=())
             self.session.commit()
             self._changed()
@@ -301,11 +298,12 @@ class Editor:
 
     def follow(self) -> None:
         """Show the edit."""
-        self._proportions.follow(self.session.recipe.develop.crop)
+        recipe = self.recipe()
+        self.proportions.follow(recipe.develop.crop)
         self._panel.follow()
         self._show_state()
         self._redraw()
-        if self._framed == framed(self.session, self.session.recipe.develop):
+        if self._framed == (self.session, recipe.develop.geometry):
             self._closeup.follow()
         else:
             self._closeup.hold()  # until the photograph is cut anew
@@ -313,27 +311,30 @@ class Editor:
     def _show_state(self) -> None:
         """Show what can be undone, and whether the edit is kept."""
         session = self.session
-        self._undo_button.set_enabled(session.can_undo)
-        self._redo_button.set_enabled(session.can_redo)
-        self._reset_button.set_enabled(session.recipe != Recipe())
-        self._client.run_javascript(f"page.isUnsaved = {'true' if session.unsaved else 'false'}")
-        if session.trouble != self._told:
-            self._told = session.trouble
-            if session.trouble is not None:
-                self._tasks.show_error(session.trouble)
+        self._undo_button.set_enabled(session is not None and session.can_undo)
+        self._redo_button.set_enabled(session is not None and session.can_redo)
+        self._reset_button.set_enabled(self.recipe() != Recipe())
+        unsaved = session is not None and session.unsaved
+        self._client.run_javascript(f"page.isUnsaved = {'true' if unsaved else 'false'}")
+        trouble = None if session is None else session.trouble
+        if trouble != self._told:
+            self._told = trouble
+            if trouble is not None:
+                self._tasks.show_error(trouble)
 
     def _undo(self) -> None:
-        if self.session.undo():
+        if self.session is not None and self.session.undo():
             self._changed()
 
     def _redo(self) -> None:
-        if self.session.redo():
+        if self.session is not None and self.session.redo():
             self._changed()
 
     def _reset(self) -> None:
-        self._proportions = Proportions()
-        self.session.load(Recipe())
-        self._changed()
+        if self.session is not None:
+            self.proportions = Proportions()
+            self.session.load(Recipe())
+            self._changed()
 
     def _key(self, event: events.KeyEventArguments) -> None:
         if event.action.keydown and event.modifiers.ctrl and str(event.key).lower() == "z":
@@ -344,7 +345,7 @@ class Editor:
     def _redraw(self, moving: int | None = None) -> None:
         """Draw the picture again, once the drawing in progress is done; quickly while a slider of a step moves."""
         self._canvas.draw_strokes()
-        if self.session.opened is None:
+        if self.session is None:
             return
         self._wanted = [moving]
         if not self._drawing:
@@ -355,7 +356,7 @@ class Editor:
         try:
             while self._wanted:
                 moving = self._wanted.pop()
-                if self._is_cropping:
+                if self.is_cropping:
                     await self._show_crop()
                     if moving == DEVELOPING:
                         continue
@@ -363,8 +364,8 @@ class Editor:
                 if moving is None:
                     self._frame()
                 self._show()
-                if moving is None and self._pictured is not self.session.developed:
-                    await self._draw_looks()
+                if moving is None and self.session is not None and self._pictured is not self.session.developed:
+                    await self._draw_looks(self.session.developed)
                     self._panel.follow()
                 if self._panel.tab == DETAIL.name:
                     await self._respond()
@@ -372,20 +373,20 @@ class Editor:
                 self._canvas.draw_strokes()
         finally:
             self._drawing = False
-        self._at_rest.drawn(self.session)
+        if self.session is not None:
+            self._at_rest.drawn(self.session)
 
-    async def _draw_looks(self) -> None:
+    async def _draw_looks(self, developed: Developed) -> None:
         """Draw thumbnails of the photograph, as it is developed, under each look."""
-        developed = self.session.developed
         pictures = await self._tasks.run("Working", thumbnails, developed.preview.pixels)
-        if self.session.opened is not None and self.session.developed is developed:  # still
+        if self.session is not None and self.session.developed is developed:  # still
             self._pictured = developed
             self._picturing += 1
             self._canvas.pictures |= {f"look-{look}": content for look, content in pictures.items()}
 
     def _lay(self) -> None:
         """Show the mask and the strokes of the open tab."""
-        if self.session.opened is not None:
+        if self.session is not None:
             self._tasks.start(self._lay_over())
 
     async def _lay_over(self) -> None:
@@ -404,7 +405,7 @@ class Editor:
     def _look(self, view: Sequence[float] | None) -> None:
         """Show a part at full size, or the whole photograph if ``view`` is None."""
         self._closeup.look(view)
-        if view is None and self.session.opened is not None:
+        if view is None and self.session is not None:
             self._at_rest.drawn(self.session)
 
     def _is_preview(self, session: object) -> bool:
@@ -414,16 +415,18 @@ class Editor:
 
     def _frame(self) -> None:
         """Show the photograph as it is straightened and cropped now, if that has changed."""
-        now = framed(self.session, self.session.developed.development)
-        if self._framed != now:
+        session = self.session
+        if session is not None and self._framed != (now := (session, session.developed.development.geometry)):
             self._framed = now
-            self._closeup.open(self.session)
+            self._closeup.open(session)
             with self._client:
-                self._canvas.frame(self.session.developed.before, self.session.size)
+                self._canvas.frame()
             self._closeup.follow()
 
     async def _respond(self) -> None:
         """Show the response of the sliders for the layers."""
+        if self.session is None:
+            return
         detail = self.session.recipe.current(DETAIL.name)
         curves = [
             (OUTSIDE, detail["alpha"]),
@@ -434,12 +437,12 @@ class Editor:
 
     def _switch(self, tab: str) -> None:
         """Show what belongs to a tab that was opened."""
-        was_pointing = self._is_cropping or self._canvas.pick is not None
+        was_pointing = self.is_cropping or self.is_picking
         self._end_crop()
         self._canvas.switch(tab)
         if was_pointing:
             self._panel.follow()
-        if tab == DETAIL.name and self.session.opened is not None:
+        if tab == DETAIL.name and self.session is not None:
             self._tasks.start(self._respond())
 
     # Files
@@ -447,7 +450,7 @@ class Editor:
     def _begin(self, image: Path | None, address: str) -> None:
         self._client.run_javascript(f"page.watchConnection(); {self._upload.dropping}")
         self._show_state()
-        if self.session.opened is not None:  # a browser that reconnects keeps its edit
+        if self.session is not None:  # a browser that reconnects keeps its edit
             return
         if address and (image is None or address != image.name):
             self._tasks.start(self._open(self._photographs.reopen, address))
@@ -465,44 +468,47 @@ class Editor:
             await self._open(self._photographs.open_upload, copy, file.name)
 
     async def _open(self, find: Callable[[*Arguments], Session], *place: *Arguments) -> None:
-        self.session = await self._tasks.run("Opening", find, *place)
-        opened = self.session.opened
-        if opened is None or self._client.is_deleted:
+        self.session = session = await self._tasks.run("Opening", find, *place)
+        if self._client.is_deleted:
             return
-        self._title.set_text(opened.name)
+        self._title.set_text(session.name)
         self._tasks.clear_error()
-        self._closeup.open(self.session)
-        self._framed = framed(self.session, self.session.developed.development)
+        self._closeup.open(session)
+        self._framed = session, session.developed.development.geometry
         with self._client:
             self._end_crop()
-            self._proportions = Proportions()
+            self.proportions = Proportions()
             self._canvas.await_click(None)
-            self._canvas.open(self.session, self.session.developed.before, self.session.size)
-        await self._draw_looks()
-        if self.session.opened is not opened or self._client.is_deleted:  # meanwhile
+            self._canvas.open(session)
+        await self._draw_looks(session.developed)
+        if self.session is not session or self._client.is_deleted:  # meanwhile
             return
         self.follow()
         with self._client:
-            ui.navigate.history.replace(f"/?photo={quote(self.session.address)}")
-            if opened.pages > 1:
-                ui.notify(f"{opened.name} has several pages; the first is shown.", position="bottom-left", timeout=8000)
-            if self.session.recipe != Recipe():
+            ui.navigate.history.replace(f"/?photo={quote(session.address)}")
+            if session.pages > 1:
+                ui.notify(
+                    f"{session.name} has several pages; the first is shown.", position="bottom-left", timeout=8000
+                )
+            if session.recipe != Recipe():
                 ui.notify("The edit is as you left it. Reset begins anew.", position="bottom-left", timeout=4000)
 
     async def _take_preset(self, event: events.UploadEventArguments) -> None:
         content = await event.file.read()
         event.sender.run_method("reset")
+        session = self._opened("to edit")
+        if session is None:
+            return
         try:
-            self.session.load_preset(content, event.file.name)
+            session.load_preset(content, event.file.name)
         except EXPECTED as error:
             self._tasks.show_error(str(error))
         else:
             self._changed()
 
     async def _ask_photo_name(self) -> None:
-        session = self.session
-        if session.opened is None:
-            self._tasks.show_error("open a photograph first; there is nothing to save")
+        session = self._opened("to save")
+        if session is None:
             return
         side, name = max(session.size), session.suggested_name()
         with self._client:
@@ -513,12 +519,15 @@ class Editor:
             self._tasks.start(self._save(progress, session.save, chosen, progress, dialog.options))
 
     async def _ask_edit_name(self) -> None:
-        name = "edit" if self.session.opened is None else Path(self.session.opened.name).stem
+        session = self._opened("to save")
+        if session is None:
+            return
+        name = f"{Path(session.name).stem}.json"
         with self._client:
-            dialog = NameDialog("Save the edit", f"{name}.json", self.session.folder, self.session.check_preset)
+            dialog = NameDialog("Save the edit", name, session.folder, session.check_preset)
         chosen = await dialog.answer()
         if chosen is not None:
-            self._tasks.start(self._save(Progress(), self.session.save_preset, chosen))
+            self._tasks.start(self._save(Progress(), session.save_preset, chosen))
 
     async def _save(self, progress: Progress, save: Callable[[*Arguments], Path], *arguments: *Arguments) -> None:
         path = await self._tasks.run("Saving", save, *arguments, progress=progress)
@@ -528,11 +537,6 @@ class Editor:
         self._show_state()
         with self._client:
             ui.notify(f"Saved {path.resolve()}", type="positive", position="bottom-left", timeout=6000)
-
-
-def framed(session: Session, development: Development) -> object:
-    """What decides where the pixels of the photograph of a session are under a development."""
-    return session.opened, development.geometry
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from nicegui import ui
 
 from nlfilter_torch.photo.app.controls import Replace, SteadySlider
-from nlfilter_torch.photo.app.tabs import DetailTab, DevelopTab, EditTab, Link, LookTab
+from nlfilter_torch.photo.app.tabs import DetailTab, DevelopTab, EditedPage, EditTab, LookTab
 from nlfilter_torch.photo.declared.development import DEVELOP
 from nlfilter_torch.photo.declared.parameters import DETAIL, EDITS
 from nlfilter_torch.photo.declared.presets import Recipe
@@ -72,7 +72,7 @@ class Row:
             self._opacity.props(f'dense aria-label="{name}: opacity"').tooltip(
                 "Opacity: how much of this step is mixed with the picture before it"
             )
-            self._opacity.on_value_change(lambda event: self.mix(event.value, place))
+            self._opacity.on_value_change(lambda event: self._moved(event.value))
             self._opacity.on("change", lambda event: self.mix(float(event.args), None))
             self._opacity.on_reset(lambda: self.mix(100.0, None))
             self._value = ui.label("").classes("value")
@@ -102,17 +102,20 @@ class Row:
         self._steps.open_tab(recipe.steps[self.place].edit)
 
     def _switch(self, on: bool) -> None:
-        if not self._steps.is_following:
-            recipe = self._steps.recipe()
+        recipe = self._steps.recipe()
+        if on != recipe.steps[self.place].on:  # otherwise it follows the edit
             self._steps.replace(recipe.replaced(self.place, recipe.steps[self.place].mixed(on=on)), None)
 
-    def mix(self, percent: float | None, moving: int | None) -> None:
+    def _moved(self, percent: float | None) -> None:
+        if percent is not None and percent != 100 * self._steps.recipe().steps[self.place].opacity:
+            self.mix(percent, self.place)
+
+    def mix(self, percent: float, moving: int | None) -> None:
         """Set the opacity; ``moving`` is the place while the slider moves, or None."""
-        if not self._steps.is_following and percent is not None:
-            recipe = self._steps.recipe()
-            self._value.set_text(f"{percent:.0f} %")
-            mixed = recipe.steps[self.place].mixed(opacity=percent / 100)
-            self._steps.replace(recipe.replaced(self.place, mixed), moving)
+        recipe = self._steps.recipe()
+        self._value.set_text(f"{percent:.0f} %")
+        mixed = recipe.steps[self.place].mixed(opacity=percent / 100)
+        self._steps.replace(recipe.replaced(self.place, mixed), moving)
 
     def _move_up(self) -> None:
         if self._earlier is not None:
@@ -137,7 +140,6 @@ class StepList:
 
     def __init__(self, recipe: Callable[[], Recipe], replace: Replace, open_tab: Callable[[str], object]) -> None:
         self.recipe, self.replace, self.open_tab = recipe, replace, open_tab
-        self.is_following = False  # changes of the controls are then no changes of the edit
         self._shown: tuple[tuple[int, str], ...] | None = None
         self.rows: list[Row] = []
         ui.label("Steps, from first to last").classes("group q-px-sm")
@@ -148,7 +150,6 @@ class StepList:
     def follow(self) -> None:
         """Show the current edit."""
         recipe = self.recipe()
-        self.is_following = True
         if listed(recipe) != self._shown:
             self._shown = listed(recipe)
             self._build(self._shown)
@@ -156,7 +157,6 @@ class StepList:
         self._none.set_visibility(not self.rows)
         for row in self.rows:
             row.follow(recipe)
-        self.is_following = False
 
     def _build(self, shown: tuple[tuple[int, str], ...]) -> None:
         places = [None, *(place for place, _ in shown), None]
@@ -174,8 +174,8 @@ class Panel:
     ``switch`` is called with the name of the edit whose tab was opened.
     """
 
-    def __init__(self, link: Link, switch: Callable[[str], None]) -> None:
-        self._recipe = link.recipe
+    def __init__(self, page: EditedPage, switch: Callable[[str], None]) -> None:
+        self._recipe = page.recipe
         with ui.tabs(on_change=lambda event: switch(event.value)).classes("w-full") as bar:
             bar.props("dense no-caps align=justify")
             self._titles = {edit: ui.tab(edit, label=TITLES[edit]) for edit in TABS}
@@ -185,8 +185,8 @@ class Panel:
         with panels.classes("w-full bg-transparent"):
             for edit, kind in TABS.items():
                 with ui.tab_panel(edit).classes("gap-1"):
-                    self._tabs[edit] = kind(edit, link)
-        self._steps = StepList(link.recipe, link.replace, bar.set_value)
+                    self._tabs[edit] = kind(edit, page)
+        self._steps = StepList(page.recipe, page.replace, bar.set_value)
         ui.label("Histogram").classes("group q-px-sm")
         self._histogram = ui.html("", sanitize=False).classes("w-full q-px-sm")
         self._clipped = ui.label("").classes("hint q-px-sm")

@@ -11,15 +11,15 @@ after its own are applied as they were fitted to the picture before.
 
 import math
 from bisect import bisect_right
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from nlfilter_torch.filtering.filters import detail_layers, weigh_layers
+from nlfilter_torch.filtering.filters import detail_layers
 from nlfilter_torch.operator.build import operator_from_points
 from nlfilter_torch.operator.features import GuideFeatures, estimate_bandwidth, reduce_channels, unit_window
 from nlfilter_torch.operator.operator import NonlocalOperator
@@ -32,20 +32,23 @@ from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.declared.strokes import sliders_of
 from nlfilter_torch.photo.edits.applying import PreparedStep, edit_of, filter_key, scribbles_of
 from nlfilter_torch.photo.picture.changes import (
+    DetailChange,
     activity,
     blend_changes,
     change_in_parts,
     change_of_mean,
     limit_by_activity,
-    split_sliders,
 )
-from nlfilter_torch.photo.picture.in_memory import InMemory, fit_edit
+from nlfilter_torch.photo.picture.drawn import Drawn
+from nlfilter_torch.photo.picture.edit import MARKS, PhotoEdit
+from nlfilter_torch.photo.picture.in_memory import InMemory, edit_image, fit_edit
 from nlfilter_torch.photo.picture.painting import TensorPainter
-from nlfilter_torch.photo.picture.pixels import Fitted, Pixels, Planes, mixed, part_of
+from nlfilter_torch.photo.picture.pixels import Fitted, mixed, part_of
 from nlfilter_torch.photo.picture.resizing import resize
-from nlfilter_torch.photo.picture.source import seeded
+from nlfilter_torch.photo.picture.source import luminance, seeded
 from nlfilter_torch.photo.picture.viewing import MEGAPIXEL, viewed_size, within_limits
 from nlfilter_torch.photo.picture.working_range import range_of
+from nlfilter_torch.photo.selections.stray import stray_parts
 
 Key = tuple[object, ...]  # the settings on which a cached result depends
 PIXELS = round(VIEWING_SIZE.default_number * MEGAPIXEL)  # of a preview, at most
@@ -117,41 +120,6 @@ def between_knots(declared: Edit, edit: Callable[[Step], Tensor], image: Tensor)
 
 
 @dataclass(frozen=True, eq=False)
-class WeighedLayers:
-    """The change of a picture by detail sliders, which weigh the layers of its luminance.
-
-    Attributes:
-        layers: layers (1, k+1, 1, h, w).
-        activity: the activity, by which changes are limited.
-        threshold: the threshold of the activity.
-        sliders: the sliders outside the region.
-        regions: those of each region.
-        masks: of the regions, (1, K, h, w), or None for no region.
-    """
-
-    layers: Planes
-    activity: Planes
-    threshold: float
-    sliders: tuple[float, ...]
-    regions: Sequence[tuple[float, ...]]
-    masks: Planes | None
-
-    def __call__(self, pixels: Pixels) -> Tensor:
-        """The change at some pixels of the picture."""
-        layers = self.layers(pixels)
-        change = _change_by(layers, self.sliders)
-        if self.masks is not None:
-            changes = [_change_by(layers, sliders) for sliders in self.regions]
-            change = blend_changes(torch.cat([*changes, change], dim=1), self.masks(pixels))
-        return limit_by_activity(change, self.activity(pixels), self.threshold)
-
-
-def _change_by(layers: Tensor, sliders: tuple[float, ...]) -> Tensor:
-    """The changes of layers by sliders, of the details and of the shading."""
-    return torch.cat([weigh_layers(layers, part) for part in split_sliders(torch.tensor(sliders) - 1)], dim=1)
-
-
-@dataclass(frozen=True, eq=False)
 class Layers:
     """Layers (1, k+1, 1, h, w) of the luminance, which the detail sliders weigh, and the eigenvalues (R,)."""
 
@@ -190,6 +158,40 @@ class StepPicture:
         return InMemory(image.clamp(0, 1)).all(self.fitted)
 
 
+def selected(step: Step, image: Tensor, stride: float = 1) -> Tensor | None:
+    """The mask (1, 1, h, w) of what the scribbles of a step select; None if there are none, or all is changed.
+
+    ``image`` (1, C, h, w) is the picture before the step, and ``stride`` its sampling step relative to the photograph.
+    """
+    size = (image.shape[-2], image.shape[-1])
+    edit = edit_of(step, size, stride=stride)
+    selection = edit.selection() if step.marks_object() else None
+    if selection is None:
+        return None
+    return edit_image(selection, image.clamp(0, 1), _marks(step, edit, size))
+
+
+def ignored(step: Step, image: Tensor) -> Tensor | None:
+    """Which pixels (1, 1, h, w) under the scribbles of a step do not count, or None."""
+    size = (image.shape[-2], image.shape[-1])
+    edit = edit_of(step, size)
+    if not step.painted_as("object") or edit.selection() is None:
+        return None
+    masks = _marks(step, edit, size).masks
+    names = [name for name in ("scribbles", "background") if name in masks]
+    parts = [stray_parts(InMemory(image.clamp(0, 1)), masks[name].amax(1, keepdim=True).ceil()) for name in names]
+    stray: Tensor = sum(parts[1:], parts[0])
+    return stray.clamp(max=1) if bool(stray.any()) else None
+
+
+def _marks(step: Step, edit: PhotoEdit, size: tuple[int, int]) -> Drawn[Tensor]:
+    """The scribbles of a step, under the names that the edit of its selection takes, without colours."""
+    marks = edit.marks(scribbles_of(step, size, TensorPainter()))
+    kinds = step.declared.with_role("object", "added")
+    coloured = {MARKS[scribble.role] for scribble in kinds if scribble.kind == "colours"}
+    return replace(marks, masks={n: mask[:, -1:] if n in coloured else mask for n, mask in marks.masks.items()})
+
+
 class Preview:
     """A reduced photograph under any edit.
 
@@ -218,6 +220,7 @@ class Preview:
         self._active: tuple[tuple[int, int], Tensor] | None = None
         self._filter: tuple[Key, Callable[[Step], Tensor]] | None = None
         self._pictures: list[StepPicture] = []
+        self._selected, self._ignored = lru_cache(maxsize=1)(selected), lru_cache(maxsize=1)(ignored)
 
     def layers(self, detail: Step) -> Layers:
         """The layers for the filter of a step; slow if its settings have changed."""
@@ -225,14 +228,14 @@ class Preview:
         key = (*filter_key(detail), detail["viewing_size"], order)
         if self._layers is None or self._layers.key != key:
             stride, shown = self._compared(detail)
-            luminance = reduce_channels(shown, "luminance")
+            guide = reduce_channels(shown, "luminance")
             bandwidth = detail.arguments(self.size)["photometric_bandwidth"]
             operator = operator_of_sample(
-                luminance,
+                guide,
                 stride,
                 detail,
-                bandwidth=estimate_bandwidth(luminance) if bandwidth == "auto" else bandwidth,
-                distance=self._distance(detail, luminance),
+                bandwidth=estimate_bandwidth(guide) if bandwidth == "auto" else bandwidth,
+                distance=self._distance(detail, guide),
                 channels="luminance",
                 patch_size=detail["patch_size"],
             )
@@ -285,6 +288,17 @@ class Preview:
             fitted = fit_edit(selection, self._source, edit.marks(drawn), working=self._working)
             self._masks = (key, self._source.all(fitted))
         return self._masks[1]
+
+    def mask(self, step: Step) -> Tensor | None:
+        """The mask (1, 1, h, w) of what the scribbles of a step select, or None."""
+        if step.declared.regional is None:
+            return self._selected(step.mixed(on=True, opacity=1.0), self.before(step), self.stride)
+        masks = self.masks(step)
+        return None if masks is None else masks.amax(1, keepdim=True)
+
+    def ignored(self, step: Step) -> Tensor | None:
+        """Which pixels (1, 1, h, w) under these scribbles do not count, or None."""
+        return self._ignored(step.mixed(on=True, opacity=1.0), self.before(step))
 
     def before(self, step: Step) -> Tensor:
         """The picture before a step, as it was last rendered, or the reduced photograph."""
@@ -345,18 +359,14 @@ class Preview:
 
     def _blend(self, detail: Step) -> Fitted:
         """A step that weighs layers."""
-        masks, regions = self.masks(detail), sliders_of(detail.strokes, detail.sliders_inside)
-        change = WeighedLayers(
-            part_of(self.layers(detail).layers),
-            part_of(self._activity(detail)),
-            detail["threshold"] / 255,
-            detail["alpha"],
-            regions,
-            None if masks is None else part_of(masks),
-        )
-        rows = torch.tensor([detail["alpha"], *regions])
-        brighter = detail["alpha"][-1] - 1 if masks is None else change_of_mean(rows - 1)
-        return within_limits(self._source, Fitted(change), detail["limits"], brighter)
+        masks, layers = self.masks(detail), part_of(self.layers(detail).layers)
+        regions = [] if masks is None else sliders_of(detail.strokes, detail.sliders_inside)
+        sliders = torch.tensor([*regions, detail["alpha"]]) - 1
+        change = torch.cat([DetailChange(luminance, layers, row)(self._source) for row in sliders], dim=1)
+        change = change if masks is None else blend_changes(change, masks)
+        limited = limit_by_activity(change, self._activity(detail), detail["threshold"] / 255)
+        brighter = detail["alpha"][-1] - 1 if masks is None else change_of_mean(sliders)
+        return within_limits(self._source, Fitted(part_of(limited)), detail["limits"], brighter)
 
     def _filter_of(self, step: Step, image: Tensor, before: Key, *, keep: bool) -> Callable[[Step], Tensor]:
         """A function that applies a step to the picture before it; slow unless its filter is cached."""

@@ -10,8 +10,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from nlfilter_torch.photo.app.developed import DEVELOPING, Developed, uncropped
-from nlfilter_torch.photo.app.overlays import Overlays
+from nlfilter_torch.photo.app.developed import DEVELOPING, Developed
 from nlfilter_torch.photo.app.preview import PIXELS, Preview
 from nlfilter_torch.photo.app.sidecar import Sidecar
 from nlfilter_torch.photo.declared.development import Crop, Development
@@ -28,7 +27,7 @@ from nlfilter_torch.photo.files.exif import read_upright
 from nlfilter_torch.photo.files.formats import BITS, DEPTHS, SUFFIXES, check_memory, first_bytes
 from nlfilter_torch.photo.files.rows import TILED_MEMORY, WHOLE_MEMORY, usual_memory
 from nlfilter_torch.photo.files.writing import open_beside
-from nlfilter_torch.photo.picture.developing import balance_of
+from nlfilter_torch.photo.picture.developing import balance_of, in_light, limits_of, turned_canvas
 from nlfilter_torch.photo.picture.photographs import Photograph, check_output, read_photograph, write_photograph
 from nlfilter_torch.photo.picture.resizing import resize
 from nlfilter_torch.photo.picture.sampling import Report, in_silence
@@ -55,95 +54,57 @@ class FileOptions:
     side: int | None = None
 
 
-@dataclass(frozen=True)
-class Opened:
-    """An open photograph.
-
-    Attributes:
-        path: its file, which may be a copy.
-        name: the name of the file for the user.
-        photograph: its pixels, before it is developed.
-        preview: its preview.
-        pages: number of pages of the file.
-    """
-
-    path: Path
-    name: str
-    photograph: Photograph
-    preview: Preview
-    pages: int = 1
-
-
 class Session:
     """The editing of a photograph, shared by all pages that show it.
 
     Args:
         folder: where files are saved.
+        path: file of the photograph, which may be a copy.
+        name: name of the file for the user, also in errors; None is that of ``path``.
         pixels: the largest number of pixels in the preview.
+
+    Raises:
+        ValueError, OSError, MemoryError: see :func:`read_photograph`.
 
     Attributes:
         recipe: the edit.
-        opened: the photograph, or None.
+        original: the photograph as it is.
+        developed: the photograph as it was shown last.
+        pages: number of pages of the file.
         address: the address by which a page finds the session again.
         saved: the edit as of the last file that was written.
     """
 
-    def __init__(self, folder: Path, pixels: int = PIXELS) -> None:
-        self.folder = folder
-        self.recipe = Recipe()
-        self.opened: Opened | None = None
-        self.address = ""
-        self.saved = Recipe()
-        self._sidecar: Sidecar | None = None
-        self._kept = Recipe()  # what the sidecar holds
-        self._developed: Developed | None = None  # the photograph as it was shown last
-        self._outdated: list[Parts] = []  # of other developments
-        self._drawing = threading.Lock()  # previews cache what they compute, so they draw one picture at a time
-        self._fitting = threading.Lock()  # the same holds for parts at full size
-        self._overlays = Overlays()
-        self._at_rest: tuple[object, Tensor] | None = None  # the last result, for other tabs
-        self._pixels = pixels
-        self._past: list[Recipe] = []
-        self._future: list[Recipe] = []
-        self._shown = Recipe()  # the last committed edit
-
-    def open(self, path: Path, name: str | None = None) -> None:
-        """Read a photograph and begin a new edit; a failure changes nothing.
-
-        Raises:
-            ValueError, OSError, MemoryError: see :func:`read_photograph`. The message calls the file ``name``; ``path``
-                may be a copy of it.
-        """
+    def __init__(self, folder: Path, path: Path, name: str | None = None, pixels: int = PIXELS) -> None:
         try:
             photograph = read_photograph(path, bytes_per_pixel=OPEN_BYTES)
         except (ValueError, OSError, MemoryError) as error:
             raise type(error)(str(error).replace(str(path), name or str(path))) from error
-        if self._developed is not None:
-            self._developed.parts.close()
-        pages = tiff.count_pages(path) if tiff.is_tiff(first_bytes(path)) else 1
-        self._developed = Developed.of(photograph, name or path.name, self._pixels)
-        self.opened = Opened(path.resolve(), name or path.name, photograph, self._developed.preview, pages)
-        self.recipe = self._shown = self.saved = Recipe()
-        self._at_rest = None
-        self._overlays = Overlays()
-        self._past, self._future = [], []
+        self.folder, self.path, self.name = folder, path.resolve(), name or path.name
+        self.pages = tiff.count_pages(path) if tiff.is_tiff(first_bytes(path)) else 1
+        self.original = self.developed = Developed.of(photograph, self.name, pixels)
+        self.address = ""
+        self.recipe = self.saved = self._shown = Recipe()  # the last one is the last committed edit
+        self._sidecar: Sidecar | None = None
+        self._outdated: list[Parts] = []  # of other developments
+        self._drawing = threading.Lock()  # previews cache what they compute, so they draw one picture at a time
+        self._fitting = threading.Lock()  # the same holds for parts at full size
+        self._at_rest: tuple[object, Tensor] | None = None  # the last result, for other tabs
+        self._pixels = pixels
+        self._past: list[Recipe] = []
+        self._future: list[Recipe] = []
 
     def keep_in(self, sidecar: Sidecar) -> None:
         """Load the edit that is kept in a file, and keep the edit there from now on."""
         self._sidecar = sidecar
-        self.recipe = self._shown = self.saved = self._kept = self._read(sidecar)
+        self.recipe = self._shown = self.saved = sidecar.read(self.whole_size)
 
     def restore(self) -> None:
         """Load the edit from its file again if another program has changed the file."""
         if self._sidecar is not None:
-            recipe = self._read(self._sidecar)
-            if recipe != self._kept:
-                self._kept = recipe
+            kept = self._sidecar.kept
+            if (recipe := self._sidecar.read(self.whole_size)) != kept:
                 self.load(recipe)
-
-    def _read(self, sidecar: Sidecar) -> Recipe:
-        """The edit that is kept in a file, or one that changes nothing."""
-        return sidecar.read(self._opened_to("edit").photograph.size) or Recipe()
 
     @property
     def trouble(self) -> str | None:
@@ -153,7 +114,7 @@ class Session:
     @property
     def unsaved(self) -> bool:
         """Whether the edit has changed since it was opened or written."""
-        return self.opened is not None and self.recipe != self.saved
+        return self.recipe != self.saved
 
     @property
     def can_undo(self) -> bool:
@@ -167,31 +128,23 @@ class Session:
 
     @property
     def preview(self) -> Preview:
-        """The preview; raises ValueError if no photograph is open."""
+        """The preview of the photograph as it was shown last."""
         return self.developed.preview
 
     @property
-    def developed(self) -> Developed:
-        """The photograph as it was developed last; raises ValueError if none is open."""
-        if self._developed is None:
-            raise ValueError("open a photograph first")
-        return self._developed
-
-    @property
     def size(self) -> tuple[int, int]:
-        """(height, width) of the developed photograph; raises ValueError if none is open."""
+        """(height, width) of the developed photograph."""
         return self.developed.photograph.size
 
     def _develop(self, development: Development) -> Developed:
         """The photograph under a development; takes a second per ten megapixels unless it is the one shown.
 
         Raises:
-            ValueError, MemoryError: if nothing is open, or the photograph cannot be developed.
+            ValueError, MemoryError: if the photograph cannot be developed.
         """
-        opened, developed = self._opened_to("develop"), self.developed
-        if developed.development == development:
-            return developed
-        return developed.changed(opened.photograph, opened.name, self._pixels, development)
+        if self.developed.development == development:
+            return self.developed
+        return self.developed.changed(self.original.photograph, self.name, self._pixels, development)
 
     def step_in_view(self, edit: str) -> Step:
         """The chosen step of an edit, with its strokes in coordinates of the developed photograph."""
@@ -200,8 +153,8 @@ class Session:
 
     @property
     def whole_size(self) -> tuple[int, int]:
-        """(height, width) of the photograph before it is developed; raises ValueError if none is open."""
-        return self._opened_to("show").photograph.size
+        """(height, width) of the photograph before it is developed."""
+        return self.original.photograph.size
 
     @property
     def crop(self) -> Crop:
@@ -211,17 +164,18 @@ class Session:
     @property
     def uncropped(self) -> Tensor:
         """The photograph as it is turned and lit, not cropped, with black corners, (1, C, h, w) in [0, 1], reduced."""
-        return uncropped(self._opened_to("show").preview.pixels, self.recipe.develop)
+        pixels, development = self.original.preview.pixels, self.recipe.develop
+        return turned_canvas(in_light(pixels, development, limits_of(pixels)).clamp(0, 1), development)
 
     @property
     def has_colours(self) -> bool:
-        """Whether the photograph has colours; raises ValueError if none is open."""
+        """Whether the photograph has colours."""
         pixels = self.preview.pixels
         return bool((pixels.amax(1) - pixels.amin(1) > COLOURED).float().mean() > RARE)
 
     @property
     def is_reduced(self) -> bool:
-        """Whether the preview has fewer pixels than the photograph; raises ValueError if none is open."""
+        """Whether the preview has fewer pixels than the photograph."""
         return self.preview.stride > 1
 
     def set(self, edit: str, *, strokes: tuple[Mark, ...] | None = None, **values: Value) -> None:
@@ -240,9 +194,9 @@ class Session:
         width of the crop is ``aspect`` times its height, unless that is None.
 
         Raises:
-            ValueError: if the middle of the crop is outside, or nothing is open.
+            ValueError: if the middle of the crop is outside.
         """
-        size = self._opened_to("develop").photograph.size
+        size = self.whole_size
         develop = Development(**{**vars(self.recipe.develop), **values})
         if "crop" in values:  # its size stays if only its place changes
             develop = replace(develop, crop=self.recipe.develop.frame(size).placed(develop.crop))
@@ -273,11 +227,8 @@ class Session:
             self._keep()
 
     def _keep(self) -> None:
-        drawn = self._shown.drawn
-        if self._sidecar is not None and drawn != self._kept:
-            self._sidecar.write(drawn)
-            if self._sidecar.trouble is None:
-                self._kept = drawn
+        if self._sidecar is not None:
+            self._sidecar.write(self._shown)
 
     def load(self, recipe: Recipe) -> None:
         """Replace the edit, as one change."""
@@ -304,7 +255,7 @@ class Session:
         """Add a stroke to a step: points (x, y) in pixels of the preview, and a radius as a share of its short side.
 
         Raises:
-            ValueError: if no photograph is open, or the step does not take strokes of that meaning or colour.
+            ValueError: if the step does not take strokes of that meaning or colour.
         """
         height, width = self.preview.size
         shares = thin(((x / width, y / height) for x, y in points), SPACING * radius)
@@ -327,7 +278,7 @@ class Session:
         recipe = self.recipe
         with self._drawing:
             if moving == DEVELOPING:
-                developed, original = self.developed, self._opened_to("show").preview
+                developed, original = self.developed, self.original.preview
                 start = developed.approximate(recipe.develop, original)
                 if developed.development.geometry != recipe.develop.geometry:  # no step can be computed so fast
                     return (start.clamp(0, 1) + developed.change_in(recipe.develop, original)).clamp(0, 1)
@@ -335,7 +286,7 @@ class Session:
                 developed, start = self._develop(recipe.develop), None
                 if developed is not self.developed:
                     self._outdated.append(self.developed.parts)
-                    self._developed = developed
+                    self.developed = developed
             steps = self._on(developed, recipe, developed.preview.size)
             return developed.preview.render(steps, moving, start)
 
@@ -350,22 +301,15 @@ class Session:
 
     def mask(self, edit: str) -> Tensor | None:
         """The mask (1, 1, h, w) of what the scribbles of the chosen step of an edit select, or None."""
-        step, preview = self.developed.counted(self.step_in_view(edit)), self.preview
+        step = self.developed.counted(self.step_in_view(edit))
         with self._drawing:
-            if step.declared.regional is not None:
-                masks = preview.masks(step)
-                return None if masks is None else masks.amax(1, keepdim=True)
-            return self._overlays.selected(step, preview.before(step), preview.stride)
+            return self.preview.mask(step)
 
     def ignored(self, edit: str) -> Tensor | None:
         """Which pixels (1, 1, h, w) under these scribbles do not count, or None."""
         step = self.developed.counted(self.step_in_view(edit))
         with self._drawing:
-            return self._overlays.ignored(step, self.preview.before(step))
-
-    def original(self, place: Rectangle) -> Tensor:
-        """A part of the photograph before the edit, (1, C, h, w) in [0, 1]; raises ValueError if none is open."""
-        return self.developed.original(place)
+            return self.preview.ignored(step)
 
     def part(self, place: Rectangle, recipe: Recipe, report: Report = in_silence) -> Tensor:
         """A part of the photograph under an edit as :meth:`save` makes it, (1, C, h, w) in [0, 1].
@@ -374,7 +318,7 @@ class Session:
         photograph. ``report`` may raise an error to interrupt.
 
         Raises:
-            ValueError, OSError, MemoryError: if nothing is open, or the photograph cannot be edited.
+            ValueError, OSError, MemoryError: if the photograph cannot be edited.
         """
         with self._fitting:
             return self._fitted(self._develop(recipe.develop), recipe, report).edited(place)
@@ -408,18 +352,12 @@ class Session:
 
     def _edited_at_once(self, developed: Developed, recipe: Recipe, report: Report) -> Tensor | None:
         """The edited pixels (1, C, H, W), as the command line computes them; None if that needs too much memory."""
-        opened, photograph, steps = self._opened_to("edit"), developed.photograph, self._on(developed, recipe)
+        photograph, steps = developed.photograph, self._on(developed, recipe)
         height, width = photograph.size
-        if _in_tiles(photograph.size, steps):
+        if height * width * steps.bytes_per_pixel > WHOLE_MEMORY:
             return None
-        check_memory(Path(opened.name), width, height, steps.bytes_per_pixel)
+        check_memory(Path(self.name), width, height, steps.bytes_per_pixel)
         return apply_recipe(steps, photograph.pixels, partial(report, "Editing"), weights=photograph.weights)
-
-    def _opened_to(self, purpose: str) -> Opened:
-        """The open photograph; if there is none, raises a ValueError that names the purpose."""
-        if self.opened is None:
-            raise ValueError(f"open a photograph first; there is nothing to {purpose}")
-        return self.opened
 
     def _passes(self, photograph: Photograph, report: Report) -> Passes:
         """How an edit passes over the photograph in tiles."""
@@ -438,8 +376,8 @@ class Session:
 
     def check_photograph(self, name: str) -> Path:
         """:meth:`target` of a name under which the photograph can be saved; raises ValueError for others."""
-        target, opened = self.target(name), self._opened_to("save")
-        if target.resolve() == opened.path:
+        target = self.target(name)
+        if target.resolve() == self.path:
             raise ValueError(
                 f"the name must not be that of the photograph, got {name!r}: its edit is kept, and would be "
                 "applied again; choose another name"
@@ -456,9 +394,7 @@ class Session:
 
     def suggested_name(self) -> str:
         """The name of the photograph with ``-edited`` appended, and the extension of a file type that can store it."""
-        if self.opened is None:
-            return ""
-        path, photograph = Path(self.opened.name), self.opened.photograph
+        path, photograph = Path(self.name), self.original.photograph
         suffix = path.suffix.lower()
         kind = SUFFIXES.get(suffix)
         fits = kind is not None and photograph.depth in DEPTHS[kind] and (photograph.alpha is None or kind != "JPEG")
@@ -470,9 +406,9 @@ class Session:
         """Edit the photograph at its full size and write it to the folder; the file appears complete or not at all.
 
         Raises:
-            ValueError, OSError, MemoryError: if nothing is open, or the file cannot be edited or written.
+            ValueError, OSError, MemoryError: if the file cannot be edited or written.
         """
-        target, opened = self.check_photograph(name), self._opened_to("save")
+        target = self.check_photograph(name)
         recipe, developed = self.recipe, self._develop(self.recipe.develop)
         photograph = developed.photograph
         size = reduced_size(photograph, options.side)
@@ -482,7 +418,7 @@ class Session:
             channels = 3 if recipe.gives_colour else rows.shape[2]
             pixels = photograph.pixels.new_empty((1, channels, *photograph.size))
             steps = self._on(developed, recipe).steps
-            for part, values in edit_rows(self._passes(photograph, report), rows, steps, opened.name):
+            for part, values in edit_rows(self._passes(photograph, report), rows, steps, self.name):
                 pixels[0, :, part] = torch.from_numpy(values).permute(2, 0, 1)
         report("Writing", 0, 1)
         write_photograph(resized_photograph(photograph.with_pixels(pixels), size), target, quality=options.quality)
@@ -505,9 +441,9 @@ class Session:
         """Load an edit from the content of a file, in which masks are named as seen from the editor's folder.
 
         Raises:
-            ValueError: if it has no edit, or names a mask outside the folder, or if no photograph is open.
+            ValueError: if it has no edit, or names a mask outside the folder.
         """
-        opened, path, folder = self._opened_to("edit"), self.folder / name, self.folder.resolve()
+        path, folder = self.folder / name, self.folder.resolve()
         try:
             recipe = Recipe.from_file(content, str(path))
         except ValueError as error:
@@ -518,13 +454,8 @@ class Session:
                     f"masks of {name} must be files in {folder}, got {mark.file}; move the file there, or apply the "
                     "edit on the command line"
                 )
-        recipe.check_crop(opened.photograph.size, name)
+        recipe.check_crop(self.whole_size, name)
         self.load(recipe)
-
-
-def _in_tiles(size: tuple[int, int], recipe: Recipe) -> bool:
-    """Whether a photograph (H, W) is edited in tiles, since that at once needs too much memory."""
-    return math.prod(size) * recipe.bytes_per_pixel > WHOLE_MEMORY
 
 
 def reduced_size(photograph: Photograph, side: int | None) -> tuple[int, int]:

@@ -7,7 +7,7 @@ is read-only, if the name would be too long, or if the browser sent a photograph
 import os
 import sys
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from nlfilter_torch.photo.declared.presets import Recipe
@@ -33,10 +33,12 @@ class Sidecar:
 
     Attributes:
         path: path of the file.
+        kept: the edit in the file, as of the last read or write.
         trouble: what went wrong in the last read or write, as a sentence, or None.
     """
 
     path: Path
+    kept: Recipe = field(default_factory=Recipe)
     trouble: str | None = None
 
     @staticmethod
@@ -49,18 +51,18 @@ class Sidecar:
                 return Sidecar(beside)
         return Sidecar(state_folder() / f"{digest[:16]}-{os.fsencode(name)[-80:].decode(errors='ignore')}{ENDING}")
 
-    def read(self, size: tuple[int, int]) -> Recipe | None:
-        """The edit in the file, or None; an unreadable file is renamed, so that nothing in it is lost.
+    def read(self, size: tuple[int, int]) -> Recipe:
+        """The edit in the file, or one that changes nothing; an unreadable file is renamed, so that nothing is lost.
 
         A file whose crop is outside a photograph (H, W) counts as one.
         """
-        self.trouble = None
+        self.trouble, self.kept = None, Recipe()
         try:
             recipe = Recipe.from_json(self.path.read_bytes(), str(self.path))
             recipe.check_crop(size, str(self.path))
-            return recipe
+            self.kept = recipe
         except FileNotFoundError:
-            return None
+            pass
         except OSError as error:
             self.trouble = f"{self.path} cannot be read: {error.strerror or error}; the photograph is shown unedited"
         except ValueError as error:
@@ -68,19 +70,22 @@ class Sidecar:
             with suppress(OSError):  # in a read-only folder the file stays, and nothing can replace it
                 aside = self.path.replace(self.path.with_name(self.path.name + UNREADABLE))
                 self.trouble += f", and the file was renamed to {aside.name}"
-        return None
+        return self.kept
 
     def write(self, recipe: Recipe) -> None:
-        """Write an edit, completely or not at all; an edit that changes nothing removes the file."""
+        """Write an edit, completely or not at all, unless it is kept; one that changes nothing removes the file."""
+        if recipe.drawn == self.kept:
+            return
         self.trouble = None
         try:
             if recipe.drawn == Recipe():
                 self.path.unlink(missing_ok=True)
-                return
-            if self.path.parent == state_folder():
-                self.path.parent.mkdir(parents=True, exist_ok=True)
-            with open_beside(self.path) as stream:
-                stream.write(recipe.to_json(drawn=True).encode())
+            else:
+                if self.path.parent == state_folder():
+                    self.path.parent.mkdir(parents=True, exist_ok=True)
+                with open_beside(self.path) as stream:
+                    stream.write(recipe.to_json(drawn=True).encode())
+            self.kept = recipe.drawn
         except OSError as error:
             reason = str(error) if str(self.path) in str(error) else f"{self.path}: {error}"
             self.trouble = f"the edit cannot be kept ({reason}); use Save edit before you leave"

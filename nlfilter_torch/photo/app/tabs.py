@@ -1,16 +1,17 @@
 """The tabs of edits: sliders, the settings of the brush, and what photographs, details and looks have beside these."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
+from typing import Protocol
 
 from nicegui import ui
 from torch import Tensor
 
 from nlfilter_torch.photo.app import controls, drawing
-from nlfilter_torch.photo.app.brush import BRUSH_RADIUS, BRUSHES, PALETTE, Brush
-from nlfilter_torch.photo.app.controls import Change, Choice, Control, Replace, Slider, SteadySlider, show_pressed
-from nlfilter_torch.photo.app.crop_tool import FREE, PROPORTIONS
+from nlfilter_torch.photo.app.canvas import BRUSH_RADIUS, BRUSHES, PALETTE, Brush
+from nlfilter_torch.photo.app.controls import Choice, Control, Slider, SteadySlider, show_pressed
+from nlfilter_torch.photo.app.crop_tool import FREE, PROPORTIONS, Proportions
 from nlfilter_torch.photo.declared.development import DEVELOP, WHOLE_CROP
 from nlfilter_torch.photo.declared.json_values import Value
 from nlfilter_torch.photo.declared.parameters import EDITS
@@ -27,57 +28,56 @@ UNITS_OF_DEVELOPMENT = {"exposure": " stops", "straighten": "\u00b0"}
 BY_HAND = "Brush (B) and Eraser (E) paint on the mask itself; S is the first tool again."
 
 
-@dataclass(frozen=True)
-class PhotoLink:
-    """What the tab of the photograph itself calls.
+class EditedPage(Protocol):
+    """What the tabs show of a page, and what they call.
 
     Attributes:
-        develop: is called with changes, and whether they are complete.
-        crop: is called to show the frame of the crop, or to hide it.
-        is_cropping: returns whether it is shown.
-        hold: is called with the proportions that a crop is to keep.
-        held: returns these.
-        pick: is called to let a person point at something grey, or to stop that.
-        is_picking: returns whether the next click does that.
+        brush: the settings of the brush, which the tabs show and change.
+        proportions: those that a crop keeps.
+        is_cropping: whether the frame of the crop is shown.
     """
 
-    develop: Callable[[Mapping[str, Value], bool], object]
-    crop: Callable[[], None]
-    is_cropping: Callable[[], bool]
-    hold: Callable[[str], None]
-    held: Callable[[], str]
-    pick: Callable[[], None]
-    is_picking: Callable[[], bool]
-
-
-@dataclass(frozen=True)
-class Link:
-    """What the tabs show, and what they call.
-
-    Attributes:
-        recipe: returns the current edit.
-        brush: its settings, which the tabs show and change.
-        change: is called with changes of the parameters of a step.
-        clear: is called with a step whose strokes are to be removed.
-        replace: is called with another edit, and the place of the step whose slider moves, or None.
-        thumbnail: returns the address of a picture of the photograph under a look, or "" if there is none.
-        photo: what the tab of the photograph itself calls.
-    """
-
-    recipe: Callable[[], Recipe]
     brush: Brush
-    change: Change
-    clear: Callable[[str], None]
-    replace: Replace
-    thumbnail: Callable[[str], str]
-    photo: PhotoLink
+    proportions: Proportions
+    is_cropping: bool
+
+    @property
+    def is_picking(self) -> bool:
+        """Whether the next click on the photograph chooses what is grey."""
+
+    def recipe(self) -> Recipe:
+        """The current edit."""
+
+    def change(self, step: str, values: Mapping[str, Value], complete: bool) -> None:
+        """Change parameters of a step; ``complete`` when the pointer is released."""
+
+    def clear(self, step: str) -> None:
+        """Remove the strokes of a step."""
+
+    def replace(self, recipe: Recipe, moving: int | None) -> None:
+        """Replace the edit; ``moving`` is the place of a step whose slider moves, or None if the change is complete."""
+
+    def thumbnail(self, look: str) -> str:
+        """The address of a picture of the photograph under a look, or "" if there is none."""
+
+    def develop(self, values: Mapping[str, Value], complete: bool) -> bool:
+        """Change how the photograph is developed, and return whether it can be; ``complete`` at the end of a drag."""
+
+    def toggle_crop(self) -> None:
+        """Show the frame of the crop over the whole photograph, or hide it."""
+
+    def hold(self, name: str) -> None:
+        """Let the crop keep proportions from now on, and cut it to them."""
+
+    def toggle_pick(self) -> None:
+        """Let the next click on the photograph choose what is grey, or no longer."""
 
 
 class EditTab:
     """The tab of an edit, built into the open element."""
 
-    def __init__(self, edit: str, link: Link) -> None:
-        self._edit, self._link = edit, link
+    def __init__(self, edit: str, page: EditedPage) -> None:
+        self._edit, self._page = edit, page
         self._sliders: list[Slider] = []
         self._choices: list[Choice] = []
         self._build()
@@ -104,18 +104,18 @@ class EditTab:
         if needs_strokes:
             self._build_brush()
         self._sliders += [self._slider(control) for control in controls.OF_EDIT[self._edit]]
-        self._choices += controls.choices(self._edit, self._link.recipe, self._link.change)
+        self._choices += controls.choices(self._edit, self._page.recipe, self._page.change)
         if not needs_strokes:
             self._build_brush()
 
     def _slider(self, control: Control, suffix: str = "") -> Slider:
-        return Slider(control, self._link.recipe, self._link.change, suffix)
+        return Slider(control, self._page.recipe, self._page.change, suffix)
 
     def _build_brush(self, hint: str = "") -> None:
         """Build the settings of the brush, if the edit takes strokes."""
         if self._edit not in BRUSHES:
             return
-        brush, edit = self._link.brush, self._edit
+        brush, edit = self._page.brush, self._edit
         with ui.row().classes("w-full items-center no-wrap"):
             ui.label("Tools").classes("group")
             ui.space()
@@ -137,11 +137,11 @@ class EditTab:
             size.on_reset(lambda: size.set_value(100 * BRUSH_RADIUS))
 
     def _clear(self) -> None:
-        self._link.clear(self._edit)
+        self._page.clear(self._edit)
 
     def _build_colours(self) -> None:
         """Build a field for the colour that the brush paints, the same in all tabs, and buttons for some colours."""
-        brush = self._link.brush
+        brush = self._page.brush
         with ui.row().classes("gap-2 q-mt-xs"):
             for colour in PALETTE:
                 ui.button(on_click=partial(brush.choose_colour, colour)).props(
@@ -178,23 +178,23 @@ class DevelopTab(EditTab):
     def follow(self) -> None:
         """Show the current edit."""
         super().follow()
-        photo = self._link.photo
-        for button, is_on in ((self._crop, photo.is_cropping()), (self._pick, photo.is_picking())):
+        for button, is_on in ((self._crop, self._page.is_cropping), (self._pick, self._page.is_picking)):
             show_pressed(button, is_on)
-        self._whole.set_enabled(self._link.recipe().develop.crop != WHOLE_CROP)
-        self._proportions.set_value(photo.held())
+        self._whole.set_enabled(self._page.recipe().develop.crop != WHOLE_CROP)
+        self._proportions.set_value(self._page.proportions.name)
 
     def _build(self) -> None:
         ui.label(DEVELOP.hint).classes("hint")
-        self._sliders = [Slider(control, self._link.recipe, self._develop) for control in DEVELOP_CONTROLS]
-        photo = self._link.photo
-        self._pick = ui.button("Grey point", icon="colorize", on_click=photo.pick).props("flat dense no-caps")
+        self._sliders = [Slider(control, self._page.recipe, self._develop) for control in DEVELOP_CONTROLS]
+        self._pick = ui.button("Grey point", icon="colorize", on_click=self._page.toggle_pick).props(
+            "flat dense no-caps"
+        )
         self._pick.tooltip("Click on something that is grey or white: the white balance makes it so")
         ui.label("Crop").classes("group")
         with ui.row().classes("w-full items-center no-wrap gap-2 q-mt-xs"):
-            self._crop = ui.button("Crop", icon="crop", on_click=photo.crop).props("flat dense no-caps")
+            self._crop = ui.button("Crop", icon="crop", on_click=self._page.toggle_crop).props("flat dense no-caps")
             self._crop.tooltip("Drag a frame over the whole photograph; Escape ends it")
-            self._proportions = ui.select(list(PROPORTIONS), value=photo.held(), label="Proportions")
+            self._proportions = ui.select(list(PROPORTIONS), value=self._page.proportions.name, label="Proportions")
             self._proportions.props("dense outlined options-dense").classes("grow")
             self._proportions.tooltip("Width to height of the crop, which it keeps while its frame is dragged")
             self._proportions.on_value_change(lambda event: self._hold(event.value))
@@ -202,31 +202,29 @@ class DevelopTab(EditTab):
 
     def _develop(self, _: str, values: Mapping[str, Value], complete: bool) -> None:
         """Change some values."""
-        self._link.photo.develop(values, complete)
+        self._page.develop(values, complete)
 
     def _hold(self, name: str) -> None:
         """Let the crop keep proportions, if these are not those that it keeps already."""
-        if name != self._link.photo.held():
-            self._link.photo.hold(name)
+        if name != self._page.proportions.name:
+            self._page.hold(name)
 
     def _uncrop(self) -> None:
-        self._link.photo.hold(FREE)
-        self._link.photo.develop({"crop": WHOLE_CROP}, True)
+        self._page.hold(FREE)
+        self._page.develop({"crop": WHOLE_CROP}, True)
 
 
 class DetailTab(EditTab):
     """The tab of an edit with sliders for layers, built into the open element."""
 
-    def __init__(self, edit: str, link: Link) -> None:
-        self._following = False
+    def __init__(self, edit: str, page: EditedPage) -> None:
         self._layout: tuple[int, bool] = (0, False)  # number of layers, and whether a region has its own sliders
         self._started: str | None = None  # the preset that was chosen last
-        super().__init__(edit, link)
+        super().__init__(edit, page)
 
     def follow(self) -> None:
         """Show the current edit."""
         detail = self._step
-        self._following = True
         if self._layout != (len(detail["alpha"]), detail.has_region()):
             self._layout = (len(detail["alpha"]), detail.has_region())
             self._build_sliders(detail)
@@ -237,7 +235,6 @@ class DetailTab(EditTab):
         if not automatic:
             self._bandwidth.set_value(detail["bandwidth"])
         self._name_preset(detail)
-        self._following = False
 
     def draw_response(self, svg: str) -> None:
         """Show the response of the sliders."""
@@ -246,7 +243,7 @@ class DetailTab(EditTab):
     @property
     def _step(self) -> Step:
         """The current step of the edit."""
-        return self._link.recipe().current(self._edit)
+        return self._page.recipe().current(self._edit)
 
     def _build(self) -> None:
         names = {name: f"{name}: {PURPOSES[name]}" for name in PRESETS}
@@ -261,7 +258,7 @@ class DetailTab(EditTab):
     def _build_bandwidth(self) -> None:
         self._automatic = ui.checkbox("What counts as detail: automatic", value=True)
         self._automatic.props("dense").classes("q-mt-xs")
-        self._automatic.on_value_change(lambda event: self._set_bandwidth("auto" if event.value else BANDWIDTH))
+        self._automatic.on_value_change(lambda event: self._let_choose(bool(event.value)))
         with ui.column().classes("control gap-0") as self._by_hand:
             ui.label("Largest difference that counts as detail").tooltip(
                 "How different two places may be and still count as alike, in grey levels of 255. Small values affect "
@@ -283,7 +280,7 @@ class DetailTab(EditTab):
                 inside = controls.detail_sliders("inside", len(detail.sliders_inside))
                 sliders += [self._slider(control, " in the region") for control in inside]
                 sliders += [self._slider(control) for control in controls.OF_EDIT[self._edit]]
-                self._choices = controls.choices(self._edit, self._link.recipe, self._link.change)
+                self._choices = controls.choices(self._edit, self._page.recipe, self._page.change)
                 ui.label("Elsewhere").classes("group")
             outside = controls.detail_sliders("alpha", len(detail["alpha"]))
             sliders += [self._slider(control) for control in outside]
@@ -291,16 +288,16 @@ class DetailTab(EditTab):
 
     def _choose(self, name: str | None) -> None:
         """Set the sliders to a preset; those of a region stay if there are as many."""
-        if name is None or self._following:
+        if name is None or name in _equal_presets(self._step):  # the latter follows the edit
             return
         self._started = name
         inside = self._step["inside"]
         fits = inside is not None and len(inside) == len(PRESETS[name].steps[0]["alpha"])
-        self._link.change(self._edit, {**preset_entries(name), "inside": inside if fits else None}, True)
+        self._page.change(self._edit, {**preset_entries(name), "inside": inside if fits else None}, True)
 
     def _name_preset(self, detail: Step) -> None:
         """Show the preset that the sliders equal, or else the one they started from, which can be chosen again."""
-        same = [name for name in PRESETS if all(detail[k] == v for k, v in preset_entries(name).items())]
+        same = _equal_presets(detail)
         if same and self._started not in same:
             self._started = same[0]
         if detail["alpha"] == NONE:
@@ -309,15 +306,24 @@ class DetailTab(EditTab):
         changed = self._started is not None and self._started not in same
         self._presets.props(f'label="{f"Started from {self._started}, then changed" if changed else "Start from"}"')
 
+    def _let_choose(self, automatic: bool) -> None:
+        """Let the bandwidth be chosen from the photograph, or by hand."""
+        if automatic != isinstance(self._step["bandwidth"], str):  # otherwise it follows the edit
+            self._set_bandwidth("auto" if automatic else BANDWIDTH)
+
     def _set_bandwidth(self, value: float | str) -> None:
-        if not self._following:
-            self._link.change(self._edit, {"bandwidth": value}, True)
+        self._page.change(self._edit, {"bandwidth": value}, True)
 
 
 def preset_entries(name: str) -> dict[str, Value]:
     """The values that a preset sets."""
     detail = PRESETS[name].steps[0]
     return {entry: detail[entry] for entry in ("alpha", "bandwidth", "spatial_bandwidth", "landmarks")}
+
+
+def _equal_presets(detail: Step) -> list[str]:
+    """The presets that a step equals."""
+    return [name for name in PRESETS if all(detail[k] == v for k, v in preset_entries(name).items())]
 
 
 def thumbnails(picture: Tensor) -> dict[str, bytes]:
@@ -336,20 +342,20 @@ def look_entries(look: Step) -> dict[str, Value]:
 class LookTab(EditTab):
     """The tab of looks, built into the open element."""
 
-    def __init__(self, edit: str, link: Link) -> None:
+    def __init__(self, edit: str, page: EditedPage) -> None:
         self._buttons: dict[str, ui.button] = {}
         self._pictures: dict[str, ui.element] = {}
-        super().__init__(edit, link)
+        super().__init__(edit, page)
 
     def follow(self) -> None:
         """Show the current edit."""
         super().follow()
-        look = self._link.recipe().current(self._edit)
+        look = self._page.recipe().current(self._edit)
         has_look = look.changed(amount=1.0).would_change()
         for slider in self._sliders:
             slider.set_enabled(has_look)
         for name, button in self._buttons.items():
-            address = self._link.thumbnail(name)
+            address = self._page.thumbnail(name)
             button.set_enabled(bool(address))
             if address:
                 self._pictures[name].props(f'src="{address}"')
@@ -368,6 +374,6 @@ class LookTab(EditTab):
 
     def _choose(self, name: str) -> None:
         entries = look_entries(LOOKS[name])
-        if self._link.recipe().current(self._edit)[AMOUNT] == 0:
+        if self._page.recipe().current(self._edit)[AMOUNT] == 0:
             entries[AMOUNT] = 1.0  # a look that is chosen is to be seen
-        self._link.change(self._edit, entries, True)
+        self._page.change(self._edit, entries, True)

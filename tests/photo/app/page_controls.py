@@ -4,8 +4,10 @@ from collections.abc import Mapping
 
 from nicegui import Client, ui
 
-from nlfilter_torch.photo.app.brush import Brush
-from nlfilter_torch.photo.app.tabs import EditTab, Link, PhotoLink
+from nlfilter_torch.photo.app.canvas import Brush
+from nlfilter_torch.photo.app.crop_tool import Proportions
+from nlfilter_torch.photo.app.tabs import EditTab
+from nlfilter_torch.photo.declared.json_values import Value
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.declared.strokes import Stroke
 
@@ -17,41 +19,56 @@ class Controls:
 
     def __init__(self, client: Client) -> None:
         self.client = client
-        self.recipe = Recipe()
-        self.brush = Brush()
+        self.edit = Recipe()
+        self.brush, self.proportions = Brush(), Proportions()
         self.changes: list[tuple[str, Mapping[str, object], bool]] = []
         self.cleared: list[str] = []
         self.thumbnails: dict[str, str] = {}
         self.developed: list[object] = []
         self.is_cropping = self.is_picking = False
-        self.held = "Free"
         self.replaced: list[tuple[Recipe, int | None]] = []
-        self.link = Link(
-            lambda: self.recipe,
-            self.brush,
-            lambda *change: self.changes.append(change),
-            self.cleared.append,
-            lambda *change: self.replaced.append(change),
-            lambda look: self.thumbnails.get(look, ""),
-            PhotoLink(
-                lambda *change: self.developed.append(change),
-                lambda: self.developed.append("crop"),
-                lambda: self.is_cropping,
-                self.hold,
-                lambda: self.held,
-                lambda: self.developed.append("pick"),
-                lambda: self.is_picking,
-            ),
-        )
 
-    def hold(self, proportions: str) -> None:
+    def recipe(self) -> Recipe:
+        """The current edit."""
+        return self.edit
+
+    def change(self, step: str, values: Mapping[str, Value], complete: bool) -> None:
+        """Change a step."""
+        self.changes.append((step, values, complete))
+
+    def clear(self, step: str) -> None:
+        """Remove the strokes of a step."""
+        self.cleared.append(step)
+
+    def replace(self, recipe: Recipe, moving: int | None) -> None:
+        """Replace the edit."""
+        self.replaced.append((recipe, moving))
+
+    def thumbnail(self, look: str) -> str:
+        """The address of a picture under a look."""
+        return self.thumbnails.get(look, "")
+
+    def develop(self, values: Mapping[str, Value], complete: bool) -> bool:
+        """Change how the photograph is developed."""
+        self.developed.append((values, complete))
+        return True
+
+    def toggle_crop(self) -> None:
+        """Show or hide the frame of the crop."""
+        self.developed.append("crop")
+
+    def toggle_pick(self) -> None:
+        """Let the next click choose what is grey, or no longer."""
+        self.developed.append("pick")
+
+    def hold(self, name: str) -> None:
         """Let the crop keep proportions."""
-        self.held = proportions
-        self.developed.append(proportions)
+        self.proportions.name = name
+        self.developed.append(name)
 
     def show(self, tab: EditTab, recipe: Recipe) -> None:
         """Let a tab show an edit."""
-        self.recipe = recipe
+        self.edit = recipe
         tab.follow()
 
     def of(self, kind: type[ui.element]) -> list[ui.element]:

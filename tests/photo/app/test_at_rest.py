@@ -36,8 +36,7 @@ RECIPES = {
 def large(tmp_path: Path) -> Session:
     """A session with a photograph of 450x300 pixels and a preview of 150x100."""
     write_photograph(Photograph(cat(1)), tmp_path / "large.png")
-    session = Session(tmp_path, pixels=15_000)
-    session.open(tmp_path / "large.png")
+    session = Session(tmp_path, tmp_path / "large.png", pixels=15_000)
     assert session.preview.stride == pytest.approx(3)
     return session
 
@@ -110,8 +109,7 @@ def test_an_edit_that_changes_interrupts_it(page: Page, large: Session) -> None:
 
 
 def test_a_small_photograph_needs_no_other_picture(page: Page, tmp_path: Path) -> None:
-    session = Session(tmp_path)
-    session.open(tmp_path / "large.png")
+    session = Session(tmp_path, tmp_path / "large.png")
     session.load(LINES)
     page.session = session
     page.draw(session)

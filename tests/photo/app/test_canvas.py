@@ -8,8 +8,7 @@ import torch
 from nicegui import Client
 
 from nlfilter_torch.photo.app import drawing
-from nlfilter_torch.photo.app.brush import Brush
-from nlfilter_torch.photo.app.canvas import Canvas
+from nlfilter_torch.photo.app.canvas import Brush, Canvas
 from nlfilter_torch.photo.app.session import Session
 from nlfilter_torch.photo.picture.photographs import Photograph, write_photograph
 from tests.problems import cat
@@ -32,8 +31,7 @@ class Page:
         self.canvas.show_layers()
 
     def open(self, session: Session) -> None:
-        assert session.opened is not None
-        self.canvas.open(session, session.preview.pixels, session.opened.photograph.size)
+        self.canvas.open(session)
 
     def paint(self, *points: tuple[float, float]) -> None:
         for kind, point in zip(("pointerdown", *["pointermove"] * len(points)), points, strict=False):
@@ -165,14 +163,14 @@ def test_masks_of_all_brushes_in_colour_and_in_black_and_white(opened: Page, ses
     assert not canvas._is_plain.visible
 
 
-def test_parts_of_strokes_that_do_not_count_are_hatched(opened: Page, tmp_path: Path, session: Session) -> None:
+def test_parts_of_strokes_that_do_not_count_are_hatched(shown: Page, tmp_path: Path) -> None:
     pixels = torch.full((1, 3, 60, 90), 0.5) + torch.tensor([0.3, -0.2, -0.2]).view(1, 3, 1, 1)
     pixels[..., 48:] = torch.tensor([0.1, 0.5, 0.2]).view(1, 3, 1, 1)
     write_photograph(Photograph(pixels), tmp_path / "two.png")
-    session.open(tmp_path / "two.png")
-    opened.open(session)
-    canvas = opened.canvas
-    opened.paint((20.0, 30.0), (55.0, 30.0))
+    session = Session(tmp_path, tmp_path / "two.png")
+    shown.open(session)
+    canvas = shown.canvas
+    shown.paint((20.0, 30.0), (55.0, 30.0))
     canvas.draw(None)
     canvas.draw_strokes()
     assert canvas._ignored.visible

@@ -92,9 +92,7 @@ class Page:
 def large(tmp_path: Path) -> Session:
     """A session with a photograph of 450x300 pixels."""
     write_photograph(Photograph(cat(1)), tmp_path / "large.png")
-    session = Session(tmp_path)
-    session.open(tmp_path / "large.png")
-    return session
+    return Session(tmp_path, tmp_path / "large.png")
 
 
 @pytest.fixture

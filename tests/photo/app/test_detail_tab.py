@@ -16,7 +16,7 @@ def shown(client: Client) -> Controls:
 
 @pytest.fixture
 def tab(shown: Controls) -> DetailTab:
-    tab = DetailTab("detail", shown.link)
+    tab = DetailTab("detail", shown)
     tab.follow()
     return tab
 

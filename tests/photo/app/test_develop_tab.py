@@ -11,7 +11,7 @@ from tests.photo.app.page_controls import Controls
 
 def test_sliders_show_and_change_the_development(client: Client) -> None:
     shown = Controls(client)
-    tab = DevelopTab("develop", shown.link)
+    tab = DevelopTab("develop", shown)
     shown.show(tab, Recipe((), Development(0.5, -0.2, 0.1, 3.0)))
     assert shown.sliders() == {"Exposure": 0.5, "Temperature": -0.2, "Tint": 0.1, "Straighten": 3.0}
     assert {"0.50 stops", "3.0\u00b0"} <= set(shown.texts())
@@ -25,7 +25,7 @@ def test_sliders_show_and_change_the_development(client: Client) -> None:
 
 def test_the_crop_is_shown_and_reset(client: Client) -> None:
     shown = Controls(client)
-    tab = DevelopTab("develop", shown.link)
+    tab = DevelopTab("develop", shown)
     shown.show(tab, Recipe())
     pick, crop, whole = shown.of(ui.button)
     assert not whole.enabled
@@ -41,11 +41,11 @@ def test_the_crop_is_shown_and_reset(client: Client) -> None:
     (select,) = shown.of(ui.select)
     select.set_value("16:9")
     assert shown.developed == ["16:9"]
-    shown.show(tab, shown.recipe)
+    shown.show(tab, shown.edit)
     assert shown.developed == ["16:9"]
     shown.click("Whole picture")
     assert shown.developed[1:] == ["Free", ({"crop": WHOLE_CROP}, True)]
-    shown.show(tab, shown.recipe)
+    shown.show(tab, shown.edit)
     assert select.value == "Free"
 
 

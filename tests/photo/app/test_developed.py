@@ -36,14 +36,13 @@ def test_preview_part_and_file_agree(session: Session, tiled: bool) -> None:
     part = Rectangle(range(10, 40), range(20, 90))
     assert difference(session.part(part, recipe), wanted[..., 10:40, 20:90]) < 1.5
     before = develop_image(cat(), ALL.geometry)
-    assert torch.equal(session.original(part), before[..., 10:40, 20:90])
+    assert torch.equal(session.developed.original(part), before[..., 10:40, 20:90])
     assert torch.equal(session.developed.before, before)
 
 
 def test_the_preview_at_rest_is_the_file(tmp_path: Path) -> None:
     write_photograph(Photograph(cat(1)), tmp_path / "large.png")
-    session = Session(tmp_path, pixels=15_000)
-    session.open(tmp_path / "large.png")
+    session = Session(tmp_path, tmp_path / "large.png", pixels=15_000)
     session.load(Recipe((Step("tone", contrast=1.3),), ALL))
     preview = session.render()
     assert session.is_reduced
@@ -95,8 +94,7 @@ def test_strokes_of_which_a_crop_leaves_hidden_pixels_select_nothing(
     alpha[..., 30:90] = 0
     write_photograph(Photograph(cat(), alpha=alpha), tmp_path / "holed.png")
     across = replace(BLUE, points=((0.3, 0.35), (0.7, 0.35)))
-    session = Session(tmp_path)
-    session.open(tmp_path / "holed.png")
+    session = Session(tmp_path, tmp_path / "holed.png")
     session.load(Recipe((Step("recolor", (across,)),), Development(crop=(0.0, 0.0, 0.7, 1.0))))
     assert (session.render() - session.developed.before).abs().max() > 0.1  # some pixels are left
     assert session.mask("recolor") is not None
@@ -128,8 +126,7 @@ def test_a_moving_slider_is_followed_and_later_steps_stay(session: Session) -> N
 
 def test_a_photograph_of_floats_is_straightened_in_its_own_light(tmp_path: Path) -> None:
     write_photograph(Photograph(1.8 * cat(), depth="float32"), tmp_path / "bright.tif")
-    session = Session(tmp_path)
-    session.open(tmp_path / "bright.tif")
+    session = Session(tmp_path, tmp_path / "bright.tif")
     session.load(Recipe((Step("tone", contrast=1.3),)))
     session.render()
     for straighten in (0.5, 3.0):

@@ -21,7 +21,7 @@ def buttons(shown: Controls) -> dict[str, ui.button]:
 
 def test_a_look_is_chosen(client: Client) -> None:
     shown = Controls(client)
-    tab = LookTab("look", shown.link)
+    tab = LookTab("look", shown)
     tab.follow()
     assert list(buttons(shown)) == list(LOOKS)
     assert not any(button.enabled for button in buttons(shown).values())  # there is no photograph

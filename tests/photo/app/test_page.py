@@ -17,6 +17,7 @@ from nlfilter_torch.photo.app.dialogs import Question
 from nlfilter_torch.photo.app.library import Library
 from nlfilter_torch.photo.app.page import EDITORS, Editor
 from nlfilter_torch.photo.app.server import SCRIPTS, STATIC, STATIC_ADDRESS
+from nlfilter_torch.photo.app.session import Session
 from nlfilter_torch.photo.declared.development import WHOLE_CROP, Development
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.picture.photographs import Photograph, write_photograph
@@ -41,6 +42,12 @@ class Page:
     def open(self, path: Path) -> None:
         self.editor._begin(path, "")
         self.finish()
+
+    @property
+    def session(self) -> Session:
+        """The session of the photograph that is shown."""
+        assert self.editor.session is not None
+        return self.editor.session
 
     def errors(self) -> list[str]:
         return [element.message for element in self.client.elements.values() if isinstance(element, ui.notification)]
@@ -81,8 +88,8 @@ ALPHA = (3.0, 1.0, 1.0, 1.0)
 def test_a_photograph_is_opened(opened: Page, photo: Path, scripts: list[str]) -> None:
     editor = opened.editor
     assert editor._title.text == "cat.png"
-    assert editor._thumbnail("warm").endswith("/look-warm?1")
-    assert editor.session.opened is not None
+    assert editor.thumbnail("warm").endswith("/look-warm?1")
+    assert editor.session is not None
     assert opened.picture("before") == opened.picture("after") == drawing.picture(cat())
     assert not opened.picture("mask")
     assert opened.picture("piece-1") is None
@@ -98,15 +105,15 @@ def test_the_frame_of_the_crop_ends_with_its_tab_and_its_photograph(opened: Page
     tool = editor._canvas._crop_tool._tool
 
     def crop() -> None:
-        editor._toggle_crop()
+        editor.toggle_crop()
         opened.finish()
-        assert editor._is_cropping
+        assert editor.is_cropping
         assert tool.visible
         assert editor._canvas.pick is None
 
     ends: list[Callable[[], None]] = [
-        editor._toggle_crop,
-        editor._toggle_pick,
+        editor.toggle_crop,
+        editor.toggle_pick,
         lambda: editor._switch("tone"),
         lambda: editor._tasks.start(editor._open(lambda: editor._photographs.open(photo))),
     ]
@@ -114,77 +121,77 @@ def test_the_frame_of_the_crop_ends_with_its_tab_and_its_photograph(opened: Page
         crop()
         end()
         opened.finish()
-        assert not editor._is_cropping
+        assert not editor.is_cropping
         assert not tool.visible
     assert editor._canvas.pick is None
 
 
 def test_proportions_of_the_crop_and_looks_of_what_it_leaves(opened: Page, scripts: list[str]) -> None:
-    editor, before = opened.editor, (opened.editor._thumbnail("warm"), opened.picture("look-warm"))
-    editor._hold("1:1")
+    editor, before = opened.editor, (opened.editor.thumbnail("warm"), opened.picture("look-warm"))
+    editor.hold("1:1")
     opened.finish()
-    assert editor._is_cropping
-    assert editor.session.size == (100, 100)
+    assert editor.is_cropping
+    assert opened.session.size == (100, 100)
     assert any("cropper.show(" in script and script.endswith(f", {100 / 150})") for script in scripts)
-    after = editor._thumbnail("warm"), opened.picture("look-warm")
+    after = editor.thumbnail("warm"), opened.picture("look-warm")
     assert [old != new for old, new in zip(before, after, strict=True)] == [True, True]
-    editor._hold("3:2")  # of the whole photograph, and not of the square
+    editor.hold("3:2")  # of the whole photograph, and not of the square
     opened.finish()
-    assert editor.session.size == (100, 150)
+    assert opened.session.size == (100, 150)
     editor._reset()
     opened.finish()
-    assert editor._proportions.name == "Free"
+    assert editor.proportions.name == "Free"
     scripts.clear()
-    editor._hold("Free")
+    editor.hold("Free")
     opened.finish()
     assert any(script.endswith(", null)") for script in scripts)
 
 
 def test_proportions_end_with_a_crop_that_lacks_them(opened: Page) -> None:
-    editor, session = opened.editor, opened.editor.session
+    editor, session = opened.editor, opened.session
     other = Editor(editor._photographs)  # a second tab, which shows the same photograph
     other.build(None)
     other.session = session
     changes: list[Callable[[], object]] = [
         lambda: (editor._undo(), editor._undo()),
         lambda: session.load(Recipe()),
-        lambda: other._develop({"crop": (0.0, 0.0, 1.0, 0.5)}, True),
+        lambda: other.develop({"crop": (0.0, 0.0, 1.0, 0.5)}, True),
     ]
     for change in changes:
-        editor._hold("1:1")
+        editor.hold("1:1")
         editor._crop((0.0, 0.0, 0.3, 0.3))
-        editor._develop({"exposure": 1.0}, True)
+        editor.develop({"exposure": 1.0}, True)
         editor._undo()
         editor._crop((0.0, 0.0, 0.6, 0.3))
         editor._undo()  # to a crop that has them, too
-        assert (editor._proportions.name, other._proportions.name) == ("1:1", "Free")
+        assert (editor.proportions.name, other.proportions.name) == ("1:1", "Free")
         change()
         editor._changed()
-        assert editor._proportions.name == "Free"
+        assert editor.proportions.name == "Free"
         editor._reset()
     opened.finish()
 
 
 def test_proportions_are_cut_from_the_crop_of_before_when_straightened(opened: Page) -> None:
-    editor, session = opened.editor, opened.editor.session
-    editor._hold("1:1")
-    editor._develop({"straighten": 3.0}, True)
+    editor, session = opened.editor, opened.session
+    editor.hold("1:1")
+    editor.develop({"straighten": 3.0}, True)
     width = session.recipe.develop.frame((100, 150)).size[1]
-    assert editor._proportions.name == "1:1"
-    editor._hold("3:2")
+    assert editor.proportions.name == "1:1"
+    editor.hold("3:2")
     assert session.recipe.develop.frame((100, 150)).size[1] > width + 20  # of the whole photograph
     opened.finish()
 
 
 def test_a_crop_that_is_refused_changes_nothing(opened: Page, scripts: list[str]) -> None:
-    editor, session = opened.editor, opened.editor.session
+    editor, session = opened.editor, opened.session
     session.load(Recipe((), Development(straighten=45.0)))
-    editor._proportions = Proportions(cut=WHOLE_CROP, base=(0.0, 0.0, 0.1, 0.1))
-    editor._hold("1:1")
+    editor.proportions = Proportions(cut=WHOLE_CROP, base=(0.0, 0.0, 0.1, 0.1))
+    editor.hold("1:1")
     assert "crop must have its middle within the photograph" in opened.errors()[-1]
-    assert editor._proportions.name == "Free"
-    assert not editor._is_cropping
-    editor._hold("1:1")  # now of the crop as it is
+    assert editor.proportions.name == "Free"
+    assert not editor.is_cropping
+    editor.hold("1:1")  # now of the crop as it is
     opened.finish()
     before = session.recipe
     scripts.clear()
@@ -196,16 +203,16 @@ def test_a_crop_that_is_refused_changes_nothing(opened: Page, scripts: list[str]
 
 
 def test_looks_that_failed_are_drawn_with_the_next_picture(opened: Page, monkeypatch: pytest.MonkeyPatch) -> None:
-    editor, before = opened.editor, opened.editor._thumbnail("warm")
+    editor, before = opened.editor, opened.editor.thumbnail("warm")
     with monkeypatch.context() as failing:
         failing.setattr("nlfilter_torch.photo.app.page.thumbnails", lambda _: ["is no dictionary"][1])
-        editor._develop({"crop": (0.0, 0.0, 0.5, 0.5)}, True)
+        editor.develop({"crop": (0.0, 0.0, 0.5, 0.5)}, True)
         with pytest.raises(IndexError):
             opened.finish()
-    assert editor._thumbnail("warm") == before
-    editor._change("detail", {"alpha": ALPHA}, True)
+    assert editor.thumbnail("warm") == before
+    editor.change("detail", {"alpha": ALPHA}, True)
     opened.finish()
-    assert editor._thumbnail("warm") != before
+    assert editor.thumbnail("warm") != before
 
 
 def test_a_file_that_cannot_be_opened(page: Page, photo: Path) -> None:
@@ -213,7 +220,7 @@ def test_a_file_that_cannot_be_opened(page: Page, photo: Path) -> None:
     page.open(photo)
     assert len(page.errors()) == 1
     assert "is not a PNG" in page.errors()[0]
-    assert page.editor.session.opened is None
+    assert page.editor.session is None
 
 
 def test_an_address_that_is_gone(page: Page) -> None:
@@ -223,14 +230,14 @@ def test_an_address_that_is_gone(page: Page) -> None:
 
 
 def test_a_change_is_shown_while_the_pointer_moves_and_can_then_be_undone(opened: Page, scripts: list[str]) -> None:
-    editor, session = opened.editor, opened.editor.session
-    editor._change("detail", {"alpha": ALPHA}, False)
+    editor, session = opened.editor, opened.session
+    editor.change("detail", {"alpha": ALPHA}, False)
     opened.finish()
     edited = opened.picture("after")
     assert edited == drawing.picture(session.render())
     assert edited != opened.picture("before")
     assert not editor._undo_button.enabled
-    editor._change("detail", {"alpha": ALPHA}, True)
+    editor.change("detail", {"alpha": ALPHA}, True)
     opened.finish()
     assert editor._undo_button.enabled
     assert editor._reset_button.enabled
@@ -249,20 +256,20 @@ def test_a_change_is_shown_while_the_pointer_moves_and_can_then_be_undone(opened
 
 
 def test_strokes_are_cleared(opened: Page) -> None:
-    session = opened.editor.session
+    session = opened.session
     for kind in ("pointerdown", "pointerup"):
         opened.editor._canvas._pointer(kind, 20, 20)
     opened.finish()
     assert len(session.recipe.current("detail").strokes) == 1
     assert opened.picture("mask")
-    opened.editor._clear_strokes("detail")
+    opened.editor.clear("detail")
     opened.finish()
     assert session.recipe.current("detail").strokes == ()
     assert not opened.picture("mask")
 
 
 def test_colorize_asks_before_it_replaces_colours(opened: Page, monkeypatch: pytest.MonkeyPatch) -> None:
-    editor, session = opened.editor, opened.editor.session
+    editor, session = opened.editor, opened.session
     answers = [False, True]
 
     async def answer(question: Question) -> bool:
@@ -279,11 +286,12 @@ def test_colorize_asks_before_it_replaces_colours(opened: Page, monkeypatch: pyt
 
 
 def test_a_change_before_a_photograph_is_not_kept(page: Page) -> None:
-    page.editor._change("tone", {"contrast": 1.3}, True)
-    page.editor._clear_strokes("detail")
-    assert page.editor.session.recipe == Recipe()
-    asyncio.run(page.editor._ask_photo_name())
-    assert page.errors() == ["open a photograph first; there is nothing to save"]
+    page.editor.change("tone", {"contrast": 1.3}, True)
+    page.editor.clear("detail")
+    assert page.editor.recipe() == Recipe()
+    for ask in (page.editor._ask_photo_name, page.editor._ask_edit_name):
+        asyncio.run(ask())
+        assert page.errors() == ["open a photograph first; there is nothing to save"]
 
 
 def test_tabs_that_show_a_photograph_share_its_edit(opened: Page, photo: Path) -> None:
@@ -291,8 +299,8 @@ def test_tabs_that_show_a_photograph_share_its_edit(opened: Page, photo: Path) -
     with Client(ui.page("/")) as client:
         other = Page(client, library, opened.works)
         other.open(photo)
-        assert other.editor.session is opened.editor.session
-        opened.editor._change("detail", {"alpha": ALPHA}, True)
+        assert other.editor.session is opened.session
+        opened.editor.change("detail", {"alpha": ALPHA}, True)
         opened.finish()
         assert other.picture("after") == opened.picture("after") != other.picture("before")
     other.editor._leave()
@@ -302,13 +310,13 @@ def test_tabs_that_show_a_photograph_share_its_edit(opened: Page, photo: Path) -
 
 def test_saving(opened: Page, photo: Path) -> None:
     editor = opened.editor
-    editor._change("detail", {"alpha": ALPHA}, True)
+    editor.change("detail", {"alpha": ALPHA}, True)
     opened.finish()
-    asyncio.run(editor._save(Progress(), editor.session.save, "out.png"))
+    asyncio.run(editor._save(Progress(), opened.session.save, "out.png"))
     assert photo.with_name("out.png").is_file()
-    asyncio.run(editor._save(Progress(), editor.session.save_preset, "edit.json"))
-    assert Recipe.from_json(photo.with_name("edit.json").read_bytes(), "") == editor.session.recipe
-    assert not editor.session.unsaved
+    asyncio.run(editor._save(Progress(), opened.session.save_preset, "edit.json"))
+    assert Recipe.from_json(photo.with_name("edit.json").read_bytes(), "") == opened.session.recipe
+    assert not opened.session.unsaved
 
 
 def node() -> str | None:

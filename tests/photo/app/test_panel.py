@@ -3,7 +3,7 @@
 import pytest
 from nicegui import Client, ui
 
-from nlfilter_torch.photo.app.brush import BRUSHES
+from nlfilter_torch.photo.app.canvas import BRUSHES
 from nlfilter_torch.photo.app.panel import Panel
 from nlfilter_torch.photo.declared.parameters import EDITS
 from nlfilter_torch.photo.declared.presets import Recipe
@@ -24,7 +24,7 @@ def opened() -> list[str]:
 
 @pytest.fixture
 def panel(shown: Controls, opened: list[str]) -> Panel:
-    return Panel(shown.link, opened.append)
+    return Panel(shown, opened.append)
 
 
 def test_every_edit_has_a_tab_with_its_sliders(shown: Controls, panel: Panel, opened: list[str]) -> None:
@@ -56,7 +56,7 @@ def test_a_key_takes_a_tool_of_the_open_tab(shown: Controls, panel: Panel) -> No
 
 
 def test_all_tabs_follow_the_edit(shown: Controls, panel: Panel) -> None:
-    shown.recipe = Recipe((Step("detail", alpha=(3.0, 1.0, 1.0, 1.0)), Step("tone", contrast=0.8)))
+    shown.edit = Recipe((Step("detail", alpha=(3.0, 1.0, 1.0, 1.0)), Step("tone", contrast=0.8)))
     panel.follow()
     assert shown.sliders()["Texture"] == 3.0
     assert shown.sliders()["Contrast"] == 0.8
@@ -80,11 +80,11 @@ def test_levels(panel: Panel) -> None:
 def test_tabs_of_acting_steps_are_marked_and_opened_from_the_list(
     shown: Controls, panel: Panel, opened: list[str]
 ) -> None:
-    shown.recipe = Recipe((Step("tone"), Step("sharpen").mixed(on=False)))
+    shown.edit = Recipe((Step("tone"), Step("sharpen").mixed(on=False)))
     panel.follow()
     assert [tab.props["name"] for tab in shown.of(ui.tab) if "alert" in tab.props] == ["tone"]
     shown.click("Sharpen")
     assert opened[-1] == "sharpen"
-    shown.recipe = Recipe()
+    shown.edit = Recipe()
     panel.follow()
     assert not any("alert" in tab.props for tab in shown.of(ui.tab))

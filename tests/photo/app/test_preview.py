@@ -10,12 +10,12 @@ from nlfilter_torch import estimate_bandwidth, nonlocal_operator, polynomial_fil
 from nlfilter_torch.operator.features import reduce_channels
 from nlfilter_torch.operator.operator import NonlocalOperator
 from nlfilter_torch.photo import region_mask
-from nlfilter_torch.photo.app.preview import PIXELS, Preview, operator_of_sample, reduce
+from nlfilter_torch.photo.app.preview import PIXELS, Preview, ignored, operator_of_sample, reduce, selected
 from nlfilter_torch.photo.app.session import Session
 from nlfilter_torch.photo.declared.parameters import EDITS
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.declared.steps import Step
-from nlfilter_torch.photo.declared.strokes import Stroke
+from nlfilter_torch.photo.declared.strokes import Region, Stroke
 from nlfilter_torch.photo.edits.applying import PreparedStep, apply_recipe, apply_step
 from nlfilter_torch.photo.picture.resizing import resize
 from nlfilter_torch.photo.picture.source import seeded
@@ -362,3 +362,33 @@ def test_areas_are_means() -> None:
     image = cat(1)
     assert reduce(image, 1) is image
     assert torch.allclose(reduce(image, 3), F.interpolate(image, scale_factor=1 / 3, mode="area"), atol=1e-6)
+
+
+TWO = torch.full((1, 3, 60, 90), 0.5) + torch.tensor([0.3, -0.2, -0.2]).view(1, 3, 1, 1)
+TWO[..., 48:] = torch.tensor([0.1, 0.5, 0.2]).view(1, 3, 1, 1)
+ACROSS = Stroke(((0.22, 0.5), (0.61, 0.5)), 0.02, "#2040e0")  # from the red into the green
+
+
+def test_results_are_kept_while_picture_and_scribbles_stay() -> None:
+    preview, step = Preview(TWO), Step("defocus", (ACROSS,))
+    first = preview.ignored(step)
+    assert first is not None
+    assert first.nonzero()[:, 3].min() >= 44  # the green begins at 48
+    assert preview.ignored(step.mixed(on=False, opacity=0.3)) is first
+    mask = preview.mask(step)
+    assert mask is not None
+    assert preview.mask(step.mixed(opacity=0.3)) is mask
+    assert ignored(step, torch.full_like(TWO, 0.5)) is None
+
+
+def test_edits_of_colours_and_of_masks_see_the_same_scribbles() -> None:
+    for edit in ("recolor", "defocus", "detail"):
+        step = Step(edit, (ACROSS, Region.upright((0.1, 0.1, 0.2, 0.2), "ellipse", "#2040e0")))
+        stray, mask = ignored(step, TWO), selected(step, TWO)
+        assert stray is not None
+        assert stray[..., 48:].any()
+        assert mask is not None
+        assert mask.shape == (1, 1, 60, 90)
+        assert mask[0, 0, 12, 18] > 0.9
+    assert selected(Step("tone"), TWO) is None
+    assert ignored(Step("tone"), TWO) is None

@@ -50,12 +50,11 @@ def test_undo_and_redo(session: Session) -> None:
 
 
 def test_a_file_of_several_pages(session: Session, tmp_path: Path) -> None:
-    assert session.opened is not None
-    assert session.opened.pages == 1
+    assert session.pages == 1
     Image.new("L", (30, 20)).save(tmp_path / "two.tif", save_all=True, append_images=[Image.new("L", (30, 20), 255)])
     with pytest.warns(UserWarning, match="only the first is read"):
-        session.open(tmp_path / "two.tif")
-    assert session.opened.pages == 2
+        several = Session(tmp_path, tmp_path / "two.tif")
+    assert several.pages == 2
 
 
 def test_undo_in_the_midst_of_a_drag_takes_it_back_whole(session: Session) -> None:
@@ -175,24 +174,10 @@ def test_what_is_changed_is_seen(session: Session) -> None:
     assert session.recipe.steps[0].opacity == 0.3
 
 
-def test_a_stroke_before_a_photograph(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="open a photograph first"):
-        Session(tmp_path).add_stroke("detail", LINE, 0.03, "in")
-
-
-def test_an_edit_before_a_photograph(tmp_path: Path) -> None:
-    """The photograph that is opened next begins with its own edit."""
-    with pytest.raises(ValueError, match="open a photograph first; there is nothing to edit"):
-        Session(tmp_path).load_preset(Recipe((Step("tone"),)).to_json().encode(), "edit.json")
-
-
-def test_another_photograph_begins_a_new_edit(session: Session, tmp_path: Path) -> None:
-    session.set("abstract", power=0.1)
-    session.commit()
+def test_a_copy_has_the_name_of_the_original(tmp_path: Path) -> None:
     Image.fromarray(skimage.data.coffee()[::8, ::8]).save(tmp_path / "copy", format="JPEG")
-    session.open(tmp_path / "copy", "coffee.jpg")
-    assert session.opened is not None
-    assert session.opened.name == "coffee.jpg"
+    session = Session(tmp_path, tmp_path / "copy", "coffee.jpg")
+    assert session.name == "coffee.jpg"
     assert session.recipe == Recipe()
     assert not session.undo()
     assert session.suggested_name() == "coffee-edited.jpg"
@@ -252,5 +237,4 @@ def test_presets_come_back(session: Session) -> None:
 def test_grey_photographs_have_no_colours(session: Session, tmp_path: Path) -> None:
     assert session.has_colours
     write_photograph(Photograph(cat().mean(1, keepdim=True).expand(-1, 3, -1, -1)), tmp_path / "grey.png")
-    session.open(tmp_path / "grey.png")
-    assert not session.has_colours
+    assert not Session(tmp_path, tmp_path / "grey.png").has_colours

@@ -16,7 +16,7 @@ RECIPE = Recipe((TONE, IDLE, SHARPEN))
 @pytest.fixture
 def shown(client: Client) -> Controls:
     shown = Controls(client)
-    shown.recipe = RECIPE
+    shown.edit = RECIPE
     return shown
 
 
@@ -27,7 +27,7 @@ def opened() -> list[str]:
 
 @pytest.fixture
 def steps(shown: Controls, opened: list[str]) -> StepList:
-    return StepList(shown.link.recipe, shown.link.replace, opened.append)
+    return StepList(shown.recipe, shown.replace, opened.append)
 
 
 def boxes(shown: Controls) -> dict[str, bool]:
@@ -37,15 +37,15 @@ def boxes(shown: Controls) -> dict[str, bool]:
 def test_steps_that_were_used_are_listed(shown: Controls, steps: StepList) -> None:
     assert boxes(shown) == {"Tone: on": True, "Sharpen: on": True}
     assert shown.sliders() == {"Tone: opacity": 100, "Sharpen: opacity": 100}
-    shown.recipe = Recipe((TONE.mixed(on=False, opacity=0.3),))
+    shown.edit = Recipe((TONE.mixed(on=False, opacity=0.3),))
     steps.follow()
     assert boxes(shown) == {"Tone: on": False}
     assert shown.sliders() == {"Tone: opacity": 30}
-    shown.recipe = Recipe()
+    shown.edit = Recipe()
     steps.follow()
     assert boxes(shown) == {}
     assert "None yet. Move a slider, or paint." in shown.texts()
-    shown.recipe = Recipe((), Development(exposure=1.0))
+    shown.edit = Recipe((), Development(exposure=1.0))
     steps.follow()
     assert 'No steps yet; the settings of "Photo" come first.' in shown.texts()
     assert shown.replaced == []
@@ -77,13 +77,13 @@ def test_one_of_two_steps_of_an_edit_is_chosen(shown: Controls, steps: StepList,
         return [button.text for button in shown.of(ui.button) if "aria-current" in button.props]
 
     assert current() == []
-    shown.recipe = Recipe((TONE, SHARPEN, TONE.changed(clarity=2.0)))
+    shown.edit = Recipe((TONE, SHARPEN, TONE.changed(clarity=2.0)))
     steps.follow()
     assert current() == ["Tone 2"]
     shown.click("Tone 1")
     ((recipe, moving),) = shown.replaced
-    assert (recipe, recipe.chosen, moving) == (shown.recipe, 0, None)
-    shown.recipe = recipe
+    assert (recipe, recipe.chosen, moving) == (shown.edit, 0, None)
+    shown.edit = recipe
     steps.follow()
     assert current() == ["Tone 1"]
     shown.click("Tone 1")

@@ -3,7 +3,7 @@
 import pytest
 from nicegui import Client, ui
 
-from nlfilter_torch.photo.app.brush import BRUSHES, PALETTE, Brush
+from nlfilter_torch.photo.app.canvas import BRUSHES, PALETTE, Brush
 from nlfilter_torch.photo.app.tabs import EditTab
 from nlfilter_torch.photo.declared.parameters import EDITS
 from nlfilter_torch.photo.declared.presets import Recipe
@@ -18,7 +18,7 @@ def shown(client: Client) -> Controls:
 
 @pytest.mark.parametrize("name", EDITS)
 def test_an_edit_has_its_hint_its_sliders_and_its_brush(shown: Controls, name: str) -> None:
-    EditTab(name, shown.link)
+    EditTab(name, shown)
     assert EDITS[name].hint in shown.texts()
     labels = {p.slider.label for p in EDITS[name] if p.slider is not None}
     assert shown.sliders().keys() - {"Brush size"} == labels
@@ -26,15 +26,15 @@ def test_an_edit_has_its_hint_its_sliders_and_its_brush(shown: Controls, name: s
 
 
 def test_the_sliders_follow_the_edit(shown: Controls) -> None:
-    shown.show(EditTab("tone", shown.link), Recipe((Step("tone", contrast=0.8),)))
+    shown.show(EditTab("tone", shown), Recipe((Step("tone", contrast=0.8),)))
     assert shown.sliders()["Contrast"] == 0.8
     assert shown.changes == []
 
 
 def test_the_settings_of_the_brush(shown: Controls) -> None:
-    EditTab("recolor", shown.link)
-    EditTab("defocus", shown.link)
-    EditTab("colorize", shown.link)  # whose field shows the same colour
+    EditTab("recolor", shown)
+    EditTab("defocus", shown)
+    EditTab("colorize", shown)  # whose field shows the same colour
     words, others, _ = shown.of(ui.toggle)
     assert (words.value, others.value) == ("colour", "in")
     words.set_value("out")
@@ -54,7 +54,7 @@ def test_the_settings_of_the_brush(shown: Controls) -> None:
 
 
 def test_strokes_are_cleared(shown: Controls) -> None:
-    EditTab("recolor", shown.link)
+    EditTab("recolor", shown)
     shown.click("Clear strokes")
     assert shown.cleared == ["recolor"]
 
@@ -72,7 +72,7 @@ def test_what_the_brush_paints() -> None:
 
 
 def test_what_takes_part_is_chosen(shown: Controls) -> None:
-    tab = EditTab("recolor", shown.link)
+    tab = EditTab("recolor", shown)
     (chosen,) = shown.of(ui.select)
     assert chosen.value == "near"
     chosen.set_value("object")
