@@ -27,8 +27,8 @@ from benchmarks.photographs import enlarged
 from benchmarks.preview import RECIPES
 from nlfilter_torch.photo.app import drawing
 from nlfilter_torch.photo.app.closeup import Closeup
+from nlfilter_torch.photo.app.dialogs import Tasks
 from nlfilter_torch.photo.app.session import Session
-from nlfilter_torch.photo.app.tasks import Tasks
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.picture.photographs import Photograph, write_photograph
 

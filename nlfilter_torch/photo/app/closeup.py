@@ -3,15 +3,14 @@
 import asyncio
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from nlfilter_torch.core.progress import Progress
 from nlfilter_torch.photo.app import drawing
+from nlfilter_torch.photo.app.dialogs import Tasks
 from nlfilter_torch.photo.app.session import Session
-from nlfilter_torch.photo.app.tasks import Tasks
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.edits.parts import Rectangle
 from nlfilter_torch.photo.picture.sampling import Report
@@ -27,27 +26,24 @@ class OutdatedError(Exception):
     """The edit has changed meanwhile."""
 
 
-@dataclass(frozen=True)
-class Interruptible:
-    """Passes reports of progress on, and raises OutdatedError at the first one after an edit is outdated.
+class Interruptible(Progress):
+    """Progress that raises OutdatedError at the first report after an edit is outdated.
 
-    Attributes:
-        progress: takes the reports.
+    Args:
         is_outdated: returns whether the edit of a session is no longer wanted.
         session: of the photograph that is edited.
         recipe: the edit.
     """
 
-    progress: Progress
-    is_outdated: Callable[[Session, Recipe], bool]
-    session: Session
-    recipe: Recipe
+    def __init__(self, is_outdated: Callable[[Session, Recipe], bool], session: Session, recipe: Recipe) -> None:
+        super().__init__()
+        self._is_outdated, self._session, self._recipe = is_outdated, session, recipe
 
     def __call__(self, stage: str, done: int, total: int) -> None:
         """Report that ``done`` of ``total`` parts of a stage are done."""
-        if self.is_outdated(self.session, self.recipe):
+        if self._is_outdated(self._session, self._recipe):
             raise OutdatedError
-        self.progress(stage, done, total)
+        super().__call__(stage, done, total)
 
 
 class Closeup:
@@ -143,11 +139,8 @@ class Closeup:
                     self._forget()
                 self._recipe = recipe
                 try:
-                    progress = Progress()
-                    report = Interruptible(progress, self._is_outdated, session, recipe)
-                    content = await self._tasks.run(
-                        "Full size", _piece, session, part, recipe, report, progress=progress
-                    )
+                    report = Interruptible(self._is_outdated, session, recipe)
+                    content = await self._tasks.run("Full size", _piece, session, part, recipe, report, progress=report)
                 except OutdatedError:
                     continue
                 if not self._is_outdated(session, recipe):
@@ -256,9 +249,8 @@ class AtRest:
         return self._again is not None or session.recipe.effect != recipe.effect or not self._wanted(session)
 
     async def _edit(self, session: Session, recipe: Recipe) -> None:
-        progress = Progress()
-        report = Interruptible(progress, self._is_outdated, session, recipe)
+        report = Interruptible(self._is_outdated, session, recipe)
         report("Full size", 0, 1)
-        picture = await self._tasks.run("Full size", session.at_rest, recipe, report, progress=progress)
+        picture = await self._tasks.run("Full size", session.at_rest, recipe, report, progress=report)
         report("Full size", 1, 1)
         self._show(picture)

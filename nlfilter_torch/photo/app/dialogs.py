@@ -1,18 +1,86 @@
-"""What the page asks for: names and confirmations in dialogs, and files that the browser sends."""
+"""What the page says of its work in threads, and what it asks for: names, confirmations, files of the browser."""
 
+import asyncio
 from collections.abc import Awaitable, Callable
 from pathlib import Path
+from typing import Any, TypeVar, TypeVarTuple
 
-from nicegui import events, ui
+from nicegui import background_tasks, events, ui
 
+from nlfilter_torch.core.progress import Progress
 from nlfilter_torch.photo.app.controls import SteadySlider
 from nlfilter_torch.photo.app.session import FileOptions
-from nlfilter_torch.photo.app.tasks import EXPECTED
 
+Result = TypeVar("Result")
+Arguments = TypeVarTuple("Arguments")
+EXPECTED = (ValueError, OSError, MemoryError)  # for unusable files and values; the message says why
+PATIENCE = 0.3  # seconds until the page shows that it is working
+BETWEEN_TEXTS = 0.5  # seconds between two texts of the progress
+LASTING = 10.0  # seconds that an error is shown
 QUALITY, LEAST_QUALITY = 95, 50  # of JPEG files; below, the damage is visible
 SHORTEST = 16  # pixels of the longest side
 PHOTOGRAPHS = "PNG, JPEG, TIFF, WebP or AVIF"
 EXISTS = "A file of that name is there already."
+
+
+class Tasks:
+    """The work of the page that is being built, with a sign that it goes on, in the open element."""
+
+    def __init__(self) -> None:
+        self._client = ui.context.client
+        self._error: ui.notification | None = None
+        with ui.row().classes("items-center gap-2 no-wrap working") as self._working:
+            ui.spinner(size="20px", color="white")
+            self._doing = ui.label("").classes("hint")
+        self._working.set_visibility(False)
+
+    def start(self, work: Awaitable[None]) -> None:
+        """Run a task in the background, and report its failure."""
+        background_tasks.create(self._reported(work))
+
+    async def _reported(self, work: Awaitable[None]) -> None:
+        try:
+            await work
+        except EXPECTED as error:
+            self.show_error(str(error))
+        except Exception:
+            self.show_error("this failed, and it is not your fault; the terminal that runs the editor shows more")
+            raise  # for the log
+
+    async def run(
+        self,
+        doing: str,
+        work: Callable[[*Arguments], Result],
+        *arguments: *Arguments,
+        progress: Progress | None = None,
+    ) -> Result:
+        """Run something in a thread; the page shows ``doing`` if it takes long, and its progress."""
+        task = asyncio.ensure_future(asyncio.to_thread(work, *arguments))
+        done, _ = await asyncio.wait({task}, timeout=PATIENCE)
+        if not done:
+            self._doing.set_text(f"{doing}\u2026")
+            self._working.set_visibility(True)
+            while not task.done():
+                await asyncio.wait({task}, timeout=BETWEEN_TEXTS)
+                known = "" if progress is None else str(progress)
+                self._doing.set_text(f"{doing}: {known}" if known else f"{doing}\u2026")
+            self._working.set_visibility(False)
+        return await task
+
+    def show_error(self, sentence: str) -> None:
+        """Show a sentence until something succeeds, or for some seconds."""
+        self.clear_error()
+        if not self._client.is_deleted:
+            with self._client:
+                self._error = ui.notification(
+                    sentence, type="negative", position="bottom", timeout=LASTING, close_button="OK", multi_line=True
+                )
+
+    def clear_error(self) -> None:
+        """Remove the error that is shown, if there is one."""
+        error, self._error = self._error, None
+        if error is not None and not error.is_deleted:
+            error.dismiss()
 
 
 class NameDialog:
@@ -55,9 +123,7 @@ class NameDialog:
 
     async def answer(self) -> str | None:
         """The name, or None if there is none; the dialog is gone then."""
-        name: str | None = await self._dialog
-        if not self._dialog.is_deleted:  # a tab that is closed takes its dialogs with it
-            self._dialog.delete()
+        name: str | None = await _answered(self._dialog)
         return name
 
     def _confirm(self) -> None:
@@ -133,10 +199,15 @@ class Question:
 
     async def answer(self) -> bool:
         """Whether to do it; the dialog is gone then."""
-        is_confirmed = bool(await self._dialog)
-        if not self._dialog.is_deleted:
-            self._dialog.delete()
-        return is_confirmed
+        return bool(await _answered(self._dialog))
+
+
+async def _answered(dialog: ui.dialog) -> Any:
+    """What a dialog is closed with; it is gone then."""
+    answer = await dialog
+    if not dialog.is_deleted:  # a tab that is closed takes its dialogs with it
+        dialog.delete()
+    return answer
 
 
 class Upload:

@@ -20,13 +20,12 @@ from nlfilter_torch.photo.app.canvas import Brush, Canvas
 from nlfilter_torch.photo.app.closeup import AtRest, Closeup
 from nlfilter_torch.photo.app.crop_tool import FREE, Proportions
 from nlfilter_torch.photo.app.developed import DEVELOPING, Developed
-from nlfilter_torch.photo.app.dialogs import NameDialog, Question, SaveDialog, Upload
+from nlfilter_torch.photo.app.dialogs import EXPECTED, Arguments, NameDialog, Question, SaveDialog, Tasks, Upload
 from nlfilter_torch.photo.app.library import Library
 from nlfilter_torch.photo.app.panel import Panel
 from nlfilter_torch.photo.app.server import SCRIPTS, STATIC
 from nlfilter_torch.photo.app.session import Session
 from nlfilter_torch.photo.app.tabs import thumbnails
-from nlfilter_torch.photo.app.tasks import EXPECTED, Arguments, Tasks
 from nlfilter_torch.photo.declared.json_values import Value
 from nlfilter_torch.photo.declared.parameters import DETAIL, EDITS
 from nlfilter_torch.photo.declared.presets import Recipe

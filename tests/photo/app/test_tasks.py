@@ -8,8 +8,8 @@ import pytest
 from nicegui import Client, background_tasks, ui
 
 from nlfilter_torch.core.progress import Progress
-from nlfilter_torch.photo.app import tasks as module
-from nlfilter_torch.photo.app.tasks import Tasks
+from nlfilter_torch.photo.app import dialogs as module
+from nlfilter_torch.photo.app.dialogs import Tasks
 
 
 @pytest.fixture
