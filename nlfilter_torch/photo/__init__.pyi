@@ -20,7 +20,7 @@ from .edits.recipe import stream as stream
 from .edits.recolor import recolor as recolor
 from .edits.sharpen import sharpen as sharpen
 from .edits.tone import adjust_tone as adjust_tone
-from .looks.look_module import Look as Look
+from .looks.look_filter import Look as Look
 from .picture.drawn import Drawn as Drawn
 from .picture.photographs import Photograph as Photograph
 from .picture.photographs import read_photograph as read_photograph

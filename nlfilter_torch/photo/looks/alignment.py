@@ -1,10 +1,12 @@
 """Registration of a photograph before an edit with one after it."""
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
 
+import numpy as np
 import torch
 import torch.nn.functional as F
+from scipy.optimize import minimize
 from torch import Tensor
 
 from nlfilter_torch.operator.features import reduce_channels
@@ -251,54 +253,29 @@ def _first_place(whole: Tensor, part: Tensor, largest: float) -> tuple[float, fl
 def _refined(
     whole: Tensor, part: Tensor, place: tuple[float, float, float], scale: float
 ) -> tuple[float, float, float]:
-    """A place whose correlation is largest in pictures reduced by a factor, by a search along the three axes."""
-    comparison = Comparison(reduced_grey(whole, scale), reduced_grey(part, scale * place[2]), place, scale)
-    moves: tuple[float, ...] = (0.0, 0.0, 0.0)
-    best, step = comparison.correlation(moves), FIRST_MOVE
-    while step > LAST_MOVE:
-        trials = [
-            tuple(move + sign * step * (axis == other) for other, move in enumerate(moves))
-            for axis in range(3)
-            for sign in (-1, 1)
-        ]
-        correlations = [comparison.correlation(trial) for trial in trials]
-        if max(correlations) > best:
-            best = max(correlations)
-            moves = trials[correlations.index(best)]
-        else:
-            step /= 2
-    return comparison.place_after(moves)
+    """A place near another whose correlation is largest in pictures reduced by a factor."""
+    shown = reduced_grey(whole, scale), reduced_grey(part, scale * place[2]), place, scale
+    moves = np.zeros((4, 3)) + FIRST_MOVE * np.eye(4, 3, -1)  # none, and one along each axis
+    options = {"initial_simplex": moves, "xatol": LAST_MOVE, "fatol": BETTER}
+    found = minimize(_unlikeness, moves[0], shown, method="Nelder-Mead", options=options)
+    return _moved(found.x.tolist(), *shown[1:])
 
 
-@dataclass(frozen=True)
-class Comparison:
-    """A part beside the whole at a place that is moved.
+def _moved(
+    moves: Sequence[float], part: Tensor, place: tuple[float, float, float], scale: float
+) -> tuple[float, float, float]:
+    """A place after moves of its middle down and right and of its ends, in pixels of the reduced pictures."""
+    down, right, wider = moves
+    size = math.exp(wider / (max(part.shape) / 2))
+    return place[0] + down / scale, place[1] + right / scale, place[2] * size
 
-    Attributes:
-        whole: luminance (H, W), reduced.
-        part: luminance (h, w), reduced.
-        place: middle row and column of the part, and pixels of the whole in one of its own, before the reduction.
-        scale: factor of the reduction.
-    """
 
-    whole: Tensor
-    part: Tensor
-    place: tuple[float, float, float]
-    scale: float
-
-    def place_after(self, moves: tuple[float, ...]) -> tuple[float, float, float]:
-        """The place after moves of its middle down and right and of its ends, in pixels of the reduced pictures."""
-        row, column, pixel = self.place
-        down, right, wider = moves
-        size = math.exp(wider / (max(self.part.shape) / 2))
-        return row + down / self.scale, column + right / self.scale, pixel * size
-
-    def correlation(self, moves: tuple[float, ...]) -> float:
-        """Correlation of the part with the whole after moves."""
-        row, column, pixel = self.place_after(moves)
-        step = pixel / self.place[2]
-        shown = _sampled(self.whole, self.scale * row, self.scale * column, step, self.part.shape)
-        return correlation_of(shown, self.part)
+def _unlikeness(
+    moves: Sequence[float], whole: Tensor, part: Tensor, place: tuple[float, float, float], scale: float
+) -> float:
+    """The correlation, times -1, of a part (h, w) with the whole (H, W), both reduced, at a place after moves."""
+    row, column, pixel = _moved(moves, part, place, scale)
+    return -correlation_of(_sampled(whole, scale * row, scale * column, pixel / place[2], part.shape), part)
 
 
 def _sampled(whole: Tensor, row: float, column: float, step: float, shape: torch.Size) -> Tensor:

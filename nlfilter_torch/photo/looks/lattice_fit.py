@@ -9,11 +9,18 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
+from scipy.sparse import csr_array
 from torch import Tensor
 
-from nlfilter_torch.core.kernels.lattice import corners
 from nlfilter_torch.operator.features import reduce_channels
-from nlfilter_torch.photo.looks.lattice_problem import CellSums, Penalised, Ridged, solve_lattices
+from nlfilter_torch.photo.looks.lattice_problem import (
+    CellSums,
+    Penalised,
+    Ridged,
+    product,
+    shares_of_nodes,
+    solve_lattices,
+)
 from nlfilter_torch.photo.looks.look_filter import colours_of_nodes, lattice_change, resampled
 
 SMOOTH = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6)  # strengths of the penalty on second derivatives
@@ -93,10 +100,7 @@ class ColourChange:
 
     def density(self, nodes: int) -> Tensor:
         """Weights (n^3,) of the pixels at the nodes of a lattice."""
-        places, shares = corners(self.before, nodes)
-        return torch.zeros(nodes**3, dtype=shares.dtype).index_add_(
-            0, places.flatten(), (shares * self.weights).flatten()
-        )
+        return torch.from_numpy(shares_of_nodes(self.before, nodes).T @ self.weights.numpy())
 
 
 @dataclass(frozen=True)
@@ -156,31 +160,26 @@ class Problem:
 
     Attributes:
         pixels: the pixels.
-        places: indices (4, P) of their nodes.
-        shares: weights (4, P) of these.
+        shares: of the nodes in each pixel, (P, n^3).
         sums: of the folds.
     """
 
     pixels: ColourChange
-    places: Tensor
-    shares: Tensor
+    shares: csr_array
     sums: CellSums
 
     @staticmethod
     def of(pixels: ColourChange, nodes: int) -> "Problem":
         """The problem for that many nodes along each axis."""
-        places, shares = corners(pixels.before, nodes)
+        shares = shares_of_nodes(pixels.before, nodes)
         counts = (nodes, len(pixels.predicted))
-        return Problem(pixels, places, shares, CellSums.of(places, shares, pixels.weights, pixels.folds, counts))
+        return Problem(pixels, shares, CellSums.of(shares, pixels.weights, pixels.folds, counts))
 
     def cross(self, looks: Sequence[int]) -> Tensor:
         """Products (looks, 3, n^3) of the nodes and what looks leave of the pixels that they are fitted to."""
-        products = torch.zeros(len(looks), 3, self.sums.nodes**3, dtype=torch.float64)
-        for own, look in zip(products, looks, strict=True):
-            rest = self.pixels.weights * (self.pixels.folds != look) * self.pixels.left(0.0, look)
-            for place, share in zip(self.places, self.shares, strict=True):
-                own.index_add_(1, place, share * rest)
-        return products
+        weights, folds = self.pixels.weights, self.pixels.folds
+        rests = [weights * (folds != look) * self.pixels.left(0.0, look) for look in looks]
+        return torch.stack([product(self.shares.T, rest) for rest in rests])
 
     def smoothest(self, most: float) -> tuple[float, list[float], Tensor]:
         """The smoothness that leaves least of the folds that are left out, and what it leaves of each.
@@ -206,10 +205,7 @@ class Problem:
 
     def left_of(self, look: int, changes: Tensor) -> float:
         """Energy of what a look leaves of its fold, the last one of all, with changes (3, n^3) at the nodes."""
-        change = torch.zeros_like(self.pixels.before)
-        for place, share in zip(self.places, self.shares, strict=True):
-            change.addcmul_(share, changes[:, place])
-        return self.pixels.energy(self.pixels.left(change, look), look)
+        return self.pixels.energy(self.pixels.left(product(self.shares, changes), look), look)
 
 
 def with_details(pixels: ColourChange, lattice: FittedLattice) -> FittedLattice:

@@ -7,69 +7,71 @@ at once; the preconditioner is the penalty for evenly distributed colours, which
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Protocol
 
+import numpy as np
 import torch
+from scipy.fft import dctn, idctn
+from scipy.sparse import csr_array
 from torch import Tensor
+
+from nlfilter_torch.core.kernels.lattice import corners
 
 RIDGE = 1e-3  # of the changes where there are no pixels, see :meth:`Penalised.ridge`
 SCARCE = 0.01  # pixels at a node, relative to an even distribution, at which half of the ridge remains
 STEPS, TOLERANCE = 200, 1e-3  # of conjugate gradients
 
 
+def shares_of_nodes(colours: Tensor, nodes: int) -> csr_array:
+    """The shares (P, n^3) of the nodes of a lattice in colours (3, P): four in each row, whose sum is 1."""
+    places, shares = (values.mT.flatten().numpy() for values in corners(colours, nodes))
+    return csr_array((shares, places, range(0, len(places) + 1, 4)), shape=(colours.shape[1], nodes**3))
+
+
 @dataclass(frozen=True)
 class CellSums:
-    """Sums over pixels of products of the weights of nodes, for each of several folds of pixels.
+    """Sums over pixels of products of the shares of two nodes.
 
     Attributes:
         nodes: n along each axis.
-        bands: (8, folds, n^3): with itself, and with the seven nodes after it that share a tetrahedron.
+        grams: a matrix (n^3, n^3) for each of several folds of pixels.
     """
 
     nodes: int
-    bands: Tensor
+    grams: Sequence[csr_array]
 
     @staticmethod
-    def of(places: Tensor, shares: Tensor, weights: Tensor, folds: Tensor, counts: tuple[int, int]) -> "CellSums":
-        """Sums over pixels: their nodes (4, P), the shares of these, weights (P,) and folds (P,) of (n, folds)."""
-        nodes, number = counts
-        offsets = torch.tensor(_offsets(nodes))
-        bands = torch.zeros(len(offsets) * nodes**3 * number, dtype=torch.float64)
-        for first in range(4):
-            for second in range(first, 4):
-                kind = torch.searchsorted(offsets, places[second] - places[first])
-                index = (kind * number + folds) * nodes**3 + places[first]
-                bands.index_add_(0, index, weights * shares[first] * shares[second])
-        return CellSums(nodes, bands.view(len(offsets), number, nodes**3))
+    def of(shares: csr_array, weights: Tensor, folds: Tensor, counts: tuple[int, int]) -> "CellSums":
+        """Sums over pixels: the shares (P, n^3) of their nodes, weights (P,) and folds (P,) of (n, folds)."""
+        roots = shares.multiply(weights.sqrt().unsqueeze(1).numpy()).tocsr()
+        parts = [roots[(folds == fold).numpy()] for fold in range(counts[1])]
+        return CellSums(counts[0], [part.T @ part for part in parts])
 
     def without(self, *folds: int) -> "CellSums":
         """For each of some folds, the sums over the others."""
-        return CellSums(self.nodes, self.bands.sum(1, keepdim=True) - self.bands[:, list(folds)])
+        return CellSums(self.nodes, [sum(self.grams) - self.grams[fold] for fold in folds])
 
     @cached_property
     def density(self) -> Tensor:
         """Sums of the weights at each node, (folds, n^3)."""
-        density = self.bands.sum(0)
-        for band, offset in zip(self.bands[1:], _offsets(self.nodes)[1:], strict=True):
-            density[:, offset:] += band[:, :-offset]
-        return density
+        return torch.from_numpy(np.stack([gram.sum(1) for gram in self.grams]))
+
+    @cached_property
+    def diagonal(self) -> Tensor:
+        """Sums of the squares of the shares, (folds, n^3)."""
+        return torch.from_numpy(np.stack([gram.diagonal() for gram in self.grams]))
 
     def __call__(self, changes: Tensor) -> Tensor:
         """The matrix of the sums, times changes (folds, 3, n^3)."""
-        bands = self.bands.unsqueeze(2)
-        result = bands[0] * changes
-        for band, offset in zip(bands[1:], _offsets(self.nodes)[1:], strict=True):
-            result[..., :-offset].addcmul_(band[..., :-offset], changes[..., offset:])
-            result[..., offset:].addcmul_(band[..., :-offset], changes[..., :-offset])
-        return result
+        return torch.stack([product(gram, own) for gram, own in zip(self.grams, changes, strict=True)])
 
 
-def _offsets(nodes: int) -> list[int]:
-    """Distances between the indices of two nodes of a tetrahedron, ascending."""
-    red, green, blue = nodes * nodes, nodes, 1
-    return [0, blue, green, green + blue, red, red + blue, red + green, red + green + blue]
+def product(matrix: csr_array, rows: Tensor) -> Tensor:
+    """A sparse matrix (Q, P), times each of some rows (C, P): (C, Q)."""
+    return torch.from_numpy(matrix @ rows.mT.numpy()).mT.contiguous()
 
 
 class Quadratic(Protocol):
@@ -156,22 +158,19 @@ class Penalised:
         return result.mul_(self.stiffness)
 
     @cached_property
-    def spectrum(self) -> tuple[Tensor, Tensor]:
-        """Cosines (n, n), and the approximate matrix of the problem in these, (folds, 1, n^3)."""
-        basis, frequencies = cosines(self.sums.nodes)
-        bends = (frequencies[:, None, None] + frequencies[:, None] + frequencies).square().flatten()
+    def spectrum(self) -> Tensor:
+        """The approximate matrix of the problem, (folds, 1, n, n, n), in cosines along each axis."""
+        steps = torch.arange(self.sums.nodes, dtype=torch.float64)
+        frequencies = 2 - 2 * torch.cos(math.pi / self.sums.nodes * steps)
+        bends = (frequencies[:, None, None] + frequencies[:, None] + frequencies).square()
         usual = (self.sums.density + self.ridge).clamp(min=1e-30).log().mean(1).exp()
-        return basis, bends * self.stiffness + usual[:, None, None]
+        return bends * self.stiffness[..., None, None] + usual.view(-1, 1, 1, 1, 1)
 
     def conditioned(self, values: Tensor) -> Tensor:
         """Values (folds, 3, n^3) times the inverse of the approximate matrix."""
-        basis, spectrum = self.spectrum
-        for axis in range(3):
-            values = along(basis.mT, values, axis)
-        values = values / spectrum
-        for axis in range(3):
-            values = along(basis, values, axis)
-        return values
+        axes = (-3, -2, -1)
+        waves = dctn(values.unflatten(2, (self.sums.nodes,) * 3).numpy(), axes=axes, norm="ortho")
+        return torch.from_numpy(idctn(waves / self.spectrum.numpy(), axes=axes, norm="ortho")).flatten(2)
 
 
 @dataclass(frozen=True)
@@ -192,7 +191,7 @@ class Ridged:
 
     def conditioned(self, values: Tensor) -> Tensor:
         """Values (1, 3, n^3) divided by the diagonal of the matrix."""
-        return values / (self.sums.bands[0].unsqueeze(1) + self.ridge)
+        return values / (self.sums.diagonal.unsqueeze(1) + self.ridge)
 
 
 def along(matrix: Tensor, values: Tensor, axis: int) -> Tensor:
@@ -201,10 +200,3 @@ def along(matrix: Tensor, values: Tensor, axis: int) -> Tensor:
     if axis == 2:
         return (values.reshape(-1, nodes) @ matrix.mT).view(values.shape)
     return (matrix @ values.reshape(-1, nodes, nodes ** (2 - axis))).view(values.shape)
-
-
-def cosines(nodes: int) -> tuple[Tensor, Tensor]:
-    """Orthonormal cosines (n, n), in columns, and the squared first differences (n,) that belong to them."""
-    steps = torch.arange(nodes, dtype=torch.float64)
-    basis = torch.cos(math.pi / nodes * (steps[:, None] + 0.5) * steps)
-    return basis / basis.norm(dim=0), 2 - 2 * torch.cos(math.pi / nodes * steps)

@@ -9,14 +9,14 @@ from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.edits.applying import apply_step
 from nlfilter_torch.photo.looks.edited_pixels import EditedPhotograph
-from nlfilter_torch.photo.looks.lattice_choice import (
+from nlfilter_torch.photo.looks.look_sums import PartLayout
+from nlfilter_torch.photo.looks.region import (
     COLOUR_PARTS,
     THINNED,
     ThinnedPixels,
     coloured,
     is_of_colours,
 )
-from nlfilter_torch.photo.looks.look_sums import PartLayout
 from tests.looks import CAT, CUP, FEW, SUIT, explained, in_bytes, single_look
 
 
@@ -84,7 +84,7 @@ def test_greys_never_get_darker_even_if_those_of_the_edit_do() -> None:
 def test_never_more_pixels_than_enough_are_kept(monkeypatch: pytest.MonkeyPatch) -> None:
     kept = ThinnedPixels()
     assert THINNED >= 1 << 16
-    monkeypatch.setattr("nlfilter_torch.photo.looks.lattice_choice.THINNED", 15_000)
+    monkeypatch.setattr("nlfilter_torch.photo.looks.region.THINNED", 15_000)
     for number, image in enumerate((CAT, CUP, SUIT, CAT, CUP)):
         photograph = EditedPhotograph(image[0], image[0] ** 0.7, None, FEW, 3, None)
         (pixels,) = photograph.regions()

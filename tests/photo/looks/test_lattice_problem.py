@@ -12,7 +12,7 @@ from tests.photo.looks.test_lattice_fit import pixels, rippled
 def test_the_matrix_is_that_of_the_sums_and_penalties() -> None:
     sample = pixels(500, 0.7)
     problem = Problem.of(sample, 4)
-    hats = torch.zeros(500, 64, dtype=torch.float64).scatter_add_(1, problem.places.mT, problem.shares.mT)
+    hats = torch.from_numpy(problem.shares.toarray())
     whole = Penalised(problem.sums.without(len(problem.pixels.predicted) - 1), 0.02)
     columns = torch.cat([whole(unit.expand(1, 3, -1))[:, :1] for unit in torch.eye(64, dtype=torch.float64)], dim=1)[0]
     data = hats.mT @ hats / 500
@@ -33,7 +33,7 @@ def test_conjugate_gradients_solve_all_folds(smooth: float) -> None:
     cross = problem.cross([0, 1, 2])
     changes = problem.solve([0, 1, 2], smooth, cross, torch.zeros_like(cross))
     for fold in range(3):
-        alone = Penalised(CellSums(5, others.bands[:, [fold]]), smooth)
+        alone = Penalised(CellSums(5, [others.grams[fold]]), smooth)
         matrix = torch.stack([alone(unit.expand(1, 1, -1))[0, 0] for unit in torch.eye(125, dtype=torch.float64)])
         exact = torch.linalg.solve(matrix, cross[fold].mT).mT
         error = changes[fold] - exact
