@@ -243,16 +243,25 @@ def _marked(region: Region, picture: Picture, start: int, stop: int) -> tuple[Te
     return opacity, tile.pixels[0].expand(3, -1, -1).float()  # a grey picture has one channel
 
 
+def _rasterised_once(
+    _: tuple[int, ...], shown: Sequence[Plane], size: Size, *, soft: bool, coloured: bool, opened: Open
+) -> Tensor:
+    """:func:`rasterised` marks, whose files were last changed at some times."""
+    return rasterised(shown, size, soft=soft, coloured=coloured, opened=opened)
+
+
 class TensorPainter:
     """Rasterises marks to tensors (1, K, H, W); the last few are kept. ``opened`` as for :func:`rasterised`."""
 
     def __init__(self, opened: Open = opened_picture) -> None:
         self._opened = opened
-        self._rasterised = lru_cache(maxsize=4)(rasterised)  # one for each kind of scribbles
+        self._rasterised = lru_cache(maxsize=4)(_rasterised_once)  # one for each kind of scribbles
 
     def planes(self, shown: Sequence[Plane], size: Size, *, soft: bool = False, coloured: bool = False) -> Tensor:
-        """Return :func:`rasterised` marks."""
-        return self._rasterised(tuple(shown), size, soft=soft, coloured=coloured, opened=self._opened)
+        """Return :func:`rasterised` marks, anew once a file of theirs has changed."""
+        files = [mark.file for marks in shown for mark, _ in marks if isinstance(mark, Region) and mark.file]
+        changed = tuple(os.stat(file).st_mtime_ns for file in files if os.path.exists(file))
+        return self._rasterised(changed, tuple(shown), size, soft=soft, coloured=coloured, opened=self._opened)
 
     def covers(self, planes: Tensor) -> bool:
         """Whether masks or colours cover a pixel."""

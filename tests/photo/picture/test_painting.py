@@ -1,6 +1,7 @@
 """Strokes and regions as masks and colours."""
 
 import math
+import os
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -12,7 +13,7 @@ from PIL import Image
 
 from nlfilter_torch.photo.declared.strokes import Region, Stroke
 from nlfilter_torch.photo.picture.drawn import colour_of
-from nlfilter_torch.photo.picture.painting import cover, opened_picture, rasterised
+from nlfilter_torch.photo.picture.painting import TensorPainter, cover, opened_picture, rasterised
 from tests.strokes import mask_of, paint
 
 SIZE = (40, 60)
@@ -167,3 +168,17 @@ def test_later_paint_covers_earlier() -> None:
     assert torch.equal(colours[0, :, 12, 16], torch.tensor([1.0, 0.0, 0.0]))
     assert torch.allclose(colours[0, :, 12, 30], torch.tensor([0x20, 0x40, 0xE0]) / 255)
     assert torch.equal(painted, mask_of([BLUE], SMALL))
+
+
+def test_a_painter_sees_that_a_picture_of_marks_has_changed(tmp_path: Path) -> None:
+    path, painter = tmp_path / "mask.png", TensorPainter()
+    region = Region.of_file(str(path), "mask", "in")
+    planes = []
+    for time, value in enumerate((255, 255, 0)):
+        if value == 0 or time == 0:
+            Image.fromarray(np.full(SIZE, value, np.uint8)).save(path)
+            os.utime(path, ns=(time, time))
+        planes.append(painter.planes([((region, True),)], SIZE))
+    assert planes[1] is planes[0]
+    assert bool(planes[0].all())
+    assert not bool(planes[2].any())
