@@ -1,26 +1,27 @@
 """The lattice of a look: what its other parts leave of an edit, as a function of colour.
 
 It is the sum of three. A few parameters say what hues do under the edit, also of colours that no pixel has. A smooth
-lattice follows the pixels, see :mod:`nlfilter_torch.photo.looks.lattice_problem`. Finer ones have a ridge that is equal
-at all nodes, and weak: they follow the colours that many pixels have, and change nothing elsewhere.
+lattice follows the pixels, with penalties on second differences, and on the changes themselves where few pixels have
+such colours, so that there other parts of a look decide alone. Both penalties are the discretisation of integrals over
+the cube of colours, the same for every number of nodes. Finer lattices have a ridge that is equal at all nodes, and
+weak: they follow the colours that many pixels have, and change nothing elsewhere. Conjugate gradients solve all folds
+of a cross-validation at once.
 """
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache, reduce
 
+import numpy as np
 import torch
-from scipy.sparse import csr_array
+from kornia.color import rgb_to_hsv
+from scipy.fft import dctn, idctn
+from scipy.sparse import csr_array, diags_array, eye_array, kron
 from torch import Tensor
 
+from nlfilter_torch.core.kernels.lattice import corners
 from nlfilter_torch.operator.features import reduce_channels
-from nlfilter_torch.photo.looks.lattice_problem import (
-    CellSums,
-    Penalised,
-    Ridged,
-    product,
-    shares_of_nodes,
-    solve_lattices,
-)
 from nlfilter_torch.photo.looks.look_filter import colours_of_nodes, lattice_change, resampled
 
 SMOOTH = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6)  # strengths of the penalty on second derivatives
@@ -33,7 +34,106 @@ HUES = 6  # hats, at red, yellow, green, cyan, blue and magenta
 HUE_RIDGES = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5)  # relative to the squares of the columns
 HUE_PIXELS = 1 << 14  # that the parameters of hues are fitted to
 PRIOR = 1e-4  # weight of evenly distributed colours that stay as they are, and keep hues of few pixels as they are
-TINY = 1e-9
+TINY = 1e-9  # of the ridge of hues, so that parameters that no pixel depends on are 0
+RIDGE = 1e-3  # of the changes where there are no pixels, see :meth:`Quadratic.smooth`
+SCARCE = 0.01  # pixels at a node, relative to an even distribution, at which half of the ridge remains
+STEPS, TOLERANCE = 200, 1e-3  # of conjugate gradients
+
+
+def shares_of_nodes(colours: Tensor, nodes: int) -> csr_array:
+    """The shares (P, n^3) of the nodes of a lattice in colours (3, P): four in each row, whose sum is 1."""
+    places, shares = (values.mT.flatten().numpy() for values in corners(colours, nodes))
+    return csr_array((shares, places, range(0, len(places) + 1, 4)), shape=(colours.shape[1], nodes**3))
+
+
+def product(matrix: csr_array, rows: Tensor) -> Tensor:
+    """A sparse matrix (Q, P), times each of some rows (C, P): (C, Q)."""
+    return torch.from_numpy(matrix @ rows.mT.numpy()).mT.contiguous()
+
+
+@lru_cache(maxsize=len(GRIDS))
+def bending(nodes: int) -> csr_array:
+    """The penalty (n^3, n^3) on second differences, also mixed ones, of changes at the nodes."""
+    straight = np.eye(nodes)
+    bends, rises = (csr_array(steps.T @ steps) for steps in (np.diff(straight, 2, 0), np.diff(straight, 1, 0)))
+    still = eye_array(nodes)
+    alone = [(bends, still, still), (still, bends, still), (still, still, bends)]
+    mixed = [(rises, rises, still), (rises, still, rises), (still, rises, rises)]
+    first, second = (sum(reduce(kron, axes) for axes in terms) for terms in (alone, mixed))
+    return csr_array(first + 2 * second)
+
+
+@dataclass(frozen=True)
+class Quadratic:
+    """Least-squares problems for the changes at the nodes of a lattice, one for each of several folds.
+
+    Attributes:
+        matrices: of the problems, (n^3, n^3).
+        spectrum: approximate matrices, which precondition the problems: diagonal in cosines along each axis of the
+            lattice, (folds, 1, n, n, n), or at the nodes, (folds, 1, n^3).
+    """
+
+    matrices: Sequence[csr_array]
+    spectrum: Tensor
+
+    @staticmethod
+    def smooth(grams: Sequence[csr_array], nodes: int, strength: float) -> "Quadratic":
+        """Problems with a penalty on second derivatives of some strength, from sums over pixels.
+
+        Changes themselves have a penalty, too: the larger, the fewer pixels have such colours.
+        """
+        density = torch.from_numpy(np.stack([gram.sum(1) for gram in grams]))
+        even = density.mean(1, keepdim=True)  # the weights at a node if colours were evenly distributed
+        ridge = RIDGE * even * (SCARCE * even) / (SCARCE * even + density)
+        stiffness = strength * even * ((nodes - 1) / 8) ** 4  # the same for every number of nodes
+        matrices = [
+            gram + diags_array(own.numpy()) + float(stiff) * bending(nodes)
+            for gram, own, stiff in zip(grams, ridge, stiffness, strict=True)
+        ]
+        frequencies = 2 - 2 * torch.cos(math.pi / nodes * torch.arange(nodes, dtype=torch.float64))
+        bends = (frequencies[:, None, None] + frequencies[:, None] + frequencies).square()
+        usual = (density + ridge).clamp(min=1e-30).log().mean(1, keepdim=True).exp()
+        return Quadratic(matrices, bends * stiffness.view(-1, 1, 1, 1, 1) + usual.view(-1, 1, 1, 1, 1))
+
+    @staticmethod
+    def ridged(grams: Sequence[csr_array], ridge: float) -> "Quadratic":
+        """Problems with an equal penalty on each change, from sums over pixels."""
+        matrices = [gram + ridge * eye_array(gram.shape[0], format="csr") for gram in grams]
+        return Quadratic(matrices, torch.from_numpy(np.stack([matrix.diagonal() for matrix in matrices])).unsqueeze(1))
+
+    def __call__(self, changes: Tensor) -> Tensor:
+        """The matrices, times changes (folds, 3, n^3)."""
+        return torch.stack([product(matrix, own) for matrix, own in zip(self.matrices, changes, strict=True)])
+
+    def conditioned(self, values: Tensor) -> Tensor:
+        """Values (folds, 3, n^3) times the inverse of the approximate matrices."""
+        if self.spectrum.ndim == values.ndim:
+            return values / self.spectrum
+        axes = (-3, -2, -1)
+        waves = dctn(values.unflatten(2, self.spectrum.shape[2:]).numpy(), axes=axes, norm="ortho")
+        return torch.from_numpy(idctn(waves / self.spectrum.numpy(), axes=axes, norm="ortho")).flatten(2)
+
+    def solve(self, cross: Tensor, start: Tensor) -> Tensor:
+        """Changes (folds, 3, n^3) at the nodes, from products with what is to be explained, in the same shape.
+
+        ``start`` is where the search starts.
+        """
+        result = start
+        rest = cross - self(result)
+        direction = ready = self.conditioned(rest)
+        size = (rest * ready).sum(2, keepdim=True)
+        limit = TOLERANCE**2 * (cross * self.conditioned(cross)).sum(2, keepdim=True)
+        for _ in range(STEPS):
+            if bool((size <= limit).all()):
+                break
+            image = self(direction)
+            length = size / (direction * image).sum(2, keepdim=True).clamp(min=1e-300)
+            result = result + length * direction
+            rest = rest - length * image
+            ready = self.conditioned(rest)
+            size, before = (rest * ready).sum(2, keepdim=True), size
+            direction = ready + size / before.clamp(min=1e-300) * direction
+        return result
 
 
 @dataclass(frozen=True)
@@ -148,7 +248,7 @@ def fit_lattice(pixels: ColourChange) -> FittedLattice:
         start = first
     changes = problem.solve([last], smooth, problem.cross([last]), start.unsqueeze(0))[0]
     fitted = 1 - problem.left_of(last, changes) / power
-    both = torch.stack([first, changes]).unflatten(2, (problem.sums.nodes,) * 3)
+    both = torch.stack([first, changes]).unflatten(2, (problem.nodes,) * 3)
     return FittedLattice(both, fitted, 1 - left / power, 1 - without / power)
 
 
@@ -160,20 +260,27 @@ class Problem:
 
     Attributes:
         pixels: the pixels.
+        nodes: n along each axis.
         shares: of the nodes in each pixel, (P, n^3).
-        sums: of the folds.
+        grams: sums over the pixels of each fold of products of the shares of two nodes, (n^3, n^3).
     """
 
     pixels: ColourChange
+    nodes: int
     shares: csr_array
-    sums: CellSums
+    grams: Sequence[csr_array]
 
     @staticmethod
     def of(pixels: ColourChange, nodes: int) -> "Problem":
         """The problem for that many nodes along each axis."""
         shares = shares_of_nodes(pixels.before, nodes)
-        counts = (nodes, len(pixels.predicted))
-        return Problem(pixels, shares, CellSums.of(shares, pixels.weights, pixels.folds, counts))
+        roots = shares.multiply(pixels.weights.sqrt().unsqueeze(1).numpy()).tocsr()
+        parts = [roots[(pixels.folds == fold).numpy()] for fold in range(len(pixels.predicted))]
+        return Problem(pixels, nodes, shares, [part.T @ part for part in parts])
+
+    def without(self, folds: Sequence[int]) -> list[csr_array]:
+        """For each of some folds, the sums over the others."""
+        return [sum(self.grams) - self.grams[fold] for fold in folds]
 
     def cross(self, looks: Sequence[int]) -> Tensor:
         """Products (looks, 3, n^3) of the nodes and what looks leave of the pixels that they are fitted to."""
@@ -201,7 +308,7 @@ class Problem:
     def solve(self, looks: Sequence[int], smooth: float, cross: Tensor, start: Tensor | None = None) -> Tensor:
         """Smooth changes (looks, 3, n^3), from :meth:`cross`."""
         start = torch.zeros_like(cross) if start is None else start
-        return solve_lattices(Penalised(self.sums.without(*looks), smooth), cross, start)
+        return Quadratic.smooth(self.without(looks), self.nodes, smooth).solve(cross, start)
 
     def left_of(self, look: int, changes: Tensor) -> float:
         """Energy of what a look leaves of its fold, the last one of all, with changes (3, n^3) at the nodes."""
@@ -230,7 +337,7 @@ def _with_details(pixels: ColourChange, lattice: FittedLattice, nodes: int) -> F
     cross, best = problem.cross([0]), (before, 0.0, torch.zeros(1, 3, nodes**3, dtype=torch.float64))
     changes = torch.zeros_like(cross)
     for ridge in FINE_RIDGES:
-        changes = solve_lattices(Ridged(problem.sums.without(0), ridge / count), cross, changes)
+        changes = Quadratic.ridged(problem.without([0]), ridge / count).solve(cross, changes)
         left = problem.left_of(0, changes[0])
         if left > best[0]:
             break
@@ -238,7 +345,7 @@ def _with_details(pixels: ColourChange, lattice: FittedLattice, nodes: int) -> F
     left, ridge, start = best
     if left >= before * (FINER if nodes > lattice.nodes else 1):
         return lattice
-    change = solve_lattices(Ridged(problem.sums.without(2), ridge / count), problem.cross([2]), start)
+    change = Quadratic.ridged(problem.without([2]), ridge / count).solve(problem.cross([2]), start)
     return replace(
         lattice.with_more(torch.cat([start, change]).unflatten(2, (nodes,) * 3)),
         fitted=1 - problem.left_of(2, change[0]) / pixels.power,
@@ -249,15 +356,9 @@ def _with_details(pixels: ColourChange, lattice: FittedLattice, nodes: int) -> F
 def hue_columns(colours: Tensor) -> Tensor:
     """What a unit of each parameter changes of colours (3, P) in [0, 1]: (F, 3, P)."""
     red, green, blue = colours
-    largest = colours.amax(0)
-    chroma = largest - colours.amin(0)
+    chroma = colours.amax(0) - colours.amin(0)
     light = reduce_channels(colours[None, :, None], "luminance").view_as(chroma)
-    safe = chroma.clamp(min=TINY)
-    hue = torch.where(
-        largest == red,
-        ((green - blue) / safe) % HUES,
-        torch.where(largest == green, (blue - red) / safe + 2, (red - green) / safe + 4),
-    )
+    hue = rgb_to_hsv(colours[None, :, None])[0, 0, 0] * (HUES / math.tau)
     numbers = torch.arange(HUES, dtype=hue.dtype).view(-1, 1)
     hats = (1 - ((hue - numbers + 3) % HUES - 3).abs()).clamp(min=0)
     saturated = colours - colours.mean(0)

@@ -7,7 +7,11 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.photo.looks.lattice_fit import (
+    RIDGE,
+    SCARCE,
     ColourChange,
+    Problem,
+    Quadratic,
     fit_hues,
     fit_lattice,
     hue_columns,
@@ -159,3 +163,45 @@ def test_noise_has_no_hues() -> None:
     noise = 0.05 * torch.randn(3, 3000, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     assert not any(bool(lattice.any()) for lattice in fit_hues(in_folds(before, before + noise)))
     assert not any(bool(lattice.any()) for lattice in fit_hues(in_folds(before[:, :30], before[:, :30])))
+
+
+def test_the_matrix_is_that_of_the_sums_and_penalties() -> None:
+    sample = pixels(500, 0.7)
+    problem = Problem.of(sample, 4)
+    hats = torch.from_numpy(problem.shares.toarray())
+    whole = Quadratic.smooth(problem.without([len(problem.pixels.predicted) - 1]), 4, 0.02)
+    columns = torch.from_numpy(whole.matrices[0].toarray())
+    data = hats.mT @ hats / 500
+    even = float(data.sum() / 64)
+    ridge = RIDGE * even * SCARCE * even / (SCARCE * even + data.sum(1))
+    colours = colours_of_nodes(4).flatten(1)
+    rest = columns - data - torch.diag(ridge)
+    # Linear functions do not bend, others do, and equally in all directions.
+    assert float((rest @ torch.cat([torch.ones(1, 64, dtype=torch.float64), colours]).mT).abs().max()) < 1e-12
+    red, green = colours[0].square(), colours[1].square()
+    assert float(red @ rest @ red) == pytest.approx(float(green @ rest @ green))
+    torch.testing.assert_close(rest, rest.mT)
+    assert float(torch.linalg.eigvalsh(rest).min()) > -1e-12
+
+
+@pytest.mark.parametrize("smooth", [1.0, 1e-2, 1e-4])
+def test_conjugate_gradients_solve_all_folds(smooth: float) -> None:
+    problem = Problem.of(pixels(3000, 0.7), 5)
+    others = problem.without([0, 1, 2])
+    cross = problem.cross([0, 1, 2])
+    changes = problem.solve([0, 1, 2], smooth, cross, torch.zeros_like(cross))
+    for fold in range(3):
+        matrix = torch.from_numpy(Quadratic.smooth([others[fold]], 5, smooth).matrices[0].toarray())
+        exact = torch.linalg.solve(matrix, cross[fold].mT).mT
+        error = changes[fold] - exact
+        assert float((error @ matrix * error).sum()) < 1e-3 * float((exact @ matrix * exact).sum())
+
+
+def test_conjugate_gradients_solve_the_problem_with_a_ridge() -> None:
+    problem = Problem.of(rippled(3000, 0.02), 5)
+    cross = problem.cross([0])
+    ridged = Quadratic.ridged(problem.without([0]), 1e-3)
+    changes = ridged.solve(cross, torch.zeros_like(cross))
+    matrix = torch.from_numpy(ridged.matrices[0].toarray())
+    exact = torch.linalg.solve(matrix, cross[0].mT).mT
+    assert float((changes[0] - exact).norm()) < 0.01 * float(exact.norm())
