@@ -17,6 +17,8 @@ from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.looks.histogram import LocalCurves, Stretch, ramps, tones
 from nlfilter_torch.photo.looks.look_filter import (
     BAND_MARGIN,
+    COLOUR_PARTS,
+    DETAIL_PARTS,
     acts,
     band_change,
     check_part,
@@ -152,12 +154,12 @@ class LookEdit(PhotoEdit):
         parts = self._parts(source.dtype)
         for name, value in parts.items():
             check_part(value, name, source.batch)
-        detailed = any(acts(parts[name]) for name in ("alpha", "bands", "texture"))
+        detailed = any(acts(parts[name]) for name in DETAIL_PARTS)
         viewing_size = self.viewing_size if detailed else 0.0  # colours need no smaller picture
         fitted = fit_change(source, partial(self._change, parts), whole_image, viewing_size, "none")
         strength = torch.as_tensor(self.amount).to(source.dtype).reshape(-1, 1, 1, 1)
         light = _change_of_light(source, parts["stretch"], parts["local"])
-        colours = {name: parts[name] for name in ("curves", "matrix", "saturation")}
+        colours = {name: parts[name] for name in COLOUR_PARTS}
         lattice = parts["lattice"] if "lattice" in parts and acts(parts["lattice"], 0.0) else None
         result = UnderLook(fitted, light, **colours, lattice=lattice, strength=strength)
         if fitted.finish is None:

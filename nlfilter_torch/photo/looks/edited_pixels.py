@@ -246,5 +246,4 @@ def check_belong(before: Tensor, after: Tensor, first: str, second: str) -> None
 def means_of_shades(grey: Tensor, values: Tensor) -> Tensor:
     """For each pixel, the mean (P,) of the values (P,) of all pixels whose luminance (P,) is of the same shade."""
     shades = (grey.clamp(0, 1) * (GREYS - 1)).round().long()
-    counts = torch.zeros(GREYS).to(values).index_add(0, shades, torch.ones_like(values)).clamp(min=1)
-    return (torch.zeros(GREYS).to(values).index_add(0, shades, values) / counts)[shades]
+    return (shades.bincount(values) / shades.bincount().clamp(min=1))[shades]

@@ -26,7 +26,7 @@ GREY_LEVEL = 1 / 255  # pictures of a smaller range are not stretched, and colou
 KINDS_OF_LEVELS = 3  # of automatic levels
 CONTRAST_LIMITS = (1.5, 2.0, 3.0, 5.0)  # clip limits relative to an even histogram; also the steepest slopes of curves
 STRENGTHS = 2 * len(CONTRAST_LIMITS)  # of tone curves of luminance, and of the largest channel
-SHADES = 33
+SHADES = 33  # between which curves are straight: 32 steps of 8 levels of 255
 TILES = 8  # along both sides
 FINE = 16  # blocks along the short side of a tile that histograms are first taken of
 

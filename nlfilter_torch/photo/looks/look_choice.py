@@ -47,6 +47,7 @@ CHOICES: tuple[Parts, ...] = (
     ("alpha", "tone", "matrix", "saturation", "bands", "texture"),
     ("alpha", "curves", "matrix", "saturation", "bands", "texture", "local"),
 )
+# Relative to the squares of the columns: from one that only rounding would notice to one that keeps the identity.
 RIDGES = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0)
 # Penalty on the second differences of a curve, relative to that on its distance from the identity. The factors of
 # saturation have the latter only.

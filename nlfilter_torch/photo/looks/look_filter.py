@@ -68,8 +68,8 @@ PART_SHAPES: dict[str, tuple[int | str, ...]] = {
     "lattice": (3, "n", "n", "n"),
 }
 LOOK_PARTS: tuple[LookPart, ...] = get_args(LookPart)
-#: Values at which these parts change nothing; they are not computed then.
-IDLE = {"alpha": 1.0, "bands": 1.0, "texture": 1.0, "stretch": 0.0, "local": 0.0, "lattice": 0.0}
+COLOUR_PARTS = ("curves", "matrix", "saturation")  # functions of the colour, which are always computed
+DETAIL_PARTS = ("alpha", "bands", "texture")  # gains, at 1 without effect; other parts are at 0
 
 
 @full_precision
@@ -81,7 +81,9 @@ def filter_look(
     Differentiable in everything. ``apply_look`` says what the parts are. ``detail`` is :func:`polynomial_filter` with
     W, a function of luminance and sliders, and needed only if ``alpha`` :func:`acts`.
     """
-    acting = {name: value for name, value in parts.items() if name not in IDLE or acts(value, IDLE[name])}
+    acting = {
+        name: value for name, value in parts.items() if name in COLOUR_PARTS or acts(value, float(name in DETAIL_PARTS))
+    }
     for name, value in acting.items():
         check_part(value, name, image.shape[0])
     result = pointwise(image, parts["curves"], parts["matrix"], parts["saturation"], acting.get("lattice"))

@@ -25,7 +25,7 @@ from nlfilter_torch.photo.looks.look_choice import (
     fit_parts,
     simplest,
 )
-from nlfilter_torch.photo.looks.look_filter import colours_of_nodes, pointwise, resampled, tone_curve
+from nlfilter_torch.photo.looks.look_filter import COLOUR_PARTS, colours_of_nodes, pointwise, resampled, tone_curve
 from nlfilter_torch.photo.looks.look_sums import SAMPLED_PIXELS, SQUARES, LookSums, PartLayout, Parts, PixelSample
 
 SLIDERS: Parts = ("alpha",)  # of looks that are steps of detail
@@ -34,7 +34,6 @@ SLIDERS_ONLY = 0.98  # share of the change from which on an edit counts as one b
 LIKELY = 0.95  # share that the layers of a sample of the pixels explain of such an edit
 Shares = tuple[float, float]  # of the change that is explained: of fitted data, and of data left out of the fit
 THINNED = 2 * SAMPLED_PIXELS  # pixels of all pairs at most
-COLOUR_PARTS = ("curves", "matrix", "saturation")  # parts that are functions of the colour
 # A lattice is chosen if a look without it leaves more than SLACK times what it leaves, plus CLEAR. Where an edit may
 # depend on the surroundings of pixels, since more than SURROUNDINGS is left, lattices gain a little on the picture and
 # lose as much on others; there it is CLEARLY times as much. For several pairs, whose colours differ, it is FAIRLY times

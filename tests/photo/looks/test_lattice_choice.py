@@ -9,9 +9,9 @@ from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.edits.applying import apply_step
 from nlfilter_torch.photo.looks.edited_pixels import EditedPhotograph
+from nlfilter_torch.photo.looks.look_filter import COLOUR_PARTS
 from nlfilter_torch.photo.looks.look_sums import PartLayout
 from nlfilter_torch.photo.looks.region import (
-    COLOUR_PARTS,
     THINNED,
     ThinnedPixels,
     coloured,
