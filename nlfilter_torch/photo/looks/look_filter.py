@@ -69,7 +69,7 @@ PART_SHAPES: dict[str, tuple[int | str, ...]] = {
 }
 LOOK_PARTS: tuple[LookPart, ...] = get_args(LookPart)
 COLOUR_PARTS = ("curves", "matrix", "saturation")  # functions of the colour, which are always computed
-DETAIL_PARTS = ("alpha", "bands", "texture")  # gains, at 1 without effect; other parts are at 0
+DETAIL_PARTS = ("alpha", "bands", "texture")  # gains without effect at 1; stretch, local and lattice have none at 0
 
 
 @full_precision
