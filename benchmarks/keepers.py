@@ -30,7 +30,7 @@ from benchmarks.free_photographs import edited_photographs
 from benchmarks.harness import options, save_picture
 from benchmarks.photographs import luminance, reduced_to, scribbled
 from nlfilter_torch.photo import region_mask
-from nlfilter_torch.photo.app.canvas import BRUSH_RADIUS
+from nlfilter_torch.photo.app.tools import BRUSH_RADIUS
 from nlfilter_torch.photo.declared.parameters import EDITS, MASK
 from nlfilter_torch.photo.declared.presets import Recipe, find_recipe
 from nlfilter_torch.photo.declared.steps import Step

@@ -9,7 +9,6 @@ from nicegui import background_tasks, events, ui
 
 from nlfilter_torch.core.progress import Progress
 from nlfilter_torch.photo.app.controls import SteadySlider
-from nlfilter_torch.photo.app.session import FileOptions
 
 Result = TypeVar("Result")
 Arguments = TypeVarTuple("Arguments")
@@ -154,11 +153,11 @@ class SaveDialog(NameDialog):
         super().__init__(title, name, folder, check)
 
     @property
-    def options(self) -> FileOptions:
-        """The options of the file."""
+    def options(self) -> tuple[int, int | None]:
+        """The quality of a JPEG file, and the longest side in pixels, or None to keep the size."""
         side = self._side.value
         shrinks = side is not None and side < self._longest
-        return FileOptions(round(self._quality.value), round(side) if shrinks else None)
+        return round(self._quality.value), round(side) if shrinks else None
 
     def _trouble(self) -> str | None:
         side = self._side.value

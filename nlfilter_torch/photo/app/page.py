@@ -16,9 +16,8 @@ from torch import Tensor
 from nlfilter_torch.core.progress import Progress
 from nlfilter_torch.photo.app import drawing
 from nlfilter_torch.photo.app.access import LARGEST_UPLOAD
-from nlfilter_torch.photo.app.canvas import Brush, Canvas
+from nlfilter_torch.photo.app.canvas import Canvas
 from nlfilter_torch.photo.app.closeup import AtRest, Closeup
-from nlfilter_torch.photo.app.crop_tool import FREE, Proportions
 from nlfilter_torch.photo.app.developed import DEVELOPING, Developed
 from nlfilter_torch.photo.app.dialogs import EXPECTED, Arguments, NameDialog, Question, SaveDialog, Tasks, Upload
 from nlfilter_torch.photo.app.library import Library
@@ -26,6 +25,7 @@ from nlfilter_torch.photo.app.panel import Panel
 from nlfilter_torch.photo.app.server import SCRIPTS, STATIC
 from nlfilter_torch.photo.app.session import Session
 from nlfilter_torch.photo.app.tabs import thumbnails
+from nlfilter_torch.photo.app.tools import FREE, Brush, Proportions
 from nlfilter_torch.photo.declared.json_values import Value
 from nlfilter_torch.photo.declared.parameters import DETAIL, EDITS
 from nlfilter_torch.photo.declared.presets import Recipe
@@ -515,7 +515,7 @@ class Editor:
         chosen = await dialog.answer()
         if chosen is not None:
             progress = Progress()
-            self._tasks.start(self._save(progress, session.save, chosen, progress, dialog.options))
+            self._tasks.start(self._save(progress, session.save, chosen, progress, *dialog.options))
 
     async def _ask_edit_name(self) -> None:
         session = self._opened("to save")

@@ -3,7 +3,7 @@
 import math
 import threading
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -39,19 +39,6 @@ UNDOS = 100
 FULL_STATISTICS = 1 << 18  # pixels, up to which statistics are those of all; a sample is nearly as exact, and fast
 COLOURED, RARE = 0.03, 0.002  # difference of channels of a colour, and the share of pixels that need not have one
 OPEN_BYTES = 40  # per pixel, for a photograph before and after the edit and the files of both; edits work in tiles
-
-
-@dataclass(frozen=True)
-class FileOptions:
-    """How a photograph is written.
-
-    Attributes:
-        quality: of a JPEG file; None is the default.
-        side: the longest side in pixels; None keeps the size.
-    """
-
-    quality: int | None = None
-    side: int | None = None
 
 
 class Session:
@@ -402,8 +389,10 @@ class Session:
             suffix = ".tif" if BITS[photograph.depth] == "floats" else ".png"
         return f"{path.stem}-edited{suffix}"
 
-    def save(self, name: str, report: Report = in_silence, options: FileOptions = FileOptions()) -> Path:
+    def save(self, name: str, report: Report = in_silence, quality: int | None = None, side: int | None = None) -> Path:
         """Edit the photograph at its full size and write it to the folder; the file appears complete or not at all.
+
+        ``quality`` is that of a JPEG file, None the default; ``side`` the longest side in pixels, None that it has.
 
         Raises:
             ValueError, OSError, MemoryError: if the file cannot be edited or written.
@@ -411,7 +400,7 @@ class Session:
         target = self.check_photograph(name)
         recipe, developed = self.recipe, self._develop(self.recipe.develop)
         photograph = developed.photograph
-        size = reduced_size(photograph, options.side)
+        size = reduced_size(photograph, side)
         pixels = self._edited_at_once(developed, recipe, report)
         if pixels is None:
             rows = photograph.pixels[0].permute(1, 2, 0).numpy()
@@ -421,7 +410,7 @@ class Session:
             for part, values in edit_rows(self._passes(photograph, report), rows, steps, self.name):
                 pixels[0, :, part] = torch.from_numpy(values).permute(2, 0, 1)
         report("Writing", 0, 1)
-        write_photograph(resized_photograph(photograph.with_pixels(pixels), size), target, quality=options.quality)
+        write_photograph(resized_photograph(photograph.with_pixels(pixels), size), target, quality=quality)
         self.saved = recipe
         return target
 

@@ -9,9 +9,8 @@ from nicegui import ui
 from torch import Tensor
 
 from nlfilter_torch.photo.app import controls, drawing
-from nlfilter_torch.photo.app.canvas import BRUSH_RADIUS, BRUSHES, PALETTE, Brush
 from nlfilter_torch.photo.app.controls import Choice, Control, Slider, SteadySlider, show_pressed
-from nlfilter_torch.photo.app.crop_tool import FREE, PROPORTIONS, Proportions
+from nlfilter_torch.photo.app.tools import BRUSH_RADIUS, BRUSHES, FREE, PALETTE, PROPORTIONS, Brush, Proportions
 from nlfilter_torch.photo.declared.development import DEVELOP, WHOLE_CROP
 from nlfilter_torch.photo.declared.json_values import Value
 from nlfilter_torch.photo.declared.parameters import EDITS

@@ -4,9 +4,8 @@ from collections.abc import Mapping
 
 from nicegui import Client, ui
 
-from nlfilter_torch.photo.app.canvas import Brush
-from nlfilter_torch.photo.app.crop_tool import Proportions
 from nlfilter_torch.photo.app.tabs import EditTab
+from nlfilter_torch.photo.app.tools import Brush, Proportions
 from nlfilter_torch.photo.declared.json_values import Value
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.declared.strokes import Stroke

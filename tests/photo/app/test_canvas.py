@@ -8,8 +8,9 @@ import torch
 from nicegui import Client
 
 from nlfilter_torch.photo.app import drawing
-from nlfilter_torch.photo.app.canvas import Brush, Canvas
+from nlfilter_torch.photo.app.canvas import Canvas
 from nlfilter_torch.photo.app.session import Session
+from nlfilter_torch.photo.app.tools import Brush
 from nlfilter_torch.photo.picture.photographs import Photograph, write_photograph
 from tests.problems import cat
 

@@ -8,7 +8,7 @@ import torch
 from torch.nn.functional import avg_pool2d
 
 from nlfilter_torch.photo.app.developed import DEVELOPING
-from nlfilter_torch.photo.app.session import FileOptions, Session
+from nlfilter_torch.photo.app.session import Session
 from nlfilter_torch.photo.declared.development import Development
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.declared.steps import Step
@@ -52,7 +52,7 @@ def test_the_preview_at_rest_is_the_file(tmp_path: Path) -> None:
     assert rest.shape == preview.shape
     assert difference(rest, resize(saved, size)) < 0.3
     assert difference(preview, rest) < 2
-    assert max(read_photograph(session.save("small.png", options=FileOptions(side=60))).size) == 60
+    assert max(read_photograph(session.save("small.png", side=60)).size) == 60
 
 
 def test_strokes_are_stored_in_coordinates_of_the_original(session: Session) -> None:

@@ -6,7 +6,6 @@ import pytest
 from nicegui import Client
 
 from nlfilter_torch.photo.app.dialogs import NameDialog, SaveDialog
-from nlfilter_torch.photo.app.session import FileOptions
 
 
 @pytest.fixture
@@ -49,13 +48,13 @@ def test_options_of_a_file(client: Client, tmp_path: Path) -> None:
     assert not dialog._lossy.visible
     dialog._name.set_value("photo.JPG")
     assert dialog._lossy.visible
-    assert dialog.options == FileOptions(95, None)
+    assert dialog.options == (95, None)
     dialog._quality.set_value(80)
     dialog._side.set_value(75)
-    assert dialog.options == FileOptions(80, 75)
+    assert dialog.options == (80, 75)
     for side in (None, 150):
         dialog._side.set_value(side)
-        assert dialog.options.side is None
+        assert dialog.options[1] is None
         assert dialog._note.text == f"In {tmp_path}"
 
 
@@ -69,4 +68,4 @@ def test_a_size_out_of_range_is_refused(client: Client, answers: list[str], tmp_
         assert (answers, dialog._note.text) == ([], said)
     dialog._side.set_value(16)
     dialog._confirm()
-    assert (answers, dialog.options.side) == (["photo.png"], 16)
+    assert (answers, dialog.options[1]) == (["photo.png"], 16)

@@ -12,12 +12,12 @@ from nicegui import Client, background_tasks, ui
 
 from nlfilter_torch.core.progress import Progress
 from nlfilter_torch.photo.app import drawing
-from nlfilter_torch.photo.app.crop_tool import Proportions
 from nlfilter_torch.photo.app.dialogs import Question
 from nlfilter_torch.photo.app.library import Library
 from nlfilter_torch.photo.app.page import EDITORS, Editor
 from nlfilter_torch.photo.app.server import SCRIPTS, STATIC, STATIC_ADDRESS
 from nlfilter_torch.photo.app.session import Session
+from nlfilter_torch.photo.app.tools import Proportions
 from nlfilter_torch.photo.declared.development import WHOLE_CROP, Development
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.picture.photographs import Photograph, write_photograph

@@ -3,8 +3,8 @@
 import pytest
 from nicegui import Client, ui
 
-from nlfilter_torch.photo.app.canvas import BRUSHES
 from nlfilter_torch.photo.app.panel import Panel
+from nlfilter_torch.photo.app.tools import BRUSHES
 from nlfilter_torch.photo.declared.parameters import EDITS
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.declared.steps import Step

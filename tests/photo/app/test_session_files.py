@@ -11,7 +11,7 @@ from PIL import Image
 
 from nlfilter_torch.__main__ import main
 from nlfilter_torch.operator.features import reduce_channels
-from nlfilter_torch.photo.app.session import FileOptions, Session, reduced_size
+from nlfilter_torch.photo.app.session import Session, reduced_size
 from nlfilter_torch.photo.declared.presets import find_recipe
 from nlfilter_torch.photo.edits.applying import apply_recipe
 from nlfilter_torch.photo.picture.photographs import HiddenPixels, Photograph, read_photograph, write_photograph
@@ -43,19 +43,19 @@ def test_saving_is_what_the_command_line_does(session: Session, photo: Path) -> 
 
 def test_a_size_and_a_quality(session: Session, photo: Path) -> None:
     session.set("tone", contrast=1.1)
-    large = session.save("a.jpg", options=FileOptions(100)).stat().st_size
-    small = session.save("b.jpg", options=FileOptions(60, 75))
+    large = session.save("a.jpg", quality=100).stat().st_size
+    small = session.save("b.jpg", quality=60, side=75)
     assert read_photograph(small).size == (50, 75)
     assert small.stat().st_size < large / 4
-    whole = read_photograph(session.save("c.png", options=FileOptions(side=4000)))
+    whole = read_photograph(session.save("c.png", side=4000))
     assert whole.size == (100, 150)
-    half = read_photograph(session.save("d.png", options=FileOptions(side=75)))
+    half = read_photograph(session.save("d.png", side=75))
     assert difference(half.pixels, resize(whole.pixels, (50, 75)).clamp(0, 1)) <= 1.5
     alpha = whole.pixels[:, :1].clone()
     alpha[..., :40] = 0
     write_photograph(replace(whole, alpha=alpha), photo.with_name("alpha.png"))
     session = Session(session.folder, photo.with_name("alpha.png"))
-    halves = read_photograph(session.save("e.png", options=FileOptions(side=75)))
+    halves = read_photograph(session.save("e.png", side=75))
     assert halves.alpha is not None
     assert halves.alpha.shape == (1, 1, 50, 75)
     hidden = HiddenPixels(np.zeros((100, 150), bool), np.zeros((0, 3), np.uint8), nodata=0)

@@ -3,8 +3,8 @@
 import pytest
 from nicegui import Client, ui
 
-from nlfilter_torch.photo.app.canvas import BRUSHES, PALETTE, Brush
 from nlfilter_torch.photo.app.tabs import EditTab
+from nlfilter_torch.photo.app.tools import BRUSHES, PALETTE, Brush
 from nlfilter_torch.photo.declared.parameters import EDITS
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.declared.steps import Step

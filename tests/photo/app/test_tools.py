@@ -2,7 +2,7 @@
 
 from nicegui import Client
 
-from nlfilter_torch.photo.app.crop_tool import CropTool, Proportions
+from nlfilter_torch.photo.app.tools import CropTool, Proportions
 
 
 def test_the_tool_tells_the_page_what_to_show(client: Client, scripts: list[str]) -> None:
