@@ -12,7 +12,7 @@ from nlfilter_torch.photo.declared.parameters import EDITS
 PALETTE = ("#2f6fde", "#12a15f", "#e0b321", "#dd5c21", "#c8283c", "#8a46c8", "#8b5e3c", "#808080")
 BRUSH_RADIUS = 0.02  # of the brush at the start
 BRUSHES: dict[str, dict[str, str]] = {
-    edit.name: {scribble.word: scribble.label for scribble in edit.scribbles}
+    edit.name: {scribble.word: scribble.label for scribble in edit.scribbles if scribble.role != "box"}
     for edit in EDITS.values()
     if edit.scribbles
 }
