@@ -92,8 +92,7 @@ QUICK := \
 	'streaming --quick' \
 	'streaming strokes --quick' \
 	'streaming memory --quick' \
-	'streaming busy --quick' \
-	'busy --quick sharpen' \
+	'busy --quick sharpen "recolor in tiles"' \
 	'commands --quick' \
 	'scribbles --quick' \
 	'app --side 96 --megapixels 0.05 --repeats 3 --quick' \

@@ -1,7 +1,7 @@
 """Whether threads get in each other's way where other programs use the cores: ``python -m benchmarks.busy [JOB ...]``.
 
-Every edit, the operator, the denoiser and steps of training take turns with one thread and with two, alone and beside
-one and two processes that keep a core busy each. Threads wait for each other as in the program
+Every edit, two edits in tiles, the operator, the denoiser and steps of training take turns with one thread and with
+two, alone and beside one and two processes that keep a core busy each. Threads wait for each other as in the program
 (``nlfilter_torch.photo.cli.process``). With two threads nothing must take more than 1.3 times as long as with one, and
 alone not more than 1.1 times as long as where threads wait as torch has it, by spinning. Ratios are medians over
 ``--repeats``. ``--spinning`` shows what spinning costs beside busy processes.
@@ -11,8 +11,9 @@ import argparse
 import os
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from statistics import median
 from typing import Self
 
@@ -21,14 +22,29 @@ from torch import Tensor, nn
 
 from benchmarks.harness import Figure, options, report, seconds
 from benchmarks.photographs import photograph
-from benchmarks.streaming import neighbours
+from benchmarks.streaming import in_tiles
 from nlfilter_torch import NonlocalDenoiser, NonlocalFilter, nonlocal_operator, photo, polynomial_filter
 from nlfilter_torch.photo import region_mask
 from nlfilter_torch.photo.cli.process import VARIABLES, sleep_while_waiting
+from nlfilter_torch.photo.declared.steps import Step
 
 NEIGHBOURS = (0, 1, 2)
 BESIDE, IDLE = 1.3, 1.1  # limits of the ratios of times
+ENDLESS = "import os\nparent = os.getppid()\nwhile os.getppid() == parent: pass"  # it ends with its parent
 Job = Callable[[], object]
+
+
+@contextmanager
+def neighbours(count: int) -> Iterator[None]:
+    """So many processes that compute without end."""
+    started = [subprocess.Popen([sys.executable, "-c", ENDLESS]) for _ in range(count)]
+    try:
+        time.sleep(0.5 if count else 0.0)  # they are there
+        yield
+    finally:
+        for process in started:
+            process.kill()
+            process.wait()
 
 
 def jobs(side: int) -> dict[str, Job]:
@@ -43,6 +59,7 @@ def jobs(side: int) -> dict[str, Job]:
     look = photo.fit_look([(image[..., ::4, ::4], image[..., ::4, ::4] ** 0.8)])
     alpha, weights = torch.tensor([3.0, 3.0, 4.0, 1.05]), torch.tensor([0.2, 0.5, 1.0, 1.0])
     layer = NonlocalFilter(learn=("alpha", "photometric_bandwidth"), photometric_bandwidth=0.3)
+    picture = (255 * image[0].permute(1, 2, 0)).round().byte().numpy()
     features, denoiser = nn.Conv2d(3, 8, 5, padding=2), NonlocalDenoiser.trained()
 
     def train(network: Callable[[], Tensor]) -> Job:
@@ -58,6 +75,8 @@ def jobs(side: int) -> dict[str, Job]:
         "colorize": lambda: photo.colorize(grey, colours, region),
         "defocus": lambda: photo.defocus(image, region),
         "mask": lambda: region_mask(image, region, other),
+        "detail in tiles": lambda: in_tiles(Step("detail", alpha=(3.0, 3.0, 4.0, 1.05)), picture),
+        "recolor in tiles": lambda: in_tiles(Step("recolor"), picture),
         "abstract": lambda: photo.abstract(image),
         "look": lambda: look.apply(image),
         "operator": lambda: nonlocal_operator(image),

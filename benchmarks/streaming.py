@@ -1,28 +1,23 @@
-"""What edits of pictures larger than memory cost, how exact they are, and what busy neighbours do to them.
+"""What edits of pictures larger than memory cost, and how exact they are.
 
     python -m benchmarks.streaming [files] [--out FILE.json]    files of 4, 25 and 100 megapixels
     python -m benchmarks.streaming strokes                      recolouring and colourising of 4 and 25 megapixels
     python -m benchmarks.streaming memory                       processor time in tiles, compared with in memory
-    python -m benchmarks.streaming busy                         time beside busy processes, compared with alone
 
 A mosaic of photographs, each piece randomly rotated, darkened or lightened and textured, is written to a BigTIFF file;
 a fresh process edits it into another file. Time is CPU time, summed over cores, so that other programs affect it
 little; peaks are above the memory that is resident after the program and its libraries are loaded. Then a smaller
-mosaic is edited in tiles and in memory. ``busy`` measures by the clock: a machine that is shared evenly gives a thread
-half of a core that a neighbour keeps busy, so twice the time is what a program takes that never waits for itself.
+mosaic is edited in tiles and in memory.
 """
 
 import argparse
 import json
-import os
 import platform
-import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -61,7 +56,6 @@ BOXES = (  # strokes: (top, left, height, width) as shares of the picture, and R
     ((0.85, 0.15, 0.02, 0.04), (0, 0, 255)),
 )
 LIMIT = 800 * MIB  # of memory for files
-BUSY = "import os\nparent = os.getppid()\nwhile os.getppid() == parent: pass"  # it ends with its parent
 Array = NDArray[np.uint8]
 
 
@@ -282,77 +276,30 @@ def strokes(chosen: argparse.Namespace) -> None:
         )
 
 
-def steps_of(chosen: argparse.Namespace) -> Iterator[tuple[str, float, Array, Step, int]]:
-    """Edits of mosaics of the sizes that are asked for, and how often each is repeated."""
-    for megapixels in [0.04] if chosen.quick else chosen.megapixels or [6.0]:
-        picture = mosaic(round((megapixels * 1e6) ** 0.5))
-        for verb in chosen.edits:
-            step = Step("detail", alpha=ALPHA) if verb == "detail" else Step(verb)
-            yield verb, megapixels, picture, step, 1 if chosen.quick else chosen.repeats
-
-
 def beside_memory(chosen: argparse.Namespace) -> None:
     """CPU time per megapixel of edits in memory and in tiles, from 8 bits to 8 bits, in turn."""
-    memory, chosen.megapixels = int(chosen.memory * 1e9), chosen.megapixels or [1.4, 4.0, 12.0]
+    memory, repeats = int(chosen.memory * 1e9), 1 if chosen.quick else chosen.repeats
     print(f"| edit | megapixels | threads | in memory, s per MP | tiled with {chosen.memory:g} GB, s per MP | ratio |")
     print("|---|---|---|---|---|---|")
     in_tiles(Step("detail", alpha=ALPHA), mosaic(100))  # lazy imports and compilation
-    for verb, megapixels, picture, step, repeats in steps_of(chosen):
-        for threads in chosen.threads[:1] if chosen.quick else chosen.threads:
-            torch.set_num_threads(threads)
-            runs = [
-                (
-                    seconds(lambda: stored_as(in_memory(verb, picture), "uint8"), processor=True),  # noqa: B023
-                    seconds(lambda: in_tiles(step, picture, memory=memory), processor=True),  # noqa: B023
-                )
-                for _ in range(repeats)
-            ]
-            whole, tiled = (median(times) * 1e6 / picture[..., 0].size for times in zip(*runs, strict=True))
-            ratio = median(run[1] / run[0] for run in runs)
-            print(f"| {verb} | {megapixels} | {threads} | {whole:.2f} | {tiled:.2f} | {ratio:.2f} |", flush=True)
+    threads = chosen.threads[:1] if chosen.quick else chosen.threads
+    for megapixels, verb, count in product([0.04] if chosen.quick else chosen.megapixels, chosen.edits, threads):
+        picture = mosaic(round((megapixels * 1e6) ** 0.5))
+        step = Step("detail", alpha=ALPHA) if verb == "detail" else Step(verb)
+        torch.set_num_threads(count)
+        runs = [
+            (
+                seconds(lambda: stored_as(in_memory(verb, picture), "uint8"), processor=True),  # noqa: B023
+                seconds(lambda: in_tiles(step, picture, memory=memory), processor=True),  # noqa: B023
+            )
+            for _ in range(repeats)
+        ]
+        whole, tiled = (median(times) * 1e6 / picture[..., 0].size for times in zip(*runs, strict=True))
+        ratio = median(run[1] / run[0] for run in runs)
+        print(f"| {verb} | {megapixels} | {count} | {whole:.2f} | {tiled:.2f} | {ratio:.2f} |", flush=True)
 
 
-@contextmanager
-def neighbours(count: int) -> Iterator[None]:
-    """So many processes that compute without end."""
-    started = [subprocess.Popen([sys.executable, "-c", BUSY]) for _ in range(count)]
-    try:
-        time.sleep(0.5 if count else 0.0)  # they are there
-        yield
-    finally:
-        for process in started:
-            process.kill()
-            process.wait()
-
-
-def busy(chosen: argparse.Namespace) -> None:
-    """Edits in tiles, alone and beside processes that keep a core busy each, in turn."""
-    print(f"{chosen.neighbours} busy processes on {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f} before")
-    print("| edit | MP | threads | alone, s | CPU, s | beside, s | CPU, s | beside / alone | 1 thread / n |")
-    print("|---|---|---|---|---|---|---|---|---|", flush=True)
-    for verb, megapixels, picture, step, repeats in steps_of(chosen):
-        passes = {"memory": int(chosen.memory * 1e9)}
-        in_tiles(step, picture, **passes)  # what is read or compiled when it is first needed
-        runs: dict[tuple[int, int], list[tuple[float, float]]] = {}
-        for _ in range(repeats):
-            for count in (0, chosen.neighbours):
-                with neighbours(count):
-                    for threads in chosen.threads:
-                        torch.set_num_threads(threads)
-                        used = time.process_time()
-                        wall = seconds(lambda: in_tiles(step, picture, **passes))  # noqa: B023
-                        runs.setdefault((threads, count), []).append((wall, time.process_time() - used))
-        first = [wall for wall, _ in runs[chosen.threads[0], 0]]
-        for threads in chosen.threads:
-            alone, beside = runs[threads, 0], runs[threads, chosen.neighbours]
-            columns = [median(run[part] for run in times) for times in (alone, beside) for part in (0, 1)]
-            columns.append(median(b[0] / a[0] for a, b in zip(alone, beside, strict=True)))
-            columns.append(median(single / several[0] for single, several in zip(first, alone, strict=True)))
-            figures = " | ".join(f"{value:.2f}" for value in columns)
-            print(f"| {verb} | {megapixels:g} | {threads} | {figures} |", flush=True)
-
-
-SUITES = {"files": files, "strokes": strokes, "memory": beside_memory, "busy": busy}
+SUITES = {"files": files, "strokes": strokes, "memory": beside_memory}
 
 
 def main() -> None:
@@ -361,12 +308,11 @@ def main() -> None:
     add = parser.add_argument
     add("suite", nargs="?", choices=SUITES, default="files")
     add("--out", type=Path, help="JSON file for the figures of files")
-    add("--megapixels", type=float, nargs="+", help="memory and busy: default 1.4 4 12, and 6")
-    add("--edits", nargs="+", choices=("detail", "recolor"), default=["detail", "recolor"], help="memory and busy")
-    add("--threads", type=int, nargs="+", default=[1, 2], help="memory and busy")
-    add("--repeats", type=int, default=3, help="memory and busy")
+    add("--megapixels", type=float, nargs="+", default=[1.4, 4.0, 12.0], help="of memory")
+    add("--edits", nargs="+", choices=("detail", "recolor"), default=["detail", "recolor"], help="of memory")
+    add("--threads", type=int, nargs="+", default=[1, 2], help="of memory")
+    add("--repeats", type=int, default=3, help="of memory")
     add("--memory", type=float, default=1.0, help="memory limit of tiles in gigabytes")
-    add("--neighbours", type=int, default=os.cpu_count() or 1, help="busy processes; default: one per core")
     add("--work", nargs=5, help=argparse.SUPPRESS)
     chosen = parser.parse_args()
     if chosen.work:
