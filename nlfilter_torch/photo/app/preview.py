@@ -42,12 +42,12 @@ from nlfilter_torch.photo.picture.changes import (
 from nlfilter_torch.photo.picture.drawn import Drawn
 from nlfilter_torch.photo.picture.edit import MARKS, PhotoEdit
 from nlfilter_torch.photo.picture.in_memory import InMemory, edit_image, fit_edit
+from nlfilter_torch.photo.picture.measuring import range_of
 from nlfilter_torch.photo.picture.painting import TensorPainter
 from nlfilter_torch.photo.picture.pixels import Fitted, mixed, part_of
 from nlfilter_torch.photo.picture.resizing import resize
 from nlfilter_torch.photo.picture.source import luminance, seeded
 from nlfilter_torch.photo.picture.viewing import MEGAPIXEL, viewed_size, within_limits
-from nlfilter_torch.photo.picture.working_range import range_of
 from nlfilter_torch.photo.selections.stray import stray_parts
 
 Key = tuple[object, ...]  # the settings on which a cached result depends

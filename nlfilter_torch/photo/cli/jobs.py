@@ -41,14 +41,13 @@ from nlfilter_torch.photo.picture.changes import blend_edited
 from nlfilter_torch.photo.picture.drawn import Painter
 from nlfilter_torch.photo.picture.edit import PhotoEdit, Rows
 from nlfilter_torch.photo.picture.in_memory import InMemory, edit_image, fit_edit
-from nlfilter_torch.photo.picture.painting import TensorPainter
+from nlfilter_torch.photo.picture.painting import RowPainter, TensorPainter
 from nlfilter_torch.photo.picture.photographs import Photograph, write_photograph
 from nlfilter_torch.photo.picture.pictures import Picture, stored_as
 from nlfilter_torch.photo.picture.pixels import M
 from nlfilter_torch.photo.picture.source import Source, seeded
 from nlfilter_torch.photo.picture.tiled import Tiled
 from nlfilter_torch.photo.picture.tiled_developed import developed_rows
-from nlfilter_torch.photo.picture.tiled_scribbles import RowPainter
 from nlfilter_torch.photo.picture.tiles import Tiling
 
 ROWS, AROUND = 256, 2  # rows of the photograph that are read at once, and additional rows on both sides

@@ -23,13 +23,13 @@ from nlfilter_torch.photo.files.writing import check_file
 from nlfilter_torch.photo.picture.drawn import Drawn
 from nlfilter_torch.photo.picture.edit import Rows
 from nlfilter_torch.photo.picture.in_memory import InMemory
+from nlfilter_torch.photo.picture.measuring import range_of
 from nlfilter_torch.photo.picture.photographs import Photograph, check_output, write_photograph
 from nlfilter_torch.photo.picture.pictures import Picture
 from nlfilter_torch.photo.picture.pixels import M
+from nlfilter_torch.photo.picture.regions import region_rows
 from nlfilter_torch.photo.picture.source import Fitted, Source, seeded
 from nlfilter_torch.photo.picture.tiled import Tiled
-from nlfilter_torch.photo.picture.tiled_scribbles import region_rows
-from nlfilter_torch.photo.picture.working_range import range_of
 from nlfilter_torch.photo.selections.mask import RegionMask
 
 PLANE_BYTES = 16  # per pixel, of a mask that is computed in tiles but written at once

@@ -18,10 +18,9 @@ from nlfilter_torch.photo.declared.strokes import WORDS, Mark, Region, ScribbleR
 from nlfilter_torch.photo.files.formats import check_depth
 from nlfilter_torch.photo.files.rows import StoredPicture
 from nlfilter_torch.photo.picture.drawn import Drawn, Painter, Size, drawn_by
-from nlfilter_torch.photo.picture.painting import TensorPainter
+from nlfilter_torch.photo.picture.painting import RowPainter, TensorPainter, plane_rows
 from nlfilter_torch.photo.picture.pictures import LazyRows, Picture
 from nlfilter_torch.photo.picture.pixels import M
-from nlfilter_torch.photo.picture.tiled_scribbles import RowPainter, plane_rows
 
 Opener = Callable[[Path], StoredPicture]  # opens a picture of marks
 DOT_SIZE = 0.03  # side of the square around a point, as a share of the short side

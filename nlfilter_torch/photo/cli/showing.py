@@ -25,9 +25,8 @@ from nlfilter_torch.photo.picture.colour import hundredths_of_lab
 from nlfilter_torch.photo.picture.drawn import Drawn
 from nlfilter_torch.photo.picture.edit import MARKS, PhotoEdit, Rows
 from nlfilter_torch.photo.picture.in_memory import InMemory, edit_image
-from nlfilter_torch.photo.picture.painting import cover
+from nlfilter_torch.photo.picture.painting import cover, plane_rows
 from nlfilter_torch.photo.picture.photographs import Photograph, write_photograph
-from nlfilter_torch.photo.picture.tiled_scribbles import plane_rows
 from nlfilter_torch.photo.selections.scribbled_colours import frame_places
 from nlfilter_torch.photo.selections.stray import stray_parts
 

@@ -518,8 +518,8 @@ def _coloured(source: Source[M], viewed: Source[M], chroma: Planes) -> Fitted:
     if source is viewed:
         return Fitted(partial(_in_chroma, chroma))
     before = everywhere(viewed, Fitted(_luminance_twice))
-    changes = Coarse.of(before, everywhere(viewed, Fitted(chroma)), None, "none").changes(source, _luminance_twice)
-    return Fitted(partial(_in_changed_chroma, changes))
+    coarse = Coarse.of(before, everywhere(viewed, Fitted(chroma)), None, "none")
+    return Fitted(partial(_in_changed_chroma, coarse.enlarged(source, _luminance_twice).changes))
 
 
 def grey_outside(viewed: Source[M], scribbles: Scribbles, boxes: Tensor) -> Scribbles:

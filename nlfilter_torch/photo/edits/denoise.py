@@ -29,10 +29,9 @@ from nlfilter_torch.photo.picture.changes import change_in_parts, remainder
 from nlfilter_torch.photo.picture.drawn import Drawn
 from nlfilter_torch.photo.picture.edit import PhotoEdit, Rows
 from nlfilter_torch.photo.picture.in_memory import edited
-from nlfilter_torch.photo.picture.measuring import check_in_memory
+from nlfilter_torch.photo.picture.measuring import check_in_memory, range_of
 from nlfilter_torch.photo.picture.pixels import M, WorkingRange, whole_image
 from nlfilter_torch.photo.picture.source import Fitted, Guide, Operator, Pixels, Planes, Source
-from nlfilter_torch.photo.picture.working_range import range_of
 
 Method = Literal["network", "rule"]
 

@@ -35,9 +35,9 @@ from nlfilter_torch.photo.picture.in_memory import edited
 from nlfilter_torch.photo.picture.limits import Limits
 from nlfilter_torch.photo.picture.measuring import everywhere
 from nlfilter_torch.photo.picture.pixels import Box, M, corner, whole_image
+from nlfilter_torch.photo.picture.regions import num_regions, resized_masks
 from nlfilter_torch.photo.picture.resizing import enlarged
 from nlfilter_torch.photo.picture.source import Fitted, Guide, Pixels, Planes, Source, luminance
-from nlfilter_torch.photo.picture.tiled_scribbles import num_regions, resized_masks
 from nlfilter_torch.photo.picture.viewing import balance, enlarged_change, fit_change, viewed_size
 from nlfilter_torch.photo.selections.by_hand import ByHand
 from nlfilter_torch.photo.selections.connected import Extent

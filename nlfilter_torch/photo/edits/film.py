@@ -80,7 +80,7 @@ class FrameOperator(TiledOperator):
 
     def _pairs_of_references(self) -> RitzPairs:
         sums = self._sums_of_references(first_plane, 1)
-        return RitzPairs.of_sums(sums.grams[:, :2], self.guide.dtype)
+        return RitzPairs.of_sums(sums.grams[:, :2], self.guide.picture.dtype)
 
     def sums(self, planes: Planes, order: int) -> Sums:
         """The sums over the references for the first ``order`` powers of W."""

@@ -19,10 +19,10 @@ from nlfilter_torch.photo.edits.detail import Channels
 from nlfilter_torch.photo.picture.changes import activity, limit_by_activity, split_sliders
 from nlfilter_torch.photo.picture.in_memory import InMemory
 from nlfilter_torch.photo.picture.limits import Balance, Limits
+from nlfilter_torch.photo.picture.measuring import range_of
 from nlfilter_torch.photo.picture.pixels import WorkingRange, whole_image
 from nlfilter_torch.photo.picture.source import Fitted, Pixels, Planes, Source, luminance
 from nlfilter_torch.photo.picture.viewing import balance, fit_change, viewed_size
-from nlfilter_torch.photo.picture.working_range import range_of
 
 
 def filter_frames(

@@ -18,12 +18,12 @@ from nlfilter_torch.core.workers import in_order
 from nlfilter_torch.photo.declared.rows import RowSource
 from nlfilter_torch.photo.declared.steps import Step, acting_steps
 from nlfilter_torch.photo.edits.applying import fit_step, scribbles_of
+from nlfilter_torch.photo.picture.painting import RowPainter
 from nlfilter_torch.photo.picture.pictures import LazyRows, Picture, Tile
 from nlfilter_torch.photo.picture.resizing import resized
 from nlfilter_torch.photo.picture.sampling import Report, in_silence
 from nlfilter_torch.photo.picture.source import Fitted
 from nlfilter_torch.photo.picture.tiled import Tiled
-from nlfilter_torch.photo.picture.tiled_scribbles import RowPainter
 from nlfilter_torch.photo.picture.tiles import Passes, Statistics, intermediate
 
 STRIP_PIXELS = 1 << 15  # pixels of a rectangle that one worker computes at a time

@@ -14,10 +14,10 @@ from nlfilter_torch.photo.declared.steps import Step, acting_steps
 from nlfilter_torch.photo.edits.applying import fit_step, scribbles_of
 from nlfilter_torch.photo.picture.changes import blend_edited
 from nlfilter_torch.photo.picture.drawn import Drawn
+from nlfilter_torch.photo.picture.painting import RowPainter
 from nlfilter_torch.photo.picture.pictures import Picture, Rows, RowTarget, Tile, mask_of
 from nlfilter_torch.photo.picture.sampling import Report, in_silence
 from nlfilter_torch.photo.picture.tiled import Tiled
-from nlfilter_torch.photo.picture.tiled_scribbles import RowPainter
 from nlfilter_torch.photo.picture.tiles import (
     SAMPLE,
     Passes,

@@ -15,7 +15,7 @@ from nlfilter_torch.operator.spectrum import Response
 from nlfilter_torch.photo.picture.source import Operator, Pixels, Planes
 
 VARIANCE_SIGMA = 2.0  # standard deviation in pixels of the Gaussian window for the local variance
-EPSILON = 1e-12
+EPSILON = 1e-12  # keeps gradients finite where neither the activity nor the threshold is above 0
 
 
 def limit_by_activity(changes: Tensor, activity: Tensor, threshold: float | Tensor) -> Tensor:

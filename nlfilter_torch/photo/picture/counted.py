@@ -10,9 +10,9 @@ from torch import Tensor
 from nlfilter_torch.operator.landmarks import candidate_pixels, weighted_draws
 from nlfilter_torch.operator.options import Sampling
 from nlfilter_torch.operator.orientation import EXCHANGED
+from nlfilter_torch.photo.declared.rows import Stored
 
 LEAST_WEIGHT = 1e-6  # below which a pixel does not count
-Stored = NDArray[np.generic]  # opacity, in the dtype of the file
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,7 +20,7 @@ class CountedPixels:
     """The opacity of a picture, of which some pixel counts and not all count alike.
 
     Attributes:
-        opacity: as it is stored, (H, W).
+        opacity: as it is stored, (H, W), in the dtype of the file.
         total: sum of the weights.
         count: number of pixels of a weight other than 0.
         even: whether these have the same weight.

@@ -5,9 +5,8 @@ becomes the same, bit for bit, as one in memory.
 """
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
-from typing import TypeVar
 
 import torch
 import torch.nn.functional as F
@@ -16,6 +15,7 @@ from torch import Tensor
 from nlfilter_torch.core.checks import check_dtype, check_tensor
 from nlfilter_torch.core.workers import divided_among, threads_for
 from nlfilter_torch.photo.declared.development import Development, Frame, rotated
+from nlfilter_torch.photo.picture.pixels import STRIP
 
 BLOCK = 256  # side in pixels of the squares that are rotated at once
 MARGIN = 2  # pixels around a point that bicubic interpolation reads
@@ -24,10 +24,8 @@ GREEN_TO_MAGENTA = 0.5  # stops that tint 1 takes from green
 #: The tone curve of sRGB: a line up to a value, and a power beyond it.
 LINEAR, SLOPE, OFFSET, GAMMA = 0.04045, 12.92, 0.055, 2.4
 DARK = 1e-3  # light in which nobody sees colours
-STRIP = 1 << 18  # pixels whose light is changed at once
 LUMINANCE = (0.2126, 0.7152, 0.0722)  # weights of red, green and blue in linear light
 
-Item = TypeVar("Item")
 ReadPart = Callable[[range, range], Tensor]  # returns rows and columns (B, C, h, w) of a picture
 
 
@@ -78,8 +76,8 @@ def develop_planes(planes: Tensor, frame: Frame) -> Tensor:
     rows, columns = range(frame.top, frame.top + frame.height), range(frame.left, frame.left + frame.width)
     if frame.angle == 0:
         return part_of_planes(planes, rows, columns)
-    turn = partial(turned_band, partial(part_of_planes, planes), frame)
-    return torch.cat(_divided(turn, bands_of(frame), planes), dim=2)
+    read = partial(part_of_planes, planes)
+    return torch.cat(list(divided_among(threads_for(planes), turned_band, bands_of(frame), read, frame)), dim=2)
 
 
 def reframed(planes: Tensor, frame: Frame, other: Frame, size: tuple[int, int]) -> Tensor:
@@ -114,7 +112,7 @@ def bands_of(frame: Frame) -> list[range]:
     return [range(top, min(top + BLOCK, frame.height)) for top in range(0, frame.height, BLOCK)]
 
 
-def turned_band(read: ReadPart, frame: Frame, rows: range) -> Tensor:
+def turned_band(rows: range, read: ReadPart, frame: Frame) -> Tensor:
     """Rows (B, C, h, W) of a developed picture that is rotated."""
     lefts = range(0, frame.width, BLOCK)
     parts = [turned_part(read, frame, rows, range(left, min(left + BLOCK, frame.width))) for left in lefts]
@@ -187,8 +185,8 @@ def in_light(image: Tensor, development: Development, limits: tuple[Tensor, Tens
     if not development.changes_tones:
         return image
     gains = gains_of(development, coloured=image.shape[1] == 3)[: image.shape[1]]
-    lit = partial(_times, gains=gains, limits=limits)
-    return torch.cat(_divided(lit, image.split(max(1, STRIP // image.shape[3]), dim=2), image), dim=2)
+    strips = image.split(max(1, STRIP // image.shape[3]), dim=2)
+    return torch.cat(list(divided_among(threads_for(image), _times, strips, gains, limits)), dim=2)
 
 
 def _times(image: Tensor, gains: Sequence[float], limits: tuple[Tensor, Tensor]) -> Tensor:
@@ -212,11 +210,6 @@ def _times(image: Tensor, gains: Sequence[float], limits: tuple[Tensor, Tensor])
 def _linear(values: Tensor) -> Tensor:
     """The linear light of values with the tone curve of sRGB."""
     return torch.where(values > LINEAR, ((values.clamp(min=LINEAR) + OFFSET) / (1 + OFFSET)) ** GAMMA, values / SLOPE)
-
-
-def _divided(function: Callable[[Item], Tensor], items: Iterable[Item], image: Tensor) -> list[Tensor]:
-    """Results of a function of parts of an image, each in a thread of its own unless derivatives are wanted."""
-    return list(divided_among(threads_for(image), function, items))
 
 
 def gains_of(development: Development, *, coloured: bool = True) -> list[float]:

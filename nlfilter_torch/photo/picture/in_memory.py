@@ -25,8 +25,9 @@ from nlfilter_torch.photo.declared.declaration import Arguments
 from nlfilter_torch.photo.picture.counted import LEAST_WEIGHT
 from nlfilter_torch.photo.picture.drawn import Drawn
 from nlfilter_torch.photo.picture.edit import PhotoEdit
-from nlfilter_torch.photo.picture.measuring import mean, reduced_with_weights
+from nlfilter_torch.photo.picture.measuring import mean, range_of, reduced_with_weights
 from nlfilter_torch.photo.picture.pixels import Block, Fitted, M, Planes, WorkingRange, part_of, strips_of, whole_image
+from nlfilter_torch.photo.picture.regions import InTiles
 from nlfilter_torch.photo.picture.resizing import resize, weights_of
 from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles
 from nlfilter_torch.photo.picture.source import (
@@ -43,8 +44,6 @@ from nlfilter_torch.photo.picture.source import (
     sampled_pairs,
     sampled_places,
 )
-from nlfilter_torch.photo.picture.tiled_scribbles import InTiles
-from nlfilter_torch.photo.picture.working_range import range_of
 
 
 class InMemory:

@@ -4,9 +4,7 @@ A change is limited in each pixel by :func:`limit`. The limits shift the mean br
 which :func:`balance_of` measures and :func:`balanced` corrects.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from typing import Literal
 
 import torch
@@ -16,6 +14,9 @@ from nlfilter_torch.core.precision import squarable
 from nlfilter_torch.core.torch_internals import is_hidden
 from nlfilter_torch.operator.features import reduce_channels
 from nlfilter_torch.photo.picture.colour import split_luminance
+from nlfilter_torch.photo.picture.measuring import mean_of
+from nlfilter_torch.photo.picture.pixels import Fitted, M
+from nlfilter_torch.photo.picture.source import Source
 
 HEADROOM_SHARE = 0.9  # share of its headroom towards white or black that a channel may use
 LEVEL = 1 / 255  # distance kept from white and black, an 8-bit level, so that rounding does not clip
@@ -24,9 +25,8 @@ MAX_SATURATION_GAIN = 2.0  # limit of the relative growth of saturation, as a mu
 MIN_LUMINANCE = 0.02  # lower limit of the luminance that the change of luminance is divided by
 MAX_CHROMA_LOSS = 0.01  # share of the mean chroma that may be lost in some pixels and made up for in others
 MAX_CURVE = 0.9  # limit of the parameter of the tone curve; 1 would make it flat at one end
-EPSILON = 1e-9
+EPSILON = 1e-9  # keeps quotients finite where a pixel has no headroom or chroma
 Limits = Literal["soft", "none"]
-MeanOf = Callable[[Callable[[Tensor, Tensor], Tensor]], Tensor]  # mean of a function of an image and its change
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,29 +116,29 @@ def clamped(image: Tensor, moved: Tensor, saturation: Tensor | None) -> tuple[Te
     return moved, torch.minimum(saturation, _share(image, luminance, chroma, moved))
 
 
-def balance_of(mean: MeanOf, brighter: float | Tensor = 0.0) -> Balance:
+def balance_of(source: Source[M], change: Fitted, brighter: float | Tensor = 0.0) -> Balance:
     """Compute the balance of a picture under a change of brightness.
 
     Args:
-        mean: returns the means (B, S, 1, 1) over the picture of a function of the image and its change, limited by
-            :func:`limit`; the function returns (B, S, H, W).
+        source: the picture.
+        change: of its brightness, limited by :func:`limit`.
         brighter: intended relative change of the mean brightness, (B, 1, 1, 1).
     """
     restraint: float | Tensor = 0.0
-    curve = _curve(mean, restraint, brighter)
-    lost, gained, chroma = _mean_chroma(mean, restraint, curve)
+    curve = _curve(source, change, restraint, brighter)
+    lost, gained, chroma = mean_of(source, change, _chroma, restraint, curve).chunk(3, dim=1)
     allowed = MAX_CHROMA_LOSS * chroma
     if is_hidden(lost) or bool((lost > allowed).any()):
         # With a constant curve, the loss is proportional to 1 - restraint.
         restraint = (1 - allowed / lost.clamp(min=EPSILON)).clamp(min=0.0)
-        curve = _curve(mean, restraint, brighter)
-        lost, gained, _ = _mean_chroma(mean, restraint, curve)
+        curve = _curve(source, change, restraint, brighter)
+        lost, gained, _ = mean_of(source, change, _chroma, restraint, curve).chunk(3, dim=1)
     return Balance(restraint, curve, (lost / gained.clamp(min=EPSILON)).clamp(max=1.0))
 
 
-def _curve(mean: MeanOf, restraint: float | Tensor, brighter: float | Tensor) -> Tensor:
+def _curve(source: Source[M], change: Fitted, restraint: float | Tensor, brighter: float | Tensor) -> Tensor:
     """:attr:`Balance.curve`, for a restraint."""
-    shift, before, room = mean(partial(_brightness, restraint=restraint)).chunk(3, dim=1)
+    shift, before, room = mean_of(source, change, _brightness, restraint).chunk(3, dim=1)
     return ((shift - brighter * before) / room.clamp(min=EPSILON)).clamp(-MAX_CURVE, MAX_CURVE)
 
 
@@ -146,11 +146,6 @@ def _brightness(image: Tensor, moved: Tensor, restraint: float | Tensor) -> Tens
     """Change of brightness under a restraint, the brightness before, and the change of the result by the tone curve."""
     before, moved = _before(image, moved), _restrained(image, moved, restraint)
     return torch.cat([moved, before, _bow(before + moved)], dim=1)
-
-
-def _mean_chroma(mean: MeanOf, restraint: float | Tensor, curve: Tensor) -> tuple[Tensor, ...]:
-    """Means of the lost chroma, of the chroma that can be gained, and of the chroma of the picture."""
-    return mean(partial(_chroma, restraint=restraint, curve=curve)).chunk(3, dim=1)
 
 
 def _chroma(image: Tensor, moved: Tensor, restraint: float | Tensor, curve: Tensor) -> Tensor:

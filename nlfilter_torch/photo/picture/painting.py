@@ -2,16 +2,18 @@
 
 import os
 from collections.abc import Callable, Iterator, Sequence
-from functools import lru_cache
+from functools import lru_cache, partial
 from itertools import pairwise
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
+from nlfilter_torch.photo.declared.rows import RowSource
 from nlfilter_torch.photo.declared.strokes import Mark, Region, Stroke
 from nlfilter_torch.photo.picture.drawn import Plane, Size, colour_of
-from nlfilter_torch.photo.picture.pictures import Picture, mask_of, transparency
+from nlfilter_torch.photo.picture.pictures import LazyRows, Picture, mask_of, stored_as, transparency
 
 Part = tuple[slice, slice]  # rows and columns of a picture
 Open = Callable[[str], Picture]  # opens the picture of marks at a path
@@ -266,3 +268,31 @@ class TensorPainter:
     def covers(self, planes: Tensor) -> bool:
         """Whether masks or colours cover a pixel."""
         return bool(planes.any())
+
+
+class RowPainter:
+    """Rasterises marks as they are read: to rows (H, W, K), of which only a few are in memory at once."""
+
+    def __init__(self, opened: Open = opened_picture) -> None:
+        self._opened = opened
+
+    def planes(self, shown: Sequence[Plane], size: Size, *, soft: bool = False, coloured: bool = False) -> RowSource:
+        """Return :func:`rasterised` marks."""
+        read = partial(_rasterised_rows, tuple(shown), size, soft=soft, coloured=coloured, opened=self._opened)
+        return LazyRows((*size, 3 * coloured + len(shown)), read)
+
+    def covers(self, planes: RowSource) -> bool:
+        """Whether masks or colours cover a pixel."""
+        return LazyRows(tuple(planes.shape), partial(plane_rows, planes), planes.dtype).any()
+
+
+def _rasterised_rows(
+    shown: Sequence[Plane], size: Size, rows: slice, *, soft: bool, coloured: bool, opened: Open
+) -> NDArray[np.generic]:
+    planes = rasterised(shown, size, rows, soft=soft, coloured=coloured, opened=opened)
+    return stored_as(planes, "float32")
+
+
+def plane_rows(planes: RowSource, rows: slice) -> NDArray[np.generic]:
+    """Some rows (h, W, K) of planes."""
+    return np.asarray(planes[rows])

@@ -20,8 +20,7 @@ from nlfilter_torch.photo.files.formats import Depth, check_depth, check_type, r
 from nlfilter_torch.photo.files.metadata import NO_EXTRAS, Extras, Header, Metadata
 from nlfilter_torch.photo.picture.developing import develop_planes, finished, in_light, limits_of
 from nlfilter_torch.photo.picture.pictures import Picture, put_back, stored_as, transparency
-
-CONVERTED = 1 << 18  # pixels that are converted at a time between files and floats
+from nlfilter_torch.photo.picture.pixels import STRIP
 
 
 @dataclass(frozen=True)
@@ -133,7 +132,7 @@ def _planes_of(channels: Stored, nodata: float | None, name: str) -> tuple[Tenso
     picture.accept_any_scale()  # until it is edited
     planes = torch.empty(1, channels.shape[2], *picture.size, dtype=picture.dtype)
     places = np.zeros(picture.size if picture.hides else (0, 0), np.bool_)
-    rows = max(CONVERTED // picture.size[1], 4 * REACH if picture.hides else 1)
+    rows = max(STRIP // picture.size[1], 4 * REACH if picture.hides else 1)
     for tile in picture.tiles(0, rows):
         part = slice(tile.start, tile.start + len(tile.stored))
         planes[:, : picture.colours, part] = tile.pixels
@@ -169,7 +168,7 @@ def write_photograph(photograph: Photograph, path: str | Path, *, quality: int |
     path = Path(path)
     check_output(path, photograph)
     planes = [photograph.pixels] if photograph.alpha is None else [photograph.pixels, photograph.alpha]
-    rows = max(1, CONVERTED // photograph.size[1])
+    rows = max(1, STRIP // photograph.size[1])
     parts = zip(*(plane.split(rows, dim=2) for plane in planes), strict=True)
     channels = np.concatenate([stored_as(torch.cat(part, dim=1), photograph.depth) for part in parts])  # (H, W, S)
     if photograph.hidden is not None:

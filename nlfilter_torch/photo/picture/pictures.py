@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator
 from copy import copy
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
@@ -17,7 +17,7 @@ from nlfilter_torch.operator.features import reduce_channels
 from nlfilter_torch.operator.hidden import REACH, fill_nearby
 from nlfilter_torch.operator.pixel_matrix import Columns
 from nlfilter_torch.photo.declared.rows import WHITE, RowSource, Stored, is_hidden
-from nlfilter_torch.photo.picture.pixels import Pixels, WorkingRange
+from nlfilter_torch.photo.picture.pixels import Pixels, WorkingRange, corner
 
 KINDS = ("uint8", "uint16", "float16", "float32", "float64")
 Rows = Iterator[tuple[slice, Stored]]  # with their position in the picture
@@ -97,10 +97,13 @@ class Tile:
 
     Attributes:
         start: index of the first of the rows.
-        convert: computes :attr:`pixels`, in the thread that first needs them.
+        picture: computes :attr:`pixels`, in the thread that first needs them.
+        read: (h', W, S), the rows with the halo as they are stored.
         halo: number of additional rows at the top and at the bottom.
-        stored: (h, W, S), the rows themselves as they are stored.
+        stored: (h, W, S), the rows themselves.
         width: W of the picture.
+        beyond: numbers of rows in ``read`` above and below the halo, if hidden pixels take colours of pixels nearby.
+        known: :attr:`pixels`, if they were computed from those of another tile.
         left: column of the picture that ``stored`` begins with.
         inside: columns of the rectangle in ``stored``; None is all.
         counted: how much the pixels of the picture count; None is 1 each.
@@ -108,10 +111,13 @@ class Tile:
     """
 
     start: int
-    convert: Callable[[], Tensor]
+    picture: "Picture"
+    read: Stored
     halo: tuple[int, int]
     stored: Stored
     width: int
+    beyond: tuple[int, int] | None = None
+    known: Tensor | None = None
     left: int = 0
     inside: slice | None = None
     counted: "Opacity | None" = None
@@ -127,7 +133,7 @@ class Tile:
         Raises:
             ValueError: if they are not finite.
         """
-        return self.convert()
+        return self.picture.pixels_of(self) if self.known is None else self.known
 
     @property
     def origin(self) -> tuple[int, int]:
@@ -158,7 +164,7 @@ class Tile:
 
     def in_range(self, working: WorkingRange | None) -> "Tile":
         """The tile of the same picture in a range of values."""
-        return self if working is None else replace(self, convert=partial(_seen, self, working))
+        return self if working is None else replace(self, known=working.seen(self.pixels))
 
     def parts(self, rows: int) -> "Iterator[Tile]":
         """Split the tile into groups of rows, whose features are computed at once."""
@@ -167,7 +173,7 @@ class Tile:
             yield replace(
                 self,
                 start=self.start + first,
-                convert=partial(_rows_of_tile, self, part),
+                known=self.pixels[:, :, self.halo[0] + part.start : self.halo[0] + part.stop],
                 halo=(0, 0),
                 stored=self.stored[part],
                 whole=(self, part),
@@ -195,14 +201,6 @@ class Tile:
             self._layers.clear()
             self._layers[planes] = planes.compute(self)
         return self._layers[planes]
-
-
-def _seen(tile: Tile, working: WorkingRange) -> Tensor:
-    return working.seen(tile.pixels)
-
-
-def _rows_of_tile(tile: Tile, part: slice) -> Tensor:
-    return tile.pixels[:, :, tile.halo[0] + part.start : tile.halo[0] + part.stop]
 
 
 class Picture:
@@ -273,11 +271,32 @@ class Picture:
         first, last = max(start - margin, 0), min(stop + margin, self.size[0])
         stored = self._read(first, last)
         halo = (start - first, last - stop)
-        convert = partial(self._converted, stored)
-        if self.hides and is_hidden(stored).any():
-            above, below = self._read(max(first - REACH, 0), first), self._read(last, min(last + REACH, self.size[0]))
-            convert = partial(self._filled, np.concatenate([above, stored, below]), len(above), last - first)
-        return Tile(start, convert, halo, stored[halo[0] : last - first - halo[1]], self.size[1]).in_range(self.working)
+        tile = Tile(start, self, stored, halo, stored[halo[0] : last - first - halo[1]], self.size[1])
+        if not (self.hides and is_hidden(stored).any()):
+            return tile
+        above, below = self._read(max(first - REACH, 0), first), self._read(last, min(last + REACH, self.size[0]))
+        return replace(tile, read=np.concatenate([above, stored, below]), beyond=(len(above), len(below)))
+
+    def pixels_of(self, tile: Tile) -> Tensor:
+        """The colours (1, C, h, W) of a tile with its halo, as they are seen; hidden ones are those of pixels nearby.
+
+        Raises:
+            ValueError: if they are not finite.
+        """
+        if tile.beyond is None:
+            image = self._converted(tile.read)
+        else:
+            above, hidden = tile.beyond[0], is_hidden(tile.read)
+            image = self._converted(np.where(hidden[..., None], tile.read.dtype.type(0), tile.read))
+            filled = fill_nearby(image, torch.from_numpy(~hidden)[None, None])
+            image = filled[:, :, above : len(hidden) - tile.beyond[1]]
+        return image if self.working is None else self.working.seen(image)
+
+    def weights(self, pixels: Pixels) -> Tensor:
+        """The values (1, K, h, w) in [0, 1] at the places of pixels of another picture of the same size."""
+        (top, left), (height, width) = corner(pixels), pixels.image.shape[-2:]
+        planes = self.tile(top, top + height, 0).pixels[..., left : left + width]
+        return planes.to(pixels.image).clamp(0.0, 1.0)
 
     def _read(self, first: int, last: int) -> Stored:
         """The rows (h, W, S) from ``first`` to ``last``."""
@@ -295,12 +314,6 @@ class Picture:
     def opacity(self, start: int, stop: int) -> Stored:
         """The transparency (h, W) of rows, as it is stored."""
         return self._read(start, stop)[..., -1].copy()
-
-    def _filled(self, stored: Stored, first: int, count: int) -> Tensor:
-        """The colours (1, C, count, W) of ``count`` rows of (h, W, S), from ``first`` on, without hidden ones."""
-        hidden = is_hidden(stored)
-        image = self._converted(np.where(hidden[..., None], stored.dtype.type(0), stored))
-        return fill_nearby(image, torch.from_numpy(~hidden)[None, None])[:, :, first : first + count]
 
     def _converted(self, stored: Stored) -> Tensor:
         """The colours (1, C, h, W) of rows (h, W, S)."""

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol, TypeVar
+from typing import Protocol, TypeVar, TypeVarTuple
 
 import torch
 from torch import Tensor
@@ -12,6 +12,7 @@ from nlfilter_torch.core.blocks import Inner, block_length
 STRIP = 1 << 18  # pixels that a core computes at a time; with fewer, cores wait for each other if other programs run
 #: Rectangles around objects: ``(left, top, right, bottom)`` in pixels for all regions, or a tensor (B, K, 4) for each.
 Box = Sequence[float] | Tensor
+Rest = TypeVarTuple("Rest")
 M = TypeVar("M")  # masks and colours of pixels as a source takes them: tensors in memory, rows in tiles
 
 
@@ -190,12 +191,14 @@ class Fitted:
     gives_picture: bool = True
     opacity: float = 1.0
 
-    def then(self, function: Callable[[Tensor, Tensor], Tensor]) -> "Fitted":
-        """Apply a pointwise function of the image and of the result."""
+    def then(self, function: Callable[[Tensor, Tensor, *Rest], Tensor], *arguments: *Rest) -> "Fitted":
+        """Apply a pointwise function of the image and of the result, which takes further arguments."""
         finish = self.finish
         if finish is None:
-            return replace(self, pixels=lambda pixels: function(pixels.image, self.pixels(pixels)))
-        return replace(self, finish=lambda image, planes, inner: function(image, finish(image, planes, inner)))
+            return replace(self, pixels=lambda pixels: function(pixels.image, self.pixels(pixels), *arguments))
+        return replace(
+            self, finish=lambda image, planes, inner: function(image, finish(image, planes, inner), *arguments)
+        )
 
     def output(self, image: Tensor, result: Tensor) -> Tensor:
         """What leaves the edit, in the units of the picture: from pixels of it and the result for them as seen."""

@@ -1,9 +1,8 @@
 """Resizing of pictures: interpolation a few rows at a time, means over blocks, and enlarging of blocks."""
 
 import math
-from collections import deque
-from collections.abc import Callable, Iterator
-from functools import partial
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
@@ -28,40 +27,43 @@ def resized(
 
     ``read`` returns rows of the picture (H, W); ``wanted`` is its new size.
     """
-    parts = resized_parts(lambda start, stop: partial(read, start, stop), size, wanted, rows, columns)
-    return torch.cat([part() for part in parts], dim=2)
+    parts = resized_parts(size, wanted, rows, columns)
+    return torch.cat([part.of(read(piece.start, piece.stop) for piece in part.pieces) for part in parts], dim=2)
 
 
 def resized_parts(
-    read: Callable[[int, int], Callable[[], Tensor]],
-    size: tuple[int, int],
-    wanted: tuple[int, int],
-    rows: range | None = None,
-    columns: range | None = None,
-) -> Iterator[Callable[[], Tensor]]:
-    """Yield parts of :func:`resized`, a few rows each.
-
-    Rows are read here; the function that ``read`` returns for them is called when the part is.
-    """
+    size: tuple[int, int], wanted: tuple[int, int], rows: range | None = None, columns: range | None = None
+) -> Iterator["ResizedPart"]:
+    """Yield the parts of which :func:`resized` joins a picture, a few rows each."""
     rows = range(wanted[0]) if rows is None else rows
     across = None if columns is None else interpolation(columns, size[1], wanted[1])
     for start in range(rows.start, rows.stop, BLOCK):
         used, weights = interpolation(range(start, min(start + BLOCK, rows.stop)), size[0], wanted[0])
         step = max(1, PIECE // size[1])
-        pieces = deque(read(first, min(first + step, used.stop)) for first in range(used.start, used.stop, step))
-        yield partial(_part, pieces, weights, across, wanted[1])
+        pieces = [slice(first, min(first + step, used.stop)) for first in range(used.start, used.stop, step)]
+        yield ResizedPart(pieces, weights, across, wanted[1])
 
 
-def _part(
-    pieces: deque[Callable[[], Tensor]], weights: Tensor, across: tuple[slice, Tensor] | None, width: int
-) -> Tensor:
-    """Interpolate rows from the rows of the picture that they depend on, in a few pieces, and weights.
+@dataclass(frozen=True, eq=False)
+class ResizedPart:
+    """Some rows of a resized picture.
 
-    A piece that was used, which may keep its pixels, is dropped.
+    Attributes:
+        pieces: the rows of the picture that they depend on, a few at a time.
+        weights: of these rows, (h, n).
+        across: the columns of the picture that they depend on, and their weights; None if all columns are wanted.
+        width: of the resized picture.
     """
-    parts = [_along_rows(pieces.popleft()(), across, width) for _ in range(len(pieces))]
-    planes = torch.cat(parts, dim=2)
-    return torch.einsum("rn,bcnw->bcrw", weights.to(planes), planes)
+
+    pieces: list[slice]
+    weights: Tensor
+    across: tuple[slice, Tensor] | None
+    width: int
+
+    def of(self, pieces: Iterable[Tensor]) -> Tensor:
+        """Interpolate the rows from the pieces (B, C, n, W), each of which is used before the next is read."""
+        planes = torch.cat([_along_rows(piece, self.across, self.width) for piece in pieces], dim=2)
+        return torch.einsum("rn,bcnw->bcrw", self.weights.to(planes), planes)
 
 
 def _along_rows(planes: Tensor, across: tuple[slice, Tensor] | None, width: int) -> Tensor:
@@ -105,14 +107,10 @@ def resized_part(rows: Tensor, start: int, size: tuple[int, int], wanted: tuple[
     return first, torch.cat(parts, dim=2)
 
 
-def resize(planes: Tensor, size: tuple[int, int]) -> Tensor:
+def resize(planes: Tensor, wanted: tuple[int, int], rows: range | None = None, columns: range | None = None) -> Tensor:
     """Resize planes (B, C, H, W), see :func:`resized`."""
-    return resized(partial(rows_of, planes), (planes.shape[-2], planes.shape[-1]), size)
-
-
-def rows_of(planes: Tensor, start: int, stop: int) -> Tensor:
-    """Rows of planes (B, C, H, W)."""
-    return planes[:, :, start:stop]
+    parts = resized_parts((planes.shape[-2], planes.shape[-1]), wanted, rows, columns)
+    return torch.cat([part.of(planes[:, :, piece] for piece in part.pieces) for part in parts], dim=2)
 
 
 def cubic(distance: Tensor) -> Tensor:

@@ -7,7 +7,6 @@ for the sums that define the filter, favours rare pixels and has no gaps.
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 import torch
@@ -26,14 +25,7 @@ from nlfilter_torch.operator.features import (
 from nlfilter_torch.operator.landmarks import candidate_pixels, condense
 from nlfilter_torch.operator.nystrom import inverse_cholesky
 from nlfilter_torch.operator.operator import Kernel
-from nlfilter_torch.operator.options import (
-    FilterOptions,
-    GuideChannels,
-    Sampling,
-    check_bandwidths,
-    check_options,
-    landmark_count,
-)
+from nlfilter_torch.operator.options import Sampling, check_bandwidths, check_options, landmark_count
 from nlfilter_torch.operator.orientation import (
     ORIENTATIONS,
     Layout,
@@ -63,21 +55,21 @@ def in_silence(stage: str, done: int, rows: int) -> None:
     """Report nothing."""
 
 
-class GuidePicture(Picture):
+@dataclass(eq=False)
+class GuidePicture:
     """The guide of a picture.
 
     Attributes:
         picture: whose guide this is.
         guide: computes the guide from the picture.
-        stored: the whole guide (1, C, H, W), if kept in memory.
         counted: how much its pixels count; None is 1 each.
+        stored: the whole guide (1, C, H, W), if kept in memory.
     """
 
-    def __init__(self, picture: Picture, guide: Guide, counted: CountedPixels | None = None) -> None:
-        super().__init__(picture.source, picture.name, hides=picture.hides)
-        self.checks_scale, self.working = picture.checks_scale, picture.working
-        self.picture, self.guide, self.counted = picture, guide, counted
-        self.stored: Tensor | None = None
+    picture: Picture
+    guide: Guide
+    counted: CountedPixels | None = None
+    stored: Tensor | None = None
 
     def __getstate__(self) -> dict[str, object]:
         """The guide in another process, which computes it from the picture."""
@@ -93,7 +85,7 @@ class GuidePicture(Picture):
         tiles = self.picture.tiles(self.margin, rows)
         for start, part in in_order(self._start_and_guide, tiles, workers):
             if planes is None:
-                planes = part.new_empty(*part.shape[:2], *self.size)
+                planes = part.new_empty(*part.shape[:2], *self.picture.size)
             planes[:, :, start : start + part.shape[2]] = part
         self.stored = planes
 
@@ -106,29 +98,17 @@ class GuidePicture(Picture):
         """Number of pixels around a pixel that are read to compute its guide."""
         return 0 if self.stored is not None else self.guide.margin
 
-    def tile(self, start: int, stop: int, margin: int) -> Tile:
-        """Read a tile of the guide, as :meth:`Picture.tile`."""
-        return self.seen(super().tile(start, stop, margin + self.margin), margin)
-
     def seen(self, tile: Tile, margin: int) -> Tile:
         """The guide, with ``margin``, of a tile of the picture that has a margin large enough to compute it."""
         stop = tile.start + tile.stored.shape[0]
-        halo = (min(tile.start, margin), min(self.size[0] - stop, margin))
+        halo = (min(tile.start, margin), min(self.picture.size[0] - stop, margin))
         if self.stored is not None:
             columns = slice(tile.left, tile.left + tile.stored.shape[1])
-            stored = self.stored[:, :, tile.start - halo[0] : stop + halo[1], columns]
-            return replace(tile, convert=partial(_unchanged, stored), halo=halo)
-        return replace(tile, convert=partial(self._computed, tile, halo), halo=halo)
-
-    def _computed(self, tile: Tile, halo: tuple[int, int]) -> Tensor:
-        """The guide of a tile of the picture and of a halo of rows around it."""
+            return replace(tile, known=self.stored[:, :, tile.start - halo[0] : stop + halo[1], columns], halo=halo)
         above, below = (min(have, want + self.guide.margin) for have, want in zip(tile.halo, halo, strict=True))
         image = tile.pixels[:, :, tile.halo[0] - above : tile.pixels.shape[2] - tile.halo[1] + below]
-        return self.guide(image)[:, :, above - halo[0] : image.shape[2] - below + halo[1]]
-
-
-def _unchanged(planes: Tensor) -> Tensor:
-    return planes
+        guide = self.guide(image)[:, :, above - halo[0] : image.shape[2] - below + halo[1]]
+        return replace(tile, known=guide, halo=halo)
 
 
 class ColumnCache:
@@ -158,7 +138,7 @@ class PassOverPicture:
     """A pass over every pixel of a picture, or over those of a sample.
 
     Attributes:
-        picture: guide of the picture.
+        guide: of the picture.
         kernel: computes the columns of the pixels.
         report: called with the progress of the ``stage``.
         stage: name for the progress.
@@ -167,7 +147,7 @@ class PassOverPicture:
         sample: blocks of the pixels of the sample, if only these are visited.
     """
 
-    picture: GuidePicture
+    guide: GuidePicture
     kernel: Kernel
     report: Report
     stage: str
@@ -181,9 +161,9 @@ class PassOverPicture:
             self.report(self.stage, 0, 1)
             yield from in_order(function, self.sample, self.workers, *arguments)
             return
-        picture = self.picture
+        picture = self.guide.picture
         height, rows = picture.size[0], picture.statistics_rows
-        tiles = picture.picture.tiles(self._radius + picture.margin, rows)
+        tiles = picture.tiles(self._radius + self.guide.margin, rows)
         self.report(self.stage, 0, height)
         results = in_order(self._applied, tiles, self.workers, function, *arguments)
         for number, result in enumerate(results, start=1):
@@ -202,10 +182,10 @@ class PassOverPicture:
         image, first = tile.image.flatten(2), tile.first
         columns = self.cache.find(slice(first, first + image.shape[2]))
         if columns is None:
-            guide = self.picture.seen(tile, self._radius)
+            guide = self.guide.seen(tile, self._radius)
             columns = self.kernel.columns(guide.pixels, origin=guide.origin, halo=guide.halo)
             self.cache.keep(first, columns)
-        weights, ones = self.picture.weights(tile), torch.ones_like(columns[1])
+        weights, ones = self.guide.weights(tile), torch.ones_like(columns[1])
         weights = ones if weights is None else weights.to(ones).view_as(ones)
         return Block(*columns, weights, image=image, start_row=tile.start)
 
@@ -232,142 +212,59 @@ class Pilot:
         return self.kernel.completion == "diagonal"
 
 
-@dataclass(frozen=True)
-class PatchReader:
-    """Reads the patches and colours of chosen pixels of a tile, and measures its gradient and orientation.
-
-    Attributes:
-        picture: guide of the picture.
-        patch_size: width of a patch in pixels.
-        guide_channels: channels of the guide that are compared.
-        measures_gradient: whether the gradient is needed; it is 0 otherwise.
-    """
-
-    picture: GuidePicture
-    patch_size: int
-    guide_channels: GuideChannels
-    measures_gradient: bool
-
-    @property
-    def margin(self) -> int:
-        """Number of rows of the guide around a tile that are read."""
-        return max(self.patch_size // 2, 1)
-
-    def __call__(self, part: tuple[Tile, Tensor]) -> tuple[Tensor, Tensor, float, Tensor, Tensor]:
-        """Patches (1, C p^2, n) and colours (1, C, n) of the pixels, and two sums over all pixels of the tile.
-
-        These are the sum of the gradients, and those of :func:`orientation_sums`, (1, C, 6, 6). If pixels differ in how
-        much they count, they are those of :func:`counted_sums`, to which the limits of the values belong.
-        """
-        tile, chosen = part
-        seen = self.picture.seen(tile, self.margin)
-        guide = reduce_channels(seen.pixels, self.guide_channels)
-        gradient, weights = 0.0, self.picture.weights(tile)
-        if self.measures_gradient:
-            gradient = self._gradient(guide, seen, weights)
-        rows = guide[:, :, seen.halo[0] : guide.shape[2] - seen.halo[1]]
-        counted = self.picture.counted
-        if counted is None:
-            sums = orientation_sums(rows, tile.start, self.picture.size), rows.new_tensor([0.0, 1.0])
-        else:
-            sums = counted_sums(rows, tile.start, counted)
-        return patches_at(guide, seen, chosen, self.patch_size), tile.image.flatten(2)[:, :, chosen], gradient, *sums
-
-    def _gradient(self, guide: Tensor, seen: Tile, weights: Tensor | None) -> float:
-        """Sum of the gradients of a tile's guide, times the weights (1, 1, h, W) of its pixels."""
-        counted, (above, below) = self.picture.counted, seen.halo
-        if counted is None or weights is None:
-            return float(gradients(guide, seen.halo).double().mean((0, 1)).sum())
-        counts = counted.rows(seen.start - above, seen.start + guide.shape[2] - above) > 0
-        slopes = gradients_within(guide, counts)[:, :, above : guide.shape[2] - below]
-        return float((slopes.double().mean((0, 1)) * weights[0, 0]).sum())
-
-
 def take_pilot(picture: GuidePicture, report: Report, workers: int = 1) -> Pilot:
     """Compute bandwidth, landmarks and an initial balancing in one pass over the picture.
 
     Bandwidth and landmarks are those of :func:`nonlocal_operator`, to rounding.
     """
-    options = picture.guide.options
+    options, counted = picture.guide.options, picture.counted
     check_options(options)
     check_bandwidths(options)
-    recipe = GuideFeatures.of(options, options.bandwidth_or(lambda: 1.0), picture.dtype)
-    count = landmark_count(options, picture.pixels)
-    if picture.counted is not None:
-        count = min(count, picture.counted.count)
-
+    recipe = GuideFeatures.of(options, options.bandwidth_or(lambda: 1.0), picture.picture.dtype)
+    count = landmark_count(options, picture.picture.pixels)
+    if counted is not None:
+        count = min(count, counted.count)
     generator = torch.Generator().manual_seed(0) if options.generator is None else options.generator
-    reader = PatchReader(
-        picture, options.patch_size, options.guide_channels, isinstance(options.photometric_bandwidth, str)
-    )
-    options = replace(options, num_landmarks=count, generator=generator)
-    look = Look(reader, recipe, options, report, workers)
-    sample = look.at_all() if picture.counted is None else look.at_counted(picture.counted)
-    with single_threaded(workers):  # so few pixels that a second thread would wait most of the time
-        points = condense(sample.subset, count, generator, sample.canonical)
-        kernel = Kernel(points, inverse_cholesky(points), options.completion, features=sample.recipe)
-        columns = kernel.factor(sample.features)
-        block = Block(*columns, sample.weights, image=sample.image)
-        completed = options.completion == "diagonal"
-        balancing = solve(block, PILOT_TOLERANCE, completed)
-        warn_of_residual(balancing.residual, PILOT_TOLERANCE, picture.dtype, completed=completed)
-        return Pilot(kernel, block, balancing.moment, sample.seed)
-
-
-@dataclass(frozen=True, eq=False)
-class PilotSample:
-    """What a pilot is computed from.
-
-    Attributes:
-        recipe: of the features.
-        subset: features (1, D, S) of the candidates for landmarks.
-        canonical: those by which they are clustered, for the canonical orientation.
-        features: of an even sample of the pixels, (1, D, n).
-        image: their colours, (1, C, n).
-        weights: number of pixels that each represents, (1, n).
-        seed: for further samples.
-    """
-
-    recipe: GuideFeatures
-    subset: Tensor
-    canonical: Tensor
-    features: Tensor
-    image: Tensor
-    weights: Tensor
-    seed: int
+    assert isinstance(options.landmarks, str)  # for mypy
+    look = Look(picture, recipe, count, options.landmarks, generator, report, workers)
+    return look.at_all() if counted is None else look.at_counted(counted)
 
 
 @dataclass(frozen=True, eq=False)
 class Look:
-    """The first look at a picture.
+    """The first look at a picture, from which its pilot is computed.
 
     Attributes:
-        reader: reads patches of its guide, and measures the gradient if the photometric bandwidth is automatic.
+        guide: of the picture.
         recipe: of the features, with the photometric bandwidth unless that is automatic.
-        options: of choosing landmarks, with their number.
+        count: number of landmarks.
+        sampling: how they are chosen.
+        generator: for this choice.
         report: called with the progress.
         workers: number of tiles looked at at once.
     """
 
-    reader: PatchReader
+    guide: GuidePicture
     recipe: GuideFeatures
-    options: FilterOptions
+    count: int
+    sampling: Sampling
+    generator: torch.Generator
     report: Report
     workers: int
 
     @property
-    def picture(self) -> GuidePicture:
-        """The guide of the picture."""
-        return self.reader.picture
+    def picture(self) -> Picture:
+        """The picture."""
+        return self.guide.picture
 
-    def at_all(self) -> PilotSample:
-        """The sample of a picture all of whose pixels count, in one pass."""
-        picture, count, generator = self.picture, self.options.num_landmarks, self._generator
-        drawn = candidate_pixels(picture.size, count, self._sampling, generator).cpu()
+    def at_all(self) -> Pilot:
+        """The pilot of a picture all of whose pixels count, in one pass."""
+        picture, count, generator = self.picture, self.count, self.generator
+        drawn = candidate_pixels(picture.size, count, self.sampling, generator).cpu()
         rest = torch.Generator().manual_seed(int(drawn.sum()) % 2**32)  # ``generator`` is for the landmarks alone
         even = stratified(picture.pixels, min(PILOT, picture.pixels), rest)
         # The orientation of the picture, which decides which pixels are candidates, is known after the pass.
-        turned = self._sampling == "kmeans" and len(drawn) > count
+        turned = self.sampling == "kmeans" and len(drawn) > count
         candidates = source_pixels(torch.arange(ORIENTATIONS if turned else 1), picture.size, drawn)
         wanted = torch.cat([candidates.flatten(), even])
         patches, values, slope, total = self._read(wanted)
@@ -378,21 +275,14 @@ class Look:
         first = int(orientation.numbers) * len(drawn)
         used = torch.cat([torch.arange(first, first + len(drawn)), torch.arange(candidates.numel(), len(wanted))])
         features = scaled_patches(patches[:, :, used], wanted[used], picture, recipe)
-        subset = features[:, :, : len(drawn)]
-        places = source_pixels(orientation.numbers, picture.size, drawn, flipped=False)[0]
-        return PilotSample(
-            recipe,
-            subset,
-            self._canonical(subset, orientation, places, picture.size[1]),
-            features[:, :, len(drawn) :],
-            values[:, :, candidates.numel() :],
-            torch.full((1, len(even)), picture.pixels / len(even), dtype=picture.dtype),
-            rest.initial_seed(),
-        )
+        weights = torch.full((1, len(even)), picture.pixels / len(even), dtype=picture.dtype)
+        image, subset, rest_of = values[:, :, candidates.numel() :], *features.tensor_split([len(drawn)], dim=2)
+        kernel = self._kernel(recipe, subset, orientation, drawn, picture.size)
+        return self._pilot(kernel, rest_of, image, weights, rest)
 
-    def at_counted(self, counted: CountedPixels) -> PilotSample:
-        """The sample of the pixels of a picture that count, in two passes, of which the second reads candidates."""
-        picture, count, generator = self.picture, self.options.num_landmarks, self._generator
+    def at_counted(self, counted: CountedPixels) -> Pilot:
+        """The pilot of the pixels of a picture that count, in two passes, of which the second reads candidates."""
+        picture, count, generator = self.picture, self.count, self.generator
         rest = torch.Generator().manual_seed(generator.initial_seed() % 2**32)
         wanted = min(picture.pixels, math.ceil(PILOT * picture.pixels / counted.count))
         spread = stratified(picture.pixels, wanted, rest)
@@ -402,61 +292,108 @@ class Look:
         patches, image, slope, total = self._read(even)
         recipe = self._with_bandwidth(slope / counted.total)
         orientation = Orientation(torch.zeros(1, dtype=torch.long))
-        if self._sampling == "kmeans" and count < counted.count:
+        if self.sampling == "kmeans" and count < counted.count:
             orientation = orientation_of(total, patches.shape[1] // recipe.patch_weights.numel())
-        drawn = counted.candidates(count, self._sampling, generator, int(orientation.numbers))
+        drawn = counted.candidates(count, self.sampling, generator, int(orientation.numbers))
         candidates = counted.whole(source_pixels(orientation.numbers, counted.box, drawn)[0])
         subset = scaled_patches(self._read(candidates)[0], candidates, picture, recipe)
-        places = source_pixels(orientation.numbers, counted.box, drawn, flipped=False)[0]
-        represented = counted.at(even).to(picture.dtype) * (counted.count / len(even))
-        return PilotSample(
-            recipe,
-            subset,
-            self._canonical(subset, orientation, places, counted.box[1]),
-            scaled_patches(patches, even, picture, recipe),
-            image,
-            represented.unsqueeze(0),
-            rest.initial_seed(),
-        )
+        kernel = self._kernel(recipe, subset, orientation, drawn, counted.box)
+        weights = counted.at(even).to(picture.dtype) * (counted.count / len(even))
+        return self._pilot(kernel, scaled_patches(patches, even, picture, recipe), image, weights.unsqueeze(0), rest)
 
-    @property
-    def _generator(self) -> torch.Generator:
-        assert self.options.generator is not None  # for mypy
-        return self.options.generator
+    def _kernel(
+        self, recipe: GuideFeatures, subset: Tensor, orientation: Orientation, drawn: Tensor, size: tuple[int, int]
+    ) -> Kernel:
+        """The kernel with landmarks from candidates.
 
-    @property
-    def _sampling(self) -> Sampling:
-        assert isinstance(self.options.landmarks, str)  # for mypy
-        return self.options.landmarks
+        Args:
+            recipe: of the features.
+            subset: features (1, D, S) of the candidates.
+            orientation: in which they are clustered, so that landmarks turn with the picture.
+            drawn: numbers of the candidates in that orientation.
+            size: (H, W) of the part of the picture in which they are numbered.
+        """
+        layout, coordinates = Layout(self.guide.guide.options.patch_size, recipe.spatial_bandwidth is not None), None
+        if layout.coordinates:
+            places = source_pixels(orientation.numbers, size, drawn, flipped=False)[0]
+            located = torch.stack([places // size[1], places % size[1]]).to(recipe.patch_weights)
+            coordinates = recipe.coordinates(located).to(subset)
+        canonical = canonical_points(subset, orientation, layout, coordinates)
+        with single_threaded(self.workers):  # so few pixels that a second thread would wait most of the time
+            points = condense(subset, self.count, self.generator, canonical)
+            completion = self.guide.guide.options.completion
+            return Kernel(points, inverse_cholesky(points), completion, features=recipe)
+
+    def _pilot(self, kernel: Kernel, features: Tensor, image: Tensor, weights: Tensor, rest: torch.Generator) -> Pilot:
+        """Balance an even sample of the pixels.
+
+        Args:
+            kernel: of the filter.
+            features: of the sample, (1, D, n).
+            image: its colours, (1, C, n).
+            weights: number of pixels that each represents, (1, n).
+            rest: for further samples.
+        """
+        completed = kernel.completion == "diagonal"
+        with single_threaded(self.workers):
+            block = Block(*kernel.factor(features), weights, image=image)
+            balancing = solve(block, PILOT_TOLERANCE, completed)
+        warn_of_residual(balancing.residual, PILOT_TOLERANCE, self.picture.dtype, completed=completed)
+        return Pilot(kernel, block, balancing.moment, rest.initial_seed())
 
     def _read(self, wanted: Tensor) -> tuple[Tensor, Tensor, float, Tensor]:
-        """What the reader returns for pixels, in their order, and its sums over the picture."""
+        """Patches (1, C p^2, n) and colours (1, C, n) of pixels, in their order, and two sums over the picture.
+
+        These are the sum of the gradients, and those of :func:`orientation_sums`, (1, C, 6, 6).
+        """
         ascending = wanted.sort()
-        margin = self.reader.margin + self.picture.margin
-        parts = visit(self.picture.picture, margin, ascending.values, self.report, "Looking")
-        patches, values, slopes, sums, ends = zip(*in_order(self.reader, parts, self.workers), strict=True)
+        margin = self._margin + self.guide.margin
+        parts = visit(self.picture, margin, ascending.values, self.report, "Looking")
+        patches, values, slopes, sums, ends = zip(*in_order(self._read_tile, parts, self.workers), strict=True)
         order = torch.empty_like(wanted)
         order[ascending.indices] = torch.arange(len(wanted))  # position of each wanted pixel in reading order
         total, limits = torch.stack(sums).sum(0), torch.stack(ends)
-        if self.picture.counted is not None:
+        if self.guide.counted is not None:
             least, most = float(limits[:, 0].amin()), float(limits[:, 1].amax())
             total = stretched_sums(total[:, :-1], total[:, -1:], least, most)
         return torch.cat(patches, dim=2)[:, :, order], torch.cat(values, dim=2)[:, :, order], sum(slopes), total
 
+    @property
+    def _margin(self) -> int:
+        """Number of rows of the guide around a tile that are read."""
+        return max(self.guide.guide.options.patch_size // 2, 1)
+
+    def _read_tile(self, part: tuple[Tile, Tensor]) -> tuple[Tensor, Tensor, float, Tensor, Tensor]:
+        """What :meth:`_read` returns for chosen pixels of a tile, with the limits of its values.
+
+        If pixels differ in how much they count, the sums are those of :func:`counted_sums`, to which the limits belong.
+        """
+        tile, chosen = part
+        seen, options, counted = self.guide.seen(tile, self._margin), self.guide.guide.options, self.guide.counted
+        guide = reduce_channels(seen.pixels, options.guide_channels)
+        gradient = self._gradient(guide, seen) if isinstance(options.photometric_bandwidth, str) else 0.0
+        rows = guide[:, :, seen.halo[0] : guide.shape[2] - seen.halo[1]]
+        if counted is None:
+            sums = orientation_sums(rows, tile.start, self.picture.size), rows.new_tensor([0.0, 1.0])
+        else:
+            sums = counted_sums(rows, tile.start, counted)
+        return patches_at(guide, seen, chosen, options.patch_size), tile.image.flatten(2)[:, :, chosen], gradient, *sums
+
+    def _gradient(self, guide: Tensor, seen: Tile) -> float:
+        """Sum of the gradients of a tile's guide, times the weights of its pixels."""
+        weights, counted, (above, below) = self.guide.weights(seen), self.guide.counted, seen.halo
+        if counted is None or weights is None:
+            return float(gradients(guide, seen.halo).double().mean((0, 1)).sum())
+        counts = counted.rows(seen.start - above, seen.start + guide.shape[2] - above) > 0
+        slopes = gradients_within(guide, counts)[:, :, above : guide.shape[2] - below]
+        return float((slopes.double().mean((0, 1)) * weights[0, 0]).sum())
+
     def _with_bandwidth(self, slope: float) -> GuideFeatures:
         """The recipe, with the bandwidth for a mean slope if it is automatic."""
-        if not self.reader.measures_gradient:
+        if not isinstance(self.guide.guide.options.photometric_bandwidth, str):
             return self.recipe
         bandwidth = float(bandwidth_of_gradient(torch.tensor(slope, dtype=torch.float64)))
         return replace(self.recipe, photometric_bandwidth=bandwidth)
-
-    def _canonical(self, subset: Tensor, orientation: Orientation, places: Tensor, width: int) -> Tensor:
-        """Features of candidates for the canonical orientation; ``places`` are in a picture of some width."""
-        layout, coordinates = Layout(self.reader.patch_size, self.recipe.spatial_bandwidth is not None), None
-        if layout.coordinates:
-            located = torch.stack([places // width, places % width]).to(self.recipe.patch_weights)
-            coordinates = self.recipe.coordinates(located).to(subset)
-        return canonical_points(subset, orientation, layout, coordinates)
 
 
 def counted_sums(rows: Tensor, first_row: int, counted: CountedPixels) -> tuple[Tensor, Tensor]:
@@ -510,13 +447,8 @@ def scaled_patches(patches: Tensor, pixels: Tensor, picture: Picture, recipe: Gu
     features = patches * scale.reshape(1, 1, -1, 1).expand(1, channels, -1, 1).reshape(1, -1, 1)
     if recipe.spatial_bandwidth is None:
         return features
-    return torch.cat([features, coordinates_of(pixels, picture, recipe).to(features)], dim=1)
-
-
-def coordinates_of(pixels: Tensor, picture: Picture, recipe: GuideFeatures) -> Tensor:
-    """Features (1, 2, n) of the rows and columns of pixels with the indices (n,)."""
     places = torch.stack([pixels // picture.size[1], pixels % picture.size[1]])
-    return recipe.coordinates(places.to(recipe.patch_weights))
+    return torch.cat([features, recipe.coordinates(places.to(recipe.patch_weights)).to(features)], dim=1)
 
 
 EVEN_SHARE = 0.1  # share of a sample that is spread evenly over the picture

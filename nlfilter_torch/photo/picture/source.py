@@ -20,7 +20,7 @@ rows with its halo, and a :class:`Tiling`, rows to write.
 import math
 from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Concatenate, ParamSpec, Protocol, TypeVar, TypeVarTuple, cast, runtime_checkable
+from typing import Concatenate, ParamSpec, Protocol, TypeVar, cast, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -36,13 +36,13 @@ from nlfilter_torch.photo.picture.pixels import Block, M, WorkingRange
 from nlfilter_torch.photo.picture.pixels import Fitted as Fitted
 from nlfilter_torch.photo.picture.pixels import Pixels as Pixels
 from nlfilter_torch.photo.picture.pixels import Planes as Planes
+from nlfilter_torch.photo.picture.pixels import Rest as Rest
 from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles
 
 SAMPLE = 1 << 15  # size of the sample of pixels that sums are estimated from, where an edit allows it
 
 Part = TypeVar("Part")
 Kept = TypeVar("Kept")
-Rest = TypeVarTuple("Rest")
 P = ParamSpec("P")
 Cache = dict[Hashable, tuple[Sequence[Tensor], object]]  # results by their names, with the tensors they depend on
 Blocks = Callable[[], Iterable[Tensor]]  # columns (B, M, n) of the factor, block by block

@@ -22,8 +22,8 @@ from nlfilter_torch.operator.scaling import LARGEST_ROOT, KernelMatrix, Pass, ne
 
 # Relative Newton step at which to stop; the error after it is its square.
 CONVERGED = {torch.float32: 1e-5, torch.float64: 1e-7}
-MAX_PASSES = 12
-UNSETTLED = 1e-3
+MAX_PASSES = 12  # two or three are usual
+UNSETTLED = 1e-3  # relative Newton step after the last pass from which on there is a warning
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,9 +1,10 @@
 """A picture that is read a few rows at a time as the source of an edit: blocks for its statistics, output in tiles."""
 
+from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Concatenate, Self, TypeVar
 
 import numpy as np
@@ -20,17 +21,13 @@ from nlfilter_torch.photo.picture.counted import CountedPixels, counted_pixels
 from nlfilter_torch.photo.picture.measuring import everywhere
 from nlfilter_torch.photo.picture.pictures import Picture, Rows, Tile
 from nlfilter_torch.photo.picture.pixels import Block, Fitted, WorkingRange
-from nlfilter_torch.photo.picture.resizing import resized_parts, weights_of
+from nlfilter_torch.photo.picture.regions import check_scribble_memory, floats_per_scribbled_pixel, read_scribbles
+from nlfilter_torch.photo.picture.resizing import ResizedPart, resized_parts, weights_of
 from nlfilter_torch.photo.picture.sampling import ColumnCache, GuidePicture, take_pilot
 from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles
 from nlfilter_torch.photo.picture.source import Guide, P, Rest, Source
 from nlfilter_torch.photo.picture.tiled_operator import TiledOperator
-from nlfilter_torch.photo.picture.tiled_scribbles import (
-    check_scribble_memory,
-    floats_per_scribbled_pixel,
-    read_scribbles,
-)
-from nlfilter_torch.photo.picture.tiles import TILE_PIXELS, Passes, Tiling, cacheable_pixels, rows_that_fit
+from nlfilter_torch.photo.picture.tiles import TILE_PIXELS, Passes, Tiling, cacheable_pixels, inner, rows_that_fit
 
 FINISH_FLOATS = 64  # floats per pixel of a tile during ``Fitted.finish``: images, their transforms and products
 Part = TypeVar("Part")
@@ -136,39 +133,31 @@ class Room:
 
 
 @dataclass(frozen=True, eq=False)
-class FirstHalf:
-    """An edit of tiles, without :attr:`Fitted.finish`.
+class TileHalves:
+    """An edit of tiles in two halves, of which the second, :attr:`Fitted.finish`, sees the neighbourhood of a pixel.
 
-    The rows of a tile are computed in groups of ``together``, which are the same for tiles of any height: the rounding
-    of a matrix product depends on its shape.
+    Attributes:
+        fitted: the edit.
+        together: rows that are computed at once; the same for tiles of any height, since the rounding of a matrix
+            product depends on its shape.
+        planes: result of the first half, of the whole picture; None until it is computed.
     """
 
     fitted: Fitted
     together: int
+    planes: Picture | None = None
 
     @full_precision
-    def __call__(self, tile: Tile) -> Tensor:
+    def first(self, tile: Tile) -> Tensor:
         """The edited rows (1, C, h, W) of a tile, or the planes that ``finish`` takes."""
         seen = tile.in_range(self.fitted.working)
         result = torch.cat([self.fitted.pixels(part) for part in seen.parts(self.together)], dim=2)
         return result if self.fitted.finish is not None else self.fitted.output(tile.image, result)
 
-
-@dataclass(frozen=True, eq=False)
-class SecondHalf:
-    """The half of an edit that depends on the neighbourhood of a pixel: :attr:`Fitted.finish` of tiles.
-
-    Attributes:
-        fitted: the edit.
-        planes: result of the first half, of the whole picture.
-    """
-
-    fitted: Fitted
-    planes: Picture
-
-    def __call__(self, tile: Tile) -> Tensor:
+    def second(self, tile: Tile) -> Tensor:
         """The edited rows (1, C, h, W) of a tile that has the margin."""
         assert self.fitted.finish is not None  # for mypy
+        assert self.planes is not None
         stop = tile.start + len(tile.stored)
         planes = self.planes.tile(tile.start, stop, self.fitted.margin).pixels
         result = self.fitted.finish(tile.in_range(self.fitted.working).pixels, planes, tile.inner)
@@ -252,20 +241,21 @@ class Tiled:
         check_count(count, "num_landmarks")
         compared = guide.channels or (self.channels if options.guide_channels == "all" else 1)
         num_features = patch_size**2 * compared + 2
-        passes, room, picture = self.passes, self.room, GuidePicture(self.picture, guide, self.counted)
+        passes, room, picture = self.passes, self.room, self.picture
+        seen = GuidePicture(picture, guide, self.counted)
         room.forget_columns()
         room.rows(num_features, count)
         workers = passes.workers(count)
         if guide.margin and passes.stores_guide(picture.pixels * compared * self.dtype.itemsize):
             room.guide_floats += picture.pixels * compared
             room.rows(num_features, count)
-            picture.store(max(1, TILE_PIXELS // self.size[1]), workers)
-        pilot = take_pilot(picture, passes.report, workers)
+            seen.store(max(1, TILE_PIXELS // self.size[1]), workers)
+        pilot = take_pilot(seen, passes.report, workers)
         sampled, count = passes.sample < picture.pixels, pilot.moment.shape[1]
         cached_pixels = cacheable_pixels(picture, passes, num_features, count, room.stored_floats(num_features))
         room.cached_floats = cached_pixels * (count + 2)
         operator = TiledOperator(
-            picture,
+            seen,
             pilot,
             passes.report,
             passes.sample if sampled else None,
@@ -312,7 +302,7 @@ class Tiled:
     @torch.no_grad()
     def resized(self, size: tuple[int, int]) -> "Tiled":
         """The picture in a smaller size, in memory, as another tiled source."""
-        planes, passes = self._resized(_image, size), replace(self.plain, tile_rows=None)
+        planes, passes = self._resized(inner, size), replace(self.plain, tile_rows=None)
         if self.counted is not None:
             weights = weights_of(self._resized(_weights, size))
             planes = torch.cat([fill_nearby(planes, weights > 0), weights], dim=1)
@@ -320,14 +310,13 @@ class Tiled:
         return Tiled(Picture(rows, self.picture.name), passes, self.strokes)
 
     def _resized(self, planes: Callable[[Tile], Tensor], size: tuple[int, int]) -> Tensor:
-        """Resize planes of tiles, which are computed by several threads."""
-        parts = resized_parts(partial(self._to_resize, planes), self.size, size)
-        return torch.cat(list(in_order(_call, parts, self.passes.workers(1))), dim=2)
+        """Resize planes of tiles, which are read here, and computed by several threads."""
+        parts = ((part, deque(map(self._to_resize, part.pieces))) for part in resized_parts(self.size, size))
+        return torch.cat(list(in_order(_resized_part, parts, self.passes.workers(1), planes)), dim=2)
 
-    def _to_resize(self, planes: Callable[[Tile], Tensor], start: int, stop: int) -> Callable[[], Tensor]:
-        """A function that computes the planes of the rows from ``start`` to ``stop``, which are read now."""
-        self.passes.report("Reducing", start, self.size[0])
-        return partial(planes, replace(self.picture.tile(start, stop, 0), counted=self.counted))
+    def _to_resize(self, rows: slice) -> Tile:
+        self.passes.report("Reducing", rows.start, self.size[0])
+        return replace(self.picture.tile(rows.start, rows.stop, 0), counted=self.counted)
 
     def all(self, fitted: Fitted) -> Tensor:
         """The planes (1, C, H, W) that an edit makes of all pixels."""
@@ -368,20 +357,17 @@ class Tiled:
         rows = room.tile_rows(together)
         with single_threaded(workers):
             room.prepare()
-        first, margin = FirstHalf(fitted, together), room.margin
-        tiling = Tiling(passes, self.picture, first, margin, rows, together, workers, transparent=not plain)
+        halves, margin = TileHalves(fitted, together), room.margin
+        tiling = Tiling(passes, self.picture, halves.first, margin, rows, together, workers, transparent=not plain)
         if fitted.finish is None:
             yield tiling
             return
         before = replace(tiling, passes=replace(passes, kind=self.plain.kind), transparent=False, stage="Comparing")
         with passes.stored(before) as planes:
-            finish = SecondHalf(fitted, Picture(planes, self.picture.name, channels=planes.shape[2]))
+            halves = replace(halves, planes=Picture(planes, self.picture.name, channels=planes.shape[2]))
             rows, workers = room.rows_to_finish(fitted, rows, workers)
-            yield replace(tiling, edit=finish, margin=fitted.margin, rows=rows, together=fitted.step, workers=workers)
-
-
-def _image(tile: Tile) -> Tensor:
-    return tile.image
+            margin, together = fitted.margin, fitted.step
+            yield replace(tiling, edit=halves.second, margin=margin, rows=rows, together=together, workers=workers)
 
 
 def _weights(tile: Tile) -> Tensor:
@@ -389,5 +375,7 @@ def _weights(tile: Tile) -> Tensor:
     return torch.ones_like(tile.image[:, :1]) if tile.weights is None else tile.weights
 
 
-def _call(compute: Callable[[], Tensor]) -> Tensor:
-    return compute()
+def _resized_part(read: tuple[ResizedPart, deque[Tile]], planes: Callable[[Tile], Tensor]) -> Tensor:
+    """A part of resized planes of tiles; a tile that was used, which keeps its pixels, is dropped."""
+    part, tiles = read
+    return part.of(planes(tiles.popleft()) for _ in part.pieces)

@@ -18,7 +18,7 @@ from nlfilter_torch.photo.declared.rows import WHITE, RowSource, Stored
 from nlfilter_torch.photo.files.writing import FileRows
 from nlfilter_torch.photo.picture.developing import bands_of, finished, in_light, turned_band
 from nlfilter_torch.photo.picture.pictures import Picture, Rows, Tile, transparency
-from nlfilter_torch.photo.picture.tiles import TILE_PIXELS, Passes, Tiling, between_steps, intermediate, tile_by_tile
+from nlfilter_torch.photo.picture.tiles import TILE_PIXELS, Passes, between_steps, intermediate, tile_by_tile
 
 
 @contextmanager
@@ -55,7 +55,7 @@ def developed_rows(
         if development.changes_tones:
             framed = Picture(source, name)
             framed.accept_any_scale()
-            source = TiledRows(tile_by_tile(floats, framed, Light(development, limits)))
+            source = LitRows(floats, framed, development, limits)
         yield source
 
 
@@ -83,36 +83,30 @@ class CroppedRows:
 
 
 @dataclass(frozen=True)
-class TiledRows:
-    """The rows of a tiling, computed when they are read."""
+class LitRows:
+    """The rows of a picture whose values are within ``limits``, with another exposure and white balance."""
 
-    tiling: Tiling
+    passes: Passes
+    picture: Picture
+    development: Development
+    limits: tuple[float, float]
 
     @property
     def shape(self) -> tuple[int, ...]:
         """(H, W, S)."""
-        picture = self.tiling.picture
-        return *picture.size, picture.samples
+        return *self.picture.size, self.picture.samples
 
     @property
     def dtype(self) -> np.dtype[np.generic]:
         """Floats."""
-        return np.dtype(self.tiling.passes.kind)
+        return np.dtype(self.passes.kind)
 
     def __getitem__(self, rows: slice) -> Stored:
         """The rows from ``rows.start`` to ``rows.stop``."""
-        return self.tiling.part(rows.start, rows.stop)[0]
+        return tile_by_tile(self.passes, self.picture, self.lit).part(rows.start, rows.stop)[0]
 
-
-@dataclass(frozen=True)
-class Light:
-    """Exposure and white balance of tiles of a picture whose values are within ``limits``."""
-
-    development: Development
-    limits: tuple[float, float]
-
-    def __call__(self, tile: Tile) -> Tensor:
-        """The changed colours (1, C, h, W)."""
+    def lit(self, tile: Tile) -> Tensor:
+        """The changed colours (1, C, h, W) of a tile."""
         least, most = map(torch.tensor, self.limits)
         return in_light(tile.image, self.development, (least, most))
 
@@ -142,8 +136,9 @@ def _bands(
 ) -> Rows:
     """The rows (h, w, S) of the developed picture."""
     hidden = None if nodata is None else nodata / WHITE.get(picture.kind, 1)
-    bands, turn = bands_of(frame), partial(turned_band, partial(_part, whole), frame)
-    for rows, band in zip(bands, in_order(turn, bands, passes.workers(1)), strict=True):
+    bands = bands_of(frame)
+    turned = in_order(turned_band, bands, passes.workers(1), partial(_part, whole), frame)
+    for rows, band in zip(bands, turned, strict=True):
         passes.report("Straightening", rows.start, frame.height)
         planes = finished(band, picture.colours, limits, hidden)
         yield slice(rows.start, rows.stop), np.ascontiguousarray(planes[0].permute(1, 2, 0).numpy())

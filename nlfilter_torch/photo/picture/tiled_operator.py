@@ -83,64 +83,35 @@ def first_plane(pixels: Pixels) -> Tensor:
 
 
 @dataclass(frozen=True, eq=False)
-class ColumnPlanes:
-    """Planes computed by a function of the columns of an operator."""
+class OperatorPlanes:
+    """Planes computed by a function of the columns of an operator.
+
+    Attributes:
+        operator: W.
+        function: returns (1, ..., n) for columns, further arguments, and the values of ``planes``, if there are any.
+        arguments: of the function.
+        planes: y, of the picture, or None.
+    """
 
     operator: "TiledOperator"
     function: Callable[..., Tensor]
     arguments: tuple[object, ...]
-
-    def __call__(self, pixels: Pixels) -> Tensor:
-        """The planes (1, C, h, w) at the pixels."""
-        height, width = pixels.image.shape[-2:]
-        columns = with_columns(pixels).columns(self.operator)
-        return self.function(columns, *self.arguments).unflatten(2, (height, width))
-
-
-@dataclass(frozen=True, eq=False)
-class LayerPlanes:
-    """Detail layers of planes of the picture, from the coefficients of powers of W."""
-
-    operator: "TiledOperator"
-    planes: Planes
-    coefficients: Tensor
-
-    def __call__(self, pixels: Pixels) -> Tensor:
-        """The layers (1, k+1, C, h, w) at the pixels."""
-        return with_columns(pixels).layers(self)
+    planes: Planes | None = None
 
     def compute(self, pixels: Pixels) -> Tensor:
-        """The layers at the pixels, without a cache."""
-        image = self.planes(pixels)
-        layers = layers_of_columns(with_columns(pixels).columns(self.operator), self.coefficients, image.flatten(2))
-        return layers.unflatten(-1, image.shape[-2:])
+        """The planes (1, ..., h, w) at the pixels."""
+        values = () if self.planes is None else (self.planes(pixels).flatten(2),)
+        columns = with_columns(pixels).columns(self.operator)
+        return self.function(columns, *self.arguments, *values).unflatten(-1, pixels.image.shape[-2:])
+
+    def cached(self, pixels: Pixels) -> Tensor:
+        """The same; tiles keep them until other planes are requested so."""
+        return with_columns(pixels).layers(self)
 
 
-@dataclass(frozen=True, eq=False)
-class RationalPlanes:
-    """A rational function of W without a polynomial, of planes y of the picture.
-
-    Attributes:
-        operator: W.
-        planes: y.
-        shifts: t, (J,).
-        weights: w, (1, 1 + J).
-        inner: coefficients of the factor in the solutions of the shifted systems, (1, J, M, C).
-    """
-
-    operator: "TiledOperator"
-    planes: Planes
-    shifts: Tensor
-    weights: Tensor
-    inner: Tensor
-
-    def __call__(self, pixels: Pixels) -> Tensor:
-        """The planes (1, C, h, W) at the pixels."""
-        image = self.planes(pixels)
-        solutions = (
-            with_columns(pixels).columns(self.operator).shifted_solutions(image.flatten(2), self.shifts, self.inner)
-        )
-        return weigh_poles(image.flatten(2), solutions, self.weights).unflatten(2, image.shape[-2:])
+def _rational(columns: Columns, shifts: Tensor, weights: Tensor, inner: Tensor, planes: Tensor) -> Tensor:
+    """A rational function of W without a polynomial, of planes (1, C, n); see :meth:`Columns.shifted_solutions`."""
+    return weigh_poles(planes, columns.shifted_solutions(planes, shifts, inner), weights)
 
 
 @dataclass(eq=False)
@@ -188,7 +159,7 @@ class TiledOperator:
         """
         if self._pixel_scaling is not None:
             return
-        total, tolerance = self.pilot.moment, CONVERGED[self.guide.dtype]
+        total, tolerance = self.pilot.moment, CONVERGED[self.guide.picture.dtype]
         biases: tuple[Tensor, ...] | None = None
         if self.sample_size is not None:
             self._sample, biases = self._draw_sample(self.sample_size, planes, order)
@@ -214,11 +185,11 @@ class TiledOperator:
     def _balanced(self, total: Tensor, bias: Tensor | float = 0.0) -> Tensor:
         """The moment of all pixels, or of the sample and a ``bias`` that stands for the others."""
         blocks, completed = self.over("Balancing"), self.pilot.completed
-        return balance_by_passes(blocks, total, self.guide.dtype, completed=completed, bias=bias)
+        return balance_by_passes(blocks, total, self.guide.picture.dtype, completed=completed, bias=bias)
 
     def _limiter(self, total: Tensor) -> Tensor | None:
         """The ``X^(1/2)`` (1, M, M) to multiply the factor by, or None if no eigenvalue exceeds 1."""
-        blocks, allowed = self.over("Bounding"), slack(self.guide.dtype, CONVERGED[self.guide.dtype])
+        blocks, allowed = self.over("Bounding"), slack(self.guide.picture.dtype, CONVERGED[self.guide.picture.dtype])
         gram = partial(self._gram_below, blocks)
         return limiter(gram, total, allowed) if exceeds(gram, total, allowed) else None
 
@@ -236,7 +207,7 @@ class TiledOperator:
         columns = guess.columns(pilot.sample)
         known = Sums(*sums_of_powers(columns, values(pilot.sample, columns), order))
         guess = replace(guess, coefficients=known.coefficients()[:, :-1])
-        draws = Draws(pilot, columns, count, self.guide.pixels)
+        draws = Draws(pilot, columns, count, self.guide.picture.pixels)
         drawn, totals = zip(*self._over_picture("Sampling")(_draw_and_sum, guess, draws), strict=True)
         step = -(-len(drawn) // SAMPLE_BLOCKS)
         sample = [Block.concatenate(drawn[first : first + step]) for first in range(0, len(drawn), step)]
@@ -324,13 +295,13 @@ class TiledOperator:
     @cached_property
     def pairs(self) -> RitzPairs:
         """The spectrum."""
-        count = self.guide.pixels
+        count = self.guide.picture.pixels
         if self.guide.guide.sampled and count > SAMPLE:
-            places = sampled_places(self.guide.size)
+            places = sampled_places(self.guide.picture.size)
             blocks = map(self._weighted_columns, places.split(sampling.CHUNK))
-            return sampled_pairs(blocks, count, self.guide.dtype)
+            return sampled_pairs(blocks, count, self.guide.picture.dtype)
         sums = next(iter(self._sums.values()), None) or self.sums(first_plane, 1)
-        return RitzPairs.of_sums(sums.grams[:, :2] + self._grams, self.guide.dtype)
+        return RitzPairs.of_sums(sums.grams[:, :2] + self._grams, self.guide.picture.dtype)
 
     def _weighted_columns(self, places: Tensor) -> Columns:
         """Columns of single pixels, whose scaling is multiplied by the roots of their weights."""
@@ -341,7 +312,7 @@ class TiledOperator:
 
     def of_columns(self, function: Callable[[Columns, *Rest], Tensor], *arguments: *Rest) -> Planes:
         """Planes computed by a function of columns."""
-        return ColumnPlanes(self, function, arguments)
+        return OperatorPlanes(self, function, arguments).compute
 
     def at(self, places: Tensor) -> Blocks:
         """Columns of single pixels, whose features are read now and kept in memory."""
@@ -354,7 +325,7 @@ class TiledOperator:
 
     def layers(self, planes: Planes, order: int) -> Planes:
         """Detail layers, from the sums for powers of W."""
-        return LayerPlanes(self, planes, self.sums(planes, order).coefficients())
+        return OperatorPlanes(self, layers_of_columns, (self.sums(planes, order).coefficients(),), planes).cached
 
     def coefficients(self, planes: Planes) -> Tensor:
         """``F y``."""
@@ -362,7 +333,8 @@ class TiledOperator:
 
     def rational(self, planes: Planes, form: RationalForm, weights: Tensor) -> Planes:
         """A rational function of W, from the sums for shifted systems."""
-        return RationalPlanes(self, planes, form.shifts, weights, self.shifted_inner(planes, form.shifts))
+        inner = self.shifted_inner(planes, form.shifts)
+        return OperatorPlanes(self, _rational, (form.shifts, weights, inner), planes).compute
 
     @torch.no_grad()
     @full_precision
@@ -377,7 +349,7 @@ class TiledOperator:
         return capacitance_inverse(grams) @ sums
 
     def _shifted_of_block(self, block: Block, planes: Planes, shifts: Tensor) -> tuple[Tensor, Tensor]:
-        pixels, exact = self.pixels(block), sums_exactly(self.guide.dtype, self.guide.pixels)
+        pixels, exact = self.pixels(block), sums_exactly(self.guide.picture.dtype, self.guide.picture.pixels)
         columns, values = pixels.known_columns, planes(pixels).flatten(2)
         return columns.shifted_grams(shifts, exact=exact), columns.shifted_sums(values, shifts)
 
@@ -387,7 +359,7 @@ class TiledOperator:
         """Means over the sample, or over all pixels if there is none."""
         self.prepare()
         total, weight = summed(self.over("Averaging")(self._weighted_sums, planes))
-        return (total / weight).to(self.guide.dtype)
+        return (total / weight).to(self.guide.picture.dtype)
 
     def _weighted_sums(self, block: Block, planes: Planes) -> tuple[Tensor, Tensor]:
         """Weighted sums (1, C) of planes over a block, and the sum of the weights."""
@@ -402,7 +374,7 @@ class TiledOperator:
             seen = self.guide.seen(tile, size // 2)
             guide = reduce_channels(seen.pixels, recipe.guide_channels)
             patches.append(patches_at(guide, seen, chosen, size))
-        return scaled_patches(torch.cat(patches, dim=2), places, self.guide, recipe)
+        return scaled_patches(torch.cat(patches, dim=2), places, self.guide.picture, recipe)
 
 
 def _planes_of_block(planes: Planes, block: Block, columns: Columns) -> Tensor:

@@ -16,7 +16,6 @@ reduced, is nearly the small result, which the editor shows while a slider moves
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 
 import torch
 import torch.nn.functional as F
@@ -25,9 +24,9 @@ from torch import Tensor
 from nlfilter_torch.core.torch_internals import cached_constants
 from nlfilter_torch.operator.features import pad_border
 from nlfilter_torch.photo.picture.limits import Balance, Limits, balance_of, balanced, clamped, limit, move_luminance
-from nlfilter_torch.photo.picture.measuring import cached, everywhere, mean_of, shrunk
+from nlfilter_torch.photo.picture.measuring import cached, everywhere, shrunk
 from nlfilter_torch.photo.picture.pixels import Fitted, M, Pixels, Planes, corner, whole_image
-from nlfilter_torch.photo.picture.resizing import interpolation, resized, rows_of
+from nlfilter_torch.photo.picture.resizing import interpolation, resize
 from nlfilter_torch.photo.picture.source import Source
 
 MEGAPIXEL = 1_000_000
@@ -97,7 +96,7 @@ def within_limits(
 ) -> Fitted:
     """The edit that applies a change of brightness to a picture; arguments as those of :func:`fit_change`."""
     fitted, balance = _limited(source, change, limits, brighter)
-    return fitted.then(partial(_with_balance, balance=balance, limits=limits))
+    return fitted.then(_with_balance, balance, limits)
 
 
 def _with_balance(image: Tensor, moved: Tensor, balance: Balance | None, limits: Limits) -> Tensor:
@@ -120,7 +119,7 @@ def _limited(
     if brighter is None or isinstance(brighter, Balance):
         return fitted, brighter
     kept = cached(source, fitted)
-    return kept, balance_of(partial(mean_of, source, kept), brighter)
+    return kept, balance_of(source, kept, brighter)
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,10 +146,6 @@ class Coarse:
     def enlarged(self, source: Source[M], planes: Planes) -> "EnlargedChange":
         """The change of a larger picture whose ``planes`` it changes."""
         return EnlargedChange(self, planes, source.size).corrected(source)
-
-    def changes(self, source: Source[M], planes: Planes) -> Callable[[Pixels], tuple[Tensor, Tensor]]:
-        """Function from pixels of a larger picture to the changes of their ``planes`` and of their saturation."""
-        return self.enlarged(source, planes).changes
 
     @property
     def size(self) -> tuple[int, int]:
@@ -208,7 +203,7 @@ class EnlargedChange:
         (top, left), (height, width) = corner(pixels), pixels.image.shape[-2:]
         columns = None if width == pixels.width else range(left, left + width)
         rows = range(top, top + height)
-        return resized(partial(rows_of, self.coarse.planes[:, channels]), self.coarse.size, self.size, rows, columns)
+        return resize(self.coarse.planes[:, channels], self.size, rows, columns)
 
 
 def _restored(planes: Tensor, stride: float) -> Tensor:

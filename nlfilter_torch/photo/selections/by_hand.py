@@ -6,9 +6,9 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.photo.picture.pixels import M, Pixels, Planes
+from nlfilter_torch.photo.picture.regions import num_regions, region_weights
 from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles
 from nlfilter_torch.photo.picture.source import Source, at
-from nlfilter_torch.photo.picture.tiled_scribbles import num_regions, region_weights
 from nlfilter_torch.photo.selections.scribbled_colours import EPSILON
 
 

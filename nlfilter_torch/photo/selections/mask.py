@@ -30,10 +30,10 @@ from nlfilter_torch.photo.picture.edit import PhotoEdit
 from nlfilter_torch.photo.picture.in_memory import edited, in_blocks
 from nlfilter_torch.photo.picture.measuring import shrunk
 from nlfilter_torch.photo.picture.pixels import Box, M, Pixels, corner
+from nlfilter_torch.photo.picture.regions import num_regions, read_regions
 from nlfilter_torch.photo.picture.resizing import enlarged
 from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles, parts_in_blocks
 from nlfilter_torch.photo.picture.source import Fitted, Reduced, Source, at, kept
-from nlfilter_torch.photo.picture.tiled_scribbles import num_regions, read_regions
 from nlfilter_torch.photo.picture.viewing import viewed_size
 from nlfilter_torch.photo.selections.by_hand import ByHand, check_drawn
 from nlfilter_torch.photo.selections.connected import Extent, connected

@@ -15,9 +15,8 @@ from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.declared.strokes import Region
 from nlfilter_torch.photo.files.rows import StoredPicture, open_picture
-from nlfilter_torch.photo.picture.painting import cover
+from nlfilter_torch.photo.picture.painting import cover, plane_rows
 from nlfilter_torch.photo.picture.photographs import Photograph, write_photograph
-from nlfilter_torch.photo.picture.tiled_scribbles import plane_rows
 from tests.commands import refusal
 from tests.problems import box, colour
 

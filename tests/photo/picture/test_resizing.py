@@ -8,9 +8,9 @@ import torch.nn.functional as F
 from nlfilter_torch.photo.picture import resizing
 from nlfilter_torch.photo.picture.in_memory import InMemory
 from nlfilter_torch.photo.picture.pictures import Picture
+from nlfilter_torch.photo.picture.regions import resized_masks
 from nlfilter_torch.photo.picture.resizing import block_means, enlarged, resize, resized
 from nlfilter_torch.photo.picture.tiled import Tiled
-from nlfilter_torch.photo.picture.tiled_scribbles import resized_masks
 from nlfilter_torch.photo.picture.tiles import Passes
 from tests.problems import cat, colour, noise
 

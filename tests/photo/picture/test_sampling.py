@@ -27,7 +27,7 @@ def test_sample_holds_about_as_many_pixels_as_asked_for_and_stands_for_all(compl
     picture = GuidePicture(Picture(cat(90, 120)), Guide(FilterOptions(num_landmarks=30, completion=completion)))
     pilot = sampling.take_pilot(picture, silent)
     guess = Guess(pilot.moment, torch.zeros(1, 0, 30, 1), lambda block, _: block.image, spectral=True)
-    draw_from, moment, grams = Draws(pilot, guess.columns(pilot.sample), 3000, picture.pixels), 0.0, 0.0
+    draw_from, moment, grams = Draws(pilot, guess.columns(pilot.sample), 3000, picture.picture.pixels), 0.0, 0.0
     drawn = []
     for block in PassOverPicture(picture, pilot.kernel, silent, "Sampling", 2, ColumnCache(2400, 5000))(
         lambda block: block
@@ -38,7 +38,7 @@ def test_sample_holds_about_as_many_pixels_as_asked_for_and_stands_for_all(compl
     assert len(drawn) > 1
     sample = Block.concatenate(drawn)
     assert 2500 < sample.weights.numel() < 3500
-    assert abs(float(sample.weights.sum()) / picture.pixels - 1) < 0.1
+    assert abs(float(sample.weights.sum()) / picture.picture.pixels - 1) < 0.1
     estimated, _, estimate = guess.totals(sample)[1]
     assert (estimated - moment).norm() < 0.02 * torch.as_tensor(moment).norm()
     assert (estimate - grams).norm() < 0.025 * torch.as_tensor(grams).norm()

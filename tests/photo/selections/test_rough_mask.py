@@ -6,7 +6,7 @@ import torch
 
 from nlfilter_torch import nonlocal_operator
 from nlfilter_torch.photo.picture.in_memory import InMemory, InMemoryOperator
-from nlfilter_torch.photo.picture.tiled_scribbles import read_regions
+from nlfilter_torch.photo.picture.regions import read_regions
 from nlfilter_torch.photo.selections import rough_mask
 from nlfilter_torch.photo.selections.rough_mask import Points, RoughMasks, region_guide
 from nlfilter_torch.photo.selections.scribbled_colours import frame_places

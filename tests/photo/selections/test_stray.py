@@ -13,7 +13,7 @@ from benchmarks.recolor import CHANGED, HATS, hat_scene
 from benchmarks.scribbles import STORED, Job, as_mask, jobs, line
 from nlfilter_torch.photo import recolor, region_mask
 from nlfilter_torch.photo.picture.in_memory import InMemory
-from nlfilter_torch.photo.picture.tiled_scribbles import read_regions
+from nlfilter_torch.photo.picture.regions import read_regions
 from nlfilter_torch.photo.selections.stray import strays
 from tests.problems import box, paint
 

@@ -4,8 +4,7 @@ Masks of regions are tensors (B, K, H, W) of a picture in memory, and rows (H, W
 """
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable
 from functools import partial
 from typing import Protocol, cast
 
@@ -16,44 +15,14 @@ from torch import Tensor
 
 from nlfilter_torch.core.checks import check_image, check_same_size, check_unit_range
 from nlfilter_torch.photo.declared.rows import RowSource
-from nlfilter_torch.photo.picture.drawn import Plane, Size
-from nlfilter_torch.photo.picture.painting import Open, opened_picture, rasterised
-from nlfilter_torch.photo.picture.pictures import LazyRows, Picture, stored_as, transparency
-from nlfilter_torch.photo.picture.pixels import M, Pixels, Planes, corner, part_of
+from nlfilter_torch.photo.picture.pictures import LazyRows, Picture, transparency
+from nlfilter_torch.photo.picture.pixels import M, Pixels, Planes, part_of
 from nlfilter_torch.photo.picture.resizing import resize, resized
 from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles
 from nlfilter_torch.photo.picture.source import Source
 
 READ_FLOATS = 32  # floats per scribbled pixel in memory while scribbles are read and grouped by colour
 ReadRows = Callable[[int, int], Tensor]  # (start, stop) to these rows
-
-
-class RowPainter:
-    """Rasterises marks as they are read: to rows (H, W, K), of which only a few are in memory at once."""
-
-    def __init__(self, opened: Open = opened_picture) -> None:
-        self._opened = opened
-
-    def planes(self, shown: Sequence[Plane], size: Size, *, soft: bool = False, coloured: bool = False) -> RowSource:
-        """Return :func:`rasterised` marks."""
-        read = partial(_rasterised_rows, tuple(shown), size, soft=soft, coloured=coloured, opened=self._opened)
-        return LazyRows((*size, 3 * coloured + len(shown)), read)
-
-    def covers(self, planes: RowSource) -> bool:
-        """Whether masks or colours cover a pixel."""
-        return LazyRows(tuple(planes.shape), partial(plane_rows, planes), planes.dtype).any()
-
-
-def _rasterised_rows(
-    shown: Sequence[Plane], size: Size, rows: slice, *, soft: bool, coloured: bool, opened: Open
-) -> NDArray[np.generic]:
-    planes = rasterised(shown, size, rows, soft=soft, coloured=coloured, opened=opened)
-    return stored_as(planes, "float32")
-
-
-def plane_rows(planes: RowSource, rows: slice) -> NDArray[np.generic]:
-    """Some rows (h, W, K) of planes."""
-    return np.asarray(planes[rows])
 
 
 def region_rows(masks: RowSource, region: int) -> LazyRows:
@@ -151,19 +120,6 @@ def overlay(picture: Picture, rows: RowSource, name: str, *, channels: int | Non
     return Picture(rows, name, channels=channels, hides=False)
 
 
-@dataclass(frozen=True, eq=False)
-class WeightRows:
-    """Weights (1, K, h, w) of given pixels in rows (H, W, K) over a picture."""
-
-    rows: Picture
-
-    def __call__(self, pixels: Pixels) -> Tensor:
-        """The weights of some pixels."""
-        (top, left), (height, width) = corner(pixels), pixels.image.shape[-2:]
-        planes = self.rows.tile(top, top + height, 0).pixels[..., left : left + width]
-        return planes.to(pixels.image).clamp(0.0, 1.0)
-
-
 def floats_per_scribbled_pixel(num_features: int) -> int:
     """Floats per scribbled pixel in memory; features are there twice while they are concatenated."""
     return 2 * num_features + 40
@@ -221,7 +177,7 @@ def region_weights(source: Source[M], masks: M, name: str) -> Planes:
         check_unit_range(planes, name)
         return part_of(planes.to(cast(Pixels, source).image).expand(source.batch, -1, -1, -1))
     picture, rows = cast(InTiles, source).picture, cast(RowSource, masks)
-    return WeightRows(overlay(picture, rows, name, channels=num_regions(source, masks, name)))
+    return overlay(picture, rows, name, channels=num_regions(source, masks, name)).weights
 
 
 def resized_masks(source: Source[M], masks: M, size: tuple[int, int], name: str) -> M:

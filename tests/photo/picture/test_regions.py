@@ -17,14 +17,14 @@ from nlfilter_torch.photo.picture.colour import split_luminance
 from nlfilter_torch.photo.picture.in_memory import InMemory
 from nlfilter_torch.photo.picture.painting import cover
 from nlfilter_torch.photo.picture.pictures import Picture
-from nlfilter_torch.photo.picture.tiled import Tiled
-from nlfilter_torch.photo.picture.tiled_scribbles import (
+from nlfilter_torch.photo.picture.regions import (
     num_regions,
     read_regions,
     read_scribbles,
     region_weights,
     resized_masks,
 )
+from nlfilter_torch.photo.picture.tiled import Tiled
 from nlfilter_torch.photo.picture.tiles import Passes
 from tests import problems
 from tests.pairwise import each_value

@@ -26,8 +26,8 @@ from nlfilter_torch.photo.edits.film import FilmEdit
 from nlfilter_torch.photo.edits.parts import Parts, Rectangle
 from nlfilter_torch.photo.edits.recipe import stream
 from nlfilter_torch.photo.picture.in_memory import InMemory
+from nlfilter_torch.photo.picture.measuring import LEAST_STEPS, range_of
 from nlfilter_torch.photo.picture.tiles import Passes
-from nlfilter_torch.photo.picture.working_range import LEAST_STEPS, range_of
 from tests.problems import colour
 
 BLACK, SCALE = 0.02, 0.01
