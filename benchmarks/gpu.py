@@ -5,16 +5,16 @@ printed beside the time that their matrix products and their reads of the factor
 Without a GPU the program prints an error and exits with status 2.
 """
 
-import statistics
 import sys
-import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import partial
+from statistics import median
 
 import torch
 from torch import Tensor
 
-from benchmarks.harness import options
+from benchmarks.harness import MIB, markdown, options, seconds
 from nlfilter_torch import (
     NonlocalFilter,
     captured_energy,
@@ -105,16 +105,15 @@ def padded_difference(eigenvalues: Tensor, expected: Tensor) -> float:
     return (eigenvalues[:, :count] - expected[:, :count]).abs().max().item()
 
 
-def seconds(call: Callable[[], object], device: str, repeats: int = 7) -> float:
+def duration(call: Callable[[], object], device: str, repeats: int = 7) -> float:
     """Median time of a call, including all work that it starts on the device; the first call is not counted."""
-    taken = []
-    for _ in range(1 + repeats):
-        wait(device)
-        start = time.perf_counter()
+
+    def whole() -> None:
         call()
         wait(device)
-        taken.append(time.perf_counter() - start)
-    return statistics.median(taken[1:])
+
+    whole()
+    return median(seconds(whole) for _ in range(repeats))
 
 
 def wait(device: str) -> None:
@@ -129,11 +128,11 @@ def measured_rates(device: str, size: int) -> Rates:
     before = torch.backends.cuda.matmul.allow_tf32
     torch.backends.cuda.matmul.allow_tf32 = False
     try:
-        products = seconds(lambda: square @ square, device)
+        products = duration(lambda: square @ square, device)
     finally:
         torch.backends.cuda.matmul.allow_tf32 = before
     target = torch.empty_like(long)
-    copies = seconds(lambda: target.copy_(long), device)
+    copies = duration(lambda: target.copy_(long), device)
     return Rates(2 * size**3 / products, 2 * long.numel() * 4 / copies)
 
 
@@ -147,24 +146,19 @@ def floors(pixels: int, rates: Rates) -> tuple[float, float]:
     )
 
 
-def size_row(megapixels: float, device: str, rates: Rates) -> str:
+def size_row(megapixels: float, device: str, rates: Rates) -> list[str]:
     """Measure times and memory for one size, and return a row of the table."""
     side = round((megapixels * 1e6) ** 0.5)
     image = picture(side, side, device)[:, :1]
-    alpha = torch.ones(3, device=device)
     if device == "cuda":
         torch.cuda.reset_peak_memory_stats()
-
-    def build() -> object:
-        return nonlocal_operator(image, num_landmarks=LANDMARKS, photometric_bandwidth=0.1)
-
-    building = seconds(build, device)
-    operator = nonlocal_operator(image, num_landmarks=LANDMARKS, photometric_bandwidth=0.1)
-    filtering = seconds(lambda: polynomial_filter(operator, image, alpha), device)
+    build = partial(nonlocal_operator, image, num_landmarks=LANDMARKS, photometric_bandwidth=0.1)
+    building, operator = duration(build, device), build()
+    filtering = duration(lambda: polynomial_filter(operator, image, torch.ones(3, device=device)), device)
     least = floors(side * side, rates)
-    memory = f"{torch.cuda.max_memory_allocated() / 2**20:.0f}" if device == "cuda" else "-"
-    times = f"{1e3 * building:.2f} | {1e3 * least[0]:.2f} | {1e3 * filtering:.2f} | {1e3 * least[1]:.2f}"
-    return f"| {megapixels:g} | {times} | {memory} |"
+    memory = f"{torch.cuda.max_memory_allocated() / MIB:.0f}" if device == "cuda" else "-"
+    times = (building, least[0], filtering, least[1])
+    return [f"{megapixels:g}", *(f"{1e3 * taken:.2f}" for taken in times), memory]
 
 
 def training_step(device: str, batch: int = BATCH, crop: int = CROP) -> Callable[[], object]:
@@ -183,15 +177,14 @@ def training_step(device: str, batch: int = BATCH, crop: int = CROP) -> Callable
 
 def report(device: str, sizes: Iterable[float], rate_size: int, *, side: int = 96, crop: int = CROP) -> None:
     """Print all tables."""
-    print("| result | largest difference from float64 on the CPU |\n|---|---|")
-    for name, difference in differences(device, side).items():
-        print(f"| {name} | {difference:.1e} |", flush=True)
+    compared = differences(device, side).items()
+    rows = [[name, f"{difference:.1e}"] for name, difference in compared]
+    print(markdown(["result", "largest difference from float64 on the CPU"], rows))
     rates = measured_rates(device, rate_size)
     print(f"\n{rates.flops / 1e12:.2f} TFLOP/s in products of float32, {rates.bytes / 1e9:.0f} GB/s in copies\n")
-    print("| MP | build, ms | at least | filter, ms | at least | peak, MiB |\n|---|---|---|---|---|---|")
-    for megapixels in sizes:
-        print(size_row(megapixels, device, rates), flush=True)
-    step = seconds(training_step(device, crop=crop), device)
+    header = ["MP", "build, ms", "at least", "filter, ms", "at least", "peak, MiB"]
+    print(markdown(header, [size_row(megapixels, device, rates) for megapixels in sizes]), flush=True)
+    step = duration(training_step(device, crop=crop), device)
     print(f"\ntraining step, {BATCH}x3x{crop}x{crop}, m = {FEW}: {1e3 * step:.1f} ms")
 
 

@@ -14,7 +14,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from benchmarks.harness import Figure
+from benchmarks.harness import Figure, seconds
 from benchmarks.layers.held_out import held_out, large
 from benchmarks.photographs import middle
 from nlfilter_torch import (
@@ -22,8 +22,6 @@ from nlfilter_torch import (
     apply_function,
     detail_layers,
     nonlocal_operator,
-    polynomial_filter,
-    polynomial_response,
     spectral_filter,
 )
 from nlfilter_torch.core.rational import interval_nodes, rational_form
@@ -122,29 +120,9 @@ def against_dense(setup: Setup) -> Iterator[Figure]:
         yield Figure(f"the same in float32: {kind}", error, 1e-3 if smooth else None)
 
 
-def against_products(setup: Setup) -> Iterator[Figure]:
-    """Identity and polynomials against products with W."""
-    identity, polynomials = 0.0, 0.0
-    for image in setup.middles(96):
-        operator = nonlocal_operator(image)
-        change = spectral_filter(operator, image, lambda values: values) - operator @ image
-        identity = max(identity, float(change.abs().max()))
-        for seed in range(8):
-            alpha = 4 * torch.rand(seed + 2, generator=torch.Generator().manual_seed(seed)) - 1
-            result = spectral_filter(operator, image, lambda values, alpha=alpha: polynomial_response(values, alpha))
-            polynomials = max(polynomials, float((result - polynomial_filter(operator, image, alpha)).abs().max()))
-    yield Figure("identity against operator @ x", identity, 1e-5)
-    yield Figure("polynomials of degree 1 to 8 against polynomial_filter", polynomials, 1e-5)
-
-
-def shortest(call: Callable[[], object], repeats: int = 3) -> float:
+def shortest(call: Callable[[], object], repeats: int) -> float:
     """Least time of several calls."""
-    times = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        call()
-        times.append(time.perf_counter() - start)
-    return min(times)
+    return min(seconds(call) for _ in range(repeats))
 
 
 @torch.no_grad()
@@ -262,5 +240,5 @@ def black_pixels(setup: Setup) -> Iterator[Figure]:
 def measure(quick: bool = False, kodak: Path | None = None) -> Iterable[Figure]:
     """All figures, on scikit-image's photographs or on those in a folder of Kodak's."""
     setup = Setup(quick, kodak)
-    for part in (against_products, against_dense, black_pixels, methods, at_a_megapixel):
+    for part in (against_dense, black_pixels, methods, at_a_megapixel):
         yield from part(setup)
