@@ -27,11 +27,6 @@ TIMES = (0.5, 1.0, 2.0, 5.0)
 STEP = 7  # pixels that the camera moves from frame to frame
 
 
-def claim(what: str, limit: float, measured: float, *, at_least: bool = False) -> Figure:
-    """A measured value with its limit."""
-    return Figure(what, measured, limit, at_most=not at_least)
-
-
 def _astronaut(side: int) -> tuple[Tensor, Tensor, Spectrum]:
     """Photograph, scribble on the suit, and spectrum of an operator that compares colours."""
     image, scale = scene("astronaut", side)
@@ -48,19 +43,19 @@ def masks() -> Iterator[Figure]:
     below_collar = np.arange(512)[:, None] > 200
     suit = torch.from_numpy((hue > 0.01) & (hue < 0.08) & (saturation > 0.6) & (value > 0.35) & below_collar)
     ratio = float(mask[0, 0][suit].mean() / mask[0, 0][~suit].mean())
-    yield claim("mask at t = 1: mean on the suit / mean elsewhere", 3.0, ratio, at_least=True)
+    yield Figure("mask at t = 1: mean on the suit / mean elsewhere", ratio, 3.0, at_most=False)
     levels = torch.linspace(0, 1, 21)
     quantiles = torch.stack([diffusion_mask(preview, small_spot, time=t).flatten().quantile(levels) for t in TIMES])
-    yield claim(
+    yield Figure(
         f"smallest growth of its 5 to 95 % quantiles, t = {TIMES}",
-        0.0,
         float(quantiles.diff(dim=0)[:, 1:-1].min()),
-        at_least=True,
+        0.0,
+        at_most=False,
     )
-    yield claim("smallest value of the mask", 1e-30, float(mask.min()), at_least=True)
-    yield claim("largest value of the mask", 1.0, float(mask.max()))
+    yield Figure("smallest value of the mask", float(mask.min()), 1e-30, at_most=False)
+    yield Figure("largest value of the mask", float(mask.max()), 1.0)
     apart = F.avg_pool2d(mask, 2) - diffusion_mask(preview, small_spot)
-    yield claim("mean difference between masks at 256 and 512 pixels", 0.05, float(apart.abs().mean()))
+    yield Figure("mean difference between masks at 256 and 512 pixels", float(apart.abs().mean()), 0.05)
 
 
 def recolouring() -> Iterator[Figure]:
@@ -69,15 +64,15 @@ def recolouring() -> Iterator[Figure]:
     colours, painted = strokes(image, scale, (SUIT, (0.1, 0.3, 0.9)))
     edited = recolor(image, colours, painted)
     change = float(255 * (luminance(edited) - luminance(image)).abs().max())
-    yield claim("recolor: largest change of luminance, grey levels", 1.0, change)
+    yield Figure("recolor: largest change of luminance, grey levels", change, 1.0)
     outside = spots(image, scale, (300, 20, 100, 120)).expand_as(image) > 0  # backdrop
-    yield claim("recolor: largest change of the backdrop, grey levels", 2.0, _levels(edited - image, outside))
+    yield Figure("recolor: largest change of the backdrop, grey levels", _levels(edited - image, outside), 2.0)
     kept = spots(image, scale, (200, 90, 50, 60))  # face
     edited = recolor(image, colours, painted, keep=kept)
-    yield claim(
+    yield Figure(
         "recolor: largest change of the area to keep, grey levels",
-        2.0,
         _levels(edited - image, kept.expand_as(image) > 0),
+        2.0,
     )
 
 
@@ -89,9 +84,9 @@ def focusing() -> Iterator[Figure]:
     for aperture in ("disc", "gaussian"):
         blurred = defocus(image, region, radius=4.0, aperture=aperture)
         kept = _energy(blurred, face) / _energy(image, face)
-        yield claim(f"defocus, {aperture}: remaining gradient energy of the face", 0.95, kept, at_least=True)
+        yield Figure(f"defocus, {aperture}: remaining gradient energy of the face", kept, 0.95, at_most=False)
         left = _energy(blurred, shuttle) / _energy(image, shuttle)
-        yield claim(f"defocus, {aperture}: remaining gradient energy behind it", 0.3, left)
+        yield Figure(f"defocus, {aperture}: remaining gradient energy behind it", left, 0.3)
 
 
 def abstraction() -> Iterator[Figure]:
@@ -99,9 +94,9 @@ def abstraction() -> Iterator[Figure]:
     image = scene("chelsea", 256)[0]
     for power, limit in ((0.0, 0.01), (1e-5, 0.1)):
         change = float(255 * (abstract(image, power=power) - image).square().mean().sqrt())
-        yield claim(f"abstract, k = {power:g}: RMS change, grey levels", limit, change)
+        yield Figure(f"abstract, k = {power:g}: RMS change, grey levels", change, limit)
     drift = adjust_tone(image, contrast=1.4, clarity=3.0, limits="none").mean((2, 3)) - image.mean((2, 3))
-    yield claim("tone, contrast 1.4: drift of the mean, grey levels", 0.1, float(255 * drift.abs().max()))
+    yield Figure("tone, contrast 1.4: drift of the mean, grey levels", float(255 * drift.abs().max()), 0.1)
 
 
 def pan() -> Iterator[Figure]:
@@ -111,8 +106,8 @@ def pan() -> Iterator[Figure]:
     alpha = torch.tensor([3.0, 3.0, 4.0, 1.05])
     together = list(filter_frames(film, alpha, references=[film[0], film[5], film[9]]))
     singles = [next(filter_frames([frame], alpha, references=[frame])) for frame in film]
-    yield claim(
-        "flicker of a ten-frame pan / flicker of frames edited alone", 0.25, _flicker(together) / _flicker(singles)
+    yield Figure(
+        "flicker of a ten-frame pan / flicker of frames edited alone", _flicker(together) / _flicker(singles), 0.25
     )
 
 

@@ -7,6 +7,7 @@ import pytest
 from PIL import Image
 
 from benchmarks import edits
+from benchmarks.harness import Figure
 from docs.figures import FIGURES
 from docs.figures.__main__ import main
 
@@ -45,6 +46,6 @@ def test_every_promise_of_masks_and_edits_is_kept(tmp_path: Path, capsys: pytest
 
 
 def test_a_promise_that_is_broken_is_told() -> None:
-    assert not edits.claim("", 1.0, 2.0).holds
-    assert not edits.claim("", 2.0, 1.0, at_least=True).holds
-    assert not edits.claim("", 1.0, float("nan")).holds
+    assert not Figure("", 2.0, 1.0).holds
+    assert not Figure("", 1.0, 2.0, at_most=False).holds
+    assert not Figure("", float("nan"), 1.0).holds
