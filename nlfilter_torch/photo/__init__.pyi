@@ -32,4 +32,5 @@ from .plotting import show_eigenvectors as show_eigenvectors
 from .plotting import show_images as show_images
 from .plotting import show_layers as show_layers
 from .plotting import show_mask as show_mask
+from .selections.cutouts import cutout as cutout
 from .selections.mask import region_mask as region_mask

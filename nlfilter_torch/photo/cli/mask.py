@@ -25,11 +25,21 @@ Depth = Annotated[
     ),
 ]
 
+Cutout = Annotated[
+    Path | None,
+    typer.Option(
+        help="Also write the object itself, a transparent .png, .tif, .webp or .avif of the photograph's depth, whose "
+        "soft borders are free of the colours of the background.",
+        rich_help_panel=options.FILES_PANEL,
+    ),
+]
+
 
 @with_declared(MASK)
 def mask(
     source: options.Source,
     target: Target,
+    cutout: Cutout = None,
     depth: Depth = None,
     seed: options.Seed = 0,
     memory: options.Memory = None,
@@ -49,8 +59,10 @@ def mask(
     if not scribbles.marks_objects(MASK):
         raise ValueError(MASK.scribbles[0].advice)
     editing.check_apart("OUT", target, photograph=source, mask=mask, strokes=strokes)
-    editing.check_apart("--show", show, photograph=source, output=target, mask=mask, strokes=strokes)
-    job = MaskJob(values, source, Path(target), scribbles, show, seed, memory, full, depth)
+    others = {"photograph": source, "output": target, "mask": mask, "strokes": strokes}
+    editing.check_apart("--show", show, **others)
+    editing.check_apart("--cutout", cutout, **others, show=show)
+    job = MaskJob(values, source, Path(target), scribbles, show, cutout, seed, memory, full, depth)
     job.check_depth()
     editing.check_processes(source, target, workers, cluster)
     job.run(workers, cluster)

@@ -4,6 +4,9 @@ from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import cast
+
+import torch
 
 from nlfilter_torch.core.workers import single_threaded
 from nlfilter_torch.photo.cli import editing, options
@@ -16,7 +19,7 @@ from nlfilter_torch.photo.cli.showing import Scribbled, tell_selected
 from nlfilter_torch.photo.declared.json_values import Value
 from nlfilter_torch.photo.declared.parameters import MASK
 from nlfilter_torch.photo.declared.steps import working_bytes
-from nlfilter_torch.photo.files.formats import PFM, Depth, check_depth, check_memory, write_pfm
+from nlfilter_torch.photo.files.formats import DEPTHS, PFM, SUFFIXES, Depth, check_depth, check_memory, write_pfm
 from nlfilter_torch.photo.files.metadata import NO_METADATA
 from nlfilter_torch.photo.files.rows import TILED_MEMORY, StoredPicture, check_place, open_picture, write_picture
 from nlfilter_torch.photo.files.writing import check_file
@@ -30,6 +33,7 @@ from nlfilter_torch.photo.picture.pixels import M
 from nlfilter_torch.photo.picture.regions import region_rows
 from nlfilter_torch.photo.picture.source import Fitted, Source, seeded
 from nlfilter_torch.photo.picture.tiled import Tiled
+from nlfilter_torch.photo.selections.cutouts import Cutout
 from nlfilter_torch.photo.selections.mask import RegionMask
 
 PLANE_BYTES = 16  # per pixel, of a mask that is computed in tiles but written at once
@@ -45,6 +49,7 @@ class MaskJob:
         target: the file to write.
         scribbles: options that mark parts of the photograph.
         show: file for the picture of scribbles and mask.
+        cutout: file for the object on transparent ground.
         seed: of the random numbers.
         memory: gigabytes that may be used.
         full: whether statistics of tiles are of all pixels.
@@ -56,6 +61,7 @@ class MaskJob:
     target: Path
     scribbles: ScribbleOptions
     show: Path | None
+    cutout: Path | None
     seed: int
     memory: float | None
     full: bool
@@ -94,13 +100,18 @@ class MaskJob:
             if photograph is not None:
                 mask = Photograph(photograph.pixels[:, :1], self.kind)
                 check_file(self.target) if self.floats else check_output(self.target, mask)
+                cut = None if self.cutout is None else self._transparent(photograph, self.cutout)
+                if self.cutout is not None and cut is not None:
+                    check_output(self.cutout, cut)
                 begin("Selecting")
-                mask = self._in_memory(photograph, mask, allowed)
+                mask, cut = self._in_memory(photograph, mask, cut, allowed)
                 begin("Writing")
                 if self.floats:
                     write_pfm(self.target, mask.pixels[0, 0].float().numpy())
                 else:
                     write_photograph(mask, self.target)
+                if self.cutout is not None and cut is not None:
+                    write_photograph(cut, self.cutout)
                 return
         with open_picture(Path(self.source), allowed) as picture, ExitStack() as files:
             report = files.enter_context(stages())
@@ -110,14 +121,26 @@ class MaskJob:
             job = editing.Job(picture, self.kind, allowed - picture.cached, limit, report, files, processes)
             self._by_rows(job, plain)
 
-    def _in_memory(self, photograph: Photograph, mask: Photograph, allowed: int) -> Photograph:
-        """The mask of a photograph in memory."""
+    def _transparent(self, photograph: Photograph, target: Path) -> Photograph:
+        """A photograph with the transparency that the cut-out will have, at a depth that its file can have."""
+        weights = photograph.weights
+        opacity = torch.ones_like(photograph.pixels[:, :1]) if weights is None else weights
+        return replace(photograph, alpha=opacity, hidden=None, depth=depth_in(target, photograph.depth))
+
+    def _in_memory(
+        self, photograph: Photograph, mask: Photograph, cut: Photograph | None, allowed: int
+    ) -> tuple[Photograph, Photograph | None]:
+        """The mask of a photograph in memory, and its object, if it is to be cut out."""
         rows = rows_in_memory(photograph, self.source)
         with ExitStack() as files:
             marked = self._marked(rows, PictureOpener(files, allowed))
             drawn = marked.tensors()
         image = InMemory(photograph.pixels, weights=photograph.weights)
-        return mask.with_pixels(image.all(self._fitted(image, drawn)))
+        fitted = self._fitted(image, drawn)
+        if cut is not None and cut.alpha is not None:
+            colours, opacity = image.all(cut_out(image, fitted)).tensor_split([-1], dim=1)
+            cut = replace(cut, pixels=colours.to(cut.pixels), alpha=opacity.to(cut.pixels) * cut.alpha)
+        return mask.with_pixels(image.all(fitted)), cut
 
     def _check_rows(self, picture: StoredPicture, allowed: int) -> StoredPicture:
         """Check whether the mask can be written, and return the picture that it is written like."""
@@ -129,6 +152,10 @@ class MaskJob:
             check_memory(Path(self.source), width, height, PLANE_BYTES, allowed)
         else:
             check_place(self.target, self.kind, plain, allowed)
+        if self.cutout is not None:
+            check_place(
+                self.cutout, depth_in(self.cutout, picture.rows.dtype.name), picture.with_transparency(), allowed
+            )
         return plain
 
     def _by_rows(self, job: editing.Job, plain: StoredPicture) -> None:
@@ -140,10 +167,17 @@ class MaskJob:
             fitted = self._fitted(tiled, marked.rows())
         if self.floats:
             write_pfm(self.target, tiled.all(fitted)[0, 0].float().numpy())
-            return
+        else:
+            self._write(tiled, fitted, self.target, self.kind, plain)
+        if self.cutout is not None:
+            depth = depth_in(self.cutout, job.picture.rows.dtype.name)
+            self._write(tiled, cut_out(tiled, fitted), self.cutout, depth, job.picture.with_transparency())
+
+    def _write(self, tiled: Tiled, fitted: Fitted, target: Path, depth: str, like: StoredPicture) -> None:
+        """Write planes that are computed in tiles."""
         with tiled.tiling(fitted) as tiling:
-            plane = replace(tiling, transparent=False)
-            write_picture(self.target, plane, self.kind, plain, fill=plane.fill)
+            planes = replace(tiling, transparent=False, passes=replace(tiling.passes, kind=depth))
+            write_picture(target, planes, depth, like, fill=planes.fill)
 
     def _edit_at(self, size: tuple[int, int], stride: float = 1) -> RegionMask:
         """The settings for a picture (H, W), sampled at every so many pixels of the photograph."""
@@ -166,3 +200,15 @@ class MaskJob:
         regions = edit.select(seen, drawn)
         tell_selected(regions.selected(seen), opposed="background" in drawn.masks)
         return Fitted(regions.masks, working=working, gives_picture=False)
+
+
+def cut_out(source: Source[M], fitted: Fitted) -> Fitted:
+    """The colours of the object of a mask that was fitted to a picture, and the mask."""
+    seen = source.in_range(fitted.working)
+    return replace(fitted, pixels=Cutout.of(seen, fitted.pixels, fitted.working))
+
+
+def depth_in(target: Path, depth: str) -> Depth:
+    """The depth of a photograph, or the nearest that the file of a cut-out can have."""
+    depths = DEPTHS.get(SUFFIXES.get(target.suffix.lower(), ""), (depth,))
+    return cast(Depth, depth if depth in depths else depths[-1])

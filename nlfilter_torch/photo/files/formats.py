@@ -4,6 +4,7 @@ Needs the ``cli`` extra (Pillow, tifffile, imagecodecs, psutil).
 """
 
 import math
+import re
 from collections.abc import Iterable
 from dataclasses import replace
 from functools import partial
@@ -20,6 +21,7 @@ from nlfilter_torch.photo.files import codecs, jpeg, png, tiff
 from nlfilter_torch.photo.files import exif as exif_tags
 from nlfilter_torch.photo.files.exif_in_tiff import shortened
 from nlfilter_torch.photo.files.metadata import (
+    NO_METADATA,
     CheckSize,
     Decoded,
     Header,
@@ -47,6 +49,8 @@ MOST_PIXELS = {"AVIF": codecs.MOST_AVIF}
 SUFFIXES = {".png": "PNG", ".jpg": "JPEG", ".jpeg": "JPEG", ".webp": "WebP", ".avif": "AVIF"}
 SUFFIXES |= {".tif": "TIFF", ".tiff": "TIFF"}
 PFM = ".pfm"  # of masks
+#: Of a PFM file: colour or grey, width, height, and the scale, negative for little-endian values.
+PFM_HEADER = re.compile(rb"P([Ff])\s+(\d+)\s+(\d+)\s+(-?[\d.]+(?:[eE][-+]?\d+)?)\s")
 
 
 def type_of(path: str | Path) -> str | None:
@@ -116,6 +120,8 @@ def _read_mapped(path: Path, data: mmap, check_size: CheckSize) -> Decoded:
         return codecs.read_webp(path, data, check_size)
     if codecs.is_avif(head):
         return codecs.read_avif(path, data, check_size)
+    if (header := PFM_HEADER.match(head)) is not None:
+        return _read_pfm(data, header, check_size)
     raise UnhandledImage(f"{path} is not a PNG, JPEG, TIFF, WebP or AVIF image; convert it to one of these")
 
 
@@ -238,6 +244,15 @@ def write_pfm(path: Path, plane: NDArray[np.float32]) -> None:
     with open_beside(path) as stream:
         stream.write(f"Pf\n{width} {height}\n-1.0\n".encode())  # negative: little-endian
         stream.write(np.ascontiguousarray(plane[::-1], "<f4").tobytes())
+
+
+def _read_pfm(data: mmap, header: re.Match[bytes], check_size: CheckSize) -> Decoded:
+    """Read a PFM file that is mapped into memory, whose header is given; its values are taken as they are."""
+    kind, width, height, scale = header.groups()
+    size, samples = (int(width), int(height)), 3 if kind == b"F" else 1
+    check_size(size)
+    values = np.frombuffer(data, "<f4" if scale.startswith(b"-") else ">f4", math.prod(size) * samples, header.end())
+    return Decoded(values.reshape(size[1], size[0], samples)[::-1].astype(np.float32), 1, NO_METADATA)
 
 
 def check_memory(path: Path, width: int, height: int, bytes_per_pixel: int, memory: int | None = None) -> None:

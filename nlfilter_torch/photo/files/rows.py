@@ -97,6 +97,13 @@ class StoredPicture:
         rows = self._empty((height, width, 3 + self.alpha))
         return replace(self, rows=rows, metadata=replace(self.metadata, icc=None))
 
+    def with_transparency(self) -> "StoredPicture":
+        """Return shape and metadata of the same picture with transparency, without pixels."""
+        if self.alpha:
+            return self
+        height, width, samples = self.shape
+        return replace(self, rows=self._empty((height, width, samples + 1)), alpha=True)
+
     def of_part(self, size: tuple[int, int]) -> "StoredPicture":
         """Return shape and metadata of a part (H, W), without pixels."""
         if size == self.shape[:2]:

@@ -4,6 +4,7 @@ import os
 from collections.abc import Callable, Iterator, Sequence
 from functools import lru_cache, partial
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -37,11 +38,10 @@ def opened_picture(path: str) -> Picture:
 def _picture_of(path: str, changed: int) -> Picture:
     """The picture in a file that was last changed at a time."""
     try:
-        import imagecodecs
+        from nlfilter_torch.photo.files.formats import read_channels
     except ImportError as error:
         raise ImportError(f"{path} is a picture, and reading it needs nlfilter-torch[cli]; install that") from error
-    with open(path, "rb") as stream:
-        return Picture(imagecodecs.imread(stream.read()), path, hides=False)
+    return Picture(read_channels(Path(path), bytes_per_pixel=0, memory=None).channels, path, hides=False)
 
 
 def rasterised(
