@@ -399,6 +399,7 @@ FUNCTIONS = {
             "photometric_bandwidth": _plain(0.03, 0.5),
         },
     ),
+    "cutout": Function(photo.cutout, {"image": _image(1, 3), "mask": lambda scene: scene.mask(1)}, {}),
     "recolor": Function(
         photo.recolor,
         {"image": _image(3)} | PAINTED,

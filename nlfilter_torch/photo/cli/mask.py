@@ -62,7 +62,7 @@ def mask(
     others = {"photograph": source, "output": target, "mask": mask, "strokes": strokes}
     editing.check_apart("--show", show, **others)
     editing.check_apart("--cutout", cutout, **others, show=show)
-    job = MaskJob(values, source, Path(target), scribbles, show, cutout, seed, memory, full, depth)
+    job = MaskJob(values, source, Path(target), scribbles, show, seed, memory, full, depth, cutout)
     job.check_depth()
     editing.check_processes(source, target, workers, cluster)
     job.run(workers, cluster)

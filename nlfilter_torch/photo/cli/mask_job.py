@@ -19,7 +19,7 @@ from nlfilter_torch.photo.cli.showing import Scribbled, tell_selected
 from nlfilter_torch.photo.declared.json_values import Value
 from nlfilter_torch.photo.declared.parameters import MASK
 from nlfilter_torch.photo.declared.steps import working_bytes
-from nlfilter_torch.photo.files.formats import DEPTHS, PFM, SUFFIXES, Depth, check_depth, check_memory, write_pfm
+from nlfilter_torch.photo.files.formats import DEPTHS, PFM, Depth, check_depth, check_memory, type_of, write_pfm
 from nlfilter_torch.photo.files.metadata import NO_METADATA
 from nlfilter_torch.photo.files.rows import TILED_MEMORY, StoredPicture, check_place, open_picture, write_picture
 from nlfilter_torch.photo.files.writing import check_file
@@ -49,11 +49,11 @@ class MaskJob:
         target: the file to write.
         scribbles: options that mark parts of the photograph.
         show: file for the picture of scribbles and mask.
-        cutout: file for the object on transparent ground.
         seed: of the random numbers.
         memory: gigabytes that may be used.
         full: whether statistics of tiles are of all pixels.
         depth: of the file; None is that of its type.
+        cutout: file for the object on transparent ground.
     """
 
     values: Mapping[str, Value]
@@ -61,11 +61,11 @@ class MaskJob:
     target: Path
     scribbles: ScribbleOptions
     show: Path | None
-    cutout: Path | None
     seed: int
     memory: float | None
     full: bool
     depth: options.FileDepth | None
+    cutout: Path | None = None
 
     @property
     def bytes_per_pixel(self) -> int:
@@ -210,5 +210,5 @@ def cut_out(source: Source[M], fitted: Fitted) -> Fitted:
 
 def depth_in(target: Path, depth: str) -> Depth:
     """The depth of a photograph, or the nearest that the file of a cut-out can have."""
-    depths = DEPTHS.get(SUFFIXES.get(target.suffix.lower(), ""), (depth,))
+    depths = DEPTHS.get(type_of(target) or "", (depth,))
     return cast(Depth, depth if depth in depths else depths[-1])

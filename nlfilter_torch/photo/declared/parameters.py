@@ -421,6 +421,8 @@ MASK = Edit(
     Example: `nlfilter-torch mask in.jpg mask.png --region 190,60,60,60 --background 10,10,40,40`
 
     Refine a rough mask: `nlfilter-torch mask in.jpg mask.tif --mask rough.png`
+
+    Cut the object out: `nlfilter-torch mask in.jpg mask.png --box 150,30,200,300 --cutout object.png`
     """,
     (
         REGION_REACH,

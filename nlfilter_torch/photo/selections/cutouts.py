@@ -22,6 +22,7 @@ from nlfilter_torch.photo.picture.resizing import enlarged
 from nlfilter_torch.photo.picture.source import Fitted, Source
 from nlfilter_torch.photo.picture.viewing import viewed_size
 
+VIEWING = VIEWING_SIZE.default_number  # megapixels, at which colours are estimated
 LEAST_WEIGHT, BORDER_WEIGHT = 1e-4, 0.1  # of the difference of neighbours: anywhere, and times that of their masks
 COARSE, COARSE_ROUNDS, ROUNDS = 32, 10, 3  # pixels of a coarse level along its long side, and rounds there and beyond
 
@@ -89,7 +90,7 @@ class Cutout:
     @staticmethod
     def of(source: Source[M], masks: Planes, working: WorkingRange | None = None) -> "Cutout":
         """Estimate the colours at the viewing size, of a picture as it is seen in a range."""
-        size = viewed_size(source.size, VIEWING_SIZE.default_number)
+        size = viewed_size(source.size, VIEWING)
         planes = shrunk(source, _WithMask(masks), size)
         colours = torch.cat(estimated(planes[:, :-1], planes[:, -1:].clamp(0.0, 1.0)), dim=1)
         return Cutout(masks, colours, (source.size[0] / size[0], source.size[1] / size[1]), working)

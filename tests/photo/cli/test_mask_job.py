@@ -9,12 +9,14 @@ import tifffile
 import torch
 from PIL import Image
 
-from nlfilter_torch.photo import region_mask
+from nlfilter_torch.photo import Recipe, Region, Step, cutout, read_photograph, region_mask
 from nlfilter_torch.photo.cli import main
 from nlfilter_torch.photo.cli.mask_job import MaskJob
 from nlfilter_torch.photo.cli.options import FileDepth
 from nlfilter_torch.photo.cli.scribbles import ScribbleOptions
 from nlfilter_torch.photo.declared.parameters import MASK
+from nlfilter_torch.photo.files.formats import write_pfm
+from nlfilter_torch.photo.picture.photographs import Photograph, write_photograph
 from nlfilter_torch.photo.picture.source import seeded
 from tests.problems import box, colour
 
@@ -92,6 +94,60 @@ def test_files_of_every_kind(photograph: Path, tmp_path: Path, capsys: pytest.Ca
     np.testing.assert_allclose(sixteen / 65535, wanted, atol=1e-4)
     assert run(photograph, tmp_path / "out.pfm") == 0
     np.testing.assert_allclose(floats(tmp_path / "out.pfm"), wanted, atol=1e-5)
+
+
+def test_an_object_is_cut_out(photograph: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    image = torch.from_numpy(tifffile.imread(photograph).astype(np.float32) / 255).permute(2, 0, 1)[None]
+    wanted = cutout(image, torch.from_numpy(expected(photograph))[None, None])[0].permute(1, 2, 0).numpy()
+    for name in ("cut.png", "cut.tif"):
+        assert run(photograph, tmp_path / "out.png", "--cutout", str(tmp_path / name)) == 0
+    with Image.open(tmp_path / "cut.png") as opened:
+        assert opened.mode == "RGBA"
+        np.testing.assert_allclose(np.asarray(opened) / 255, wanted, atol=0.5 / 255 + 1e-4)
+    assert read_photograph(tmp_path / "cut.tif").alpha is not None
+    sixteen = tmp_path / "sixteen.tif"
+    tifffile.imwrite(sixteen, tifffile.imread(photograph).astype(np.uint16) * 257, photometric="rgb")
+    monkeypatch.setattr("nlfilter_torch.photo.cli.editing.read_if_it_fits", lambda *_: None)
+    assert run(sixteen, tmp_path / "out.pfm", "--cutout", str(tmp_path / "cut.png")) == 0
+    cut = read_photograph(tmp_path / "cut.png")
+    assert (cut.depth, cut.alpha is None) == ("uint16", False)
+    shown = wanted[..., 3] > 0.05
+    np.testing.assert_allclose(cut.pixels[0].permute(1, 2, 0).numpy()[shown], wanted[..., :3][shown], atol=0.02)
+
+
+@pytest.mark.usefixtures("tiled")
+def test_cut_outs_that_cannot_be_written(photograph: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for name, sentence in (
+        ("cut.jpg", "cannot hold this picture: JPEG has no alpha channel; write a PNG"),
+        ("out.png", "--cutout must be another file than the output, got"),
+        ("cut.pfm", "must end in .png, .jpg, .webp, .avif or .tif, got '.pfm'"),
+    ):
+        assert run(photograph, tmp_path / "out.png", "--cutout", str(tmp_path / name)) == 2
+        assert sentence in capsys.readouterr().err
+        assert sorted(file.name for file in tmp_path.iterdir()) == [photograph.name]
+
+
+@pytest.mark.parametrize("verb", ["mask", "defocus", "detail"])
+def test_masks_of_other_programs_are_read_from_files_of_every_kind(photograph: Path, tmp_path: Path, verb: str) -> None:
+    plane = np.zeros(SIZE, np.float32)
+    plane[20:50, 20:60] = 1
+    write_pfm(tmp_path / "mask.pfm", plane)
+    Image.fromarray((plane * 255).astype(np.uint8)).save(tmp_path / "mask8.png")
+    write_photograph(Photograph(torch.from_numpy(plane)[None, None], "uint16"), tmp_path / "mask16.png")
+    tifffile.imwrite(tmp_path / "mask.tif", (plane * 65535).astype(np.uint16))
+    results = []
+    for name in ("mask.pfm", "mask8.png", "mask16.png", "mask.tif"):
+        assert main([verb, str(photograph), str(tmp_path / "out.png"), "--mask", str(tmp_path / name)]) == 0
+        with Image.open(tmp_path / "out.png") as opened:
+            results.append(np.asarray(opened))
+        if name == "mask.pfm":
+            edit = Step(verb, (Region.of_file(str(tmp_path / name), "mask", "in"),)) if verb == "defocus" else None
+    assert all(np.array_equal(result, results[0]) for result in results)
+    if edit is not None:
+        (tmp_path / "edit.json").write_text(Recipe((edit,)).to_json())
+        assert main(["apply", str(photograph), str(tmp_path / "out.png"), "--preset", str(tmp_path / "edit.json")]) == 0
+        with Image.open(tmp_path / "out.png") as opened:
+            np.testing.assert_array_equal(np.asarray(opened), results[0])
 
 
 def test_a_rough_mask_becomes_a_soft_one(photograph: Path, tmp_path: Path) -> None:
