@@ -7,12 +7,12 @@ import torch.nn.functional as F
 
 from nlfilter_torch.photo import cutout
 from nlfilter_torch.photo.picture.in_memory import InMemory
+from nlfilter_torch.photo.picture.measuring import range_of
 from nlfilter_torch.photo.picture.pictures import Picture
 from nlfilter_torch.photo.picture.pixels import part_of
 from nlfilter_torch.photo.picture.source import Fitted
 from nlfilter_torch.photo.picture.tiled import Tiled
 from nlfilter_torch.photo.picture.tiles import Passes
-from nlfilter_torch.photo.picture.working_range import range_of
 from nlfilter_torch.photo.selections import cutouts
 from nlfilter_torch.photo.selections.cutouts import Cutout, explained
 from tests.problems import colour, noise
