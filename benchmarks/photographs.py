@@ -19,6 +19,9 @@ LOADERS = {"motorcycle": lambda: skimage.data.stereo_motorcycle()[0]}
 
 CHOOSING = ("astronaut", "coffee", "chelsea", "motorcycle", "rocket")  # defaults of edits were chosen on these
 REPORTING = ("hubble_deep_field", "immunohistochemistry", "retina", "colorwheel")  # and not on these
+HELD_OUT = ("motorcycle", "immunohistochemistry", "coins")  # nothing of layers was chosen on these
+HELD_OUT_OF_KODAK = (1, 13, 19)  # of Kodak's photographs
+PIECES = (2, 3, 7, 9, 14, 15, 17, 21, 22)  # of a large picture, of Kodak's
 SIZE = 640  # longer side of a scene, in pixels
 Box = tuple[int, int, int, int]  # column, row, width, height, in pixels of the full-size photograph
 
@@ -59,6 +62,27 @@ def pictures(folder: Path | None, side: int, names: Sequence[str]) -> dict[str, 
 def kodak(folder: Path, number: int) -> Tensor:
     """One of Kodak's 24 photographs (1, 3, H, W), from a folder of files with their usual names (kodim07.png)."""
     return read_photograph(folder / f"kodim{number:02d}.png").pixels.float()
+
+
+def held_out(folder: Path | None) -> dict[str, Tensor]:
+    """Three photographs (1, C, H, W) for figures that are reported: scikit-image's, or Kodak's if a folder is told."""
+    if folder is None:
+        return {name: photograph(name) for name in HELD_OUT}
+    return {f"kodim{number:02d}": kodak(folder, number) for number in HELD_OUT_OF_KODAK}
+
+
+def large(folder: Path | None, side: int) -> Tensor:
+    """A square picture (1, 3, side, side): a retina, or the middles of nine of Kodak's photographs."""
+    if folder is None:
+        return photograph("retina", side, side)
+    length = -(-side // 3)
+    pieces = []
+    for number in PIECES:
+        picture = kodak(folder, number)
+        top, left = ((size - length) // 2 for size in picture.shape[-2:])
+        pieces.append(picture[..., top : top + length, left : left + length])
+    rows = [torch.cat(pieces[first : first + 3], dim=3) for first in (0, 3, 6)]
+    return torch.cat(rows, dim=2)[..., :side, :side].contiguous()
 
 
 def middle(picture: Tensor, height: int, width: int) -> Tensor:

@@ -1,7 +1,7 @@
 """f(W) of any response: its error against the dense eigen-decomposition, its cost at a megapixel, and the methods.
 
 The forms and limits of the methods were chosen on the astronaut; coffee, chelsea and camera were looked at meanwhile.
-The figures are of other photographs (:mod:`benchmarks.layers.held_out`).
+The figures are of other photographs (:data:`benchmarks.photographs.HELD_OUT`).
 """
 
 import math
@@ -15,8 +15,7 @@ import torch
 from torch import Tensor
 
 from benchmarks.harness import Figure, seconds
-from benchmarks.layers.held_out import held_out, large
-from benchmarks.photographs import middle
+from benchmarks.photographs import held_out, large, middle
 from nlfilter_torch import (
     NonlocalOperator,
     apply_function,

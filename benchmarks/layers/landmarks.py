@@ -9,8 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from benchmarks.harness import Figure
-from benchmarks.layers.held_out import held_out
-from benchmarks.photographs import photograph
+from benchmarks.photographs import held_out, photograph
 from nlfilter_torch import NonlocalFilter
 from nlfilter_torch.nn.affinity import Hold
 from nlfilter_torch.operator.options import Sampling

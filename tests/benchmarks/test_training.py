@@ -10,8 +10,8 @@ import torch
 
 from benchmarks.harness import Figure
 from benchmarks.layers import __main__ as program
-from benchmarks.layers.held_out import NUMBERS, PIECES, held_out, large
 from benchmarks.layers.styles import StyleNetwork, style
+from benchmarks.photographs import HELD_OUT_OF_KODAK, PIECES, held_out, large
 from nlfilter_torch.photo.picture.photographs import Photograph, write_photograph
 
 
@@ -48,10 +48,10 @@ def test_the_program_fails_for_a_figure_that_does_not_hold(
 def test_pictures_are_those_of_scikit_image_or_kodak(tmp_path: Path) -> None:
     assert [picture.shape[1] for picture in held_out(None).values()] == [3, 3, 1]
     assert large(None, 60).shape == (1, 3, 60, 60)
-    for number in {*NUMBERS, *PIECES}:
+    for number in {*HELD_OUT_OF_KODAK, *PIECES}:
         picture = torch.full((1, 3, 60, 90), number / 255)
         write_photograph(Photograph(picture), tmp_path / f"kodim{number:02d}.png")
-    for number, picture in zip(NUMBERS, held_out(tmp_path).values(), strict=True):
+    for number, picture in zip(HELD_OUT_OF_KODAK, held_out(tmp_path).values(), strict=True):
         assert picture.shape == (1, 3, 60, 90)
         torch.testing.assert_close(picture[0, 0, 0, 0], torch.tensor(number / 255))
     mosaic = large(tmp_path, 100)
