@@ -10,8 +10,9 @@ from nlfilter_torch.photo.app import drawing
 from nlfilter_torch.photo.app.session import Session
 from nlfilter_torch.photo.app.tools import BRUSHES, Brush, CropTool
 from nlfilter_torch.photo.declared.parameters import DETAIL, EDITS
-from nlfilter_torch.photo.declared.strokes import Mark, Stroke
+from nlfilter_torch.photo.declared.strokes import Mark
 
+LEAST_SIDE = 3  # pixels of the preview, of a box; less is a click
 Draw = Callable[[str, Callable[[], None]], None]  # adds a stroke to a step
 
 
@@ -246,8 +247,7 @@ class Canvas:
             strokes = self._session.step_in_view(self._step).strokes if self._step in BRUSHES else ()
             if self._line:
                 height, width = self._preview_size
-                points = tuple((x / width, y / height) for x, y in self._line)
-                strokes += (Stroke(points, self._brush.radius[self._step], self._brush.paint(self._step)),)
+                strokes += (self._brush.mark(self._step, [(x / width, y / height) for x, y in self._line]),)
         self._photo.set_content(drawing.strokes_svg(strokes, self._preview_size, keeps=drawing.keeps(self._step)))
         is_hatched = bool(strokes and self.pictures.get("ignored"))
         if is_hatched:
@@ -271,8 +271,13 @@ class Canvas:
             self._line.append((x, y))
         else:
             line, self._line = self._line, []
-            stroke = line, self._brush.radius[self._step], self._brush.paint(self._step)
-            self._draw(self._step, partial(self._session.add_stroke, self._step, *stroke))
+            if self._brush.draws_box(self._step):
+                if min(abs(a - b) for a, b in zip(line[0], line[-1], strict=True)) >= LEAST_SIDE:
+                    corners = line[0], line[-1], self._brush.paint(self._step)
+                    self._draw(self._step, partial(self._session.add_box, self._step, *corners))
+            else:
+                stroke = line, self._brush.radius[self._step], self._brush.paint(self._step)
+                self._draw(self._step, partial(self._session.add_stroke, self._step, *stroke))
         self.draw_strokes()
 
     def drop_stroke(self) -> None:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Self
 
 from nicegui import ui
@@ -183,14 +184,26 @@ class Slider:
 
 
 class Choice:
-    """A choice among words on the page, which shows the current edit and calls ``change`` with changes."""
+    """A choice of what takes part, which shows the current edit and calls ``change`` with changes.
+
+    Two buttons choose between all that is alike nearby and the object alone; a box lets what is alike be anywhere.
+    """
 
     def __init__(self, edit: str, parameter: Parameter, recipe: Callable[[], Recipe], change: Change) -> None:
         self._edit, self._parameter, self._recipe, self._change = edit, parameter, recipe, change
-        labels = dict(zip(parameter.choices, parameter.labels, strict=True))
-        self._select = ui.select(labels, value=self._chosen, label="What takes part")
-        self._select.props("dense outlined options-dense").classes("w-full q-mt-xs").tooltip(parameter.help)
-        self._select.on_value_change(lambda event: self._choose(event.value))
+        (near, alike), (alone, only), (self._wide, wider) = zip(parameter.choices, parameter.labels, strict=True)
+        self._near = near
+        with ui.row().classes("w-full items-center no-wrap gap-2 q-mt-xs"):
+            self._buttons = {
+                value: ui.button(label, on_click=partial(self._choose, value))
+                .props("dense no-caps unelevated")
+                .classes("q-px-sm")
+                .tooltip(parameter.help)
+                for value, label in ((alone, only), (near, alike))
+            }
+            self._wider = ui.checkbox(wider).props("dense").tooltip(parameter.help)
+        self.follow()
+        self._wider.on_value_change(lambda event: self._widen(event.value))
 
     @property
     def _chosen(self) -> str:
@@ -198,11 +211,22 @@ class Choice:
 
     def follow(self) -> None:
         """Show the current edit."""
-        self._select.set_value(self._chosen)
+        chosen = self._chosen
+        for value, button in self._buttons.items():
+            is_on = value == (self._near if chosen == self._wide else chosen)
+            show_pressed(button, is_on)
+            button.props(f"color={'primary' if is_on else 'grey-8'}")
+        self._wider.set_visibility(chosen in (self._near, self._wide))
+        self._wider.set_value(chosen == self._wide)
 
     def _choose(self, value: str) -> None:
-        if value != self._chosen:  # otherwise it follows the edit
+        if value != self._chosen and not (value == self._near and self._wider.value):
             self._change(self._edit, {self._parameter.name: value}, True)
+
+    def _widen(self, wide: bool) -> None:
+        """Let what is alike be anywhere, or near; the box follows the edit, too, where only the object takes part."""
+        if self._chosen == (self._near if wide else self._wide):
+            self._change(self._edit, {self._parameter.name: self._wide if wide else self._near}, True)
 
 
 def choices(edit: str, recipe: Callable[[], Recipe], change: Change) -> list[Choice]:

@@ -528,6 +528,22 @@ class Editor:
         if chosen is not None:
             self._tasks.start(self._save(Progress(), session.save_preset, chosen))
 
+    def cut_out(self, step: str) -> None:
+        """Ask for a name, and save the object that a step marks on transparent ground."""
+        self._tasks.start(self._ask_cutout_name(step))
+
+    async def _ask_cutout_name(self, step: str) -> None:
+        session = self._opened("to cut out of")
+        if session is None:
+            return
+        name = f"{Path(session.name).stem}-cut.png"
+        with self._client:
+            dialog = NameDialog("Cut out the object", name, session.folder, session.check_cutout)
+        chosen = await dialog.answer()
+        if chosen is not None:
+            progress = Progress()
+            self._tasks.start(self._save(progress, session.cut_out, chosen, step, progress))
+
     async def _save(self, progress: Progress, save: Callable[[*Arguments], Path], *arguments: *Arguments) -> None:
         path = await self._tasks.run("Saving", save, *arguments, progress=progress)
         self._tasks.clear_error()

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.photo.app.developed import DEVELOPING, Developed
-from nlfilter_torch.photo.app.preview import PIXELS, Preview
+from nlfilter_torch.photo.app.preview import PIXELS, Preview, selected
 from nlfilter_torch.photo.app.sidecar import Sidecar
 from nlfilter_torch.photo.declared.development import Crop, Development
 from nlfilter_torch.photo.declared.json_values import Value
@@ -28,10 +28,17 @@ from nlfilter_torch.photo.files.formats import BITS, DEPTHS, SUFFIXES, check_mem
 from nlfilter_torch.photo.files.rows import TILED_MEMORY, WHOLE_MEMORY, usual_memory
 from nlfilter_torch.photo.files.writing import open_beside
 from nlfilter_torch.photo.picture.developing import balance_of, in_light, limits_of, turned_canvas
-from nlfilter_torch.photo.picture.photographs import Photograph, check_output, read_photograph, write_photograph
+from nlfilter_torch.photo.picture.photographs import (
+    Photograph,
+    check_output,
+    read_photograph,
+    transparent,
+    write_photograph,
+)
 from nlfilter_torch.photo.picture.resizing import resize
 from nlfilter_torch.photo.picture.sampling import Report, in_silence
 from nlfilter_torch.photo.picture.tiles import Passes, Statistics
+from nlfilter_torch.photo.selections.cutouts import cutout
 
 POINTED = 2  # pixels of the preview on all sides of a point that are averaged
 SPACING = 0.2  # distance of the points of a stroke, as a share of its radius
@@ -247,11 +254,34 @@ class Session:
         height, width = self.preview.size
         shares = thin(((x / width, y / height) for x, y in points), SPACING * radius)
         entries = {"points": [list(point) for point in shares], "radius": round(radius, 4), "paint": paint}
+        self._add(step, entries)
+
+    def add_box(self, step: str, start: tuple[float, float], end: tuple[float, float], paint: str) -> None:
+        """Add a rectangle around an object of a step, in place of an earlier one around the same object.
+
+        Corners (x, y) are in pixels of the preview; what lies outside it is left out.
+
+        Raises:
+            ValueError: if the step does not take boxes of that meaning.
+        """
+        sides = []
+        for a, b, length in zip(start, end, self.preview.size[::-1], strict=True):
+            first, last = sorted(round(min(max(place / length, 0.0), 1.0), 4) for place in (a, b))
+            sides.append((first, last - first))
+        (left, width), (top, height) = sides
+        self._add(step, {"rectangle": [left, top, width, height], "paint": paint})
+
+    def _add(self, step: str, entries: dict[str, object]) -> None:
+        """Add a mark, where it is in the preview, to a step."""
         if not EDITS[step].scribbles:
             raise ValueError(f"{step} takes no strokes: it holds for the whole photograph")
-        stroke = self.developed.frame.mark_outward(EDITS[step].mark_of(entries, step))
+        mark = self.developed.frame.mark_outward(EDITS[step].mark_of(entries, step))
         current = self.recipe.current(step)
-        painted = current.changed(strokes=(*current.strokes, stroke)).switched_on()
+        others = current.strokes
+        if mark.role == "box":
+            same = mark.meaning.sliders
+            others = tuple(m for m in others if m.role != "box" or m.meaning.sliders != same)
+        painted = current.changed(strokes=(*others, mark)).switched_on()
         if painted.has_region() and not current.has_region():  # it begins with the sliders of the rest
             painted = painted.changed(inside=current["alpha"])
         self.recipe = self.recipe.with_current(painted)
@@ -412,6 +442,38 @@ class Session:
         report("Writing", 0, 1)
         write_photograph(resized_photograph(photograph.with_pixels(pixels), size), target, quality=quality)
         self.saved = recipe
+        return target
+
+    def check_cutout(self, name: str) -> Path:
+        """:meth:`target` of a name under which an object can be cut out; raises ValueError for others."""
+        target, photograph = self.target(name), self.developed.photograph
+        if target.resolve() == self.path:
+            raise ValueError(f"the name must not be that of the photograph, got {name!r}; choose another name")
+        check_output(target, transparent(photograph, target))
+        return target
+
+    def cut_out(self, name: str, edit: str, report: Report = in_silence) -> Path:
+        """Write the edited photograph without what the scribbles of the chosen step of an edit do not select.
+
+        Raises:
+            ValueError, OSError, MemoryError: if nothing is marked, or the file cannot be edited or written.
+        """
+        target, recipe, developed = self.check_cutout(name), self.recipe, self._develop(self.recipe.develop)
+        photograph, steps = developed.photograph, self._on(developed, recipe)
+        pixels = self._edited_at_once(developed, recipe, report)
+        if pixels is None:
+            raise ValueError(
+                f"{self.name} must have fewer pixels to be cut out here, got {math.prod(photograph.size)}; save the "
+                "edit, and use nlfilter-torch mask --cutout"
+            )
+        place = recipe.place_of(edit)
+        before = apply_recipe(Recipe(steps.steps[: place or 0]), photograph.pixels, weights=photograph.weights)
+        mask = None if place is None else selected(steps.steps[place].mixed(on=True, opacity=1.0), before)
+        if mask is None:
+            raise ValueError(f"an object of {edit} must be marked to be cut out, got none; paint on it, or draw a box")
+        report("Writing", 0, 1)
+        cut = cutout(pixels, mask.amax(1, keepdim=True).to(pixels))[:, -1 - pixels.shape[1] :]
+        write_photograph(transparent(photograph, target, cut), target)
         return target
 
     def save_preset(self, name: str) -> Path:

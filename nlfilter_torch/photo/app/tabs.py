@@ -53,6 +53,9 @@ class EditedPage(Protocol):
     def clear(self, step: str) -> None:
         """Remove the strokes of a step."""
 
+    def cut_out(self, step: str) -> None:
+        """Ask for a name, and save the object that a step marks on transparent ground."""
+
     def replace(self, recipe: Recipe, moving: int | None) -> None:
         """Replace the edit; ``moving`` is the place of a step whose slider moves, or None if the change is complete."""
 
@@ -103,7 +106,6 @@ class EditTab:
         if needs_strokes:
             self._build_brush()
         self._sliders += [self._slider(control) for control in controls.OF_EDIT[self._edit]]
-        self._choices += controls.choices(self._edit, self._page.recipe, self._page.change)
         if not needs_strokes:
             self._build_brush()
 
@@ -118,12 +120,16 @@ class EditTab:
         with ui.row().classes("w-full items-center no-wrap"):
             ui.label("Tools").classes("group")
             ui.space()
+            if EDITS[edit].with_role("added"):
+                cut = ui.button("Cut out", on_click=lambda: self._page.cut_out(edit)).props("flat dense no-caps")
+                cut.tooltip("Save the object on transparent ground")
             ui.button("Clear strokes", on_click=self._clear).props("flat dense no-caps")
         if hint:
             ui.label(hint).classes("hint")
         self._tools = ui.toggle(BRUSHES[edit], value=brush.word[edit])
         self._tools.props('dense no-caps unelevated spread role="group" aria-label="Tools"').classes("w-full q-mt-xs")
         self._tools.on_value_change(lambda event: brush.word.update({edit: event.value}))
+        self._choices += controls.choices(edit, self._page.recipe, self._page.change)
         if EDITS[edit].with_role("added"):
             ui.label(BY_HAND).classes("hint wide")
         if "colour" in BRUSHES[edit]:
@@ -271,7 +277,6 @@ class DetailTab(EditTab):
     def _build_sliders(self, detail: Step) -> None:
         self._box.clear()
         sliders: list[Slider] = []
-        self._choices = []
         with self._box:
             if detail.has_region():
                 ui.label("In the region").classes("group")
@@ -279,7 +284,6 @@ class DetailTab(EditTab):
                 inside = controls.detail_sliders("inside", len(detail.sliders_inside))
                 sliders += [self._slider(control, " in the region") for control in inside]
                 sliders += [self._slider(control) for control in controls.OF_EDIT[self._edit]]
-                self._choices = controls.choices(self._edit, self._page.recipe, self._page.change)
                 ui.label("Elsewhere").classes("group")
             outside = controls.detail_sliders("alpha", len(detail["alpha"]))
             sliders += [self._slider(control) for control in outside]

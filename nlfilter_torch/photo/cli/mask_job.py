@@ -4,9 +4,6 @@ from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import cast
-
-import torch
 
 from nlfilter_torch.core.workers import single_threaded
 from nlfilter_torch.photo.cli import editing, options
@@ -19,7 +16,7 @@ from nlfilter_torch.photo.cli.showing import Scribbled, tell_selected
 from nlfilter_torch.photo.declared.json_values import Value
 from nlfilter_torch.photo.declared.parameters import MASK
 from nlfilter_torch.photo.declared.steps import working_bytes
-from nlfilter_torch.photo.files.formats import DEPTHS, PFM, Depth, check_depth, check_memory, type_of, write_pfm
+from nlfilter_torch.photo.files.formats import PFM, Depth, check_depth, check_memory, write_pfm
 from nlfilter_torch.photo.files.metadata import NO_METADATA
 from nlfilter_torch.photo.files.rows import TILED_MEMORY, StoredPicture, check_place, open_picture, write_picture
 from nlfilter_torch.photo.files.writing import check_file
@@ -27,7 +24,13 @@ from nlfilter_torch.photo.picture.drawn import Drawn
 from nlfilter_torch.photo.picture.edit import Rows
 from nlfilter_torch.photo.picture.in_memory import InMemory
 from nlfilter_torch.photo.picture.measuring import range_of
-from nlfilter_torch.photo.picture.photographs import Photograph, check_output, write_photograph
+from nlfilter_torch.photo.picture.photographs import (
+    Photograph,
+    check_output,
+    depth_in,
+    transparent,
+    write_photograph,
+)
 from nlfilter_torch.photo.picture.pictures import Picture
 from nlfilter_torch.photo.picture.pixels import M
 from nlfilter_torch.photo.picture.regions import region_rows
@@ -100,7 +103,7 @@ class MaskJob:
             if photograph is not None:
                 mask = Photograph(photograph.pixels[:, :1], self.kind)
                 check_file(self.target) if self.floats else check_output(self.target, mask)
-                cut = None if self.cutout is None else self._transparent(photograph, self.cutout)
+                cut = None if self.cutout is None else transparent(photograph, self.cutout)
                 if self.cutout is not None and cut is not None:
                     check_output(self.cutout, cut)
                 begin("Selecting")
@@ -121,12 +124,6 @@ class MaskJob:
             job = editing.Job(picture, self.kind, allowed - picture.cached, limit, report, files, processes)
             self._by_rows(job, plain)
 
-    def _transparent(self, photograph: Photograph, target: Path) -> Photograph:
-        """A photograph with the transparency that the cut-out will have, at a depth that its file can have."""
-        weights = photograph.weights
-        opacity = torch.ones_like(photograph.pixels[:, :1]) if weights is None else weights
-        return replace(photograph, alpha=opacity, hidden=None, depth=depth_in(target, photograph.depth))
-
     def _in_memory(
         self, photograph: Photograph, mask: Photograph, cut: Photograph | None, allowed: int
     ) -> tuple[Photograph, Photograph | None]:
@@ -137,9 +134,8 @@ class MaskJob:
             drawn = marked.tensors()
         image = InMemory(photograph.pixels, weights=photograph.weights)
         fitted = self._fitted(image, drawn)
-        if cut is not None and cut.alpha is not None:
-            colours, opacity = image.all(cut_out(image, fitted)).tensor_split([-1], dim=1)
-            cut = replace(cut, pixels=colours.to(cut.pixels), alpha=opacity.to(cut.pixels) * cut.alpha)
+        if self.cutout is not None:
+            cut = transparent(photograph, self.cutout, image.all(cut_out(image, fitted)))
         return mask.with_pixels(image.all(fitted)), cut
 
     def _check_rows(self, picture: StoredPicture, allowed: int) -> StoredPicture:
@@ -206,9 +202,3 @@ def cut_out(source: Source[M], fitted: Fitted) -> Fitted:
     """The colours of the object of a mask that was fitted to a picture, and the mask."""
     seen = source.in_range(fitted.working)
     return replace(fitted, pixels=Cutout.of(seen, fitted.pixels, fitted.working))
-
-
-def depth_in(target: Path, depth: str) -> Depth:
-    """The depth of a photograph, or the nearest that the file of a cut-out can have."""
-    depths = DEPTHS.get(type_of(target) or "", (depth,))
-    return cast(Depth, depth if depth in depths else depths[-1])

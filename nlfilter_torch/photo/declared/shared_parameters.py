@@ -209,7 +209,7 @@ EXTENT = Parameter(
     "`everywhere`, all of the picture.",
     domain="choice",
     choices=("near", "object", "everywhere"),
-    labels=("What is like it nearby", "This object", "Everywhere"),
+    labels=("All alike", "Only this", "Far away, too"),
 )
 REGION_REACH_SLIDER = Slider("Reach of the region", 0, 0.95, 0.05)
 

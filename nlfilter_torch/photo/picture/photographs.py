@@ -5,6 +5,7 @@ Needs the ``cli`` extra (Pillow, tifffile, imagecodecs, psutil).
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import torch
@@ -16,7 +17,15 @@ from nlfilter_torch.operator.hidden import REACH
 from nlfilter_torch.photo.declared.development import Development, Frame
 from nlfilter_torch.photo.declared.rows import NodataRows, Stored, is_hidden, keep_apart
 from nlfilter_torch.photo.files.exif import of_part
-from nlfilter_torch.photo.files.formats import Depth, check_depth, check_type, read_channels, write_file
+from nlfilter_torch.photo.files.formats import (
+    DEPTHS,
+    Depth,
+    check_depth,
+    check_type,
+    read_channels,
+    type_of,
+    write_file,
+)
 from nlfilter_torch.photo.files.metadata import NO_EXTRAS, Extras, Header, Metadata
 from nlfilter_torch.photo.picture.developing import develop_planes, finished, in_light, limits_of
 from nlfilter_torch.photo.picture.pictures import Picture, put_back, stored_as, transparency
@@ -184,6 +193,27 @@ def check_output(path: str | Path, photograph: Photograph) -> str:
     Call it before long work, so that the error comes early.
     """
     return check_type(path, photograph.depth, photograph.alpha is not None, photograph.size, photograph.metadata)
+
+
+def transparent(photograph: Photograph, target: Path, cut: Tensor | None = None) -> Photograph:
+    """A photograph as it is when an object of it is cut out, see :func:`depth_in`.
+
+    ``cut`` are the colours of the object and its mask, (1, C + 1, H, W); None is all of the photograph.
+    """
+    weights = photograph.weights
+    opacity = torch.ones_like(photograph.pixels[:, :1]) if weights is None else weights.to(photograph.pixels)
+    pixels = photograph.pixels
+    if cut is not None:
+        pixels, mask = cut.detach().to(pixels).tensor_split([-1], dim=1)
+        opacity = opacity * mask
+    depth = depth_in(target, photograph.depth)
+    return replace(photograph.with_pixels(pixels), alpha=opacity, hidden=None, depth=depth)
+
+
+def depth_in(target: Path, depth: str) -> Depth:
+    """The depth of a photograph, or the nearest that a file of that name can have."""
+    depths = DEPTHS.get(type_of(target) or "", (depth,))
+    return cast(Depth, depth if depth in depths else depths[-1])
 
 
 def develop_photograph(photograph: Photograph, development: Development) -> Photograph:

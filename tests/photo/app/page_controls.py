@@ -22,6 +22,7 @@ class Controls:
         self.brush, self.proportions = Brush(), Proportions()
         self.changes: list[tuple[str, Mapping[str, object], bool]] = []
         self.cleared: list[str] = []
+        self.cut: list[str] = []
         self.thumbnails: dict[str, str] = {}
         self.developed: list[object] = []
         self.is_cropping = self.is_picking = False
@@ -38,6 +39,10 @@ class Controls:
     def clear(self, step: str) -> None:
         """Remove the strokes of a step."""
         self.cleared.append(step)
+
+    def cut_out(self, step: str) -> None:
+        """Cut out the object of a step."""
+        self.cut.append(step)
 
     def replace(self, recipe: Recipe, moving: int | None) -> None:
         """Replace the edit."""
@@ -81,6 +86,11 @@ class Controls:
     def sliders(self) -> dict[str, float]:
         """Values of the sliders by their labels for screen readers."""
         return {slider.props["aria-label"]: slider.value for slider in self.of(ui.slider)}
+
+    def pressed(self, label: str) -> bool:
+        """Whether a button that switches something is pressed."""
+        (button,) = [b for b in self.of(ui.button) if b.text == label]
+        return bool(button.props["aria-pressed"] == "true")
 
     def click(self, label: str) -> None:
         """Click a button by its text or by its label for screen readers."""

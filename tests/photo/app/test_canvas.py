@@ -11,6 +11,7 @@ from nlfilter_torch.photo.app import drawing
 from nlfilter_torch.photo.app.canvas import Canvas
 from nlfilter_torch.photo.app.session import Session
 from nlfilter_torch.photo.app.tools import Brush
+from nlfilter_torch.photo.declared.strokes import Region
 from nlfilter_torch.photo.picture.photographs import Photograph, write_photograph
 from tests.problems import cat
 
@@ -99,6 +100,20 @@ def test_a_stroke(opened: Page, session: Session) -> None:
     assert canvas._photo.content == ""
     canvas._show_strokes.set_value(True)
     assert canvas._photo.content.count("<path") == 1
+
+
+def test_a_box(opened: Page, session: Session) -> None:
+    canvas = opened.canvas
+    canvas._brush.word["detail"] = "box"
+    canvas._pointer("pointerdown", 20, 20)
+    canvas._pointer("pointerup", 21, 60)  # a click, nearly
+    assert session.recipe.current("detail").strokes == ()
+    canvas._pointer("pointerdown", 120, 80)
+    canvas._pointer("pointermove", 30, 20)
+    assert canvas._photo.content.count("Z") == 1  # while it is drawn
+    canvas._pointer("pointerup", 30, 20)
+    (box,) = session.recipe.current("detail").strokes
+    assert box == Region.upright((0.2, 0.2, 0.6, 0.6), "rectangle", "box")
 
 
 def test_a_stroke_that_is_dropped(opened: Page, session: Session) -> None:

@@ -16,7 +16,7 @@ from nlfilter_torch.photo.app.session import Session
 from nlfilter_torch.photo.declared.colour_tables import cube_of, hald_of
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.declared.steps import Step
-from nlfilter_torch.photo.declared.strokes import Stroke
+from nlfilter_torch.photo.declared.strokes import Region, Stroke
 from nlfilter_torch.photo.picture.photographs import Photograph, write_photograph
 from tests.problems import LINE, cat, difference
 
@@ -79,6 +79,25 @@ def test_strokes(session: Session) -> None:
         session.add_stroke("abstract", LINE, 0.03, "in")
     with pytest.raises(ValueError, match="must be one of in, out, box, add, remove, got 'red'"):
         session.add_stroke("defocus", LINE, 0.03, "red")
+
+
+def test_a_box_takes_the_place_of_the_one_before(session: Session) -> None:
+    session.add_box("defocus", (30, 20), (120, 80), "box")
+    session.add_stroke("defocus", LINE, 0.03, "in")
+    session.add_box("defocus", (130, 90), (-5, 10), "box")
+    stroke, box = session.recipe.current("defocus").strokes
+    assert (stroke.paint, box) == ("in", Region.upright((0.0, 0.1, 0.8667, 0.8), "rectangle", "box"))
+    mask = session.mask("defocus")
+    assert mask is not None
+    assert mask[..., :10, :].max() == 0
+    session.add_box("recolor", (10, 10), (140, 90), "box #2040e0")
+    assert session.recipe.current("recolor").changes()
+    for sliders in ("", " 3,1,1,1", " 2,1,1,1", " 3,1,1,1"):
+        session.add_box("detail", (10, 10), (140, 90), f"box{sliders}")
+    paints = [mark.paint for mark in session.recipe.current("detail").strokes]
+    assert paints == ["box", "box 2,1,1,1", "box 3,1,1,1"]
+    with pytest.raises(ValueError, match="abstract takes no strokes"):
+        session.add_box("abstract", (10, 10), (140, 90), "box")
 
 
 def test_regions_of_files_are_those_of_the_preview(session: Session, tmp_path: Path) -> None:

@@ -41,6 +41,23 @@ def test_saving_is_what_the_command_line_does(session: Session, photo: Path) -> 
     assert difference(saved, apply_recipe(session.recipe, cat())) <= 1
 
 
+def test_an_object_is_cut_out_of_the_edited_photograph(session: Session, photo: Path) -> None:
+    with pytest.raises(ValueError, match="an object of defocus must be marked to be cut out, got none"):
+        session.cut_out("cut.png", "defocus")
+    session.set("tone", contrast=1.3)
+    session.add_box("defocus", (30, 20), (120, 80), "box")
+    saved, cut = (read_photograph(path) for path in (session.save("out.png"), session.cut_out("cut.png", "defocus")))
+    assert cut.alpha is not None
+    assert cut.alpha[..., :20, :].max() == 0
+    solid = (cut.alpha > 0.99).expand(-1, 3, -1, -1)
+    assert solid.any()
+    assert (cut.pixels - saved.pixels)[solid].abs().max() <= 3 / 255
+    with pytest.raises(ValueError, match=r"cut\.jpg cannot hold this picture: JPEG has no alpha channel"):
+        session.check_cutout("cut.jpg")
+    with pytest.raises(ValueError, match="the name must not be that of the photograph"):
+        session.check_cutout("cat.png")
+
+
 def test_a_size_and_a_quality(session: Session, photo: Path) -> None:
     session.set("tone", contrast=1.1)
     large = session.save("a.jpg", quality=100).stat().st_size

@@ -73,10 +73,25 @@ def test_what_the_brush_paints() -> None:
 
 def test_what_takes_part_is_chosen(shown: Controls) -> None:
     tab = EditTab("recolor", shown)
-    (chosen,) = shown.of(ui.select)
-    assert chosen.value == "near"
-    chosen.set_value("object")
+    assert shown.pressed("All alike")
+    shown.click("All alike")
+    assert shown.changes == []
+    shown.click("Only this")
     assert shown.changes == [("recolor", {"extent": "object"}, True)]
-    shown.show(tab, Recipe((Step("recolor", extent="everywhere"),)))
-    assert chosen.value == "everywhere"
+    (wider,) = shown.of(ui.checkbox)
+    wider.set_value(True)
+    assert shown.changes.pop() == ("recolor", {"extent": "everywhere"}, True)
+    for extent, button in (("everywhere", "All alike"), ("object", "Only this"), ("near", "All alike")):
+        shown.show(tab, Recipe((Step("recolor", extent=extent),)))
+        assert shown.pressed(button)
+        assert (wider.value, wider.visible) == (extent == "everywhere", extent != "object")
+        shown.click(button)
     assert len(shown.changes) == 1
+
+
+def test_an_object_is_cut_out(shown: Controls) -> None:
+    EditTab("defocus", shown)
+    shown.click("Cut out")
+    assert shown.cut == ["defocus"]
+    EditTab("colorize", shown)
+    assert [button.text for button in shown.of(ui.button)].count("Cut out") == 1

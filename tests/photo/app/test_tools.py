@@ -2,7 +2,8 @@
 
 from nicegui import Client
 
-from nlfilter_torch.photo.app.tools import CropTool, Proportions
+from nlfilter_torch.photo.app.tools import Brush, CropTool, Proportions
+from nlfilter_torch.photo.declared.strokes import Region, Stroke
 
 
 def test_the_tool_tells_the_page_what_to_show(client: Client, scripts: list[str]) -> None:
@@ -13,6 +14,16 @@ def test_the_tool_tells_the_page_what_to_show(client: Client, scripts: list[str]
     assert scripts.pop() == "cropper.show('/picture/token/whole?1', 150, 100, [0.1, 0.0, 1.0, 0.5], 1.5)"
     tool.hide()
     assert scripts == ["cropper.hide()"]
+
+
+def test_a_box_goes_from_where_a_drag_begins_to_where_it_ends() -> None:
+    brush = Brush()
+    assert brush.mark("defocus", [(0.1, 0.2), (0.3, 0.4)]) == Stroke(((0.1, 0.2), (0.3, 0.4)), 0.02, "in")
+    brush.word["defocus"], brush.word["recolor"] = "box", "box colour"
+    box = brush.mark("defocus", [(0.5, 0.75), (0.9, 0.9), (0.25, 0.25)])
+    assert box == Region.upright((0.25, 0.25, 0.25, 0.5), "rectangle", "box")
+    assert brush.draws_box("recolor")
+    assert brush.mark("recolor", [(0.0, 0.0), (0.5, 0.5)]).colour == brush.colour
 
 
 def test_proportions_are_cut_from_what_a_person_has_made() -> None:

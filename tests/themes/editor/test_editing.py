@@ -8,7 +8,9 @@ from playwright.sync_api import expect
 
 from nlfilter_torch.photo.cli import main
 from nlfilter_torch.photo.declared.presets import Recipe, find_recipe
-from nlfilter_torch.photo.edits.applying import apply_recipe
+from nlfilter_torch.photo.declared.steps import Step
+from nlfilter_torch.photo.declared.strokes import Region, Stroke
+from nlfilter_torch.photo.edits.applying import apply_recipe, apply_step
 from nlfilter_torch.photo.picture.photographs import read_photograph
 from tests.browser import Tab, difference
 from tests.problems import cat
@@ -301,3 +303,46 @@ def test_a_grey_point_sets_the_white_balance(opened: Tab) -> None:
     opened.wait_for_picture(before)
     expect(button).to_have_attribute("aria-pressed", "false")
     expect(opened.slider("Temperature")).not_to_have_attribute("aria-valuenow", "0")
+
+
+def test_a_rectangle_is_dragged_around_an_object(opened: Tab) -> None:
+    """Once, with no stroke: all outside it is blurred."""
+    page = opened.page
+    page.get_by_role("tab", name="Defocus").click()
+    tools = page.get_by_role("group", name="Tools").locator("visible=true")
+    tools.get_by_role("button", name="Around it").click()
+    before = opened.source()
+    opened.paint((0.2, 0.2), (0.5, 0.5), (0.8, 0.9))
+    expect(page.locator("path.stroke")).to_have_count(1)
+    opened.wait_for_picture(before)
+    step = Step("defocus", (Region.upright((0.2, 0.2, 0.6, 0.7), "rectangle", "box"),))
+    opened.expect_picture(apply_step(step, cat()), most=5)
+    before = opened.source()
+    opened.paint((0.1, 0.1), (0.9, 0.9))  # takes its place
+    opened.wait_for_picture(before)
+    expect(page.locator("path.stroke")).to_have_count(1)
+
+
+def test_only_this_or_all_alike_is_a_click(opened: Tab) -> None:
+    page = opened.page
+    page.get_by_role("tab", name="Defocus").click()
+    opened.paint((0.37, 0.35), (0.4, 0.37))
+    only, alike = (page.get_by_role("button", name=name).locator("visible=true") for name in ("Only this", "All alike"))
+    stroke = Stroke(((0.37, 0.35), (0.4, 0.37)), 0.02, "in")
+    for button, extent in ((only, "object"), (alike, "near")):
+        button.click()
+        expect(button).to_have_attribute("aria-pressed", "true")
+        opened.expect_picture(apply_step(Step("defocus", (stroke,), extent=extent), cat()), most=6)
+
+
+def test_an_object_is_cut_out_into_a_file(opened: Tab, folder: Path) -> None:
+    page = opened.page
+    page.get_by_role("tab", name="Defocus").click()
+    opened.paint((0.37, 0.35), (0.4, 0.37))
+    page.get_by_role("button", name="Cut out", exact=True).locator("visible=true").click()
+    page.get_by_label("Name").fill("cut.png")
+    page.get_by_role("button", name="Save", exact=True).click()
+    page.get_by_text("Saved ").and_(page.get_by_text("cut.png")).wait_for()
+    cut = read_photograph(folder / "cut.png")
+    assert cut.alpha is not None
+    assert 0 < cut.alpha.mean() < 1
