@@ -7,10 +7,10 @@ by more than two grey levels, and "border" the RMS error at the border, in grey 
 of the object that stays in focus, "blurred" the share of the background that does not, and "halo" the error beside the
 object, compared with a background that is blurred alone.
 
-With the brightness of the strokes, the object's texture in the new colour is known exactly, since it was tinted:
-"matched" is the RMS error inside the object under ``brightness=1``, "own" under the default, 0, both in grey levels,
-with one scribble, and "nothing" that of the object as it was. Where the painted texture leaves [0, 1], it is clipped in
-the expected result.
+The object's texture in the painted colour is known exactly, since it was tinted: "lit" is the mean difference in CIELAB
+in the object's light part, "shade" where it has at most 0.8 times the light under the scribble, and "neutral" in grey
+surroundings, which must not change; "own" is the same with ``brightness=0``, and "before" that of the object as it was.
+Where the painted texture leaves [0, 1], it is clipped in the expected result.
 
 Hats of several colours are put on the photograph of an astronaut and recoloured with one scribble. Printed are the
 shares of the hat, and of face, lips and suit beside it, that change, with each of two extents.
@@ -49,6 +49,8 @@ COLOURS = ((0.1, 0.3, 0.9), (0.9, 0.5, 0.1), (0.7, 0.15, 0.7), (0.15, 0.6, 0.3))
 RADIUS = 0.03  # of the blur, as a share of the short side
 BESIDE = 0.06  # width of the area beside the object, as a share of the short side
 CHANGED = 2 / 255
+SHADED = 0.8  # light of shade, relative to that under the scribble
+NEUTRAL = 8  # largest a* and b* of grey, in CIELAB
 AREA_SIZE = 0.13  # megapixels to which photographs are reduced for smooth areas
 # Smooth areas: blur and distance to borders as shares of the short side, largest change of colour along that distance,
 # largest differences from the colour of the innermost pixel in lightness and in a* and b*, all in units of Lab, and
@@ -99,8 +101,10 @@ def measure_recolor(
     scene = tinted(composite, number)
     inside = scene.scribbles(count, seed)[0]
     colour = torch.tensor(COLOURS[number % len(COLOURS)]).view(1, 3, 1, 1)
-    options = {"keep": scene.scribbles(1, seed + 1)[1]} if keep else {}
-    result = recolor(scene.image, (colour * inside).expand_as(scene.image), inside, extent=extent, **options)
+    kept = scene.scribbles(1, seed + 1)[1] if keep else None
+    result = recolor(
+        scene.image, (colour * inside).expand_as(scene.image), inside, keep=kept, extent=extent, brightness=0.0
+    )
     wanted = recoloured(scene, colour, inside)
     change, ideal = result - scene.image, wanted - scene.image
     along = (change * ideal).sum(1, keepdim=True) / ideal.square().sum(1, keepdim=True).clamp(min=1e-8)
@@ -134,26 +138,36 @@ def measure_hat(tint: tuple[float, float, float]) -> dict[str, float]:
     strokes = torch.tensor(COLOURS[3]).view(1, 3, 1, 1).expand_as(image)
     shares = {}
     for extent in HAT_EXTENTS:
-        changed = (recolor(image, strokes, inside, extent=extent) - image).abs().amax(1)[0] > CHANGED
+        changed = (recolor(image, strokes, inside, extent=extent, brightness=0.0) - image).abs().amax(1)[0] > CHANGED
         parts = {"hat": hat[0, 0] > 0.98} | BESIDE_HAT
         shares |= {f"{name}, {extent}": 100 * float(changed[part].float().mean()) for name, part in parts.items()}
     return shares
 
 
 def measure_brightness(composite: Composite, number: int, seed: int) -> dict[str, float]:
-    """Errors of an object in the brightness of a scribble: taken from the scribble, kept, and of the object before."""
+    """Differences (CIELAB) in light, shade and grey surroundings: by default, with own brightness, and before."""
     scene = tinted(composite, number)
     inside = scene.scribbles(1, seed)[0]
     tint, colour = (torch.tensor(table[number % len(table)]).view(1, 3, 1, 1) for table in (TINTS, COLOURS))
     # The colour is that of the texture where it is painted, not of the mean texture.
     texture = (scene.object / tint).mean(1, keepdim=True)
-    wanted = (colour * texture / ((texture * inside).sum() / inside.sum())).clamp(0, 1)
-    core = (scene.alpha > 0.98).float()
+    lit = texture / ((texture * inside).sum() / inside.sum())
+    thing, before = (colour * lit).clamp(0, 1), 100 * hundredths_of_lab(scene.image)
+    core, grey = scene.alpha > 0.98, before[:, 1:].norm(dim=1, keepdim=True) < NEUTRAL
+    parts = {"lit": core & (lit > SHADED), "shade": core & (lit <= SHADED), "neutral": (scene.alpha < 0.02) & grey}
+    wanted = 100 * hundredths_of_lab(torch.where(core, thing, scene.image))
+    painted = (colour * inside).expand_as(scene.image)
     results = {
-        name: recolor(scene.image, (colour * inside).expand_as(scene.image), inside, brightness=brightness)
-        for name, brightness in (("matched", 1.0), ("own", 0.0))
+        "": recolor(scene.image, painted, inside),
+        ", own": recolor(scene.image, painted, inside, brightness=0.0),
+        ", before": scene.image,
     }
-    return {name: rms(result - wanted, core) for name, result in (results | {"nothing": scene.image}).items()}
+    measured = {}
+    for name, result in results.items():
+        difference = (100 * hundredths_of_lab(result) - wanted).norm(dim=1, keepdim=True)
+        for part, where in parts.items():
+            measured[part + name] = float((difference * where).sum() / where.sum().clamp(min=1))
+    return measured
 
 
 def measure_defocus(composite: Composite, count: int, seed: int) -> dict[str, float]:
@@ -208,7 +222,7 @@ def measure_smooth(image: Tensor, area: NDArray[np.bool_], number: int, seed: in
     """Measure the recolouring of a smooth area by one scribble: share in percent, and standard deviations."""
     inside = draw_strokes(area, 1, np.random.default_rng(seed))
     colour = torch.tensor(COLOURS[number % len(COLOURS)]).view(1, 3, 1, 1)
-    result = recolor(image, (colour * inside).expand_as(image), inside)
+    result = recolor(image, (colour * inside).expand_as(image), inside, brightness=0.0)
     whole = Composite("", image, torch.ones_like(inside), image, image)
     before, even, after = (
         100 * hundredths_of_lab(part)[0, 1:, torch.from_numpy(area)]
@@ -254,7 +268,7 @@ def main(arguments: list[str] | None = None) -> None:
     two = [measure_recolor(scene, i, 2, first + 10 * i, keep=True) for i, scene in scenes]
     report("recolor, two and one to keep", two, {"covered": "covered", "outside": "outside, keep", "border": "border"})
     bright = [measure_brightness(scene, i, first + 10 * i) for i, scene in scenes]
-    report("recolor, brightness of the scribble", bright, {})
+    report("recolor, difference from the painted colour", bright, {})
     report("defocus, one scribble", [measure_defocus(s, 1, first + 10 * i) for i, s in scenes], {"kept": "kept"})
     report("defocus, two", [measure_defocus(s, 2, first + 10 * i) for i, s in scenes], {"kept": "kept, two"})
     size = AREA_SIZE / 16 if chosen.quick else AREA_SIZE

@@ -62,7 +62,7 @@ class Job:
 
     def result(self, mask: Tensor) -> Tensor:
         """The photograph, recoloured by a part of the stroke."""
-        return recolor(self.image, (self.colour * mask).expand_as(self.image), mask)
+        return recolor(self.image, (self.colour * mask).expand_as(self.image), mask, brightness=0.0)
 
 
 def line(points: NDArray[np.float64], size: tuple[int, int], width: int) -> Mask:

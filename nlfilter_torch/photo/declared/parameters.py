@@ -271,13 +271,13 @@ RECOLOR = Edit(
     "recolor",
     """Recolour an object: paint some colour on it, and the rest of it and similar objects nearby take that colour.
 
-    Brightness stays exactly the same unless --brightness is given, and so does everything unlike the object; mark what
-    is alike but must keep its colour with --keep. Photographs that do not fit in memory are processed in tiles,
-    preferably from TIFF files or zarr arrays, which are read in parts.
+    The object also takes the brightness of the colour, unless --brightness is 0. Everything unlike the object stays
+    exactly the same; mark what is alike but must keep its colour with --keep. Photographs that do not fit in memory are
+    processed in tiles, preferably from TIFF files or zarr arrays, which are read in parts.
 
     Turn a red car blue: `nlfilter-torch recolor in.jpg out.jpg --region 420,215,14,14:blue`
 
-    Turn a white car blue: `nlfilter-torch recolor in.jpg out.jpg --region 420,215,14,14:blue --brightness 1`
+    Keep the brightness of the car: `nlfilter-torch recolor in.jpg out.jpg --region 420,215,14,14:blue --brightness 0`
 
     Keep the wood unchanged: `nlfilter-torch recolor in.jpg out.jpg --strokes paint.png --keep 60,100,20,20`
     """,
@@ -296,9 +296,9 @@ RECOLOR = Edit(
         EXTENT,
         number(
             "brightness",
-            0.0,
-            "Whose brightness the object has: 0 keeps its own, 1 takes that of the colour, so that yellow becomes red "
-            "and white becomes blue. Its shading remains.",
+            1.0,
+            "Whose brightness the object has: 1 takes that of the colour, so that yellow becomes red and white becomes "
+            "blue, 0 keeps its own. Its shading remains.",
             (0, 1),
             domain="share",
             metavar="0...1",

@@ -64,7 +64,7 @@ def recolor(
 
     Args:
         image: (B, 3, H, W), RGB in [0, 1].
-        strokes: (B, 3, H, W), RGB, of which only hue and saturation are used unless ``brightness`` is above 0. A
+        strokes: (B, 3, H, W), RGB, of which only hue and saturation are used if ``brightness`` is 0. A
             saturation too strong for the luminance of a region is reduced for the whole region, so that its shading
             remains. Up to 16 colours are distinguished, each with its own region.
         stroke_mask: (B, 1, H, W) in [0, 1], above 0 where painted.
@@ -76,8 +76,8 @@ def recolor(
         added: (B, 4, H, W), RGB and, in [0, 1], how much of it: painted by hand, takes that colour whatever is
             computed. Without other strokes, these are None.
         removed: (B, 1, H, W) in [0, 1], likewise: 1 stays unchanged. It takes precedence over ``added``.
-        brightness: in [0, 1], 0 keeps the luminance of the image, 1 gives the object's pixels under a stroke the mean
-            luminance of the stroke, and others theirs in proportion; highlights stay white.
+        brightness: in [0, 1], 1 gives the object's pixels under a stroke the mean luminance of the stroke, and others
+            theirs in proportion, 0 keeps the luminance of the image; highlights stay white.
         reach: in [0, 1), probability that a walk over similar pixels continues after each step; larger includes less
             similar pixels.
         extent: that of :func:`region_mask`: what is similar nearby, the object under a stroke alone, or everywhere.
