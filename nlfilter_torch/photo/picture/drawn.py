@@ -29,7 +29,8 @@ class Drawn(Generic[M_co]):
             of ``masks``.
         sliders: (K, k+1), a row for each region that has sliders of its own; None if none has.
         outside: sliders (k+1,) outside these regions; None leaves the other pixels unchanged.
-        box: rectangles that hold the objects, in pixels, see :func:`~nlfilter_torch.photo.picture.boxes.boxes_of`.
+        box: a rectangle that holds the objects, (left, top, right, bottom) in pixels, or a tensor (B, K, 4) with one
+            for each.
         colour: RGB (3,) that an object without scribbles takes, which only a box marks.
     """
 

@@ -39,7 +39,7 @@ def cutout(image: Tensor, mask: Tensor) -> Tensor:
         mask: (B, 1, H, W) in [0, 1], such as that of :func:`region_mask`; (1, 1, H, W) for all images.
 
     Returns:
-        (B, 4, H, W): RGB, not multiplied by the mask, and the mask; to be written as a transparent picture. Where the
+        (B, 4, H, W), RGB, not multiplied by the mask, and the mask, to be written as a transparent picture. Where the
         mask is 1, the colours are those of the image, to rounding; where it is 0, those of the object nearby.
         Differentiable in image and mask.
 
