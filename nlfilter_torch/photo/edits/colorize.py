@@ -152,7 +152,8 @@ def colorize(
 
     Args:
         grey: (B, 1, H, W) in [0, 1].
-        strokes: (B, 3, H, W), RGB, of which only the chroma is used.
+        strokes: (B, 3, H, W), RGB, of which only the chroma is used, and less of it the more the luminance of a stroke
+            differs from that under it.
         stroke_mask: (B, 1, H, W) in [0, 1], above 0 where painted. Grey strokes keep similar pixels grey.
         box: ``(left, top, right, bottom)`` in pixels, a rectangle that holds all that is coloured, or a tensor
             (B, 1, 4): what lies outside stays grey, and pixels just outside count as grey strokes.
@@ -325,12 +326,13 @@ class Estimates(Generic[M]):
     def of(operators: Operators[M], scribbles: Scribbles, wanted: Tensor, strength: float | Tensor) -> "Estimates[M]":
         """Fit the estimates to the chroma, red and blue, (B, 2, n), of scribbles; green follows from these."""
         viewed = operators.viewed
+        groups = StrokeGroups.of(scribbles, viewed.size)
+        wanted = suited(groups, scribbles, wanted)
         mean_square = region_means(squared_sum(wanted).unsqueeze(2), scribbles.weights.unsqueeze(2))  # (B, 1, 1)
         saturation = (mean_square + NO_CHROMA).sqrt()
         wanted = wanted / saturation
         usual = usual_chroma(scribbles.image.unsqueeze(2)).squeeze(2)
         scaled = wanted / usual.sqrt()
-        groups = StrokeGroups.of(scribbles, viewed.size)
         propagation = Propagation(viewed, scribbles, groups)
         absolute = propagation.solve(ABSOLUTE, scaled)
         relative = propagation.solve(RELATIVE, torch.cat([scaled, wanted], dim=1), wanted)
@@ -391,6 +393,21 @@ def usual_chroma(image: Tensor) -> Tensor:
     """Usual chroma of pixels (B, 1 or 3, H, W) of one colour, (B, 1, H, W): largest halfway from black to white."""
     own = reduce_channels(image, "luminance")
     return ((own * (1 - own)).clamp(min=0.0) + LEAST_CHROMA).sqrt()
+
+
+def suited(groups: StrokeGroups, scribbles: Scribbles, chroma: Tensor) -> Tensor:
+    """Chroma (B, 2, n) of scribbles, reduced where their strokes are darker or lighter than the picture under them.
+
+    Dark green on bright grass would be gaudy: of all greens that bright, few have as much chroma. The factor is the
+    geometric mean of 1 and of the one that keeps the saturation of HSL, the share of the chroma that the luminance
+    allows. Strokes of the picture's own brightness keep all of it.
+    """
+    levels = [reduce_channels(part.unsqueeze(2), "luminance") for part in (scribbles.image, scribbles.shown)]
+    both = torch.cat(levels, dim=1).squeeze(2).clamp(0.0, 1.0)  # of the picture and of the strokes
+    dark, light = (groups.sums((part + LEAST_CHROMA) * scribbles.weights) + NO_CHROMA for part in (both, 1 - both))
+    ratio = torch.minimum(dark[:, :1] / dark[:, 1:], light[:, :1] / light[:, 1:])  # (B, 1, S)
+    factor = ratio.clamp(max=1.0).sqrt()
+    return chroma * factor.gather(2, groups.strokes.unsqueeze(1)).to(chroma)
 
 
 def bandwidth_ratio(source: Source[M]) -> Tensor:

@@ -192,6 +192,21 @@ def test_what_lies_outside_a_box_stays_grey(method: Method) -> None:
         colorize(grey, strokes, painted, box=(0, 0, 9, 9), **options)
 
 
+def test_a_stroke_darker_or_lighter_than_what_is_under_it_gives_less_chroma() -> None:
+    """One in the picture's own brightness gives all of its chroma; as a factor, the root of that of HSL saturation."""
+    grey, dot = torch.full((1, 1, 40, 40), 0.6), box(16, 16, 8, 8, size=(40, 40))
+    chroma = torch.tensor([-0.1, 0.08, -0.155]).view(1, 3, 1, 1)
+    chroma = chroma - split_luminance(chroma)[0]
+
+    def strength(level: float) -> float:
+        coloured = colorize(grey, (level + chroma) * dot, dot, num_landmarks=40)
+        return float((split_luminance(coloured)[1] * dot).norm() / (chroma * dot).norm())
+
+    assert strength(0.6) == pytest.approx(1.0, abs=0.01)
+    assert strength(0.8) == pytest.approx((0.61 / 0.81) ** 0.5, abs=0.01)
+    assert strength(0.3) == pytest.approx((0.41 / 0.71) ** 0.5, abs=0.01)
+
+
 def test_a_colour_too_strong_for_its_luminance_is_weakened() -> None:
     grey, chroma = torch.tensor([0.05, 0.5, 0.98]).view(1, 1, 1, 3), paint(1, 0, 0, torch.ones(1, 1, 1, 3))
     coloured = merge_luminance(grey, split_luminance(chroma)[1])
