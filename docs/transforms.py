@@ -9,6 +9,7 @@ compared with rows of ``torch.autograd.grad``. Without a file the table is print
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 
 import torch
 import torch.autograd.functional as functional
@@ -250,6 +251,12 @@ COLUMNS = (
 )
 
 
+@cache
+def reference_of(reference: Transform, name: str) -> Tensor:
+    """What a transform must give, computed once for all with the same reference."""
+    return reference(FILTERS[EQUAL.get(name, name)][0], FILTERS[name][1])
+
+
 def measured(transform: Transform, reference: Transform, name: str) -> str:
     """``"yes"`` if a transform is right, ``"refused"`` by a sentence of this library, or what went wrong."""
     function, value = FILTERS[name]
@@ -257,7 +264,7 @@ def measured(transform: Transform, reference: Transform, name: str) -> str:
         result = transform(function, value)
     except (RuntimeError, TypeError, ValueError, NotImplementedError) as error:
         return "refused" if any(words in str(error) for words in REFUSALS) else f"error: {error}"
-    expected = reference(FILTERS[EQUAL.get(name, name)][0], value)
+    expected = reference_of(reference, name)
     scale = max(float(expected.abs().max()), 1e-3)  # layers of a constant are 0
     difference = float((result - expected).abs().max()) / scale
     limit = TOLERANCE if name in BY_TOLERANCE else CLOSE

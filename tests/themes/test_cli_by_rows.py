@@ -244,14 +244,14 @@ def edit_slowly(*arguments: str) -> None:
     original = tiles.Tiling._edited
 
     def edited(tiling: tiles.Tiling, tile: Any) -> Any:
-        time.sleep(0.2 * tiling.transparent)
+        time.sleep(0.5 * tiling.transparent)
         return original(tiling, tile)
 
     # Background jobs of a shell, and so their children, ignore this signal; these tests may be such a job.
     signal.signal(signal.SIGINT, signal.default_int_handler)
     os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
     tiles.Tiling._edited = edited  # type: ignore[method-assign]
-    tiles.TILE_PIXELS = 300
+    tiles.TILE_PIXELS = 6000
     tiles.sampling.PILOT = pictures.STATISTICS_PIXELS = 8000
     sys.exit(main(list(arguments)))
 

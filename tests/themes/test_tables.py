@@ -6,7 +6,7 @@ from docs import tables
 from docs.tables import METHODS, PICTURES, figure_20, is_rising, table_1
 
 PAPER, DEFAULTS = METHODS
-LONG_SIDE = 160
+LONG_SIDE = 100
 
 
 @pytest.mark.slow

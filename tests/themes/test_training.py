@@ -1,4 +1,4 @@
-"""Robust training: the loss decreases for any seed, and a thousand steps on difficult crops give no NaN."""
+"""Robust training: the loss decreases for any seed, and hundreds of steps on difficult crops give no NaN."""
 
 import math
 from collections.abc import Iterator
@@ -92,11 +92,11 @@ def clean_and_noisy(step: int, generator: torch.Generator) -> tuple[Tensor, Tens
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:guide must have differences near:UserWarning")  # of bandwidths tried on purpose
-def test_a_thousand_steps_without_a_nan() -> None:
+def test_hundreds_of_steps_without_a_nan() -> None:
     generator = seeded(0)
     model = Denoiser(0)
     optimizer = torch.optim.Adam(model.parameters(), lr=0.01)
-    for step in range(1000):
+    for step in range(300):
         clean, noisy = clean_and_noisy(step, generator)
         with random_bandwidths(model.filter, generator) if step % 3 == 0 else nullcontext():
             optimizer.zero_grad()
