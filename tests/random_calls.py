@@ -397,6 +397,7 @@ FUNCTIONS = {
             "reach": _number(0, 0.99),
             "extent": _one_of(*EXTENT.choices),
             "photometric_bandwidth": _plain(0.03, 0.5),
+            "box": lambda scene: (0.0, 0.0, float(scene.size[1]), float(scene.size[0])),
         },
     ),
     "cutout": Function(photo.cutout, {"image": _image(1, 3), "mask": lambda scene: scene.mask(1)}, {}),

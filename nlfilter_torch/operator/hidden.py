@@ -6,7 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from nlfilter_torch.core.checks import check_dtype, described
+from nlfilter_torch.core.checks import check_dtype, check_finite, described
 
 NEAR = 32  # pixels of its row or column up to which :func:`fill_nearby` looks for one that counts
 MIRRORED = 8  # pixels that are continued by their mirror images
@@ -118,6 +118,7 @@ def pad_images(images: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
         raise TypeError(f"images must be a list of one or more tensors, got {described(images)}; pass [image]")
     for image in images:
         check_dtype(image, "images", "divide integer pixels by the value of white, such as 255")
+        check_finite(image, "images")
     first = images[0]
     for image in images:
         alike = (image.ndim, image.shape[:1], image.dtype, image.device) == (

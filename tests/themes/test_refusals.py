@@ -436,6 +436,7 @@ OPERATORS: dict[str, list[Refusal]] = {
         ({"images": [torch.ones(3, 4, 4), None]}, "^images must be a torch.Tensor, got NoneType", TypeError),
         ({"images": [torch.ones(3, 4, 4).byte()]}, "^images must have a floating-point dtype", TypeError),
         ({"images": [torch.ones(3, 4, 4), torch.ones(1, 4, 4)]}, r"same channels.*got \(3, 4, 4\), \(1, 4, 4\)"),
+        ({"images": [torch.full((3, 4, 4), NAN)]}, "^images must be finite, got 48 NaN"),
         ({"images": [torch.ones(4, 4)]}, r"^images must have shape \(C, H, W\)"),
         ({"images": [torch.ones(3, 4, 4), torch.ones(3, 4, 4).double()]}, "dtype"),
     ),
