@@ -47,10 +47,13 @@ def chromium() -> Iterator[Browser]:
 
 
 class Editor:
-    """``nlfilter-torch app`` in a separate process."""
+    """``nlfilter-torch app`` in a separate process, in which some Python code may have run before."""
 
-    def __init__(self, folder: Path, *arguments: str, threads: int = 1) -> None:
-        command = [sys.executable, "-m", "nlfilter_torch", "app", "--no-open", *arguments]
+    def __init__(self, folder: Path, *arguments: str, threads: int = 1, before: str = "") -> None:
+        program = ["-m", "nlfilter_torch"]
+        if before:
+            program = ["-c", f"{before}\nfrom nlfilter_torch.__main__ import main\nmain()"]
+        command = [sys.executable, *program, "app", "--no-open", *arguments]
         # With pytest's environment variables, NiceGUI would treat the process as a test of NiceGUI.
         inherited = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST")}
         self.state = folder.parent / f"{folder.name}-state"

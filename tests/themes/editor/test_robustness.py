@@ -244,10 +244,11 @@ def wait_for_part(folder: Path, name: str) -> None:
 
 def test_stopped_in_the_midst_of_saving(browser: Browser, tmp_path: Path) -> None:
     """The process is killed: the old file is unchanged, and after a new start the page has the edit and saves it."""
-    large = torch.nn.functional.interpolate(cat(), size=(560, 840), mode="bicubic").clamp(0, 1)
-    write_photograph(Photograph(large), tmp_path / "large.png")
+    write_photograph(Photograph(cat()), tmp_path / "cat.png")
     (tmp_path / "out.png").write_bytes(b"what was there")
-    editor = Editor(tmp_path, "large.png")
+    # Saving stops where the complete file is about to replace the old one.
+    stopping = "import shutil, time\nshutil.copymode = lambda _, part: time.sleep(3600 * ('out.png' in str(part)))"
+    editor = Editor(tmp_path, "cat.png", before=stopping)
     try:
         tab = Tab.at(browser, editor.with_token())
         tab.wait_until_ready()
@@ -264,7 +265,7 @@ def test_stopped_in_the_midst_of_saving(browser: Browser, tmp_path: Path) -> Non
         editor.process.wait()
         assert (tmp_path / "out.png").read_bytes() == b"what was there"
         editor.stop()
-        editor = Editor(tmp_path, "large.png", "--port", editor.url.rstrip("/").rsplit(":", 1)[1])
+        editor = Editor(tmp_path, "cat.png", "--port", editor.url.rstrip("/").rsplit(":", 1)[1])
         address = tab.page.url
         tab.close()
         tab = Tab.at(browser, editor.with_token(address))
@@ -272,6 +273,6 @@ def test_stopped_in_the_midst_of_saving(browser: Browser, tmp_path: Path) -> Non
         expect(tab.page.get_by_text("4.00 ×")).to_be_visible()
         tab.save("Save photo", "again.png")
         tab.close()
-        assert {path.name for path in tmp_path.iterdir()} >= {"again.png", "large.png.edit.json"}
+        assert {path.name for path in tmp_path.iterdir()} >= {"again.png", "cat.png.edit.json"}
     finally:
         editor.stop()
