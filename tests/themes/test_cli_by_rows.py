@@ -244,7 +244,7 @@ def edit_slowly(*arguments: str) -> None:
     original = tiles.Tiling._edited
 
     def edited(tiling: tiles.Tiling, tile: Any) -> Any:
-        time.sleep(0.5 * tiling.transparent)
+        time.sleep(2 * tiling.transparent)
         return original(tiling, tile)
 
     # Background jobs of a shell, and so their children, ignore this signal; these tests may be such a job.
