@@ -23,6 +23,7 @@ that of the old colour.
 ``--set choosing`` takes the photographs and seeds that the defaults were chosen on.
 """
 
+import math
 import statistics
 from dataclasses import replace
 
@@ -166,7 +167,7 @@ def measure_brightness(composite: Composite, number: int, seed: int) -> dict[str
     for name, result in results.items():
         difference = (100 * hundredths_of_lab(result) - wanted).norm(dim=1, keepdim=True)
         for part, where in parts.items():
-            measured[part + name] = float((difference * where).sum() / where.sum().clamp(min=1))
+            measured[part + name] = float(difference[where].mean())  # not a number where nothing is in shade
     return measured
 
 
@@ -241,7 +242,9 @@ def report(title: str, cases: list[dict[str, float]], limits: dict[str, str]) ->
     """Print means, the worst tenth, and the share of cases within each limit."""
     print(f"\n{title}: mean, worst tenth, of {len(cases)}")
     for name in cases[0] if cases else ():
-        values = sorted(case[name] for case in cases)
+        values = sorted(case[name] for case in cases if not math.isnan(case[name]))
+        if not values:
+            continue
         high = name in ("covered", "kept", "blurred")
         tenth = values[len(values) // 10] if high else values[-1 - len(values) // 10]
         line = f"  {name:12}{statistics.mean(values):8.1f}{tenth:8.1f}"
