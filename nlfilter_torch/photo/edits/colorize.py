@@ -6,8 +6,7 @@ two notions of an edge. Their errors are in different places, so that the mean i
 
 An estimate counts less the farther it is from the other two and the more saturated it is. The regression also counts
 less where no stroke is on similar pixels nearby, and where strokes on similar pixels differ in colour. The estimate by
-relative differences has the fewest large errors; where a stroke is connected without an edge, the one by absolute
-differences takes its place. The distance of the mean from it is limited. The one by relative differences and the
+relative differences has the fewest large errors, so that the distance of the mean from it is limited. It and the
 regression are compared by predicting the colour of each stroke from other strokes: the smaller the errors of the
 regression are in comparison, and the more strokes there are, the more it counts, and the larger the distance may be.
 
@@ -359,8 +358,6 @@ class Estimates(Generic[M]):
         alike = (mean + residual) * usual
         around = torch.lerp(alike, around, influence + self.everywhere * (1 - influence))
         connected = torch.lerp((alike + around) / 2, connected * usual.sqrt(), influence)
-        # The nearer a stroke along the picture, the more its own colour is what the mean must not leave far.
-        around = torch.lerp(around, connected, influence**2)
         trust = (support.clamp(min=0.0) + LEAST_SUPPORT) ** 1.5 / (1 + variance.clamp(min=0.0) / LARGE_VARIANCE)
         factors = self.regression_weight * trust, influence**2, RELATIVE_WEIGHT
         change = weighted_mean((alike, connected, around), factors) - around
