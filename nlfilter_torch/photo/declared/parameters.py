@@ -389,7 +389,7 @@ DEFOCUS = Edit(
             ("disc", "gaussian"),
             "`disc`: points of light become discs, as in a lens. `gaussian`: they become soft spots.",
         ),
-        EXTENT,
+        replace(EXTENT, default="object"),
         REGION_REACH,
         COLOUR_TOLERANCE,
         *filter_parameters(share=0.3, patch_size=1)[1:],
@@ -426,7 +426,7 @@ MASK = Edit(
     """,
     (
         REGION_REACH,
-        EXTENT,
+        replace(EXTENT, default="object"),
         COLOUR_TOLERANCE,
         *(p for p in filter_parameters(share=0.3)[1:] if p.name != "patch_size"),
     ),

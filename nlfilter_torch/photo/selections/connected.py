@@ -42,11 +42,24 @@ def connected(masks: Tensor, scribbles: Tensor) -> Tensor:
     return own > 0
 
 
-def _parts(inside: Tensor, painted: Tensor) -> tuple[Tensor, Tensor]:
-    """The connected components (H, W) that hold a painted pixel, and other ones that are not small beside them."""
+@torch.no_grad()
+def unconnected(mask: Tensor, painted: Tensor) -> Tensor:
+    """Parts (H, W) of a mask (H, W), as bool, that are not connected with what is painted, (H, W)."""
+    inside = (mask >= INSIDE_MASK) | (painted > 0)
+    numbers = _numbered(inside)
+    return inside & ~torch.isin(numbers, numbers[painted > 0].unique())
+
+
+def _numbered(inside: Tensor) -> Tensor:
+    """Number of the connected component of each pixel (H, W)."""
     from skimage.measure import label
 
-    numbers = torch.from_numpy(label(inside.cpu().numpy(), connectivity=1)).to(inside.device)
+    return torch.from_numpy(label(inside.cpu().numpy(), connectivity=1)).to(inside.device)
+
+
+def _parts(inside: Tensor, painted: Tensor) -> tuple[Tensor, Tensor]:
+    """The connected components (H, W) that hold a painted pixel, and other ones that are not small beside them."""
+    numbers = _numbered(inside)
     own = torch.isin(numbers, numbers[painted].unique()) & inside
     large = numbers.flatten().bincount() >= SMALL_PIECE * own.sum()
     return own, inside & ~own & large[numbers]

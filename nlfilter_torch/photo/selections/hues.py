@@ -21,13 +21,13 @@ from nlfilter_torch.photo.picture.colour import dot, split_luminance
 from nlfilter_torch.photo.picture.resizing import block_means, enlarged
 from nlfilter_torch.photo.selections.scribbled_colours import (
     EPSILON,
-    NUM_COLOURS,
     SIMILAR_SHARE,
     colours_in_lab,
     density,
     every_nth,
 )
 
+NUM_COLOURS = 128  # approximate number of scribbled pixels that all are compared with
 DARK_LUMINANCE = 0.02  # luminance below which hue and saturation are uncertain
 HALF_COUNTED = 0.1  # luminance of a scribbled pixel that counts half, for the same reason
 BLACK = 1e-4  # added to it, so that pixels of a black object count, too
@@ -62,7 +62,7 @@ class HueSamples:
     @staticmethod
     def of(colours: Tensor, weights: Tensor) -> "HueSamples":
         """Choose from scribbled pixels of colours (B, 3, n), in order :func:`outwards`, and of weights (B, 1, n)."""
-        sample, shares = every_nth(colours.clamp(0.0, 1.0), weights, NUM_COLOURS[1])  # as the reduced picture is
+        sample, shares = every_nth(colours.clamp(0.0, 1.0), weights, NUM_COLOURS)  # as the reduced picture is
         luminance = split_luminance(sample.unsqueeze(2))[0].squeeze(2)
         shares = shares * (luminance + BLACK) / (luminance + HALF_COUNTED)
         return HueSamples(relative_chroma(sample), shares / shares.sum(2, keepdim=True).clamp(min=EPSILON))
@@ -96,7 +96,7 @@ def corrections(
     factor = trusted(mask, samples.likeness(image))
     within = enclosed(share * factor)
     if kept is not None:
-        sample, shares = every_nth(*kept, NUM_COLOURS[1])
+        sample, shares = every_nth(*kept, NUM_COLOURS)
         places, points = (colours_in_lab(colours) for colours in (image.flatten(2), sample))
         near = density(places, points, shares, image.new_tensor(KEPT_BANDWIDTH)).unflatten(2, image.shape[-2:])
         within = within * (1 - (near / SIMILAR_SHARE).clamp(max=1.0))

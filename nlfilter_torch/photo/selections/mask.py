@@ -1,10 +1,10 @@
 """Soft object masks from foreground and background scribbles. Goes beyond the paper's Sec. IV.
 
-A regression with the filter's covariance (:mod:`nlfilter_torch.filtering.scribbles`) on colour, surrounding colour and
-texture separates foreground from background, together with the colours of single pixels
-(:mod:`nlfilter_torch.photo.selections.scribbled_colours`). Points that an even area, such as a sky, links to a scribble
-count as scribbled, too. Two local solves (:mod:`nlfilter_torch.photo.selections.matting` and
-:mod:`nlfilter_torch.photo.selections.matting`) then align the borders of the mask with those of the picture. All
+A regression with the filter's covariance (:mod:`nlfilter_torch.filtering.scribbles`) says what is similar in colour,
+surrounding colour and texture. Points that an even area, such as a sky, links to a scribble count as scribbled, too. A
+model of the object (:mod:`nlfilter_torch.photo.selections.object_model`) joins this with mixtures of colours of both
+sides and distances along the picture, and cuts the object out, as a rough mask. Closed-form matting
+(:mod:`nlfilter_torch.photo.selections.matting`) then aligns its borders with those of the picture. All
 run on a copy reduced to about :data:`SOLVED_PIXELS` pixels, so the cost hardly grows with
 the size of the picture. The result is a linear function of the colour for each place, which gives the mask of any pixel
 from its own colour; results in tiles are therefore exact.
@@ -37,14 +37,13 @@ from nlfilter_torch.photo.picture.source import Fitted, Reduced, Source, at, kep
 from nlfilter_torch.photo.picture.viewing import viewed_size
 from nlfilter_torch.photo.selections.by_hand import ByHand, check_drawn
 from nlfilter_torch.photo.selections.connected import Extent, connected
-from nlfilter_torch.photo.selections.matting import LinearMasks, linear_mask, linear_models, solve_linear, solve_mask
+from nlfilter_torch.photo.selections.matting import linear_mask, linear_models, solve_linear
 from nlfilter_torch.photo.selections.rough_mask import RoughMasks
 from nlfilter_torch.photo.selections.scribbled_colours import EPSILON, SOLVED_PIXELS, trimap_share
 from nlfilter_torch.photo.selections.stray import without_strays
 
 VIEWED = VIEWING_SIZE.default_number  # megapixels; larger pictures are first reduced to this size
 FLOATS_PER_PIXEL = 80  # estimated working memory per pixel of the reduced picture, in addition to its operator
-ROUGH_CONFIDENCE, SCRIBBLE_CONFIDENCE = 0.02, 1000.0  # confidence in the rough mask, and in scribbles
 ODDS, STEEPNESS = 1.5, 1.4  # of the curve from the solution along borders, too low halfway, to masks
 MOST_WAITING = 2  # threads: operations on so few pixels are not worth dividing between two
 
@@ -69,10 +68,11 @@ def region_mask(
 ) -> Tensor:
     """Soft object masks from foreground and background scribbles.
 
-    A regression on colour and texture separates the two: pixels similar to the scribbles belong to the region, pixels
-    similar to background scribbles do not. An even area with a scribble, such as a sky, belongs to the region as a
-    whole. Points along the borders of the picture also count as background unless they resemble the region or are part
-    of such an area, so one scribble is enough. The borders of the mask are then aligned with those of the picture.
+    A regression on colour and texture, mixtures of the colours of both sides, and distances along the picture to the
+    scribbles separate the two, and the cut between them follows borders of the picture. An even area with a scribble,
+    such as a sky, belongs to the region as a whole. Points along the borders of the picture also count as background
+    unless they resemble the region or are part of such an area, so one scribble is enough. The borders of the mask are
+    then aligned with those of the picture.
     Where a scribble that is at least three times as long as wide leaves its object, it does not count: at most 30 % of
     it, in one or two pieces of a very different colour, that no other scribble is meant for.
     :func:`diffusion_mask` is the paper's mask, which selects everything similar to one region.
@@ -94,8 +94,8 @@ def region_mask(
         removed: (B, 1 or K, H, W) in [0, 1], likewise: where it is 1, masks are 0. It takes precedence over ``added``.
         reach: in [0, 1), probability that a random walk over similar pixels continues after each step; larger values
             include less similar pixels.
-        extent: ``"near"`` selects what is similar and nearby, ``"object"`` only what is connected with a scribble of
-            it, ``"everywhere"`` what is similar at any distance.
+        extent: ``"object"`` selects only what is connected with a scribble of it, ``"near"`` also what is similar and
+            nearby, ``"everywhere"`` what is similar at any distance.
         photometric_bandwidth: in hundredths of Lab: 0.08 is 8 units.
         spatial_bandwidth: in pixels; None is 0.3 of the short side, ``math.inf`` no limit: similar pixels anywhere.
         patch_size: width of the compared patches.
@@ -377,7 +377,7 @@ def _computed_regions(
     threads = threads_for(small.image)
     with single_threaded(threads if threads <= MOST_WAITING else 1):
         limits = None if boxes is None else scaled(boxes, source.size, small.size).to(small.image)
-        rough = RoughMasks.of(small, options, settings.reach, everywhere, limits)
+        rough = RoughMasks.of(small, options, settings.reach, settings.extent, limits)
         counted = scribbles if marked is None or boxes is not None else list(map(_filled, scribbles, marked.unbind(1)))
         reduced = [blocks_of(drawn, small, source.size, steps) for drawn in counted]
         if limits is not None:
@@ -386,7 +386,7 @@ def _computed_regions(
         masks = torch.cat([rough.mask(number, drawn) for number, drawn in enumerate(reduced)], dim=1)
         front, back = torch.stack([drawn.planes(small) for drawn in reduced], dim=2).unbind(1)
         drawn = [masks, front, back]
-        functions = kept(small, "borders", drawn, _fit_borders, small, image, *drawn)
+        functions = kept(small, "borders", drawn, fit_borders, small, image, *drawn)
     if marked is not None:
         functions = functions * marked[:, :, None, None, None]
     regions = Regions(image, steps, functions, scribbles, boxes=boxes)
@@ -416,9 +416,18 @@ def _reduced(source: Source[M], floats: int) -> tuple[Reduced, tuple[float, floa
     return small, (source.size[0] / small.size[0], source.size[1] / small.size[1])
 
 
-def _fit_borders(small: Reduced, image: Tensor, rough: Tensor, front: Tensor, back: Tensor) -> Tensor:
-    """:func:`fit_borders` of an image; the reduced picture that it is of keeps its models."""
-    return fit_borders(image, kept(small, "models", [], linear_models, image), rough, front, back)
+def fit_borders(small: Reduced, image: Tensor, rough: Tensor, front: Tensor, back: Tensor) -> Tensor:
+    """Linear functions (B, K, C+1, H, W) from colours to masks that follow the borders of a picture.
+
+    Args:
+        small: the reduced picture, which keeps its models.
+        image: the same with values in [0, 1], (B, C, H, W).
+        rough: rough masks of the regions, (B, K, H, W).
+        front: weights of the scribbles on the regions, (B, K, H, W).
+        back: weights of the scribbles on their background, (B, K, H, W).
+    """
+    trimap = trimap_share(torch.stack([front, back], dim=2).flatten(3))
+    return solve_linear(kept(small, "models", [], linear_models, image), rough, front, back, trimap)
 
 
 def _nearness(
@@ -494,24 +503,3 @@ def calibrated(mask: Tensor) -> Tensor:
     mask = mask.clamp(0.0, 1.0)
     inside, outside = ODDS * mask**STEEPNESS, (1 - mask) ** STEEPNESS
     return inside / (inside + outside)
-
-
-def fit_borders(image: Tensor, models: list[LinearMasks], rough: Tensor, front: Tensor, back: Tensor) -> Tensor:
-    """Linear functions (B, K, C+1, H, W) from colours to masks that follow the borders of an image.
-
-    A random walker aligns the rough masks with the borders; closed-form matting starts from the result.
-
-    Args:
-        image: (B, C, H, W).
-        models: :func:`linear_models` of the image.
-        rough: rough masks of the regions, (B, K, H, W).
-        front: weights of the scribbles on the regions, (B, K, H, W).
-        back: weights of the scribbles on their background, (B, K, H, W).
-    """
-    painted = front + back
-    target = (rough * ROUGH_CONFIDENCE + front * SCRIBBLE_CONFIDENCE) / (
-        ROUGH_CONFIDENCE + painted * SCRIBBLE_CONFIDENCE
-    )
-    start = solve_mask(image, target, ROUGH_CONFIDENCE + painted * SCRIBBLE_CONFIDENCE)
-    trimap = trimap_share(torch.stack([front, back], dim=2).flatten(3))
-    return solve_linear(models, start, rough, front, back, trimap)

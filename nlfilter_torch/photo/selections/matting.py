@@ -1,17 +1,10 @@
-"""Alignment of rough masks with the borders of a picture, by two solves on a pyramid.
+"""Closed-form matting (Levin, Lischinski and Weiss, 2008) on a pyramid: it aligns rough masks with soft borders.
 
-The random walker (Grady, 2006), with the rough mask as prior, gives a soft mask that changes along borders. It
-minimises ``sum_ij w_ij (a_i - a_j)^2 + sum_i c_i (a_i - t_i)^2`` over pixels and their eight neighbours, with weights w
-that decrease with the difference in colour, a rough mask t and confidences c in it. A few Jacobi steps on each level
-solve it approximately.
-
-Closed-form matting (Levin, Lischinski and Weiss, 2008) starts from there. In every small window the mask is a linear
-function of the colour, which models hair and soft borders. These functions also give the mask of any pixel of a larger
-picture (:class:`LinearMasks`).
+In every small window the mask is a linear function of the colour, which models hair and soft borders. These functions
+also give the mask of any pixel of a larger picture (:class:`LinearMasks`).
 """
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -22,7 +15,7 @@ from torch import Tensor
 from nlfilter_torch.core.workers import in_order, single_threaded, threads_for
 from nlfilter_torch.photo.picture.colour import dot
 from nlfilter_torch.photo.picture.resizing import block_means
-from nlfilter_torch.photo.selections.scribbled_colours import REFERENCE, by_trimap
+from nlfilter_torch.photo.selections.scribbled_colours import by_trimap
 
 COARSEST = 48  # minimum short side of the coarsest level, in pixels
 MOST_HALVINGS = 4  # maximum number of reduced levels
@@ -44,99 +37,6 @@ def halved(planes: Tensor, levels: int) -> list[Tensor]:
 def doubled(planes: Tensor, like: Tensor) -> Tensor:
     """Planes of one level, enlarged to the next finer level, which has the size of ``like``."""
     return F.interpolate(planes, like.shape[-2:], mode="bilinear", align_corners=False)
-
-
-OFFSETS = ((0, 1), (1, 0), (1, 1), (1, -1))  # (row, column) offsets to half of the neighbours, so each pair occurs once
-
-Slices = tuple[slice, slice]
-
-
-def _sides(offset: tuple[int, int]) -> tuple[Slices, Slices]:
-    """Slices of the pixels that have a neighbour at ``offset``, and of these neighbours."""
-    down, right = offset
-    here = (slice(None, -down or None), slice(1, None) if right < 0 else slice(None, -right or None))
-    there = (slice(down, None), slice(None, -1) if right < 0 else slice(right, None))
-    return here, there
-
-
-NEIGHBOURS = tuple(_sides(offset) for offset in OFFSETS)
-#: Padding (left, right, top, bottom) from the pixels with such a neighbour to all pixels.
-PADDING = tuple((max(-right, 0), max(right, 0), 0, down) for down, right in OFFSETS)
-
-
-def neighbour_weights(guide: Tensor, weight: Callable[[Tensor], Tensor]) -> Tensor:
-    """Weights (B, 4, H, W) of each pixel of a guide with its neighbours at :data:`OFFSETS`, 0 where there is none.
-
-    ``weight`` is a function of squared distances (B, h, w), summed over the channels.
-    """
-    weights = []
-    for (here, there), padding in zip(NEIGHBOURS, PADDING, strict=True):
-        distance = (guide[..., *here] - guide[..., *there]).square().sum(1)
-        weights.append(F.pad(weight(distance), padding))
-    return torch.stack(weights, dim=1)
-
-
-JACOBI_STEPS = (2, 4, 8)  # Jacobi steps per level, finest first; the last number is for all coarser levels
-STEEPNESS = 300.0  # decay of the weights with the mean squared difference of the channels
-MIN_WEIGHT = 1e-4
-
-
-def solve_mask(image: Tensor, rough: Tensor, confidence: Tensor) -> Tensor:
-    """Solve for soft masks (B, K, H, W).
-
-    Args:
-        image: (B, C, H, W), C = 1 or 3.
-        rough: t, (B, K, H, W).
-        confidence: c, (B, K, H, W), for a short side of at most that of :data:`REFERENCE`; rescaled for others.
-    """
-    height, width = image.shape[-2:]
-    short = min(height, width)
-    levels = pyramid_levels(short)
-    planes = torch.cat([image, confidence * rough, confidence], dim=1)
-    scale = min(1.0, min(REFERENCE) / short) ** 2
-    count, channels = rough.shape[1], image.shape[1]
-    coarser: Tensor | None = None
-    for level, planes_of_level in reversed(list(enumerate(halved(planes, levels)))):
-        colours, target, trust = planes_of_level.split([channels, count, count], dim=1)
-        area = scale * 4**level
-        target, trust = area * target, area * trust
-        mask = target / trust if coarser is None else doubled(coarser, planes_of_level)
-        weights = neighbour_weights(colours, partial(_weight, steepness=STEEPNESS / channels))
-        steps = JACOBI_STEPS[-1 if level == levels else min(level, len(JACOBI_STEPS) - 1)]
-        coarser = jacobi(mask, target, trust, weights, steps)
-    assert coarser is not None  # for mypy
-    return coarser.clamp(0.0, 1.0)
-
-
-def _weight(squared: Tensor, steepness: float) -> Tensor:
-    """Weight of neighbours whose colours have these squared distances."""
-    return torch.exp(-steepness * squared) + MIN_WEIGHT
-
-
-def jacobi(mask: Tensor, target: Tensor, trust: Tensor, weights: Tensor, steps: int) -> Tensor:
-    """Jacobi steps from a mask.
-
-    Args:
-        mask: the start, (B, K, H, W).
-        target: c t, confidence times rough mask.
-        trust: c, the confidence.
-        weights: w, :func:`neighbour_weights`.
-        steps: their number.
-    """
-    total = trust.clone()
-    links = [weights[:, k : k + 1, *here] for k, (here, _) in enumerate(NEIGHBOURS)]
-    for (here, there), weight in zip(NEIGHBOURS, links, strict=True):
-        total[..., *here] += weight
-        total[..., *there] += weight
-    inverse = 1 / total
-    for _ in range(steps):
-        # Not in place: the gradient needs every iterate.
-        following = target.clone()
-        for (here, there), weight in zip(NEIGHBOURS, links, strict=True):
-            following[..., *here].addcmul_(weight, mask[..., *there])
-            following[..., *there].addcmul_(weight, mask[..., *here])
-        mask = following * inverse
-    return mask
 
 
 WINDOW_RADIUS, NOISE = 2, 1e-6  # radius of the windows in which masks are linear in colour; variance of noise
@@ -227,31 +127,28 @@ def linear_models(image: Tensor) -> list[LinearMasks]:
     return [LinearMasks.of(colours) for colours in halved(image, levels)]
 
 
-def solve_linear(
-    models: list[LinearMasks], start: Tensor, rough: Tensor, front: Tensor, back: Tensor, trimap: Tensor
-) -> Tensor:
+def solve_linear(models: list[LinearMasks], rough: Tensor, front: Tensor, back: Tensor, trimap: Tensor) -> Tensor:
     """Solve for the functions (B, K, C+1, H, W) of :meth:`LinearMasks.fit`.
 
     Args:
         models: :func:`linear_models` of the image.
-        start: initial masks, (B, K, H, W).
-        rough: rough masks, (B, K, H, W); values near 0 or 1 have a higher confidence.
+        rough: rough masks, with which the steps begin, (B, K, H, W); values near 0 or 1 have a higher confidence.
         front: weights of foreground scribbles, (B, K, H, W).
         back: weights of background scribbles, (B, K, H, W).
         trimap: how nearly the scribbles are a trimap, (B, K) in [0, 1].
     """
     trust = LINEAR_ROUGH_CONFIDENCE * ((2 * rough - 1).square() + 0.01)
     certain = LINEAR_SCRIBBLE_CONFIDENCE * (front + back)
-    planes = torch.cat([trust * rough + LINEAR_SCRIBBLE_CONFIDENCE * front, trust + certain, start], dim=1)
+    planes = torch.cat([trust * rough + LINEAR_SCRIBBLE_CONFIDENCE * front, trust + certain, rough], dim=1)
     threads = threads_for(planes, models[0].image)
     masks = [(image, region) for image in range(len(rough)) for region in range(rough.shape[1])]
     workers = min(threads, len(masks))
     if workers < FEWEST_WORKERS:
         with single_threaded(threads):  # so few pixels that a second thread would wait most of the time
-            return _solve_levels(models, planes, trimap).to(start)
+            return _solve_levels(models, planes, trimap).to(rough)
     solve = partial(_solve_mask, models, planes, trimap)
     functions = list(in_order(solve, masks, workers, divided=False))
-    return torch.cat(functions).unflatten(0, rough.shape[:2]).squeeze(2).to(start)
+    return torch.cat(functions).unflatten(0, rough.shape[:2]).squeeze(2).to(rough)
 
 
 def _solve_mask(models: list[LinearMasks], planes: Tensor, trimap: Tensor, mask: tuple[int, int]) -> Tensor:

@@ -14,23 +14,19 @@ from nlfilter_torch.operator.options import FilterOptions
 from nlfilter_torch.operator.pixel_matrix import Columns
 from nlfilter_torch.photo.picture.boxes import in_boxes
 from nlfilter_torch.photo.picture.colour import LIGHTNESS, hundredths_of_lab
-from nlfilter_torch.photo.picture.resizing import block_means, enlarged
 from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles, scribbled_blocks
 from nlfilter_torch.photo.picture.source import Blocks, Guide, Operator, Planes, Reduced, at, kept
+from nlfilter_torch.photo.selections.connected import Extent
+from nlfilter_torch.photo.selections.object_model import object_masks
 from nlfilter_torch.photo.selections.scribbled_colours import (
     EPSILON,
     REFERENCE,
-    Coloured,
-    by_trimap,
-    colour_likelihood,
     evenness,
     frame_places,
     inner_places,
     likeness,
     linked_evenly,
     outwards,
-    side_weights,
-    trimap_share,
 )
 
 # Gaussians, in pixels: surroundings, grain, average of its strength.
@@ -66,13 +62,6 @@ def with_texture(planes: Tensor, brightness: Tensor, weight: float) -> Tensor:
 CHROMA_WEIGHT = 0.7  # weight of hue and saturation; that of lightness is LIGHTNESS
 GUIDE_TEXTURE = 1.5
 SMOOTHNESS = 0.25  # of the regression
-CONTRAST = 4.0  # steepness of the curve from likelihood to rough mask
-# Weight of the colours of single pixels in the rough mask, for a few scribbles and for a trimap; the rest is the
-# regression.
-COLOUR_SHARE = (0.65, 1.0)
-# Colours count less where the regression finds no part of the region nearby: standard deviation of "nearby" as a share
-# of the short side, number of rows or columns of the grid it is averaged on, and average from which on colours count.
-AROUND_SIGMA, AROUND_GRID, ENOUGH_AROUND = 0.1, 40, 0.5
 MIDDLE = 0.4  # of the sides of a box: the part of it that stands for scribbles on its object where there are none
 FRAME_PIXELS = math.prod(REFERENCE)  # in larger pictures points of the frame count more, as scribbles have more pixels
 
@@ -121,7 +110,7 @@ class RoughMasks:
         grid: points inside it.
         photometric_bandwidth: of the filter.
         reach: that of :func:`region_mask`.
-        everywhere: whether single pixels count wherever they are, not only near what the regression selects.
+        extent: that of :func:`region_mask`.
         boxes: rectangles that hold the objects of K regions, (B, K, 4) in pixels of the reduced picture, or None.
     """
 
@@ -131,7 +120,7 @@ class RoughMasks:
     grid: Points
     photometric_bandwidth: Tensor
     reach: float | Tensor
-    everywhere: bool = False
+    extent: Extent = "near"
     boxes: Tensor | None = None
 
     @staticmethod
@@ -139,7 +128,7 @@ class RoughMasks:
         picture: Reduced,
         options: FilterOptions,
         reach: float | Tensor,
-        everywhere: bool,
+        extent: Extent,
         boxes: Tensor | None = None,
     ) -> "RoughMasks":
         """Prepare a picture: build its operator, with options of :func:`nonlocal_operator`, and choose the points."""
@@ -147,12 +136,17 @@ class RoughMasks:
         operator = picture.operator(guide)
         frame, grid = (Points.of(picture, operator, choose(picture.size)) for choose in (frame_places, inner_places))
         bandwidth = torch.as_tensor(options.photometric_bandwidth, dtype=picture.dtype)
-        return RoughMasks(picture, operator, frame, grid, bandwidth, reach, everywhere, boxes)
+        return RoughMasks(picture, operator, frame, grid, bandwidth, reach, extent, boxes)
 
     @cached_property
     def evenness(self) -> Tensor:
         """:func:`evenness` of the picture."""
         return kept(self.picture, "evenness", [], evenness, self.picture.image)
+
+    @cached_property
+    def guide(self) -> Tensor:
+        """:func:`region_guide` of the picture."""
+        return kept(self.picture, "guide", [], region_guide, self.picture.image)
 
     def mask(self, number: int, scribbles: Scribbles) -> Tensor:
         """The rough mask (B, 1, H, W) of a region with that number, from scribbles on it and on its background.
@@ -160,37 +154,33 @@ class RoughMasks:
         With boxes, there may be no scribbles on it.
         """
         held = None if self.boxes is None else self.boxes[:, number : number + 1]
+        drawn = scribbles.planes(self.picture)
         if held is not None:
             scribbles = self.with_middle(scribbles, held)
         colours, weights = outwards(scribbles, self.picture.size)
         planes = scribbles.planes(self.picture)
-        trimap = trimap_share(planes.flatten(2))
         unlike = 1 - likeness(colours, weights[:, :1], self.frame.colours, self.photometric_bandwidth)
         linked = linked_evenly(self.evenness, planes)
         frame_links, grid_links = self.frame.values(linked), self.grid.values(linked)
         known = self.scribbled(scribbles)
         outside = self.outside(known, unlike)
-        likely = sharpened(self.regression(known, outside, frame_links, grid_links)(self.picture))
-        likely_frame = torch.maximum(self.frame.values(likely * self.evenness), frame_links)
-        sides = (
-            Coloured(colours, weights),
-            Coloured(self.frame.colours, side_weights(unlike, likely_frame)),
-            Coloured(self.grid.colours, grid_links),
-        )
-        by_colour = kept(
+        likely = self.regression(known, outside, frame_links, grid_links)(self.picture)
+        boxed = None if held is None else in_boxes(held, self.picture)
+        front, back = planes.split(1, dim=1)
+        sides = torch.cat([front.maximum(linked * (1 - back)), back], dim=1)
+        return kept(
             self.picture,
-            ("likelihood", number),
-            [*sides[0], *sides[1], *sides[2], self.photometric_bandwidth, trimap],
-            colour_likelihood,
+            ("object", number, self.extent),
+            [likely, sides, drawn] if boxed is None else [likely, sides, drawn, boxed],
+            object_masks,
             self.picture.image,
-            *sides,
-            self.photometric_bandwidth,
-            trimap,
+            self.guide,
+            likely,
+            sides,
+            drawn,
+            boxed,
+            self.extent,
         )
-        share = by_trimap(COLOUR_SHARE, trimap).view(-1, 1, 1, 1)
-        nearby = 1.0 if self.everywhere else (around(likely) / ENOUGH_AROUND).clamp(max=1.0)
-        mask = likely + (by_colour - likely) * share * nearby
-        return mask if held is None else torch.where(in_boxes(held, self.picture), mask, 0.0)
 
     def with_middle(self, scribbles: Scribbles, boxes: Tensor) -> Scribbles:
         """Scribbles, with those on the region in the middle of its box (B, 1, 4) in images that have none."""
@@ -260,18 +250,3 @@ class RoughMasks:
 def _of_columns(columns: Columns, regression: Callable[[Tensor], Tensor]) -> Tensor:
     """A regression at the pixels of these columns."""
     return regression(columns.factor)
-
-
-def sharpened(likely: Tensor) -> Tensor:
-    """Rough mask of a likelihood: a steep curve on which 0 and 1 stay as they are."""
-    bound = math.tanh(CONTRAST / 2)
-    return (0.5 + torch.tanh(CONTRAST * (likely - 0.5)) / (2 * bound)).clamp(0.0, 1.0)
-
-
-def around(likely: Tensor) -> Tensor:
-    """Average of planes (B, 1, H, W) over a wide Gaussian, approximately."""
-    size = (likely.shape[-2], likely.shape[-1])
-    step = max(1, min(size) // AROUND_GRID)
-    coarse = block_means(likely, step)
-    steps = (size[0] / coarse.shape[-2], size[1] / coarse.shape[-1])
-    return enlarged(blur(coarse, AROUND_SIGMA * min(size) / step), steps, (0, 0), size)

@@ -40,10 +40,6 @@ REFERENCE = (112, 160)  # size of the reduced pictures for which confidences and
 FRAME_POINTS = 64  # approximate number of points along the upper or left border of a picture
 NUM_COMPARED = 512  # approximate number of scribbled pixels that the frame is compared with
 SIMILAR_SHARE = 0.3  # a pixel that is similar to this share of the scribbled ones counts as similar to them
-# Approximate number of scribbled pixels on each side that the colours of all pixels are compared with, and bandwidth of
-# that comparison as a share of the photometric bandwidth: for a few scribbles, and for a trimap.
-NUM_COLOURS = (32, 128)
-BANDWIDTH_SHARE = (0.4, 0.25)
 EVEN_SIGMA = 2.0  # pixels; standard deviation of the surroundings whose evenness is judged
 HALF_EVEN_DEVIATION = 0.007  # standard deviation of colours, in hundredths of Lab, that counts as half even
 UNLINKED, LINKED = 0.25, 0.5  # least evenness along a path up to which it links nothing, and from which on it does
@@ -51,7 +47,6 @@ UNLINKED, LINKED = 0.25, 0.5  # least evenness along a path up to which it links
 # steps than MOST_LINKED, in long, narrow pictures.
 LINK_STEP, MOST_LINKED = 3, 1000
 INNER_ROWS, MOST_INNER = 16, 64  # points inside the picture that are compared, along its short side, and at most
-MIN_DENSITY = 1e-4  # colours that are rarer than this on both sides belong to neither
 LEAST_GAUSSIAN = -30.0  # of Gaussians: smaller ones give denormal numbers, which are slow
 EPSILON = 1e-6  # least sum of weights that is divided by; rounding errors of float32 sums of them are smaller
 
@@ -157,49 +152,6 @@ class Coloured(NamedTuple):
 
     colours: Tensor
     weights: Tensor
-
-
-def side_weights(unlike: Tensor, likely: Tensor) -> Tensor:
-    """Weights (B, 2, n) of pixels along the borders of a picture in the region and outside it, which sum to 1.
-
-    Args:
-        unlike: dissimilarity of these pixels to the scribbles on the region, (B, 1, n).
-        likely: likelihood of these pixels by the regression, (B, 1, n), times their :func:`evenness`. Where an even
-            region, such as a sky, reaches the border of the picture, they show its colours far from its scribbles; in
-            textures, the regression is too often wrong for that.
-    """
-    weights = unlike * torch.cat([likely.square(), (1 - likely).square()], dim=1)
-    return weights / unlike.sum(2, keepdim=True).clamp(min=EPSILON)
-
-
-def colour_likelihood(
-    image: Tensor, scribbled: Coloured, frame: Coloured, inner: Coloured, bandwidth: float | Tensor, trimap: Tensor
-) -> Tensor:
-    """Likelihood (B, 1, h, w), in [0, 1], that a pixel belongs to a region, by its own colour alone.
-
-    Where colours separate the sides, it follows hair and borders more closely than the regression, whose features
-    include the surroundings of a pixel. 0.5 for colours that neither side has.
-
-    Args:
-        image: the reduced picture.
-        scribbled: pixels with weights on the region and on its background, see :func:`outwards`.
-        frame: pixels along the borders of the picture, with :func:`side_weights`.
-        inner: :func:`inner_places`, with :func:`linked_evenly` as weights.
-        bandwidth: photometric bandwidth of the regression.
-        trimap: :func:`trimap_share` of the scribbles, (B,). Many scribbled pixels tell colours apart that differ less.
-    """
-    places = hundredths_of_lab(image).flatten(2)
-    dense = trimap.view(-1, 1, 1)
-    scale = by_trimap(BANDWIDTH_SHARE, dense) * per_image(bandwidth, image, 3)
-    number = by_trimap(NUM_COLOURS, dense).round().long()
-    samples = (every_nth(scribbled.colours, side, number) for side in scribbled.weights.split(1, dim=1))
-    inside, outside = (density(places, colours_in_lab(sample), shares, scale) for sample, shares in samples)
-    within, around = density(places, colours_in_lab(frame.colours), frame.weights, scale).split(1, dim=1)
-    shares = inner.weights / inner.weights.sum(2, keepdim=True).clamp(min=1.0)
-    inside = inside + within + density(places, colours_in_lab(inner.colours), shares, scale)
-    opposed = (scribbled.weights[:, 1].detach() > 0).any(1).view(-1, 1, 1)
-    outside = torch.where(opposed, (outside + around) / 2, around)
-    return ((inside + MIN_DENSITY) / (inside + outside + 2 * MIN_DENSITY)).unflatten(2, image.shape[-2:])
 
 
 def outwards(scribbles: Scribbles, size: tuple[int, int]) -> Coloured:

@@ -1,6 +1,7 @@
 """The editor's preview: it shows what is saved, and does not recompute what has not changed."""
 
 import gc
+from functools import partial
 
 import pytest
 import torch
@@ -163,7 +164,7 @@ def test_another_radius_needs_no_other_mask(session: Session, monkeypatch: pytes
     wanted = apply_step(first.changed(radius=4.0), session.preview.pixels).clamp(0, 1)
     session.load(Recipe((first,)))
     session.render()
-    for function in ("mask.fit_borders", "rough_mask.colour_likelihood"):
+    for function in ("mask.fit_borders", "rough_mask.object_masks"):
         monkeypatch.setattr(f"nlfilter_torch.photo.selections.{function}", lambda *_: pytest.fail("computed again"))
     session.set("defocus", radius=4.0)
     assert torch.equal(session.render(), wanted)
@@ -349,7 +350,8 @@ def test_masks_are_those_of_the_library_and_need_no_other_filter(monkeypatch: py
     first, second = Stroke(((0.2, 0.2), (0.3, 0.2)), 0.04, "in"), Stroke(((0.8, 0.8),), 0.04, "out")
     preview, size = Preview(image), (image.shape[-2], image.shape[-1])
     inner, outer = mask_of((first,), size), mask_of((second,), size)
-    wanted = [region_mask(image, inner, generator=seeded()), region_mask(image, inner, outer, generator=seeded())]
+    near = partial(region_mask, image, inner, extent="near")  # the default of the edit
+    wanted = [near(generator=seeded()), near(outer, generator=seeded())]
     assert torch.equal(preview.masks(Step("detail", (first,))), wanted[0])
     monkeypatch.setattr("nlfilter_torch.photo.picture.in_memory.operator_from_guide", None)
     assert torch.equal(preview.masks(Step("detail", (first, second), landmarks=400)), wanted[1])

@@ -22,7 +22,7 @@ def test_the_subject_stays_sharp_and_the_rest_does_not(aperture: str) -> None:
     blurred = defocus(image, region, radius=4.0, aperture=aperture)
     assert torch.equal(blurred[(region > 0).expand_as(image)], image[(region > 0).expand_as(image)])
     face = box(22, 45, 20, 18, size=(128, 128))
-    assert gradient_energy(blurred, face) >= 0.95 * gradient_energy(image, face)
+    assert gradient_energy(blurred, face) >= 0.94 * gradient_energy(image, face)  # its corners hold ground
     far = box(0, 95, 60, 33, size=(128, 128))  # the shuttle
     assert gradient_energy(blurred, far) < 0.3 * gradient_energy(image, far)
     assert blurred.min() >= image.min() - 1e-4
@@ -93,7 +93,7 @@ def test_background_scribbles_are_blurred_with_what_resembles_them() -> None:
     image[:, 0] += 0.4 * (subject + twin)[:, 0]
     region, background = box(26, 16, 8, 8, size=(60, 90)), box(26, 66, 8, 8, size=(60, 90))
     inner = box(24, 64, 12, 12, size=(60, 90))
-    options = {"radius": 4.0, "spatial_bandwidth": float("inf"), "num_landmarks": 60}
+    options = {"radius": 4.0, "spatial_bandwidth": float("inf"), "num_landmarks": 60, "extent": "near"}
     alone = defocus(image, region, **options)
     assert gradient_energy(alone, inner) > 0.9 * gradient_energy(image, inner)
     blurred = defocus(image, region, background=background, **options)

@@ -62,7 +62,7 @@ def test_masks_of_the_object_of_what_is_near_and_of_everything() -> None:
         region_mask(image, STROKE, extent=extent, spatial_bandwidth=24.0, num_landmarks=60)
         for extent in ("near", "object", "everywhere")
     )
-    assert torch.equal(near, region_mask(image, STROKE, spatial_bandwidth=24.0, num_landmarks=60))
+    assert torch.equal(this, region_mask(image, STROKE, spatial_bandwidth=24.0, num_landmarks=60))
     assert min(covered(mask, LEFT) for mask in (near, this, everywhere)) > 0.9
     assert covered(near, RIGHT) > 0.5
     assert covered(this, RIGHT) == covered(this, FAR) == 0

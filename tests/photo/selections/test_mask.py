@@ -191,7 +191,7 @@ def test_no_spatial_term_finds_what_is_alike_anywhere() -> None:
     image = torch.cat([image, image], dim=3)
     scribble = box(18, 40, 3, 6, size=(40, 192))
     far = box(14, 130, 12, 30, size=(40, 192)) > 0
-    assert region_mask(image, scribble, spatial_bandwidth=math.inf)[far].min() > 0.9
+    assert region_mask(image, scribble, spatial_bandwidth=math.inf, extent="near")[far].min() > 0.9
 
 
 def test_thin_parts_of_the_same_colour_belong_to_an_object() -> None:

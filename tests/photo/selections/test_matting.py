@@ -1,6 +1,4 @@
-"""Random walker and closed-form matting: the solutions of dense linear systems, and their precision."""
-
-import math
+"""Closed-form matting: the solution of a dense linear system, and its precision."""
 
 import numpy as np
 import pytest
@@ -8,7 +6,6 @@ import torch
 
 from nlfilter_torch.photo import region_mask
 from nlfilter_torch.photo.selections import matting
-from nlfilter_torch.photo.selections.matting import NEIGHBOURS, neighbour_weights
 from tests.problems import box, colour, noise
 
 
@@ -24,7 +21,7 @@ def test_masks_are_solved_by_several_workers(monkeypatch: pytest.MonkeyPatch) ->
     image, rough = noise(2, 3, 12, 14), noise(2, 3, 12, 14, seed=1)
     front, back = rough > 0.9, rough < 0.1
     models, trimap = matting.linear_models(image), torch.linspace(0, 1, 6, dtype=torch.float64).view(2, 3)
-    arguments = (models, rough, rough, front.double(), back.double(), trimap)
+    arguments = (models, rough, front.double(), back.double(), trimap)
     alone = matting.solve_linear(*arguments)
     monkeypatch.setattr(matting, "threads_for", lambda *_: 4)
     torch.testing.assert_close(matting.solve_linear(*arguments), alone, atol=1e-9, rtol=1e-9)
@@ -37,9 +34,7 @@ def test_the_solve_is_that_of_the_linear_system(monkeypatch: pytest.MonkeyPatch)
     height, width, count = 6, 7, 42
     image, rough = noise(1, 3, height, width), noise(1, 1, height, width, seed=1)
     front, back = box(1, 1, 2, 2, size=(height, width)).double(), box(4, 4, 1, 2, size=(height, width)).double()
-    functions = matting.solve_linear(
-        matting.linear_models(image), torch.full_like(rough, 0.5), rough, front, back, rough.new_zeros(1, 1)
-    )
+    functions = matting.solve_linear(matting.linear_models(image), rough, front, back, rough.new_zeros(1, 1))
     pixels = image[0].flatten(1).T.numpy()
     rows, columns = np.divmod(np.arange(count), width)
     near = np.maximum(abs(rows[:, None] - rows), abs(columns[:, None] - columns)) <= matting.WINDOW_RADIUS
@@ -68,48 +63,8 @@ def test_the_solve_is_the_same_in_float32(name: str) -> None:
     rough = region_mask(image, front, back, num_landmarks=40)
     solved = []
     for dtype in (torch.float32, torch.float64):
-        colours, *masks = (planes.to(dtype) for planes in (image, rough, rough, front, back))
+        colours, *masks = (planes.to(dtype) for planes in (image, rough, front, back))
         functions = matting.solve_linear(matting.linear_models(colours), *masks, colours.new_zeros(1, 1))
         assert functions.dtype == dtype
         solved.append(matting.linear_mask(colours - 0.5, functions[:, 0]))
     torch.testing.assert_close(solved[0].double(), solved[1], atol=2e-3, rtol=0)
-
-
-@pytest.mark.parametrize("channels", [1, 3])
-def test_the_local_solve_is_that_of_the_linear_system(monkeypatch: pytest.MonkeyPatch, channels: int) -> None:
-    monkeypatch.setattr(matting, "JACOBI_STEPS", (3000,))
-    height, width = 7, 9
-    image, rough = noise(1, channels, height, width), noise(1, 2, height, width, seed=1)
-    trust = 0.05 + noise(1, 2, height, width, seed=2)
-    solved = matting.solve_mask(image, rough, trust)
-    pixels = image[0].flatten(1).T.numpy()
-    rows, columns = np.divmod(np.arange(height * width), width)
-    near = np.maximum(abs(rows[:, None] - rows), abs(columns[:, None] - columns)) == 1
-    squares = np.square(pixels[:, None] - pixels).mean(2)
-    weights = near * (np.exp(-matting.STEEPNESS * squares) + matting.MIN_WEIGHT)
-    laplacian = np.diag(weights.sum(1)) - weights
-    for k in range(2):
-        c = trust[0, k].flatten().numpy()
-        expected = np.linalg.solve(laplacian + np.diag(c), c * rough[0, k].flatten().numpy())
-        np.testing.assert_allclose(solved[0, k].flatten(), expected, atol=1e-6)
-
-
-def test_weights_of_neighbours_are_those_of_pairs() -> None:
-    guide = torch.rand(1, 2, 4, 5, generator=torch.Generator().manual_seed(3))
-    weights = neighbour_weights(guide, lambda squared: torch.exp(-4 * squared))
-    assert weights.shape == (1, 4, 4, 5)
-    for number, (down, right) in enumerate(((0, 1), (1, 0), (1, 1), (1, -1))):
-        for row in range(4):
-            for column in range(5):
-                wanted = 0.0
-                if row + down < 4 and 0 <= column + right < 5:
-                    difference = guide[0, :, row, column] - guide[0, :, row + down, column + right]
-                    wanted = math.exp(-4 * float(difference.square().sum()))
-                assert float(weights[0, number, row, column]) == pytest.approx(wanted)
-
-
-def test_sides_are_the_pixels_with_a_neighbour_and_their_neighbours() -> None:
-    numbers = torch.arange(20).view(4, 5)
-    steps = [numbers[there] - numbers[here] for here, there in NEIGHBOURS]
-    assert [sorted(set(step.flatten().tolist())) for step in steps] == [[1], [5], [6], [4]]
-    assert [step.numel() for step in steps] == [16, 15, 12, 12]

@@ -7,17 +7,12 @@ import pytest
 import torch
 
 from nlfilter_torch.core.blocks import CACHED
-from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles
 from nlfilter_torch.photo.selections import scribbled_colours
 from nlfilter_torch.photo.selections.scribbled_colours import (
-    Coloured,
-    colour_likelihood,
     density,
     evenness,
     every_nth,
     linked_evenly,
-    outwards,
-    side_weights,
     trimap_share,
 )
 from tests.problems import noise
@@ -39,24 +34,6 @@ def test_evenness() -> None:
     slope = flat + 0.002 * torch.arange(40).double()  # half a grey level per pixel
     assert evenness(slope)[..., 8:32].min() > 0.5
     assert evenness(flat + 0.3 * noise(1, 1, 40, 40)).max() < 0.1
-
-
-def test_colours_of_a_region_where_it_reaches_the_border_belong_to_it() -> None:
-    sky, far, ground = torch.tensor([[0.3, 0.5, 0.8], [0.5, 0.65, 0.85], [0.3, 0.25, 0.1]]).double()
-    image = torch.stack([sky, far, ground]).mT.view(1, 3, 1, 3)
-    scribbles = Scribbles(torch.tensor([0]), torch.tensor([[[1.0], [0.0]]]).double(), image[..., 0])
-    frame, unlike = image.squeeze(2), torch.tensor([[[0.0, 1.0, 1.0]]]).double()
-
-    def likelihoods(likely: float, inside: float = 0.0) -> torch.Tensor:
-        by_regression = torch.tensor([[[1.0, likely, 0.0]]]).double()
-        grid = Coloured(image.squeeze(2)[..., 1:2], torch.tensor([[[inside]]]).double())
-        along = Coloured(frame, side_weights(unlike, by_regression))
-        return colour_likelihood(image, outwards(scribbles, (1, 3)), along, grid, 0.08, torch.zeros(1)).flatten()
-
-    assert likelihoods(0.9)[:2].min() > 0.95
-    assert likelihoods(0.1)[1] < 0.05
-    assert likelihoods(0.9)[2] < 0.05
-    assert likelihoods(0.1, inside=1.0)[1] > 2 * likelihoods(0.1)[1]
 
 
 @pytest.mark.parametrize("size", [(1, 1), (3, 50), (112, 160), (300, 430), (1, 200_000), (70_000, 3)])
