@@ -318,8 +318,9 @@ def sampled_newton(matrix: KernelMatrix, tolerance: float) -> Balancing:
         if resampled:
             sample, places = _draw(matrix, scaling, count)
             # The sample predicts how the moment changes with t. Its error at the current t, where the true moment is
-            # known, is subtracted; a sample of all points has none.
-            bias = 0.0 if places is None else actual - sample.moment(scaling.gather(1, places))
+            # known, is subtracted; a sample of all points has none. Ranks differ in whether they sample.
+            part = scaling if places is None else scaling.gather(1, places)
+            bias = 0.0 if places is None and ranks == 1 else actual - sample.moment(part)
             total, lower, _ = newton(sample.whole, actual, steps=SAMPLE_STEPS, bias=bias)
             inverse = torch.cholesky_inverse(lower)
         else:

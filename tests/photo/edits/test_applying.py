@@ -63,7 +63,7 @@ def test_detail_in_a_region_and_elsewhere(pixels: torch.Tensor) -> None:
     plain = DETAIL.changed(limits="none", threshold=0.0)
     edited = apply_recipe(Recipe((plain,)), pixels)
     regions = mask_of([IN], SIZE), mask_of([OUT], SIZE)
-    mask = region_mask(pixels, *regions, reach=0.7, generator=seeded())
+    mask = region_mask(pixels, *regions, extent="near", reach=0.7, generator=seeded())
     operator = nonlocal_operator(
         reduce_channels(pixels, "luminance"),
         photometric_bandwidth=30 / 255,

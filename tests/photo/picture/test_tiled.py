@@ -31,7 +31,9 @@ def test_regions_are_those_in_memory(alpha: Tensor) -> None:
     picture, regions = cat(60, 90), spots(60, 90)
     image = torch.from_numpy(picture).permute(2, 0, 1)[None]
     options: dict[str, Any] = {"num_landmarks": 50, "spatial_bandwidth": 60.0}
-    masks = region_mask(image, torch.from_numpy(regions).permute(2, 0, 1)[None], reach=0.7, num_landmarks=50)
+    masks = region_mask(
+        image, torch.from_numpy(regions).permute(2, 0, 1)[None], extent="near", reach=0.7, num_landmarks=50
+    )
     operator = nonlocal_operator(reduce_channels(image, "luminance"), **options)
     wanted = edit_luminance(image, lambda planes: filter_regions(operator, planes, masks, alpha.expand(2, -1)))
     edited = streamed(picture, alpha, regions=regions, reach=0.7, statistics="full", tile_rows=17, **options)
