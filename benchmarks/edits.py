@@ -62,13 +62,13 @@ def recolouring() -> Iterator[Figure]:
     """Recolouring from one blue stroke on the suit."""
     image, scale = scene("astronaut", 256)
     colours, painted = strokes(image, scale, (SUIT, (0.1, 0.3, 0.9)))
-    edited = recolor(image, colours, painted)
+    edited = recolor(image, colours, painted, brightness=0.0)
     change = float(255 * (luminance(edited) - luminance(image)).abs().max())
     yield Figure("recolor: largest change of luminance, grey levels", change, 1.0)
     outside = spots(image, scale, (300, 20, 100, 120)).expand_as(image) > 0  # backdrop
     yield Figure("recolor: largest change of the backdrop, grey levels", _levels(edited - image, outside), 2.0)
     kept = spots(image, scale, (200, 90, 50, 60))  # face
-    edited = recolor(image, colours, painted, keep=kept)
+    edited = recolor(image, colours, painted, brightness=0.0, keep=kept)
     yield Figure(
         "recolor: largest change of the area to keep, grey levels",
         _levels(edited - image, kept.expand_as(image) > 0),

@@ -5,6 +5,7 @@ Legal arguments must give finite values and no error; invalid ones, finite value
 
 import math
 import random
+import warnings
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property
@@ -68,9 +69,11 @@ class Scene:
 
     @cached_property
     def operator(self) -> nlf.NonlocalOperator:
-        """Operator with a bandwidth suitable for noise."""
-        bandwidth = log_uniform(self.rng, 0.03, 1.0)
-        return nlf.nonlocal_operator(self.guide, photometric_bandwidth=bandwidth, num_landmarks=self.rng.randint(1, 16))
+        """Operator with a bandwidth suitable for noise; nearly the identity for some guides of two channels."""
+        bandwidth, count = log_uniform(self.rng, 0.03, 1.0), self.rng.randint(1, 16)
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "guide must have differences near photometric_bandwidth")
+            return nlf.nonlocal_operator(self.guide, photometric_bandwidth=bandwidth, num_landmarks=count)
 
     @cached_property
     def spectrum(self) -> nlf.Spectrum:
