@@ -130,21 +130,28 @@ class Points:
         return labels
 
 
-def beside(planes: Tensor, offset: tuple[int, int], *, repeated: bool = False) -> Tensor:
-    """Planes (C, h, w) of the neighbours at an offset; beyond the picture 0, or the pixel itself if ``repeated``."""
-    (down, right), (height, width) = offset, planes.shape[-2:]
-    padded = F.pad(planes, (1, 1, 1, 1), mode="replicate") if repeated else F.pad(planes, (1, 1, 1, 1))
-    return padded[..., 1 + down : 1 + down + height, 1 + right : 1 + right + width]
+def beside(padded: Tensor, offset: tuple[int, int]) -> Tensor:
+    """Planes (..., h, w) of the neighbours at an offset, of planes that are padded by a pixel on every side."""
+    down, right = offset
+    return padded[..., 1 + down : padded.shape[-2] - 1 + down, 1 + right : padded.shape[-1] - 1 + right]
 
 
 def differences(planes: Tensor) -> Tensor:
     """Differences (4, C, h, w) of planes from their neighbours at :data:`OFFSETS`; without meaning at the border."""
-    return torch.stack([planes - beside(planes, offset, repeated=True) for offset in OFFSETS])
+    padded = F.pad(planes, (1, 1, 1, 1), mode="replicate")
+    return torch.stack([planes - beside(padded, offset) for offset in OFFSETS])
 
 
 def neighbours(planes: Tensor) -> Tensor:
     """Which pixels of planes (C, h, w) have a neighbour at :data:`OFFSETS`, (4, h, w): 1 or 0."""
-    return torch.cat([beside(torch.ones_like(planes[:1]), offset) for offset in OFFSETS])
+    padded = F.pad(torch.ones_like(planes[0]), (1, 1, 1, 1))
+    return torch.stack([beside(padded, offset) for offset in OFFSETS])
+
+
+def from_before(planes: Tensor) -> list[Tensor]:
+    """For planes (4, h, w) at :data:`OFFSETS`, those of the neighbours on the other side; 0 beyond the picture."""
+    padded = F.pad(planes, (1, 1, 1, 1)).unbind(0)
+    return [beside(plane, (-down, -right)) for plane, (down, right) in zip(padded, OFFSETS, strict=True)]
 
 
 def cut(odds: Tensor, weights: Tensor, flow: Tensor, steps: int) -> tuple[Tensor, Tensor]:
@@ -173,8 +180,8 @@ def cut(odds: Tensor, weights: Tensor, flow: Tensor, steps: int) -> tuple[Tensor
 def _mask(odds: Tensor, flow: Tensor) -> Tensor:
     """The mask of a dual: what flows in from the pixels before, and out to those after, changes the odds."""
     total = odds - flow.sum(0)
-    for (down, right), part in zip(OFFSETS, flow.split(1), strict=True):
-        total = total + beside(part, (-down, -right)).squeeze(0)
+    for part in from_before(flow):
+        total = total + part
     return total.sigmoid()
 
 
@@ -196,8 +203,7 @@ def nearness(lab: Tensor, sides: Tensor) -> Tensor:
     anchors = ANCHOR * anchors
     own = 1 + anchors.sum(0)
     coefficients: dict[tuple[int, int], Tensor] = {}
-    for (down, right), link in zip(OFFSETS, links, strict=True):
-        before = beside(link.unsqueeze(0), (-down, -right)).squeeze(0)
+    for (down, right), link, before in zip(OFFSETS, links, from_before(links), strict=True):
         coefficients[down, right], coefficients[-down, -right] = -link, -before
         own = own + link + before
     coefficients[0, 0] = own
