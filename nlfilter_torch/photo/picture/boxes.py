@@ -85,13 +85,14 @@ def in_boxes(boxes: Tensor, pixels: Pixels) -> Tensor:
 
 def held(boxes: Tensor, size: Sequence[int], first: tuple[int, int] = (0, 0)) -> Tensor:
     """Which of (h, w) pixels, the first of which is in that row and column, have their centre in boxes."""
-    y, x = (
-        torch.arange(start, start + count, device=boxes.device) + 0.5 for start, count in zip(first, size, strict=True)
-    )
-    across, down = (
-        (boxes[..., axis, None] <= places) & (places < boxes[..., axis + 2, None]) for axis, places in ((0, x), (1, y))
-    )
-    return down.unsqueeze(3) & across.unsqueeze(2)
+    rows, columns = (torch.arange(start, start + count) for start, count in zip(first, size, strict=True))
+    return _within(boxes, 1, rows).unsqueeze(3) & _within(boxes, 0, columns).unsqueeze(2)
+
+
+def _within(boxes: Tensor, axis: int, places: Tensor) -> Tensor:
+    """Which pixels at places (n,) along an axis have their centre between the sides of boxes (..., 4), (..., n)."""
+    centres = places.to(boxes.device) + 0.5
+    return (boxes[..., axis, None] <= centres) & (centres < boxes[..., axis + 2, None])
 
 
 def just_outside(boxes: Tensor, size: Size) -> Tensor:
@@ -114,10 +115,9 @@ def check_scribbles_in(boxes: Tensor, inside: Sequence[Scribbles], size: Size, n
     """
     for number, scribbles in enumerate(inside):
         weights = scribbles.weights.detach()[:, 0]
-        own = boxes[:, number, :, None].to(weights.device)
-        rows, columns = scribbles.places // size[1] + 0.5, scribbles.places % size[1] + 0.5
-        held = (own[:, 0] <= columns) & (columns < own[:, 2]) & (own[:, 1] <= rows) & (rows < own[:, 3])
-        if not is_hidden(weights) and bool(((weights * held).sum(1) < weights.sum(1) / 2).any()):
+        own, places = boxes[:, number].to(weights.device), scribbles.places
+        inner = _within(own, 1, places // size[1]) & _within(own, 0, places % size[1])
+        if not is_hidden(weights) and bool(((weights * inner).sum(1) < weights.sum(1) / 2).any()):
             raise ValueError(
                 f"box must hold most of the {name} on its object in every image, got some that lie mostly outside; "
                 "enlarge it, or move them"
