@@ -50,7 +50,6 @@ OTHER_NAMES: Mapping[str, tuple[str, ...] | str] = {
     "--luminance": ("--brightness",),
     "--stroke": ("--strokes", "--region"),
     "--scribbles": ("--strokes", "--region"),
-    "--box": ("--region",),
     "--roi": ("--region",),
     "--foreground": ("--region",),
     "--exclude": ("--background", "--keep", "--remove"),
