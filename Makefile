@@ -74,11 +74,11 @@ node_modules/.installed: package.json
 types: $(VENV)/.installed-test
 	$(BIN)/mypy
 
-# All speed measurements, in ten minutes, on an otherwise idle machine; then 25 megapixels in tiles beside busy processes.
+# All speed measurements, in ten minutes, on an otherwise idle machine; then an edit in tiles beside busy processes.
 bench: $(VENV)/.installed-test
 	$(BIN)/python -m benchmarks.speed --out out/speed.json
 	$(BIN)/python -m docs.speed out/speed.json
-	$(BIN)/python -m benchmarks.streaming busy --megapixels 25 --edits detail --repeats 1
+	$(BIN)/python -m benchmarks.busy "detail in tiles"
 
 # Checks that every benchmark runs, on sizes that take seconds. One single-threaded benchmark per core.
 bench-quick: export OMP_NUM_THREADS = 1
