@@ -2,13 +2,16 @@
 
 The outlines are polygons whose points are fractions of width and height, with holes; they and all strokes were drawn
 without looking at results. Parts that may or may not be meant, such as the orange tips of red legs or a shadow that
-hides feet, are "either" and do not count. There are four sets:
+hides feet, are "either" and do not count. There are six sets:
 
 - "choosing" and "reporting": the outlines of ``outlines.json`` are of objects in :mod:`benchmarks.keepers`. Each is
   selected from the strokes of its job, with the settings of its edit; that of ``recolor`` before hues are compared.
   Those of the choosing set may guide changes of masks.
 - "short" and "generous": ``selections.json`` has objects of 25 other photographs of the reporting set, each with about
   four short strokes inside and four outside, and with longer ones that visit its main parts and go around it.
+- "random": the same objects with four random short strokes on each side, away from the outline where there is room.
+- "training": likewise, 89 objects on photographs of the training set (``training/outlines.json``), to choose and train
+  on. Most of their borders were refined by GrabCut, so they are not meant for comparisons with it.
 
 "IoU" is the intersection over union of the pixels above 0.5 and the object, "missed" the share of the object that is
 not selected, and "outside" what is selected beside it, as a share of the object; pixels within 1 % of the short side of
@@ -19,14 +22,14 @@ object, from the strokes inside alone, and from these with the rectangle.
 photographs are measured. ``--peers`` adds GrabCut, from the same strokes where there are some outside, and with the
 rectangle, and closed-form matting with the rectangle on at most 240 pixels of short side, as it takes long. ``--out
 FOLDER`` writes the photographs with what is selected, missed in red and beside the object in blue.
-
-``training/outlines.json`` holds the outlines of 89 objects on photographs of the training set, with their kind, to
-choose and train on; most of their borders were refined by GrabCut, so they are not meant for comparisons with it.
+``--stability`` draws 40 sets of such random strokes on each object of a set and computes a mask from each. "Alike" is
+the share of masks whose IoU with what most of the 40 select is at least 0.93, "IoU" the mean with the outline, and
+"moved" the share of those that change at most 5 % of the object's area when one stroke inside moves by its width.
 """
 
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import mean
@@ -38,13 +41,14 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from benchmarks.composites import RADIUS as STROKE_RADIUS
+from benchmarks.composites import draw_strokes
 from benchmarks.free_photographs import edited_photographs
-from benchmarks.harness import options, save_picture
-from benchmarks.keepers import Job, jobs, mask_of
+from benchmarks.harness import options, row, save_picture
+from benchmarks.keepers import SIDE, Job, jobs, mask_of
 from benchmarks.mask_peers import PEERS
 from benchmarks.photographs import reduced_to
 from nlfilter_torch.photo import region_mask
-from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.declared.strokes import Mark
 from nlfilter_torch.photo.edits.applying import edit_of, scribbles_of
 from nlfilter_torch.photo.picture.boxes import Box
@@ -56,7 +60,10 @@ from nlfilter_torch.photo.selections.mask import ObjectEdit
 
 STORED = Path(__file__).with_suffix(".json")
 SELECTIONS = Path(__file__).with_name("selections.json")
-SETS = "choosing", "reporting", "short", "generous"
+TRAINING = Path(__file__).parent / "training" / "outlines.json"
+SETS = "choosing", "reporting", "short", "generous", "random", "training"
+RANDOM_STROKES = 4  # on each side of an outline
+SETS_OF_STROKES, ALIKE, MOST_MOVED = 40, 0.93, 0.05  # for stability: their number, least IoU, and largest change
 RADIUS = 0.01  # of the strokes of selections.json, as a share of the short side
 BAND = 0.01  # on either side of an outline, as a share of the short side
 MARGIN = 0.02  # between an object and the rectangle around it, as a share of the short side
@@ -66,6 +73,7 @@ MISSED, BESIDE = (1.0, 0.1, 0.1), (0.1, 0.3, 1.0)
 
 Mask = NDArray[np.bool_]
 Polygon = Sequence[tuple[float, float]]
+Polygons = tuple[Polygon, ...]
 
 
 @dataclass(frozen=True)
@@ -73,10 +81,11 @@ class Outline:
     """The outline of the object of a job: polygons of (x, y) as fractions of width and height."""
 
     job: Job
-    outlines: tuple[Polygon, ...]  # the object is their union
-    holes: tuple[Polygon, ...] = ()  # not part of it
-    either: tuple[Polygon, ...] = ()  # parts that do not count
+    outlines: Polygons  # the object is their union
+    holes: Polygons = ()  # not part of it
+    either: Polygons = ()  # parts that do not count
     set: str = ""  # one of SETS
+    seed: int | None = None  # of random strokes, in place of those of the job
 
     def object(self, size: tuple[int, int]) -> Mask:
         """The object in a picture (H, W)."""
@@ -91,6 +100,22 @@ class Outline:
             min(most, int(places[-1]) + 1 + margin) for places, most in ((columns, size[1]), (rows, size[0]))
         )
         return left, top, right, bottom
+
+    def sides(self, size: tuple[int, int]) -> tuple[Mask, Mask]:
+        """What counts of the object and of its surroundings in a picture (H, W): not near the outline."""
+        wanted, either = self.object(size), filled(self.either, size)
+        radius = max(1, round(BAND * min(size)))
+        disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
+        inside, outside = ((cv2.erode(side.astype(np.uint8), disc) > 0) & ~either for side in (wanted, ~wanted))
+        return inside, outside
+
+    def scribbles(self, size: tuple[int, int]) -> tuple[Tensor, Tensor | None]:
+        """Masks (1, 1, H, W) of strokes on the object and, if there are any, on its background."""
+        if self.seed is None:
+            return separated(self.job.strokes, size)
+        random = np.random.default_rng(self.seed)
+        inside, outside = (draw_strokes(side, RANDOM_STROKES, random) for side in self.sides(size))
+        return inside, outside
 
 
 def filled(polygons: Sequence[Polygon], size: tuple[int, int]) -> Mask:
@@ -118,51 +143,47 @@ def outlines() -> list[Outline]:
     for entry in json.loads(STORED.read_text(encoding="utf-8")):
         job = by_name[entry["photograph"], entry["what"]]
         stored.append(Outline(job, *_polygons(entry), job.set))
-    entries = json.loads(SELECTIONS.read_text(encoding="utf-8"))
-    for kind in ("short", "generous"):
-        for number, entry in enumerate(entries, 1):
-            drawn = [{"radius": RADIUS} | stroke for stroke in entry["strokes"][kind]]
+    for kind in SETS[2:]:
+        file = TRAINING if kind == "training" else SELECTIONS
+        for number, entry in enumerate(json.loads(file.read_text(encoding="utf-8")), 1):
+            drawn = [{"radius": RADIUS} | stroke for stroke in entry.get("strokes", {}).get(kind, ())]
             named = {name: entry[name] for name in ("photograph", "what")}
             job = Job.of(number, named | {"edit": "mask", "strokes": drawn})
-            stored.append(Outline(job, *_polygons(entry), kind))
+            stored.append(Outline(job, *_polygons(entry), kind, None if drawn else number))
     return stored
 
 
-def _polygons(entry: dict[str, Any]) -> tuple[tuple[Polygon, ...], ...]:
-    return tuple(tuple(entry.get(name, ())) for name in ("outlines", "holes", "either"))
+def _polygons(entry: dict[str, Any]) -> tuple[Polygons, Polygons, Polygons]:
+    return tuple(entry["outlines"]), tuple(entry.get("holes", ())), tuple(entry.get("either", ()))
 
 
-def score(selected: Mask, wanted: Mask, either: Mask | None = None) -> Score:
-    """Score a selection (H, W) of an object, without the band around its outline and parts that do not count."""
-    radius = max(1, round(BAND * min(wanted.shape)))
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
-    inside, outside = (cv2.erode(side.astype(np.uint8), disc) > 0 for side in (wanted, ~wanted))
-    if either is not None:
-        inside, outside = inside & ~either, outside & ~either
+def score(selected: Mask, sides: tuple[Mask, Mask]) -> Score:
+    """Score a selection (H, W) by :meth:`Outline.sides`."""
+    inside, outside = sides
     covered, total, beside = (
         (side & part).sum() for side, part in ((inside, selected), (inside, inside), (outside, selected))
     )
     return Score(float(covered / (total + beside)), float(1 - covered / total), float(beside / total))
 
 
-def selected(job: Job, image: Tensor, box: Box | None = None) -> Tensor:
-    """The mask (1, 1, H, W) that the edit of a job uses; that of ``recolor`` before it is corrected by hue."""
-    size = (image.shape[-2], image.shape[-1])
+def selected(outline: Outline, image: Tensor, box: Box | None = None, *, alone: bool = False) -> Tensor:
+    """The mask (1, 1, H, W) that the edit of a job uses; that of ``recolor`` before it is corrected by hue.
+
+    With ``alone``, strokes on the background are left out.
+    """
+    size, job = (image.shape[-2], image.shape[-1]), outline.job
     if job.edit == "mask":
-        return region_mask(image, *separated(job.strokes, size), box=box)
+        inside, background = outline.scribbles(size)
+        return region_mask(image, inside, None if alone else background, box=box)
     (step,) = job.recipe.steps
+    if alone:
+        step = step.changed(strokes=tuple(stroke for stroke in job.strokes if stroke.role != "background"))
     edit = edit_of(step, size)
     selection = edit.selection_in(size) if isinstance(edit, ObjectEdit) else edit.selection()
     assert selection is not None, job.name
     marks = edit.marks(scribbles_of(step, size, TensorPainter())).masks
     # The last plane of what has colours is its mask.
     return edit_image(selection, image, Drawn({name: mask[:, -1:] for name, mask in marks.items()}, box=box))
-
-
-def from_inside(job: Job) -> Job:
-    """A job without its strokes on the background."""
-    inside = tuple(stroke for stroke in job.strokes if stroke.role != "background")
-    return replace(job, strokes=inside, recipe=Recipe(tuple(step.changed(strokes=inside) for step in job.recipe.steps)))
 
 
 def separated(strokes: Sequence[Mark], size: tuple[int, int]) -> tuple[Tensor, Tensor | None]:
@@ -172,9 +193,9 @@ def separated(strokes: Sequence[Mark], size: tuple[int, int]) -> tuple[Tensor, T
     return inside, background * (1 - inside) if sides[1] else None
 
 
-def by_peer(name: str, job: Job, image: Tensor, box: Box | None = None) -> Tensor:
+def by_peer(name: str, outline: Outline, image: Tensor, box: Box | None = None) -> Tensor:
     """The mask (1, 1, H, W) of another method, for which a rectangle around the object adds to its background."""
-    inside, background = separated(job.strokes, (image.shape[-2], image.shape[-1]))
+    inside, background = outline.scribbles((image.shape[-2], image.shape[-1]))
     outside = torch.zeros_like(inside) if background is None else background
     if box is not None:
         left, top, right, bottom = box
@@ -188,17 +209,17 @@ def by_peer(name: str, job: Job, image: Tensor, box: Box | None = None) -> Tenso
 
 def methods(outline: Outline, image: Tensor, *, peers: bool) -> dict[str, Tensor]:
     """Masks (1, 1, H, W) of an object by what is told of it and, if asked for, by other methods, by their names."""
-    job, box = outline.job, outline.box((image.shape[-2], image.shape[-1]))
-    masks = {OURS: selected(job, image), BOXED: selected(job, image, box)}
-    inner = from_inside(job)
-    if inner != job:
-        masks |= {INNER: selected(inner, image), INNER_BOXED: selected(inner, image, box)}
+    size = (image.shape[-2], image.shape[-1])
+    box, opposed = outline.box(size), outline.scribbles(size)[1] is not None
+    masks = {OURS: selected(outline, image), BOXED: selected(outline, image, box)}
+    if opposed:
+        masks |= {INNER: selected(outline, image, alone=True), INNER_BOXED: selected(outline, image, box, alone=True)}
     if peers:
         small = reduced_to(image, PEER_SIDE)
-        matted = by_peer("closed form", job, small, outline.box((small.shape[-2], small.shape[-1])))
-        if inner != job:
-            masks["GrabCut"] = by_peer("GrabCut", job, image)
-        masks["GrabCut, r."] = by_peer("GrabCut", job, image, box)
+        matted = by_peer("closed form", outline, small, outline.box((small.shape[-2], small.shape[-1])))
+        if opposed:
+            masks["GrabCut"] = by_peer("GrabCut", outline, image)
+        masks["GrabCut, r."] = by_peer("GrabCut", outline, image, box)
         masks["matting, r."] = resize(matted, (image.shape[-2], image.shape[-1]))
     return masks
 
@@ -215,11 +236,10 @@ def overlay(image: Tensor, mask: Mask, wanted: Mask) -> Tensor:
 def measure(outline: Outline, image: Tensor, out: Path | None = None, *, peers: bool = False) -> dict[str, Score]:
     """Scores of the masks of an object, by the names of :func:`methods`."""
     size = (image.shape[-2], image.shape[-1])
-    wanted, either = outline.object(size), filled(outline.either, size)
     masks = {name: mask[0, 0].numpy() > 0.5 for name, mask in methods(outline, image, peers=peers).items()}
     if out is not None:
-        save_picture(out / f"{outline.job.name}-{outline.set}.png", overlay(image, masks[OURS], wanted))
-    return {name: score(mask, wanted, either) for name, mask in masks.items()}
+        save_picture(out / f"{outline.job.name}-{outline.set}.png", overlay(image, masks[OURS], outline.object(size)))
+    return {name: score(mask, outline.sides(size)) for name, mask in masks.items()}
 
 
 def means(rows: Sequence[dict[str, Score]]) -> dict[str, Score]:
@@ -238,6 +258,71 @@ def line(name: str, scores: dict[str, Score], columns: Sequence[str]) -> str:
     return f"{name:44}{ours.overlap:8.3f}{ours.missed:8.1%}{ours.outside:9.1%}" + "".join(figures)
 
 
+@dataclass(frozen=True)
+class Stability:
+    """How little the masks of an object depend on its strokes.
+
+    Attributes:
+        alike: share of the masks from random strokes that are :data:`ALIKE` with what most of them select.
+        overlap: mean IoU with the outline.
+        moved: share of moved strokes that change at most :data:`MOST_MOVED` of the object's area.
+    """
+
+    alike: float
+    overlap: float
+    moved: float
+
+
+def stability(outline: Outline, image: Tensor, count: int) -> Stability:
+    """Compare masks from so many sets of random strokes, and from the same when one stroke on the object has moved."""
+    size = (image.shape[-2], image.shape[-1])
+    sides, area = outline.sides(size), outline.object(size).sum()
+    masks, changes = [], []
+    for seed in range(count):
+        inside, background = replace(outline, seed=seed).scribbles(size)
+        mask, moved = (
+            region_mask(image, strokes, background)[0, 0].numpy() > 0.5
+            for strokes in (inside, with_one_moved(inside, sides[0], seed))
+        )
+        masks.append(mask)
+        changes.append((mask ^ moved).sum() / area)
+    common = np.mean(masks, axis=0) > 0.5
+    alike = [(mask & common).sum() / max((mask | common).sum(), 1) >= ALIKE for mask in masks]
+    return Stability(
+        float(np.mean(alike)),
+        mean(score(mask, sides).overlap for mask in masks),
+        float(np.mean(np.array(changes) <= MOST_MOVED)),
+    )
+
+
+def report_stability(listed: Iterable[tuple[Outline, Tensor]], count: int) -> None:
+    """Print the stability of each object, and means."""
+    print(row("", ["alike", "IoU", "moved"], 9, 44))
+    found = []
+    for outline, image in listed:
+        found.append(stability(outline, image, count))
+        print(row(f"{outline.job.name}: {outline.job.what}"[:43], _cells(found[-1]), 9, 44), flush=True)
+    if found:
+        mean_of = Stability(*(mean(getattr(one, part) for one in found) for part in ("alike", "overlap", "moved")))
+        print(row(f"mean of {len(found)}", _cells(mean_of), 9, 44))
+
+
+def _cells(found: Stability) -> list[str]:
+    return [f"{found.alike:.0%}", f"{found.overlap:.3f}", f"{found.moved:.0%}"]
+
+
+def with_one_moved(strokes: Tensor, allowed: Mask, number: int) -> Tensor:
+    """Random strokes (1, 1, H, W), one of which is moved by its width along an axis, as far as that is allowed."""
+    plane = strokes[0, 0].numpy()
+    count, labels = cv2.connectedComponents((plane > 0).astype(np.uint8))
+    own = labels == 1 + number % (count - 1)
+    width = max(1, round(2 * STROKE_RADIUS * min(plane.shape)))
+    steps = ((0, width), (width, 0), (0, -width), (-width, 0))
+    shifted = [np.roll(own, step, (0, 1)) & allowed for step in steps]
+    most = max(shifted, key=lambda moved: int(moved.sum()))
+    return torch.from_numpy(np.where(own, 0, plane) + (most & (labels * ~own == 0)))[None, None].float()
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Measure and print a table, with the means of each set."""
     parser = options("outlines", __doc__, "one small photograph")
@@ -246,17 +331,22 @@ def main(arguments: list[str] | None = None) -> int:
     add("--set", choices=SETS, help="measure this set only")
     add("--peers", action="store_true", help="compare with other methods")
     add("--out", type=Path, help="folder for pictures")
+    add("--stability", action="store_true", help="compare masks from many random strokes")
+    add("--every", type=int, default=1, help="measure every n-th object of each set")
     chosen = parser.parse_args(arguments)
-    listed = [outline for outline in outlines() if chosen.set in (None, outline.set)]
+    listed = [outline for outline in outlines() if chosen.set in (None, outline.set)][:: chosen.every]
     if chosen.pictures is None:
         listed = [outline for outline in listed if edited_photographs()[outline.job.photograph].is_shipped]
+    listed = listed[:1] if chosen.quick else listed
+    seen = (reduced_to(outline.job.before(chosen.pictures), QUICK_SIDE if chosen.quick else SIDE) for outline in listed)
+    if chosen.stability:
+        report_stability(zip(listed, seen, strict=True), 2 if chosen.quick else SETS_OF_STROKES)
+        return 0
     columns = [OURS, BOXED, INNER, INNER_BOXED] + (["GrabCut", "GrabCut, r.", "matting, r."] if chosen.peers else [])
     print(f"{'':44}     IoU  missed  outside" + "".join(f"{column:>12}" for column in columns[1:]))
     rows: dict[str, list[dict[str, Score]]] = {}
-    for outline in listed[:1] if chosen.quick else listed:
-        image = outline.job.before(chosen.pictures)
-        seen = reduced_to(image, QUICK_SIDE) if chosen.quick else image
-        scores = measure(outline, seen, chosen.out, peers=chosen.peers)
+    for outline, image in zip(listed, seen, strict=True):
+        scores = measure(outline, image, chosen.out, peers=chosen.peers)
         rows.setdefault(outline.set, []).append(scores)
         print(line(f"{outline.job.name}: {outline.job.what}"[:43], scores, columns), flush=True)
     for name, own in rows.items():
