@@ -24,7 +24,7 @@ from nlfilter_torch.photo.edits.parts import Parts, Rectangle
 from nlfilter_torch.photo.edits.recipe import edit_rows
 from nlfilter_torch.photo.files import tiff
 from nlfilter_torch.photo.files.exif import read_upright
-from nlfilter_torch.photo.files.formats import BITS, DEPTHS, SUFFIXES, check_memory, first_bytes
+from nlfilter_torch.photo.files.formats import BITS, DEPTHS, SUFFIXES, check_memory, first_bytes, type_of
 from nlfilter_torch.photo.files.rows import TILED_MEMORY, WHOLE_MEMORY, usual_memory
 from nlfilter_torch.photo.files.writing import open_beside
 from nlfilter_torch.photo.picture.developing import balance_of, in_light, limits_of, turned_canvas
@@ -440,6 +440,7 @@ class Session:
             for part, values in edit_rows(self._passes(photograph, report), rows, steps, self.name):
                 pixels[0, :, part] = torch.from_numpy(values).permute(2, 0, 1)
         report("Writing", 0, 1)
+        quality = quality if type_of(target) == "JPEG" else None
         write_photograph(resized_photograph(photograph.with_pixels(pixels), size), target, quality=quality)
         self.saved = recipe
         return target

@@ -10,7 +10,7 @@ import re
 import reprlib
 import sys
 import warnings
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Annotated, Any
 
 import typer
@@ -22,6 +22,7 @@ from nlfilter_torch.photo.cli.edits import command
 from nlfilter_torch.photo.cli.mask import mask
 from nlfilter_torch.photo.cli.process import INTERRUPTED, tell
 from nlfilter_torch.photo.declared.parameters import EDITS
+from nlfilter_torch.photo.declared.presets import did_you_mean, named_recipe
 from nlfilter_torch.version import __version__
 
 NAME = "nlfilter-torch"
@@ -33,9 +34,16 @@ OTHER_NAMES: Mapping[str, tuple[str, ...] | str] = {
     "--noise": ("--noise-level",),
     "--denoise": "nlfilter-torch denoise IN OUT is a command of its own",
     "--sharpen": "nlfilter-torch sharpen IN OUT is a command of its own",
+    "--sharpness": "nlfilter-torch sharpen IN OUT is a command of its own",
+    "--cutout": "nlfilter-torch mask IN OUT --region X,Y,W,H --cutout FILE writes an object without its background",
+    "--subject": ("--region", "--box"),
+    "--auto": "regions are marked by hand, such as by --region X,Y,W,H",
+    "--preset": "nlfilter-torch apply IN OUT NAME takes presets, looks and files of all edits",
+    "--look": ("--preset",),
+    "--lut": "nlfilter-torch apply IN OUT FILE.cube applies a colour table",
     "--h": ("--noise-level", "--bandwidth"),
     "--blur": ("--radius", "--guide-blur"),
-    "--radius": ("--guide-blur", "--spatial-bandwidth", "--reach"),
+    "--radius": ("--amount", "--spatial-bandwidth", "--reach"),
     "--size": ("--patch-size", "--viewing-size"),
     "--amount": ("--strength", "--alpha", "--contrast"),
     "--strength": ("--amount", "--alpha", "--contrast"),
@@ -74,16 +82,24 @@ OTHER_NAMES: Mapping[str, tuple[str, ...] | str] = {
     "--wb": ("--temperature", "--tint"),
     "--white-balance": ("--temperature", "--tint"),
     "--rotate": ("--straighten",),
+    "--ev": ("--exposure",),
     "--ratio": ("--aspect",),
     "--proportions": ("--aspect",),
     "--resize": "photographs keep their size",
+    "--width": "photographs keep their size",
+    "--height": "photographs keep their size",
     "--gpu": "the commands work on the processor; the functions of the library take tensors on any device",
     "--device": "the commands work on the processor; the functions of the library take tensors on any device",
+    "--help": "nlfilter-torch --help lists all commands, and nlfilter-torch COMMAND --help explains one",
+    "--version": "nlfilter-torch --version prints the version",
     "--verbose": "progress is printed to standard error without an option",
     "--quiet": "redirect standard error to silence progress: 2>/dev/null",
 }
 #: What other programs call a command: ours, with an option if it has several purposes.
 OTHER_COMMANDS: Mapping[str, str] = {
+    "bw": "apply IN OUT mono",
+    "monochrome": "apply IN OUT mono",
+    "saturation": "apply IN OUT vivid",
     "crop": "develop IN OUT --crop L,T,R,B",
     "straighten": "develop IN OUT --straighten DEGREES",
     "rotate": "develop IN OUT --straighten DEGREES",
@@ -105,7 +121,7 @@ OTHER_COMMANDS: Mapping[str, str] = {
     "colourise": "colorize IN OUT --region X,Y,W,H:COLOUR",
     "colourize": "colorize IN OUT --region X,Y,W,H:COLOUR",
     "cartoon": "abstract IN OUT",
-    "lut": "apply IN OUT --preset FILE.cube",
+    "lut": "apply IN OUT FILE.cube",
     "video": "frames FILM OUT",
     "edit": "app IN",
     "gui": "app IN",
@@ -122,9 +138,11 @@ SHORT: Mapping[str, str] = {
     "-y": "--yes",
     "-r": "--recursive",
     "-v": "--verbose",
+    "-V": "--version",
     "-m": "--mask",
     "-p": "--preset",
 }
+HELP = {"help_option_names": ["-h", "--help"]}
 NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)")
 IMAGE = re.compile(r".*\.(png|jpe?g|tiff?|webp|avif|heic|dng|nef|cr2|arw|bmp|gif)", re.IGNORECASE)
 
@@ -182,7 +200,8 @@ def _common(
 
 def assembled(others: Iterable[Callable[..., None]]) -> typer.Typer:
     """The command line, with other commands before its own."""
-    whole = typer.Typer(name=NAME, add_completion=False, rich_markup_mode="markdown", pretty_exceptions_enable=False)
+    usual: dict[str, Any] = {"add_completion": False, "pretty_exceptions_enable": False, "context_settings": HELP}
+    whole = typer.Typer(name=NAME, rich_markup_mode="markdown", **usual)
     whole.callback()(_common)
     for verb in others:
         whole.command(cls=Verb)(verb)
@@ -203,11 +222,10 @@ def run_program(arguments: list[str] | None, others: Iterable[Callable[..., None
             status = assembled(others)(args=arguments or ["--help"], prog_name=NAME, standalone_mode=False)
         except typer.TyperException as error:  # a wrong option or argument
             message = error.format_message()
-            if message.startswith("No such option: --preset"):
-                message = "No such option: --preset; use nlfilter-torch detail or apply, which have it"
             context = getattr(error, "ctx", None)  # of the command that the error is about
-            own = [] if context is None else [name for parameter in context.command.params for name in parameter.opts]
-            return _refuse(explained(message, arguments, own))
+            parameters = [] if context is None else context.command.params
+            helps = {name: getattr(parameter, "help", "") for parameter in parameters for name in parameter.opts}
+            return _refuse(explained(message, arguments, helps))
         except OSError as error:
             return _refuse(_sentence(error))
         except (ValueError, MemoryError) as error:  # a bad file or value, found by the library
@@ -240,39 +258,58 @@ def _show_warning(message: Warning | str, *_: object, **__: object) -> None:
     sys.stderr.write(f"{NAME}: note: {message}\n")
 
 
-def explained(message: str, arguments: Sequence[str], options: Collection[str]) -> str:
+def explained(message: str, arguments: Sequence[str], options: Mapping[str, str]) -> str:
     """A message of typer, with what was probably meant.
 
     Args:
         message: of the error.
         arguments: of the command line.
-        options: of the command, such as ``--alpha``.
+        options: of the command, such as ``--alpha``, and their help.
 
-    >>> explained("No such option: --sigma (Possible options: --mask)", ["denoise"], ["--noise-level", "--bandwidth"])
-    'No such option: --sigma; here it is --noise-level or --bandwidth'
-    >>> explained("No such command 'in.jpg'.", ["in.jpg", "out.jpg"], [])[:50]
+    >>> helps = {"--noise-level": "Noise in grey levels. Default: measured.", "--mask": "A mask."}
+    >>> explained("No such option: --sigma (Possible options: --mask)", ["denoise"], helps)
+    'No such option: --sigma; here it is --noise-level (noise in grey levels)'
+    >>> explained("No such command 'in.jpg'.", ["in.jpg", "out.jpg"], {})[:50]
     "No such command 'in.jpg'; the command comes first,"
+    >>> explained("Invalid value for '--extent': 'objects' is not one of 'near', 'object'.", ["mask"], {})
+    "Invalid value for '--extent': 'objects' is not one of 'near', 'object'; did you mean object?"
     """
-    option = re.match(r"No such option: (-\S+)", message)
-    if option is not None:
+    if option := re.match(r"No such option: (-\S+)", message):
         meant = _meant(option[1], options)
         return f"No such option: {option[1]}; {meant}" if meant else message
-    command = re.match(r"No such command '(.*)'\.", message)
-    if command is not None and IMAGE.fullmatch(command[1]):
-        return (
-            f"No such command '{command[1]}'; the command comes first, such as nlfilter-torch detail "
-            f"{command[1]} OUT --preset crisp, and nlfilter-torch --help lists all of them"
-        )
-    if command is not None:
-        ours = OTHER_COMMANDS.get(command[1].lower())
-        here = "" if ours is None else f"here it is nlfilter-torch {ours}, and "
-        return f"No such command '{command[1]}'; {here}nlfilter-torch --help lists all of them"
+    if command := re.match(r"No such command '([^']*)'", message):
+        return f"No such command '{command[1]}'; {_of_command(command[1], message)}"
+    if choice := re.search(r"'([^']*)' is not one of (.*)\.$", message):
+        return message[:-1] + did_you_mean(choice[1], re.findall(r"'([^']*)'", choice[2]))
+    if number := re.match(r"Invalid value for '(--[^']*)'.* valid (number|integer), unable .*, got (.*)", message):
+        kind = "an integer" if number[2] == "integer" else "a number"
+        return f"{number[1]} must be {kind}, got {number[3]}{_first_sentence(options, number[1])}"
+    if missing := re.match(r"Missing argument '([A-Z_]*)'", message):
+        return f"{missing[0]}; nlfilter-torch {arguments[0]} --help shows what it is"
     if message.startswith("Got unexpected extra argument"):
         return message + _of_extra(arguments)
     return message
 
 
-def _meant(option: str, options: Collection[str]) -> str:
+def _of_command(name: str, message: str) -> str:
+    """What was meant by a command that does not exist, of which typer may propose others in its message."""
+    if IMAGE.fullmatch(name):
+        return (
+            f"the command comes first, such as nlfilter-torch detail {name} OUT --preset crisp, and nlfilter-torch "
+            "--help lists all of them"
+        )
+    if isinstance(sentence := OTHER_NAMES.get(f"--{name}"), str):
+        return sentence
+    ours, proposed = OTHER_COMMANDS.get(name.lower()), re.findall(r"'([^']*)'", message)[1:]
+    if ours is None and named_recipe(name) is not None:
+        ours = f"apply IN OUT {name}"
+    meant = f"here it is nlfilter-torch {ours}, and " if ours else ""
+    if proposed and not ours:
+        meant = f"did you mean {' or '.join(proposed)}? "
+    return f"{meant}nlfilter-torch --help lists all of them"
+
+
+def _meant(option: str, options: Mapping[str, str]) -> str:
     """What was meant by an option that a command does not have, or nothing."""
     name = SHORT.get(option, option)
     meanings = OTHER_NAMES.get(name, ())
@@ -280,10 +317,16 @@ def _meant(option: str, options: Collection[str]) -> str:
         return meanings
     own = [meaning for meaning in ((name,) if name in options else meanings) if meaning.split()[0] in options]
     if own:
-        return f"here it is {' or '.join(own[:2])}"
+        return f"here it is {' or '.join(own[:2])}" + ("" if own[1:] else _first_sentence(options, own[0]))
     if any(meaning in DEVELOP_OPTIONS for meaning in meanings):
         return f"nlfilter-torch develop has {', '.join(DEVELOP_OPTIONS[:-1])} and {DEVELOP_OPTIONS[-1]}"
     return "nlfilter-torch batch has --workers" if "--workers" in meanings else ""
+
+
+def _first_sentence(options: Mapping[str, str], option: str) -> str:
+    """What an option is, in parentheses, or nothing."""
+    sentence = (options.get(option) or "").split(". ")[0].removesuffix(".")
+    return f" ({sentence[0].lower()}{sentence[1:]})" if sentence else ""
 
 
 def _of_extra(arguments: Sequence[str]) -> str:
@@ -291,6 +334,9 @@ def _of_extra(arguments: Sequence[str]) -> str:
     for option, *values in zip(arguments, arguments[1:], arguments[2:], strict=False):
         if option.startswith("--") and all(map(NUMBER.fullmatch, values)):
             return f"; the numbers of {option} are separated by commas: {option} 2,2,2,1"
+    preset = next((argument for argument in arguments[1:] if named_recipe(argument) is not None), None)
+    if preset is not None:
+        return f"; nlfilter-torch apply IN OUT {preset} applies it"
     pictures = [argument for argument in arguments[1:] if IMAGE.fullmatch(argument)]
     if len(pictures) >= 2:
         return "; the command edits one photograph, and nlfilter-torch batch IN_DIR OUT_DIR all of a folder"

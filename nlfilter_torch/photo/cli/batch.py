@@ -22,7 +22,7 @@ from nlfilter_torch.photo.cli.options import NOTE, FolderOptions, PhotographOpti
 from nlfilter_torch.photo.cli.process import INTERRUPTED
 from nlfilter_torch.photo.cli.progress import steps
 from nlfilter_torch.photo.cli.workers import Crew, worker_pool
-from nlfilter_torch.photo.files.formats import type_of
+from nlfilter_torch.photo.files.formats import LOSSY, type_of
 from nlfilter_torch.photo.files.rows import WHOLE_MEMORY, free_memory
 from nlfilter_torch.photo.files.writing import remove_stale
 
@@ -102,8 +102,8 @@ def edit_photographs(
 
 
 def _edited(edit: FileEdit, files: PhotographOptions, source: str, target: str) -> None:
-    """Edit a file, with the quality of these options if it is a JPEG."""
-    edit(source, target, files if type_of(target) == "JPEG" else replace(files, quality=None))
+    """Edit a file, with the quality of these options if its type has one."""
+    edit(source, target, files if type_of(target) in LOSSY else replace(files, quality=None))
 
 
 def _cores() -> int:

@@ -67,14 +67,17 @@ def develop(
 
 
 Edits = Annotated[
-    list[str],
-    typer.Option(
-        "--preset",
-        metavar="FILE|NAME",
+    list[str] | None,
+    typer.Argument(
+        metavar="PRESET",
         help="A file saved by the editor (`nlfilter-torch app`) or written by `nlfilter-torch fit`, a colour table (a "
-        ".cube file or a Hald), or the name of a preset (see `nlfilter-torch presets`). May be repeated, each "
-        "time with the --mask of its region; the rest of the photograph stays unchanged.",
+        ".cube file or a Hald), or the name of a preset (see `nlfilter-torch presets`). Several have a --mask each, "
+        "in the same order; the rest of the photograph stays unchanged.",
+        show_default=False,
     ),
+]
+NamedEdits = Annotated[
+    list[str] | None, typer.Option("--preset", metavar="FILE|NAME", help="The same as an option; may be repeated.")
 ]
 
 
@@ -82,24 +85,32 @@ Edits = Annotated[
 def apply(
     source: options.Source,
     target: options.Target,
-    preset: Edits,
+    presets: Edits = None,
     *,
+    preset: NamedEdits = None,
     mask: options.Masks = None,
     files: options.PhotographOptions,
     full: options.Full = False,
 ) -> None:
-    """Apply an edit saved in the browser to a photograph, including its sliders, strokes and crop.
+    """Apply an edit to a photograph: one saved in the browser, with its strokes and crop, a look, or a colour table.
 
     Photographs larger than memory are edited in tiles.
 
-    Example: `nlfilter-torch apply in.jpg out.jpg --preset edit.json`
+    Example: `nlfilter-torch apply in.jpg out.jpg edit.json`
 
-    Two looks that `nlfilter-torch fit` found for regions: `nlfilter-torch apply in.jpg out.jpg --preset look-1.json
-    --mask sky.png --preset look-2.json --mask ground.png`
+    A look by its name: `nlfilter-torch apply in.jpg out.jpg vivid`
+
+    Two looks that `nlfilter-torch fit` found for regions: `nlfilter-torch apply in.jpg out.jpg look-1.json look-2.json
+    --mask sky.png --mask ground.png`
     """
+    named = [*(presets or []), *(preset or [])]
+    if not named:
+        raise ValueError(
+            "PRESET must be given, such as nlfilter-torch apply IN OUT vivid; nlfilter-torch presets lists the names"
+        )
     from nlfilter_torch.photo.cli.jobs import apply_files
 
-    apply_files(preset, mask or [], source, target, files, full=full)
+    apply_files(named, mask or [], source, target, files, full=full)
 
 
 Before = Annotated[str, typer.Argument(metavar="BEFORE", help="The photograph before the edit, or a folder of them.")]
@@ -161,7 +172,7 @@ def fit(
 
     `nlfilter-torch fit before.jpg after.jpg look.json --preview seen.png`
 
-    `nlfilter-torch apply other.jpg out.jpg --preset look.json`
+    `nlfilter-torch apply other.jpg out.jpg look.json`
 
     For other programs: `nlfilter-torch fit before.jpg after.jpg look.json --cube look.cube`
 
@@ -179,7 +190,7 @@ def fit(
 PresetOfList = Annotated[
     str | None,
     typer.Argument(
-        metavar="NAME", help="Print this preset or look as JSON, to be edited and passed to `apply --preset`."
+        metavar="NAME", help="Print this preset or look as JSON, to be edited and passed to `apply`."
     ),
 ]
 
@@ -189,7 +200,7 @@ def presets(name: PresetOfList = None) -> None:
 
     To start one of your own: `nlfilter-torch presets crisp > mine.json`
     """
-    if name is not None:
+    if name not in (None, "list"):
         typer.echo(find_recipe(name).to_json(complete=True), nl=False)
         return
     from rich.console import Console

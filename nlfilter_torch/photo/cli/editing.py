@@ -16,7 +16,7 @@ from nlfilter_torch.photo.cli.processes import zarr_processes
 from nlfilter_torch.photo.cli.progress import stages, steps
 from nlfilter_torch.photo.declared.development import AS_IT_IS, Development
 from nlfilter_torch.photo.declared.steps import Step, working_bytes
-from nlfilter_torch.photo.files.formats import Depth, TooLarge, check_depth, check_memory, check_type, type_of
+from nlfilter_torch.photo.files.formats import LOSSY, Depth, TooLarge, check_depth, check_memory, check_type, type_of
 from nlfilter_torch.photo.files.rows import (
     TILED_MEMORY,
     WHOLE_MEMORY,
@@ -115,18 +115,20 @@ def check_not_input(source: str, target: str, *, force: bool) -> None:
 
 
 def check_quality(target: str, quality: int | None) -> None:
-    """Raise ValueError if a quality is set for a file that is no JPEG."""
-    if quality is not None and type_of(target) != "JPEG":
+    """Raise ValueError if a quality is set for a file of a type without one."""
+    if quality is not None and type_of(target) not in LOSSY:
         raise ValueError(
-            f"--quality must be used with a JPEG file, got {quality} for {target}; name a .jpg file, or leave it out"
+            f"--quality must be used with a JPEG, WebP or AVIF file, got {quality} for {target}; name a .jpg file, or "
+            "leave it out"
         )
 
 
 def check_quality_of(paths: Sequence[Path], quality: int) -> None:
-    """Raise ValueError if a quality is set for a folder of files of which none is a JPEG."""
-    if not any(type_of(path) == "JPEG" for path in paths):
+    """Raise ValueError if a quality is set for a folder of files of which none has a type with one."""
+    if not any(type_of(path) in LOSSY for path in paths):
         raise ValueError(
-            f"--quality must be used with JPEG files, got {quality} for {paths[0].parent}, which has none; leave it out"
+            f"--quality must be used with JPEG, WebP or AVIF files, got {quality} for {paths[0].parent}, which has "
+            "none; leave it out"
         )
 
 

@@ -107,6 +107,8 @@ def scribble_options(edit: Edit) -> dict[str, object]:
         annotations["mask"] = options.MaskFile
     if "colours" in kinds:
         annotations["colour"] = options.Colour
+        if not edit.coloured:
+            annotations["source_colour"] = options.ColourRange
     if edit.scribbles:
         annotations["show"] = options.Show
     if edit.map_help:
@@ -261,6 +263,7 @@ def edit_photograph(
     strokes, mask = values.pop("strokes", None), values.pop("mask", None)
     # Of the options for scribbles only "colour" may also be the name of a parameter.
     colour = values.pop("colour", None) if "colour" in scribble_options(edit) else None
+    source_colour = values.pop("source_colour", None)
     show, map = values.pop("show", None), values.pop("map", None)
     others = {scribble.option: values.pop(scribble.option.removeprefix("--"), None) for scribble in edit.with_options}
     step = step_of(edit, values)
@@ -280,7 +283,7 @@ def edit_photograph(
     from nlfilter_torch.photo.cli.scribbles import ScribbleOptions
 
     rectangles = {name: texts for name, texts in others.items() if texts is not None}
-    drawn = ScribbleOptions(region, strokes, mask, rectangles, colour)
+    drawn = ScribbleOptions(region, strokes, mask, rectangles, colour, source_colour)
     check_written(source, target, show=show, map=map, mask=mask, strokes=strokes, preset=preset)
     notes = useless_options(step, typed, marked=drawn.marks_objects(edit))
     EditJob(source, target, files, full, step, drawn, show, map, seed, notes).run()

@@ -127,7 +127,7 @@ class EditJob(FileEdit):
     def _marked(self, rows: Rows, opener: Opener) -> MarkedPhotograph:
         """The marks, from the options."""
         edit = self.step.declared
-        return self.scribbles.on(edit, rows.size, opener, () if edit.regional is None else self.step["alpha"])
+        return self.scribbles.on(edit, rows, opener, () if edit.regional is None else self.step["alpha"])
 
     def _tell(self, rows: Rows, marked: MarkedPhotograph) -> None:
         """Print what marks cover and what the edit leaves out, and write the picture of ``--show``."""

@@ -182,7 +182,7 @@ class MaskJob:
 
     def _marked(self, rows: Rows, opener: Opener) -> MarkedPhotograph:
         """The marks; prints the colours that they cover, and writes the picture of ``--show``."""
-        marked = self.scribbles.on(MASK, rows.size, opener)
+        marked = self.scribbles.on(MASK, rows, opener)
         scribbled = Scribbled(marked, rows)
         scribbled.tell_colours()
         if self.show is not None:

@@ -205,11 +205,12 @@ Insist = Annotated[
 
 def quality(help: str) -> object:
     """The option ``--quality``."""
-    return typer.Option(min=1, max=100, metavar="1-100", help=f"{help} Default: 95.", rich_help_panel=FILES_PANEL)
+    default = "Default: 95 for JPEG, 90 for AVIF; WebP is lossless without it."
+    return typer.Option(min=1, max=100, metavar="1-100", help=f"{help} {default}", rich_help_panel=FILES_PANEL)
 
 
-Quality = Annotated[int | None, quality("Quality of a JPEG file.")]
-QualityOfFolder = Annotated[int | None, quality("Quality of the JPEG files; others are not affected.")]
+Quality = Annotated[int | None, quality("Quality of a JPEG, WebP or AVIF file.")]
+QualityOfFolder = Annotated[int | None, quality("Quality of JPEG, WebP and AVIF files; others are not affected.")]
 
 
 def workers(help: str) -> object:
@@ -278,7 +279,17 @@ StrokesFile = file(
 )
 Colour = Annotated[
     str | None,
-    typer.Option("--colour", metavar="COLOUR", help="Colour of --mask, and of regions and strokes that say none."),
+    typer.Option(
+        "--colour", "--to", metavar="COLOUR", help="Colour of --mask, and of regions and strokes without one."
+    ),
+]
+ColourRange = Annotated[
+    str | None,
+    typer.Option(
+        "--from",
+        metavar="COLOUR",
+        help="Mark all pixels that look like a colour, such as red or #c04020, in place of a region; with --to.",
+    ),
 ]
 _SHAPES = "`ellipse:X,Y,W,H` is the ellipse in a rectangle, and X,Y,X,Y,X,Y and so on are the corners of a polygon. "
 #: The placeholder of a rectangle and the help of ``--region``, for each kind of scribbles.

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 from PIL import ImageColor
+from skimage.color import rgb2hsv
 from torch import Tensor
 
 from nlfilter_torch.photo.cli.options import parse_sliders, split_region
@@ -18,12 +19,14 @@ from nlfilter_torch.photo.declared.strokes import WORDS, Mark, Region, ScribbleR
 from nlfilter_torch.photo.files.formats import check_depth
 from nlfilter_torch.photo.files.rows import StoredPicture
 from nlfilter_torch.photo.picture.drawn import Drawn, Painter, Size, drawn_by
+from nlfilter_torch.photo.picture.edit import Rows
 from nlfilter_torch.photo.picture.painting import RowPainter, TensorPainter, plane_rows
 from nlfilter_torch.photo.picture.pictures import LazyRows, Picture
 from nlfilter_torch.photo.picture.pixels import M
 
 Opener = Callable[[Path], StoredPicture]  # opens a picture of marks
 DOT_SIZE = 0.03  # side of the square around a point, as a share of the short side
+HUE_RANGE, NEUTRAL, VALUE_RANGE = 1 / 12, 0.2, 0.25  # of colours alike, in HSV: most primaries are 1/6 apart
 OPAQUE = (
     "has no transparency, so every pixel would count as a scribble; "
     "draw on a transparent layer and save only that layer"
@@ -40,6 +43,7 @@ class ScribbleOptions:
         mask: a picture of the objects.
         rectangles: further regions, by their options.
         colour: of marks that do not say one.
+        source: a colour, whose pixels are marked.
     """
 
     region: list[str] | None = None
@@ -47,6 +51,7 @@ class ScribbleOptions:
     mask: Path | None = None
     rectangles: Mapping[str, list[str] | None] = field(default_factory=dict)
     colour: str | None = None
+    source: str | None = None
 
     def of(self, edit: Edit, *roles: ScribbleRole) -> list[str]:
         """The regions of an edit's scribbles that have one of these roles and options of their own."""
@@ -54,15 +59,16 @@ class ScribbleOptions:
 
     def marks_objects(self, edit: Edit) -> bool:
         """Whether an object is marked, or its mask painted."""
-        return bool(self.region or self.of(edit, *edit.object_roles)) or (self.mask or self.strokes) is not None
+        pictures = self.mask or self.strokes or self.source
+        return bool(self.region or self.of(edit, *edit.object_roles)) or pictures is not None
 
     @property
     def called(self) -> str:
         """Name of the coloured scribbles in errors."""
         return "--region" if self.strokes is None else str(self.strokes)
 
-    def on(self, edit: Edit, size: Size, opener: Opener, alpha: tuple[float, ...] = ()) -> "MarkedPhotograph":
-        """Mark a photograph (H, W) for an edit.
+    def on(self, edit: Edit, photograph: Rows, opener: Opener, alpha: tuple[float, ...] = ()) -> "MarkedPhotograph":
+        """Mark a photograph for an edit.
 
         ``alpha`` are the sliders of regions without their own, if the edit takes regions that have sliders.
 
@@ -70,6 +76,7 @@ class ScribbleOptions:
             ValueError: if an option does not fit the photograph, the edit or the other options.
         """
         self._check_region(edit)
+        size = photograph.size
         reader = _Reader(edit, size, self.colour, alpha)
         marks, pictures = list[Mark](), dict[str, Picture]()
         if self.mask is not None:
@@ -80,6 +87,10 @@ class ScribbleOptions:
         for mark in marks:
             if isinstance(mark, Region) and mark.file:
                 pictures[mark.file] = _picture(mark, size, opener)
+        if self.source is not None:
+            name = f"--from {self.source}"
+            marks.append(reader.of_picture(Path(name), "mask", name))
+            pictures[name] = _colour_range(photograph, self.source, name)
         for scribble in edit.scribbles:
             is_object = scribble.role == "object"
             texts = self.region if is_object else self.rectangles.get(scribble.option)
@@ -180,12 +191,12 @@ class _Reader:
             )
         return noted(region, _listed(own))
 
-    def of_picture(self, path: Path, shape: Shape) -> Mark:
-        """The region of the objects that a picture shows."""
+    def of_picture(self, path: Path, shape: Shape, option: str = "--mask") -> Mark:
+        """The region of the objects that a picture shows, which comes from an option."""
         region = Region.of_file(str(path), shape, WORDS["object"])
         if shape == "layer" and self.colour is None:
             return self._with_sliders(region)
-        return self._with_note(region, "--mask")
+        return self._with_note(region, option)
 
     def of_recipe(self, path: Path) -> list[Mark]:
         """The strokes of a step in a file, whatever edit they were drawn for."""
@@ -337,6 +348,31 @@ def _picture(region: Region, size: Size, opener: Opener) -> Picture:
     if region.shape == "layer" and not _any(region, picture, lambda weights: weights == 0):
         raise ValueError(f"{path} {OPAQUE}")
     return picture
+
+
+def _colour_range(photograph: Rows, colour: str, name: str) -> Picture:
+    """A mask of the pixels of a photograph that have the hue of a colour and half its saturation, or its grey.
+
+    Raises:
+        ValueError: if there is none, or the photograph is grey.
+    """
+    wanted = rgb2hsv(np.array(ImageColor.getrgb(_colour(colour, "--from", colour)))[:3] / 255)
+
+    def read(rows: slice) -> NDArray[np.generic]:
+        hue, saturation, value = np.moveaxis(rgb2hsv(photograph.read(rows)[0].movedim(0, -1).numpy()), -1, 0)
+        if wanted[1] < NEUTRAL:
+            chosen = (saturation < NEUTRAL) & (abs(value - wanted[2]) < VALUE_RANGE)
+        else:
+            apart = abs((hue - wanted[0] + 0.5) % 1 - 0.5)
+            chosen = (apart < HUE_RANGE) & (saturation >= max(NEUTRAL, wanted[1] / 2)) & (value >= NEUTRAL)
+        return chosen.astype(np.float32)
+
+    if photograph.channels != 3:
+        raise ValueError(f"{name} must be used with a photograph in colour, got a grey one; mark parts by --region")
+    mask = LazyRows(photograph.size, read)
+    if not mask.any():
+        raise ValueError(f"{name} must be a colour of the photograph, which has none like it; mark a part by --region")
+    return Picture(mask, name, hides=False)
 
 
 def _any(region: Region, picture: Picture, holds: Callable[[NDArray[np.generic]], NDArray[np.bool_]]) -> bool:

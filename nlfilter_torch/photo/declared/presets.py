@@ -17,7 +17,9 @@ relative to the picture as it is before it is developed, so that an edit made on
 and strokes stay in place when the crop changes. Does not import torch.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
+from difflib import get_close_matches
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -360,6 +362,16 @@ def named_recipe(name: str) -> Recipe | None:
     return PRESETS.get(spoken)
 
 
+def did_you_mean(word: str, words: Iterable[str]) -> str:
+    """The end of a message on a word that is none of these: the one that was probably meant, or nothing.
+
+    >>> did_you_mean("vivd", ("vivid", "warm")), did_you_mean("x", ("vivid", "warm"))
+    ('; did you mean vivid?', '')
+    """
+    close = get_close_matches(word.lower(), words, n=1)
+    return f"; did you mean {close[0]}?" if close else ""
+
+
 def find_recipe(name: str) -> Recipe:
     """Return the preset or look of that name (``soft-skin`` is ``soft skin``), or read the file at that path.
 
@@ -378,7 +390,7 @@ def find_recipe(name: str) -> Recipe:
     path = Path(name)
     if not path.is_file():
         raise ValueError(
-            f"{name} is neither a file nor one of the presets {', '.join((*PRESETS, *LOOKS))}; "
-            "create a file with nlfilter-torch fit"
+            f"{name} is neither a file nor one of the presets {', '.join((*PRESETS, *LOOKS))}"
+            + (did_you_mean(name, (*PRESETS, *LOOKS)) or "; create a file with nlfilter-torch fit")
         )
     return Recipe.from_file(path.read_bytes(), name)

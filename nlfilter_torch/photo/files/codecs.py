@@ -38,6 +38,7 @@ ENCODING: dict[str, dict[str, object]] = {
     "WebP": {"lossless": True, "exact": True},  # exact: also where it is transparent
     "AVIF": {"quality": 90, "subsampling": "4:4:4"},
 }
+LOSSY_WEBP: dict[str, object] = {"lossless": False}  # if a quality is given
 MOST_AVIF, LONGEST_AVIF = 1 << 28, 1 << 15  # pixels, and those of a side, that libavif decodes
 HEAD = 1 << 16  # bytes that hold the description of an AVIF file
 WEBP_PIXELS = (b"VP8 ", b"VP8L", b"ALPH", b"ANMF")
@@ -149,12 +150,16 @@ def _bits_of_avif(data: bytes | mmap) -> int:
     return (12 if flags & 0x20 else 10) if flags & 0x40 else 8
 
 
-def write_by_pillow(stream: BinaryIO, kind: str, channels: Stored, metadata: Metadata) -> None:
-    """Write channels (H, W) or (H, W, S) of 8 bits as a WebP or AVIF file."""
+def write_by_pillow(
+    stream: BinaryIO, kind: str, channels: Stored, metadata: Metadata, quality: int | None = None
+) -> None:
+    """Write channels (H, W) or (H, W, S) of 8 bits as a WebP file, lossless without a quality, or AVIF."""
     block = metadata.exif or b""
     # Pillow writes a block with an orientation anew. It gets it under another number, which is then set right.
     hidden = exif_tags.hidden_orientation(block)
     options: dict[str, object] = {"icc_profile": metadata.icc, "exif": hidden} | ENCODING[kind]
+    if quality is not None:
+        options |= {"quality": quality} | (LOSSY_WEBP if kind == "WebP" else {})
     if metadata.extras.xmp is not None:
         options["xmp"] = metadata.extras.xmp
     encoded = io.BytesIO()

@@ -48,9 +48,12 @@ LONGEST_SIDE = {"WebP": 16383, "JPEG": 65500, "PNG": png.LONGEST_PNG, "AVIF": co
 MOST_PIXELS = {"AVIF": codecs.MOST_AVIF}
 SUFFIXES = {".png": "PNG", ".jpg": "JPEG", ".jpeg": "JPEG", ".webp": "WebP", ".avif": "AVIF"}
 SUFFIXES |= {".tif": "TIFF", ".tiff": "TIFF"}
+LOSSY = "JPEG", "WebP", "AVIF"  # types of file with a quality, 1 to 100
 PFM = ".pfm"  # of masks
 #: Of a PFM file: colour or grey, width, height, and the scale, negative for little-endian values.
 PFM_HEADER = re.compile(rb"P([Ff])\s+(\d+)\s+(\d+)\s+(-?[\d.]+(?:[eE][-+]?\d+)?)\s")
+
+ADDRESSES = "http:", "https:", "ftp:"  # how they begin
 
 
 def type_of(path: str | Path) -> str | None:
@@ -77,6 +80,8 @@ def first_bytes(path: Path) -> bytes:
     Raises:
         FileNotFoundError, ValueError: see :func:`read_photograph`.
     """
+    if path.parts and path.parts[0] in ADDRESSES:
+        raise ValueError(f"{path.parts[0]}//{'/'.join(path.parts[1:])} is an address, not a file; download it first")
     if not path.exists():
         raise FileNotFoundError(f"{path} does not exist; check the name and the folder")
     if path.is_dir():
@@ -142,8 +147,9 @@ def _check_size(
 def write_file(path: Path, picture: Stored | Iterable[Stored], header: Header, quality: int | None = None) -> None:
     """Write a picture (H, W, S), or its rows as they are computed, to a file of a type in :data:`SUFFIXES`.
 
-    The file appears complete or not at all. ``quality`` is that of JPEG files; None is the default. A thumbnail shows
-    the picture, or is left out where rows are written, and in TIFF. Warns of metadata that are left out.
+    The file appears complete or not at all. ``quality`` is that of a type in :data:`LOSSY`; None is the default. A
+    thumbnail shows the picture, or is left out where rows are written, and in TIFF. Warns of metadata that are left
+    out.
     """
     kind = SUFFIXES[path.suffix.lower()]
     metadata, extras, left_out = header.metadata, header.metadata.extras, list[str]()
@@ -169,7 +175,7 @@ def write_file(path: Path, picture: Stored | Iterable[Stored], header: Header, q
             if extras.dpi is not None and exif_tags.resolution(metadata.exif) is None:
                 left_out.append("the print resolution")
             whole = np.concatenate(list(rows))
-            codecs.write_by_pillow(stream, kind, whole[..., 0] if header.shape[2] == 1 else whole, metadata)
+            codecs.write_by_pillow(stream, kind, whole[..., 0] if header.shape[2] == 1 else whole, metadata, quality)
     note_left_out(path, left_out)
 
 

@@ -187,7 +187,7 @@ def write_picture(
         rows: (h, W, S), in order, with their position.
         depth: dtype to write.
         like: the other picture.
-        quality: of JPEG files; None is the default.
+        quality: of a file of a type that has one; None is the default.
         fill: writes the rows to the zarr array in a folder, in place of this process; None is this process.
     """
     shape, dtype = like.shape, np.dtype(depth)

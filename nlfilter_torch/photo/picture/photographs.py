@@ -165,7 +165,8 @@ def write_photograph(photograph: Photograph, path: str | Path, *, quality: int |
     Args:
         photograph: what to write.
         path: name of the file.
-        quality: of a JPEG file, 1 to 100; None is 95. Other types of file ignore it.
+        quality: of a JPEG, AVIF or WebP file, 1 to 100, which makes WebP lossy; None is the default. Other types
+            ignore it.
 
     Raises:
         ValueError: if the quality is out of range; see also

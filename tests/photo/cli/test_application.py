@@ -16,7 +16,10 @@ from nlfilter_torch.photo.picture.photographs import Photograph, write_photograp
 from tests.commands import refusal, refused
 
 
-@pytest.mark.parametrize("arguments", [[], ["--help"], ["detail", "--help"], ["inspect", "--help"], ["demo", "--help"]])
+@pytest.mark.parametrize(
+    "arguments",
+    [[], ["-h"], ["--help"], ["detail", "-h"], ["detail", "--help"], ["inspect", "--help"], ["demo", "--help"]],
+)
 def test_help(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert main(arguments) == 0
     captured = capsys.readouterr()
@@ -32,7 +35,7 @@ def test_version(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_wrong_calls(capsys: pytest.CaptureFixture[str]) -> None:
-    assert refusal(capsys, "detail") == "Missing argument 'IN'."
+    assert refusal(capsys, "detail") == "Missing argument 'IN'; nlfilter-torch detail --help shows what it is"
     assert refusal(capsys, "embellish") == "No such command 'embellish'; nlfilter-torch --help lists all of them"
 
 
@@ -111,5 +114,7 @@ def test_errors_of_the_system(photo: Path, monkeypatch: pytest.MonkeyPatch, caps
 
 
 def test_a_command_without_presets_says_where_they_are(photo: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    told = refused(capsys, "look", photo, photo.with_name("out.png"), "--preset", "crisp")
-    assert told == "nlfilter-torch: No such option: --preset; use nlfilter-torch detail or apply, which have it\n"
+    told = refusal(capsys, "look", photo, photo.with_name("out.png"), "--preset", "crisp")
+    assert told == (
+        "No such option: --preset; nlfilter-torch apply IN OUT NAME takes presets, looks and files of all edits"
+    )

@@ -169,8 +169,9 @@ def test_the_quality_of_jpeg_files(
     assert json.loads((tmp_path / "small" / RECORD).read_text())["quality"] == 30
     assert "contains results of other settings" in refused(capsys, source, tmp_path / "small", "--preset", preset)
     (source / "001.jpg").unlink()
-    assert f"--quality must be used with JPEG files, got 30 for {source}, which has none; leave it out" in refused(
-        capsys, source, tmp_path / "none", "--quality", 30
+    assert (
+        f"--quality must be used with JPEG, WebP or AVIF files, got 30 for {source}, which has none; leave it out"
+        in refused(capsys, source, tmp_path / "none", "--quality", 30)
     )
     assert "--quality" in refused(capsys, source, tmp_path / "none", "--quality", 101)
 

@@ -306,5 +306,5 @@ def test_quality_of_jpeg(memory: list[str], tmp_path: Path, capsys: pytest.Captu
     assert sizes[0] < sizes[1] < sizes[2]
     assert (tmp_path / "usual.jpg").stat().st_size == sizes[1]
     assert refusal(capsys, "sharpen", photo, tmp_path / "out.png", "--quality", "80").startswith(
-        "--quality must be used with a JPEG file, got 80 for "
+        "--quality must be used with a JPEG, WebP or AVIF file, got 80 for "
     )

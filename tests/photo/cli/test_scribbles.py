@@ -15,12 +15,14 @@ from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.declared.strokes import Region
 from nlfilter_torch.photo.files.rows import StoredPicture, open_picture
+from nlfilter_torch.photo.picture.edit import Rows
 from nlfilter_torch.photo.picture.painting import cover, plane_rows
 from nlfilter_torch.photo.picture.photographs import Photograph, write_photograph
 from tests.commands import refusal
 from tests.problems import box, colour
 
 SIZE = HEIGHT, WIDTH = 60, 90  # of the photograph
+PHOTOGRAPH = Rows("photograph", SIZE, 3, lambda rows: torch.zeros(1, 3, HEIGHT, WIDTH)[..., rows, :])
 
 
 def rgb(path: Path) -> np.ndarray:
@@ -35,7 +37,7 @@ def placed(text: str, size: tuple[int, int], option: str = "--region") -> str:
 
 def marked(edit: Edit, options: ScribbleOptions, alpha: tuple[float, ...] = ()) -> MarkedPhotograph:
     """A photograph of :data:`SIZE` with options that name no picture."""
-    return options.on(edit, SIZE, unread, alpha)
+    return options.on(edit, PHOTOGRAPH, unread, alpha)
 
 
 def test_rectangles() -> None:
@@ -131,7 +133,7 @@ def test_what_is_transparent_in_a_mask_is_not_selected(tmp_path: Path) -> None:
     planes = torch.ones(1, 3, HEIGHT, WIDTH)
     write_photograph(Photograph(planes, "uint8", box(8, 10, 6, 8, SIZE)), tmp_path / "layer.png")
     with open_picture(tmp_path / "layer.png", 10**9) as stored:
-        drawn = ScribbleOptions(mask=tmp_path / "layer.png").on(MASK, SIZE, lambda _: stored).tensors()
+        drawn = ScribbleOptions(mask=tmp_path / "layer.png").on(MASK, PHOTOGRAPH, lambda _: stored).tensors()
         assert torch.equal(drawn.masks["scribbles"], box(8, 10, 6, 8, SIZE))
 
 
