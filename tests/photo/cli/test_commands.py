@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import tifffile
 import torch
+import torch.nn.functional as F
 from numpy.typing import NDArray
 from PIL import Image
 
@@ -26,13 +27,14 @@ def test_the_command_line_goes_by_rows(tmp_path: Path, monkeypatch: pytest.Monke
     monkeypatch.setattr("nlfilter_torch.photo.picture.sampling.PILOT", 4000)
     monkeypatch.setattr("nlfilter_torch.photo.picture.pictures.STATISTICS_PIXELS", 6000)
     photo, preset = tmp_path / "in.tif", tmp_path / "edit.json"
-    write_photograph(Photograph(cat().repeat(1, 1, 2, 2), "uint16"), photo)  # more than tiles need
+    pixels = F.interpolate(cat(), scale_factor=2, mode="bicubic").clamp(0, 1)  # more than tiles need
+    write_photograph(Photograph(pixels, "uint16"), photo)
     preset.write_text(Recipe((DETAIL, RECOLOR)).to_json())
     names = [tmp_path / "whole.tif", tmp_path / "rows.tif"]
     for name, options in zip(names, ([], ["--memory", "0.044", "--full"]), strict=True):
         assert main(["apply", str(photo), str(name), "--preset", str(preset), *options]) == 0
     whole, rows = (read_photograph(name).pixels for name in names)
-    # Rounding in the first step may change the k-means of the second: noise of 1e-7 changes single pixels by 3 levels.
+    # Rounding in the first step may change the k-means of the second: noise of 1e-7 changes single pixels by 1.4 levels.
     assert 0 < difference(whole, rows) < 8
     assert 255 * (whole - rows).square().mean().sqrt() < 0.5
     assert sorted(path.name for path in tmp_path.iterdir()) == ["edit.json", "in.tif", "rows.tif", "whole.tif"]
