@@ -189,9 +189,7 @@ def fit(
 
 PresetOfList = Annotated[
     str | None,
-    typer.Argument(
-        metavar="NAME", help="Print this preset or look as JSON, to be edited and passed to `apply`."
-    ),
+    typer.Argument(metavar="NAME", help="Print this preset or look as JSON, to be edited and passed to `apply`."),
 ]
 
 
