@@ -24,6 +24,8 @@ detail in.png small.webp --quality 80
 detail in.png small.avif --quality 80
 detail in.png more.jpeg --landmarks 20
 develop in.png light.png --exposure +1
+develop in.png crop.png --crop 10,10,20,20
+develop in.png crop.png --crop 10%,10%,80%,80%
 mask in.png mask.png --region 20,20
 mask in.png mask.png --region 50%,50% --cutout alone.png
 """
@@ -54,6 +56,7 @@ ANSWERED = {
     "tone in.png out.png --contrast 20%": "(contrast of the smooth shading: 1 leaves it unchanged",
     "develop in.png out.png --exposure 1EV": "(brightness in stops: 1 doubles the light",
     "develop in.png out.png --ev 0.5": "here it is --exposure",
+    "develop in.png out.png --crop 0.1,0.1,0.9,0.9": "such as 10%,0%,80%,100%",
     "develop in.png out.png --aspect 16/9": "such as 3:2",
     "defocus in.png out.png --subject 20,20,9,9": "here it is --region or --box",
     "recolor in.png out.png --cutout a.png": "nlfilter-torch mask IN OUT --region X,Y,W,H --cutout FILE",

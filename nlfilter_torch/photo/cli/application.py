@@ -100,7 +100,7 @@ OTHER_COMMANDS: Mapping[str, str] = {
     "bw": "apply IN OUT mono",
     "monochrome": "apply IN OUT mono",
     "saturation": "apply IN OUT vivid",
-    "crop": "develop IN OUT --crop L,T,R,B",
+    "crop": "develop IN OUT --crop X,Y,W,H",
     "straighten": "develop IN OUT --straighten DEGREES",
     "rotate": "develop IN OUT --straighten DEGREES",
     "exposure": "develop IN OUT --exposure STOPS",

@@ -37,6 +37,15 @@ from nlfilter_torch.photo.declared.shared_parameters import LOOK
 #: Edits without scribbles.
 EDITS_WITHOUT_STROKES = tuple(edit for edit in EDITS.values() if not edit.requires_strokes)
 
+Crop = Annotated[
+    str | None,
+    typer.Option(
+        "--crop",
+        metavar="X,Y,W,H",
+        help="What is kept of the straightened photograph: column and row of the upper left corner, width and height, "
+        "in pixels or in % of it. It shrinks about its middle if it has empty corners.",
+    ),
+]
 Aspect = Annotated[
     str | None,
     typer.Option(
@@ -53,17 +62,17 @@ def develop(
     source: options.Source,
     target: options.Target,
     *,
+    crop: Crop = None,
     aspect: Aspect = None,
     files: options.PhotographOptions,
     **values: Any,
 ) -> None:
     """Develop a photograph; the help is that of the declaration."""
-    recipe = Recipe((), Development(**values | {"crop": options.parse_crop(values["crop"])}))
     sides = None if aspect is None else options.parse_aspect(aspect)
 
     from nlfilter_torch.photo.cli.jobs import develop_file
 
-    develop_file(recipe, sides, source, target, files)
+    develop_file(Recipe((), Development(**values)), crop, sides, source, target, files)
 
 
 Edits = Annotated[

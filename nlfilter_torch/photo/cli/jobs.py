@@ -222,15 +222,17 @@ class RecipeJob(FileEdit):
     Attributes:
         recipes: a recipe for the whole photograph, or a recipe for each mask.
         masks: grey pictures of the regions of the recipes.
+        crop: a crop as an option states it, or None for that of the recipe.
         aspect: width by height of the crop, which is trimmed to it, or None.
         cropped: how the photograph has been straightened and cropped already, if it has been.
-        notes: what is to be said about the options, once the photograph has been read; with an aspect, only if
-            nothing is trimmed or developed.
+        notes: what is to be said about the options, once the photograph has been read; with a crop or an
+            aspect, only if nothing is trimmed or developed.
     """
 
     recipes: Sequence[Recipe]
     masks: Sequence[Path] = ()
     notes: Sequence[str] = ()
+    crop: str | None = None
     aspect: float | None = None
     cropped: Development | None = None
 
@@ -251,11 +253,15 @@ class RecipeJob(FileEdit):
 
     def at_size(self, size: tuple[int, int]) -> "RecipeJob":
         """The same for a photograph (H, W), with the edges of its crop."""
-        if self.aspect is None:
+        if self.crop is None and self.aspect is None:
             return self
-        crop = self.develop.frame(size).trimmed(self.aspect).edges
-        recipes = [replace(recipe, develop=replace(recipe.develop, crop=crop)) for recipe in self.recipes]
-        return replace(self, recipes=recipes, aspect=None, notes=self.notes if recipes[0].develop.is_idle else ())
+        develop = self.develop
+        if self.crop is not None:
+            develop = replace(develop, crop=options.parse_crop(self.crop, size))
+        if self.aspect is not None:
+            develop = replace(develop, crop=develop.frame(size).trimmed(self.aspect).edges)
+        recipes = [replace(recipe, develop=develop) for recipe in self.recipes]
+        return replace(self, recipes=recipes, crop=None, aspect=None, notes=self.notes if develop.is_idle else ())
 
     def cropped_away(self, size: tuple[int, int]) -> list[tuple[int, Step]]:
         """The steps, with their numbers, whose objects in a photograph (H, W) are all outside the crop."""
@@ -323,11 +329,16 @@ class RecipeJob(FileEdit):
 
 
 def develop_file(
-    recipe: Recipe, aspect: float | None, source: str, target: str, files: options.PhotographOptions
+    recipe: Recipe,
+    crop: str | None,
+    aspect: float | None,
+    source: str,
+    target: str,
+    files: options.PhotographOptions,
 ) -> None:
-    """Develop a photograph by a recipe without steps, whose crop is trimmed to width by height, or not for None."""
+    """Develop a photograph by a recipe without steps, and a crop that is trimmed to width by height, if not None."""
     notes = [f"no option changes anything: {target} is written without an edit"] if recipe.develop.is_idle else []
-    RecipeJob(source, target, files, False, [recipe], notes=notes, aspect=aspect).run()
+    RecipeJob(source, target, files, False, [recipe], notes=notes, crop=crop, aspect=aspect).run()
 
 
 def apply_files(

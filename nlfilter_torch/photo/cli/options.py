@@ -5,7 +5,9 @@ at once.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import cycle
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -19,7 +21,7 @@ from nlfilter_torch.photo.declared.declaration import (
     Parameter,
     ScribbleKind,
 )
-from nlfilter_torch.photo.declared.development import Crop, check_value
+from nlfilter_torch.photo.declared.development import Crop
 from nlfilter_torch.photo.declared.strokes import Shape
 
 if TYPE_CHECKING:
@@ -94,19 +96,45 @@ def split_region(text: str) -> tuple[Shape, str, str | None]:
     return "rectangle" if rest == text else "ellipse", numbers, note if colon else None
 
 
-def parse_crop(text: str) -> Crop:
-    """Parse the edges of a crop, separated by commas.
+def parse_lengths(parts: Sequence[str], sides: tuple[int, int]) -> list[float]:
+    """Parse places in a photograph of these sides (W, H): columns and rows in turn, in pixels or in percent.
 
-    >>> parse_crop("0.1, 0,1,0.9")
-    (0.1, 0.0, 1.0, 0.9)
+    >>> parse_lengths(["10", "25%", "50%", "40"], (100, 80))
+    [10, 20.0, 50.0, 40]
+
+    Raises:
+        ValueError: if one is neither a whole number nor a percentage.
     """
+    lengths = list[float]()
+    for place, side in zip(parts, cycle(sides), strict=False):
+        number = place.strip().removesuffix("%")
+        # In this order, whole numbers of pixels are exact.
+        lengths.append(int(number) if number == place.strip() else float(number) * side / 100)
+    if not all(map(math.isfinite, lengths)):
+        raise ValueError(f"places must be finite numbers, got {', '.join(parts)}")
+    return lengths
+
+
+def parse_crop(text: str, size: tuple[int, int]) -> Crop:
+    """Parse a crop X,Y,W,H of a photograph (H, W), in pixels or percent, into shares of its sides.
+
+    >>> parse_crop("10%,0,75,100%", (80, 100))
+    (0.1, 0.0, 0.85, 1.0)
+    """
+    height, width = size
     try:
-        edges = [float(part) for part in text.split(",")]
+        left, top, across, down = parse_lengths(text.split(","), (width, height))
     except ValueError:
-        edges = []
-    check_value("crop", edges or text, dashes="--")
-    left, top, right, bottom = edges
-    return left, top, right, bottom
+        raise ValueError(
+            "--crop must be column and row of the upper left corner, width and height, X,Y,W,H, in whole pixels or in "
+            f"%, such as 10%,0%,80%,100%, got {text!r}; correct it"
+        ) from None
+    if not (0 <= left < left + across <= width and 0 <= top < top + down <= height):
+        raise ValueError(
+            f"--crop must lie within the photograph, which is {width} pixels wide and {height} high, got {text!r} "
+            "as X,Y,W,H; move or shrink it"
+        )
+    return left / width, top / height, (left + across) / width, (top + down) / height
 
 
 def parse_number(text: str, parameter: Parameter) -> float | str:

@@ -11,7 +11,7 @@ from PIL import ImageColor
 from skimage.color import rgb2hsv
 from torch import Tensor
 
-from nlfilter_torch.photo.cli.options import parse_sliders, split_region
+from nlfilter_torch.photo.cli.options import parse_lengths, parse_sliders, split_region
 from nlfilter_torch.photo.declared.declaration import Edit, Scribble
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.declared.rows import RowSource
@@ -251,8 +251,7 @@ def parse_region(text: str, option: str, size: Size, paint: str) -> tuple[Region
     shape, numbers, note = split_region(text)
     lengths = size[1], size[0]
     try:
-        parts = numbers.split(",")
-        values = [_pixels(part, lengths[i % 2]) for i, part in enumerate(parts)]
+        values = parse_lengths(numbers.split(","), lengths)
         if len(values) % 2 or (shape == "ellipse" and len(values) != 4):
             raise ValueError(text)
     except ValueError:
@@ -288,17 +287,6 @@ def _check_points(values: Sequence[float], option: str, size: Size, text: str) -
             f"{option} must be a point in the photograph, which is {size[1]} pixels wide and {size[0]} high, got "
             f"{text!r}; move it"
         )
-
-
-def _pixels(text: str, length: int) -> float:
-    """Parse a number of pixels or a percentage of a length."""
-    text = text.strip()
-    if not text.endswith("%"):
-        return int(text)
-    value = float(text[:-1]) * length / 100  # in this order, whole numbers of pixels are exact
-    if not math.isfinite(value):
-        raise ValueError(text)
-    return value
 
 
 def _colour(name: str, option: str, text: str) -> str:

@@ -25,7 +25,7 @@ DEVELOP = Edit(
 
     Example: `nlfilter-torch develop in.jpg out.jpg --exposure 0.5 --temperature 0.1 --straighten 1.5`
 
-    Cut a tenth off at the left and at the bottom: `nlfilter-torch develop in.jpg out.jpg --crop 0.1,0,1,0.9`
+    Cut a tenth off at the left and at the bottom: `nlfilter-torch develop in.jpg out.jpg --crop 10%,0%,90%,90%`
     """,
     (
         Parameter(
@@ -82,19 +82,16 @@ DEVELOP = Edit(
             1,
             idle=WHOLE_CROP,
             length=4,
-            metavar="L,T,R,B",
+            is_option=False,  # the command takes pixels
         ),
     ),
     hint="Comes before all steps. Strokes stay where they are on the photograph.",
 )
 
 
-def check_value(name: str, value: object, place: str = "", dashes: str = "") -> None:
-    """Raise ValueError unless a value is valid.
-
-    In the message, ``place`` says where it stands, and ``dashes`` come before the name of an option.
-    """
-    called = f"{dashes}{name}{place}"
+def check_value(name: str, value: object, place: str = "") -> None:
+    """Raise ValueError unless a value is valid; ``place`` says in the message where it stands."""
+    called = f"{name}{place}"
     if name == "crop":
         edges = value if isinstance(value, list | tuple) and len(value) == 4 else ()
         numbers = [edge for edge in edges if is_within(edge, 0, 1)]

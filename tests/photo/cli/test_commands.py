@@ -34,7 +34,7 @@ def test_the_command_line_goes_by_rows(tmp_path: Path, monkeypatch: pytest.Monke
     for name, options in zip(names, ([], ["--memory", "0.044", "--full"]), strict=True):
         assert main(["apply", str(photo), str(name), "--preset", str(preset), *options]) == 0
     whole, rows = (read_photograph(name).pixels for name in names)
-    # Rounding in the first step may change the k-means of the second: noise of 1e-7 changes single pixels by 1.4 levels.
+    # Rounding in the first step may change the k-means of the second: noise of 1e-7 changes pixels by 1.4 levels.
     assert 0 < difference(whole, rows) < 8
     assert 255 * (whole - rows).square().mean().sqrt() < 0.5
     assert sorted(path.name for path in tmp_path.iterdir()) == ["edit.json", "in.tif", "rows.tif", "whole.tif"]
@@ -84,7 +84,7 @@ def test_apply_refuses_what_is_no_edit(tmp_path: Path, capsys: pytest.CaptureFix
 
 
 SIZE = (300, 420)  # more than a block that is turned at once
-ALL = ["--exposure", "0.5", "--temperature", "0.2", "--straighten", "3", "--crop", "0.05,0,1,0.9"]
+ALL = ["--exposure", "0.5", "--temperature", "0.2", "--straighten", "3", "--crop", "5%,0%,95%,90%"]
 
 
 def written(path: Path, kind: str) -> Path:
@@ -121,7 +121,7 @@ def by_both(monkeypatch: pytest.MonkeyPatch, source: Path, *arguments: str) -> l
     ("kind", "arguments"),
     each_value(
         ["plain", "transparent", "nodata", "floats"],
-        [ALL, ["--crop", "0.2,0.1,0.7,1"], ["--exposure", "-1", "--tint", "0.3"]],
+        [ALL, ["--crop", "84,10%,50%,270"], ["--exposure", "-1", "--tint", "0.3"]],
     ),
 )
 def test_tiles_give_the_same(kind: str, arguments: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -144,7 +144,7 @@ def test_tiles_give_the_same(kind: str, arguments: list[str], tmp_path: Path, mo
 
 def test_a_crop_is_trimmed_to_proportions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     source = written(tmp_path / "in.tif", "plain")
-    for picture in by_both(monkeypatch, source, "develop", "--crop", "0.2,0,1,1", "--aspect", "1:1"):
+    for picture in by_both(monkeypatch, source, "develop", "--crop", "20%,0,80%,100%", "--aspect", "1:1"):
         assert np.array_equal(picture, tifffile.imread(source)[:, 102:402])
     for picture in by_both(monkeypatch, source, "develop", "--straighten", "4", "--aspect", "16:9"):
         assert picture.shape[1] == pytest.approx(picture.shape[0] * 16 / 9, abs=1)
@@ -171,7 +171,7 @@ def test_the_file_keeps_its_depth_and_its_exif_tells_its_size(tmp_path: Path, ti
     exif[271] = "Maker"
     exif.get_ifd(34665).update({40962: 30, 40963: 20, 37396: (15, 10)})  # size, and the place of the subject
     Image.fromarray(np.zeros((20, 30, 3), np.uint8)).save(tmp_path / "in.jpg", exif=exif)
-    assert main(["develop", str(tmp_path / "in.jpg"), str(tmp_path / "out.jpg"), "--crop", "0,0,0.5,0.5"]) == 0
+    assert main(["develop", str(tmp_path / "in.jpg"), str(tmp_path / "out.jpg"), "--crop", "0,0,50%,10"]) == 0
     with Image.open(tmp_path / "out.jpg") as after:
         assert after.size == (15, 10)
         assert after.getexif()[271] == "Maker"
@@ -179,14 +179,15 @@ def test_the_file_keeps_its_depth_and_its_exif_tells_its_size(tmp_path: Path, ti
 
 
 BAD_OPTIONS = [
-    (["--crop", "1,2"], "--crop must be the left, top, right and bottom edge as shares from 0 to 1"),
-    (["--crop", "a,b"], 'got "a,b"; correct it'),
+    (["--crop", "1,2"], "--crop must be column and row of the upper left corner, width and height, X,Y,W,H, in"),
+    (["--crop", "0.1,0,1,0.9"], "or in %, such as 10%,0%,80%,100%, got '0.1,0,1,0.9'; correct it"),
+    (["--crop", "0,0,9999,10"], "--crop must lie within the photograph, which is"),
     (["--exposure", "9"], "--exposure"),
     (
         ["--aspect", "3/2"],
         "--aspect must be a width and a height from 0.01 to 100000, such as 3:2, got '3/2'; correct it",
     ),
-    (["--straighten", "45", "--crop", "0,0,0.1,0.1"], "crop must have its middle within the photograph turned"),
+    (["--straighten", "45", "--crop", "0,0,2,2"], "crop must have its middle within the photograph turned"),
     (["--workers", "2"], "--workers takes zarr arrays"),
 ]
 
