@@ -1,4 +1,5 @@
 from .core.containers import collate as collate
+from .filtering.contraction import Contraction as Contraction
 from .filtering.filters import compose_alpha as compose_alpha
 from .filtering.filters import detail_layers as detail_layers
 from .filtering.filters import filter_regions as filter_regions
@@ -26,7 +27,10 @@ from .nn.denoiser.profile import profile_of_difference as profile_of_difference
 from .nn.masks import DiffusionMask as DiffusionMask
 from .nn.masks import SegmentMask as SegmentMask
 from .nn.portable import Portable as Portable
+from .nn.prior import NonlocalPrior as NonlocalPrior
 from .nn.refine import Refine as Refine
+from .nn.restoration import Restoration as Restoration
+from .nn.restoration import restore as restore
 from .nn.sliders import NonlocalFilter as NonlocalFilter
 from .nn.sliders import PolynomialSliders as PolynomialSliders
 from .operator.build import nonlocal_operator as nonlocal_operator

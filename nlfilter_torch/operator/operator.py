@@ -14,6 +14,7 @@ from nlfilter_torch.core.checks import (
     check_fits,
     check_instance,
     check_order,
+    spelled,
 )
 from nlfilter_torch.core.communicator import ALONE, Communicator
 from nlfilter_torch.core.containers import Batch, loadable
@@ -177,9 +178,9 @@ class NonlocalOperator(Batch):
     communicator: Communicator = ALONE
 
     def __repr__(self) -> str:
-        images, (height, width) = len(self), self.size
+        images = len(self)
         return (
-            f"NonlocalOperator({images} image{'' if images == 1 else 's'} of {height}x{width}, "
+            f"NonlocalOperator({images} image{'' if images == 1 else 's'} of {spelled(self.size)}, "
             f"{self.factor.shape[1]} landmarks, {self.dtype}, {self.device})"
         )
 
