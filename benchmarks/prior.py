@@ -17,11 +17,12 @@ STEPS = 20
 NEAR = 0.05
 
 
-def measure(count: int) -> list[Figure]:
-    """Figures over so many problems."""
+def measure(seeds: range) -> list[Figure]:
+    """Figures over the problems of these seeds."""
+    count = len(seeds)
     exceeded, too_low, gaps, norms, products = 0, 0, list[float](), list[float](), list[int]()
     kinds: dict[str, list[float]] = {kind: [] for kind in KINDS}
-    for seed in range(count):
+    for seed in seeds:
         problem = random_problem(seed)
         found, truth = problem.promised, problem.truth()
         factor = float(found.factor)
@@ -47,8 +48,10 @@ def main() -> int:
     """Command line."""
     parser = options("prior", __doc__, "some problems")
     parser.add_argument("--problems", type=int, default=PROBLEMS, help="number of problems (default: %(default)s)")
+    parser.add_argument("--first", type=int, default=0, help="seed of the first problem (default: %(default)s)")
     arguments = parser.parse_args()
-    return report(measure(QUICK if arguments.quick else arguments.problems), quick=arguments.quick)
+    count = QUICK if arguments.quick else arguments.problems
+    return report(measure(range(arguments.first, arguments.first + count)), quick=arguments.quick)
 
 
 if __name__ == "__main__":

@@ -4,6 +4,7 @@ The first dimension of their tensors numbers the images of a batch; a tensor wit
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from copy import deepcopy
 from dataclasses import fields, is_dataclass, replace
 from functools import partial
 from typing import Any, Self, TypeVar
@@ -54,6 +55,17 @@ class Batch:
         """Select images: an int selects one and keeps the batch dimension, a slice, a list or a tensor any of them."""
         chosen = _chosen(index, len(self), self.device)
         return map_tensors(self, partial(_select, chosen, len(self)))
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Self:
+        """Copy all tensors; those of a graph, which torch does not copy deeply, are cloned in it."""
+        copies: dict[int, Tensor] = {}  # tensors that are shared stay so
+
+        def copied(tensor: Tensor, _: Path) -> Tensor:
+            if id(tensor) not in copies:
+                copies[id(tensor)] = deepcopy(tensor, memo) if tensor.is_leaf else tensor.clone()
+            return copies[id(tensor)]
+
+        return map_tensors(self, copied)
 
     @classmethod
     def cat(cls, batches: Sequence[Self]) -> Self:

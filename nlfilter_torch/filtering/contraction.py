@@ -170,7 +170,9 @@ def _check_linear(forward: Map, transpose: Map, like: Tensor, mass: Tensor, gene
 def _normal(like: Tensor, mass: Tensor, generator: torch.Generator) -> Tensor:
     """A random image that is normal in the product of ``mass``, (1 or B, n)."""
     deviation = torch.where(mass > 0, mass, torch.inf).rsqrt().view(-1, *like.shape[1:])
-    return deviation * torch.randn(like.shape, generator=generator, dtype=torch.float64).to(like)
+    return deviation * torch.randn(like.shape, generator=generator, dtype=torch.float64, device=generator.device).to(
+        like
+    )
 
 
 def squared_norm(forward: Map, transpose: Map, start: Tensor, mass: Tensor, failure: float) -> tuple[Tensor, int]:

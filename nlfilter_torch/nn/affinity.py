@@ -121,7 +121,8 @@ class NonlocalAffinity(Learnable):
             ``hold="assignment"``, unless ``hold="features"``; features are held as with ``hold="features"``, and must
             be divided by the bandwidths with which the layer starts.
         completion: as for :func:`nonlocal_operator`.
-        guide_channels: as for :func:`nonlocal_operator`.
+        guide_channels: as for :func:`nonlocal_operator`. None lets each call say what counts, and is luminance in those
+            that do not.
         patch_weights: as for :func:`nonlocal_operator`.
         tolerance: as for :func:`nonlocal_operator`.
         generator: as for :func:`nonlocal_operator`. Every call then draws different landmarks; do not combine it with
@@ -163,7 +164,7 @@ class NonlocalAffinity(Learnable):
         num_landmarks: int = FilterOptions.num_landmarks,
         landmarks: Landmarks = FilterOptions.landmarks,
         completion: Completion = FilterOptions.completion,
-        guide_channels: GuideChannels = FilterOptions.guide_channels,
+        guide_channels: GuideChannels | None = None,
         patch_weights: Tensor | None = FilterOptions.patch_weights,
         tolerance: float | None = FilterOptions.tolerance,
         generator: torch.Generator | None = FilterOptions.generator,
@@ -173,7 +174,7 @@ class NonlocalAffinity(Learnable):
     ) -> None:
         super().__init__()
         names = check_learn(learn, tuple(self.learnable))
-        options = FilterOptions.of(locals())
+        options = FilterOptions.of({**locals(), "guide_channels": _channels(guide_channels)})
         check_options(options)
         check_group(group)
         window = unit_window(patch_size, patch_weights).detach()  # learned only with learn=("patch_weights",)
@@ -181,7 +182,7 @@ class NonlocalAffinity(Learnable):
         self.num_landmarks = options.landmark_count
         self.landmarks: Sampling = landmarks if isinstance(landmarks, str) else SAMPLING
         self.completion: Completion = completion
-        self.guide_channels: GuideChannels = guide_channels
+        self.guide_channels: GuideChannels | None = guide_channels
         self.tolerance = tolerance
         self.generator = generator
         self.group = group
@@ -208,26 +209,39 @@ class NonlocalAffinity(Learnable):
             self.register_buffer("patch_weights", None if patch_weights is None else window, persistent=False)
         self.held = self._held(hold, landmarks)
 
-    def forward(self, guide: Tensor, weights: Tensor | None = None) -> NonlocalOperator:
-        """Build the operator of a guide (B, C, H, W), with weights (B, 1, H, W) of its pixels: 0 for padding."""
+    def forward(
+        self, guide: Tensor, weights: Tensor | None = None, guide_channels: GuideChannels | None = None
+    ) -> NonlocalOperator:
+        """Build the operator of a guide.
+
+        Args:
+            guide: (B, C, H, W).
+            weights: (B, 1, H, W) of its pixels: 0 for padding.
+            guide_channels: the channels that count in this call, if the layer was made with None.
+        """
+        channels = _channels(self.guide_channels, guide_channels)
         if isinstance(self.held, HeldFeatures):
             _check_no_volume(guide)
             bandwidth = self.photometric_bandwidth
             if isinstance(bandwidth, str):
-                bandwidth = estimate_bandwidth(
-                    guide, guide_channels=self.guide_channels, weights=weights, group=self.group
-                )
-            return self._build(guide, self.held.of(self._recipe(bandwidth, guide)), bandwidth, weights)
+                bandwidth = estimate_bandwidth(guide, guide_channels=channels, weights=weights, group=self.group)
+            landmarks = self.held.of(self._recipe(bandwidth, guide, channels))
+            return self._build(guide, landmarks, bandwidth, weights, channels)
         if isinstance(self.held, HeldAssignment):
             check_image(guide, "guide", empty=True, dimensions=(4, 5))
-            landmarks = self.held.of(guide) or self.landmarks
-            operator = self._build(guide, landmarks, self.photometric_bandwidth, weights)
+            kept = self.held.of(guide) or self.landmarks
+            operator = self._build(guide, kept, self.photometric_bandwidth, weights, channels)
             self.held.keep(operator.assignment, guide)
             return operator
-        return self._build(guide, self.landmarks, self.photometric_bandwidth, weights)
+        return self._build(guide, self.landmarks, self.photometric_bandwidth, weights, channels)
 
     @torch.no_grad()
-    def renew(self, guide: Tensor | None = None, weights: Tensor | None = None) -> None:
+    def renew(
+        self,
+        guide: Tensor | None = None,
+        weights: Tensor | None = None,
+        guide_channels: GuideChannels | None = None,
+    ) -> None:
         """Choose the landmarks that are held anew, by the sampling, number and generator of the layer.
 
         Args:
@@ -238,6 +252,7 @@ class NonlocalAffinity(Learnable):
                 call makes a new one.
             weights: (B, 1, H, W), how much each pixel of the guides counts, 0 for padding, from which no landmarks are
                 made.
+            guide_channels: as for :meth:`forward`.
 
         Raises:
             TypeError, ValueError: if the layer holds no landmarks, or the guide is missing or invalid.
@@ -249,16 +264,16 @@ class NonlocalAffinity(Learnable):
         if isinstance(self.held, HeldAssignment):
             self.held.forget()
             if guide is not None:
-                self(guide, weights)
+                self(guide, weights, guide_channels)
             return
         if guide is None:
             raise ValueError("guide must be images to choose landmarks from if hold is 'features', got None; pass some")
         _check_no_volume(guide)
         check_image(guide, "guide")
-        bandwidth = self.photometric_bandwidth
+        bandwidth, channels = self.photometric_bandwidth, _channels(self.guide_channels, guide_channels)
         if isinstance(bandwidth, str):
-            bandwidth = estimate_bandwidth(guide, guide_channels=self.guide_channels, weights=weights).mean()
-        recipe = self._recipe(bandwidth, guide)
+            bandwidth = estimate_bandwidth(guide, guide_channels=channels, weights=weights).mean()
+        recipe = self._recipe(bandwidth, guide, channels)
         counts = None if weights is None else check_pixel_weights(weights, guide)
         features = recipe(guide, counts=None if counts is None else counts > 0)
         features = features.transpose(0, 1).flatten(1).unsqueeze(0)  # (1, D, B N), of all images
@@ -307,15 +322,15 @@ class NonlocalAffinity(Learnable):
                     "photometric_bandwidth must be a number if landmarks are features, which are divided by it, got "
                     "'auto'; pass a number, or an operator of a guide"
                 )
-            recipe = self._recipe(bandwidth, features)
+            recipe = self._recipe(bandwidth, features, _channels(self.guide_channels))
         held = HeldFeatures()
         held.keep(features, recipe)
         return held
 
-    def _recipe(self, bandwidth: float | Tensor, like: Tensor) -> GuideFeatures:
+    def _recipe(self, bandwidth: float | Tensor, like: Tensor, channels: GuideChannels) -> GuideFeatures:
         """The function that computes features of a guide, in the precision of ``like``."""
         window = unit_window(self.patch_size, self._weights()).to(like.device, working_dtype(like))
-        return GuideFeatures(window, bandwidth, self.spatial_bandwidth, self.guide_channels)
+        return GuideFeatures(window, bandwidth, self.spatial_bandwidth, channels)
 
     def _weights(self) -> Tensor | None:
         """Learned or fixed patch weights (p, p); None for the Gaussian window."""
@@ -328,6 +343,7 @@ class NonlocalAffinity(Learnable):
         landmarks: Landmarks,
         bandwidth: float | Tensor | Literal["auto"],
         weights: Tensor | None,
+        channels: GuideChannels,
     ) -> NonlocalOperator:
         """Build the operator with the options of the layer, and these landmarks."""
         options = FilterOptions(
@@ -337,7 +353,7 @@ class NonlocalAffinity(Learnable):
             num_landmarks=self.num_landmarks,
             landmarks=landmarks,
             completion=self.completion,
-            guide_channels=self.guide_channels,
+            guide_channels=channels,
             patch_weights=self._weights(),
             tolerance=self.tolerance,
             generator=self.generator,
@@ -354,6 +370,11 @@ class NonlocalAffinity(Learnable):
             f"landmarks={self.landmarks!r}{holding}, completion={self.completion!r}, "
             f"guide_channels={self.guide_channels!r}"
         )
+
+
+def _channels(own: GuideChannels | None, of_call: GuideChannels | None = None) -> GuideChannels:
+    """What counts: what the layer says, or else the call, or else luminance."""
+    return own or of_call or FilterOptions.guide_channels
 
 
 def _check_no_volume(guide: Tensor) -> None:

@@ -139,7 +139,8 @@ class NonlocalFilter(nn.Module):
         num_landmarks: as for :class:`NonlocalAffinity`.
         landmarks: as for :class:`NonlocalAffinity`.
         completion: as for :class:`NonlocalAffinity`.
-        guide_channels: as for :class:`NonlocalAffinity`.
+        guide_channels: ``"luminance"`` or ``"all"``, as for :func:`nonlocal_operator`; None compares all channels of a
+            guide that is passed to the layer, and the luminance of an image that is its own guide.
         patch_weights: as for :class:`NonlocalAffinity`.
         tolerance: as for :class:`NonlocalAffinity`.
         generator: as for :class:`NonlocalAffinity`.
@@ -209,7 +210,7 @@ class NonlocalFilter(nn.Module):
         num_landmarks: int = FilterOptions.num_landmarks,
         landmarks: Landmarks = FilterOptions.landmarks,
         completion: Completion = FilterOptions.completion,
-        guide_channels: GuideChannels = FilterOptions.guide_channels,
+        guide_channels: GuideChannels | None = None,
         patch_weights: Tensor | None = FilterOptions.patch_weights,
         tolerance: float | None = FilterOptions.tolerance,
         generator: torch.Generator | None = FilterOptions.generator,
@@ -224,9 +225,17 @@ class NonlocalFilter(nn.Module):
         )
         self.sliders = PolynomialSliders(alpha, residual=residual, learn=[name for name in LEARNABLE if name in names])
 
-    def renew(self, guide: Tensor | None = None, weights: Tensor | None = None) -> None:
-        """Choose the landmarks that are held anew; see :meth:`NonlocalAffinity.renew`."""
-        self.affinity.renew(guide, weights)
+    def renew(
+        self,
+        guide: Tensor | None = None,
+        weights: Tensor | None = None,
+        guide_channels: GuideChannels | None = None,
+    ) -> None:
+        """Choose the landmarks that are held anew; see :meth:`NonlocalAffinity.renew`.
+
+        With ``guide_channels="all"`` for guides of three channels that are passed to the layer beside images.
+        """
+        self.affinity.renew(guide, weights, guide_channels)
 
     def forward(
         self,
@@ -240,7 +249,8 @@ class NonlocalFilter(nn.Module):
 
         Args:
             image: (B, C, H, W), or one image (C, H, W); then guide, mask and alpha are also those of one image.
-            guide: (B, C', H, W) from which the operator is built; None means the image itself.
+            guide: (B, C', H, W) of the image's height and width, from which the operator is built; None means the image
+                itself. All of its channels count, unless the layer was made with ``guide_channels``.
             mask: (B, K, H, W) in [0, 1]: 1 where the image is filtered, 0 where it is unchanged; None means 1
                 everywhere.
             alpha: sliders that replace the layer's own in this call, for example computed by a network: (k+1,),
@@ -264,7 +274,11 @@ class NonlocalFilter(nn.Module):
                 "call layer.sliders(operator, image)"
             )
         check_image(image, "image", empty=True, dimensions=(4, 5))
-        operator = self.affinity(image if guide is None else guide, weights)
+        if guide is None:
+            operator = self.affinity(image, weights)
+        else:
+            check_fits(guide, tuple(image.shape[2:]), "guide", "image", image, empty=len(image) == 0)
+            operator = self.affinity(guide, weights, "all")
         if mask is not None:
             batch = max(image.shape[0], operator.factor.shape[0])
             check_fits(mask, tuple(image.shape[2:]), "mask", "image", batch=batch, empty=len(image) == 0)

@@ -62,6 +62,7 @@ from nlfilter_torch.operator.traps import (
     SAMPLED,
     sampled_points,
     share_above,
+    warn_of_long_patches,
     warn_of_scale_of_features,
     warn_of_units,
 )
@@ -188,6 +189,7 @@ def _checked(guide: Tensor, options: FilterOptions, weights: Tensor | None) -> N
     if not is_hidden(guide) and _is_small(bandwidth):
         warn_of_scale(guide, "guide")
     warn_of_units(guide, bandwidth)
+    warn_of_long_patches(guide, options.patch_size)
     operator = _from_guide(guide, options, weights)
     if options.completion == "diagonal" and weights is None and operator.communicator.size == 1:
         warn_of_scale_of_features(operator.scaling, guide, bandwidth)

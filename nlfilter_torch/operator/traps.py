@@ -71,6 +71,20 @@ def warn_of_scale_of_features(scaling: Tensor, guide: Tensor, bandwidth: float |
         )
 
 
+LONG = 512  # features of a pixel, above which most of the time of building an operator goes into comparing them
+
+
+def warn_of_long_patches(guide: Tensor, patch_size: int) -> None:
+    """Warn of patches of a feature map (B, C, ...), whose channels tell of the surroundings of a pixel already."""
+    features = guide.shape[1] * patch_size ** (guide.ndim - 2)
+    if patch_size > 1 and features > LONG and not is_hidden(guide):
+        warn(
+            f"patch_size must be 1 for guides of many channels, unless time does not matter, got {patch_size} for "
+            f"{guide.shape[1]} channels: {features} numbers are compared for every pixel; pass patch_size=1, and fewer "
+            "landmarks, such as 32"
+        )
+
+
 SAMPLED = 1024  # points whose rows are compared; all, if there are at most twice as many
 FEW = 256  # points of a first look, in about 2 ms on one core
 LARGEST_SHARE = 0.15  # of badly covered points, above which there is a warning
@@ -81,11 +95,12 @@ HALF = 0.5  # share of its weight by which the row of a badly covered point is o
 
 
 def sampled_points(points: int) -> Tensor:
-    """Numbers (S,) of the points whose features are kept, spread over all ``points``; always the same."""
-    if points <= 2 * SAMPLED:
-        return torch.arange(points)
-    starts = torch.arange(SAMPLED + 1) * points // SAMPLED
-    return starts[:-1] + (torch.arange(SAMPLED).double() * GOLDEN % 1 * starts.diff()).long()
+    """Numbers (S,) of the points whose features are kept, spread over all ``points``; always the same, on the CPU."""
+    with torch.device("cpu"):
+        if points <= 2 * SAMPLED:
+            return torch.arange(points)
+        starts = torch.arange(SAMPLED + 1) * points // SAMPLED
+        return starts[:-1] + (torch.arange(SAMPLED).double() * GOLDEN % 1 * starts.diff()).long()
 
 
 def share_above(values: Tensor, limit: float, weights: Tensor | None) -> Tensor:

@@ -1,5 +1,6 @@
 """Operators and spectra as values: indexing, moving, detaching, collating, joining."""
 
+import copy
 import pickle
 from collections import namedtuple
 from typing import Any
@@ -198,3 +199,18 @@ def test_batches_of_several_images_and_of_none() -> None:
 
 
 FIRST = build(GUIDES[:1])
+
+
+def test_deep_copies_are_other_tensors_and_stay_in_the_graph() -> None:
+    copied = copy.deepcopy(BATCH)
+    assert copied.factor.data_ptr() != BATCH.factor.data_ptr()
+    torch.testing.assert_close(copied @ IMAGES, BATCH @ IMAGES, atol=0, rtol=0)
+    guide = GUIDES.clone().requires_grad_()
+    operator = nonlocal_operator(guide, photometric_bandwidth=BANDWIDTHS, **OPTIONS)
+    for built in (operator, operator.spectrum()):
+        slopes = [
+            torch.autograd.grad(value.factor.square().sum(), guide, retain_graph=True)[0]
+            for value in (built, copy.deepcopy(built))
+        ]
+        assert slopes[0].abs().max() > 0
+        torch.testing.assert_close(*slopes, atol=0, rtol=0)

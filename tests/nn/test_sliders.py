@@ -38,8 +38,8 @@ def test_filter_is_the_function(residual: float | None) -> None:
 def test_guide_may_be_another_picture(channels: int, guide_channels: int) -> None:
     guide, picture_ = noise(2, guide_channels, 12, 13, seed=1), noise(2, channels, 12, 13)
     result = NonlocalFilter(ALPHA, **OPTIONS)(picture_, guide=guide)
-    expected = polynomial_filter(nonlocal_operator(guide, **OPTIONS), picture_, torch.tensor(ALPHA))
-    torch.testing.assert_close(result, expected)
+    operator = nonlocal_operator(guide, guide_channels="all", **OPTIONS)
+    torch.testing.assert_close(result, polynomial_filter(operator, picture_, torch.tensor(ALPHA)))
 
 
 def test_mask_blends() -> None:
@@ -223,3 +223,28 @@ def test_type_checkers_refuse_misspelt_names(tmp_path: Path) -> None:
     output = subprocess.run(command, cwd=root, capture_output=True, text=True, check=False).stdout
     refused = {int(number) for number in re.findall(r"user.py:(\d+): error", output)}
     assert refused == set(range(2, 2 + len(lines))), output
+
+
+def test_a_guide_counts_with_all_its_channels_and_an_image_by_its_luminance() -> None:
+    """As a learned guide of three channels, whose gradient would otherwise be that of one."""
+    picture_ = image()
+    learned = noise(*picture_.shape, seed=4, dtype=picture_.dtype)
+    alpha, layer = torch.tensor(ALPHA), NonlocalFilter(ALPHA, **OPTIONS)
+
+    def expected(guide: torch.Tensor, channels: str) -> torch.Tensor:
+        operator = nonlocal_operator(guide, guide_channels=channels, **OPTIONS)  # type: ignore[arg-type]
+        return polynomial_filter(operator, picture_, alpha)
+
+    torch.testing.assert_close(layer(picture_, guide=learned), expected(learned, "all"), atol=0, rtol=0)
+    torch.testing.assert_close(layer(picture_), expected(picture_, "luminance"), atol=0, rtol=0)
+    for channels in ("luminance", "all"):
+        chosen = NonlocalFilter(ALPHA, guide_channels=channels, **OPTIONS)  # type: ignore[arg-type]
+        torch.testing.assert_close(chosen(picture_, guide=learned), expected(learned, channels), atol=0, rtol=0)
+    held = NonlocalFilter(ALPHA, hold="features", **OPTIONS)
+    held.renew(learned, guide_channels="all")
+    assert held(picture_, guide=learned).shape == picture_.shape
+
+
+def test_a_guide_of_another_size_is_named() -> None:
+    with pytest.raises(ValueError, match="guide must have the height and width of the image, 12x13, got 6x13"):
+        NonlocalFilter(ALPHA, **OPTIONS)(image(), guide=image()[:, :, :6])

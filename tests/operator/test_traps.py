@@ -11,6 +11,7 @@ from torch import Tensor
 
 from nlfilter_torch import NonlocalFilter, NonlocalOperator, nonlocal_operator, operator_from_features
 from nlfilter_torch.operator.build import operator_from_points
+from nlfilter_torch.operator.features import unit_window
 from nlfilter_torch.operator.options import FilterOptions
 from nlfilter_torch.operator.traps import LARGEST_SHARE, LEAST_POINTS, SAMPLED, sampled_points, share_above
 from tests.pairwise import each_value
@@ -185,3 +186,19 @@ def test_photographs_with_the_defaults_are_covered(name: str) -> None:
     picture = torch.from_numpy(getattr(data, name)()).float()[:160, :160] / 255
     guide = picture.permute(2, 0, 1)[None] if picture.ndim == 3 else picture[None, None]
     assert nonlocal_operator(guide).badly_covered().item() < LARGEST_SHARE / 3
+
+
+def test_long_patches_of_feature_maps_are_warned_of() -> None:
+    guide = noise(1, 64, 16, 16, dtype=torch.float32)
+    with pytest.warns(UserWarning, match="patch_size must be 1 for guides of many channels, .* 1600 numbers"):
+        nonlocal_operator(guide, photometric_bandwidth=0.3, num_landmarks=9)
+    for quiet, patch_size in ((guide, 1), (guide[:, :3], 5), (guide[:, :16], 5)):
+        nonlocal_operator(quiet, photometric_bandwidth=0.3, num_landmarks=9, patch_size=patch_size)
+
+
+def test_images_on_the_cpu_are_filtered_under_another_default_device() -> None:
+    expected = nonlocal_operator(IMAGE, num_landmarks=9) @ IMAGE
+    with torch.device("meta"):
+        assert unit_window(5, None).device.type == "cpu"
+        found = nonlocal_operator(IMAGE, num_landmarks=9) @ IMAGE
+    torch.testing.assert_close(found, expected, atol=0, rtol=0)

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from nlfilter_torch.core.blocks import EVERYWHERE, Inner
 from nlfilter_torch.core.checks import (
     check_count,
+    check_image,
     check_photograph,
     described,
 )
@@ -128,7 +129,8 @@ class NonlocalDenoiser(nn.Module):
                 longer and are better by about 0.1 dB.
 
         Returns:
-            The denoised image, with the shape and dtype of ``noisy``. Differentiable in image, noise and weights.
+            The denoised image, with the shape and dtype of ``noisy``, also if this is an empty batch. Differentiable in
+            image, noise and weights.
 
         Raises:
             TypeError, ValueError: if an argument has the wrong shape or is not finite, or noise is negative.
@@ -138,6 +140,9 @@ class NonlocalDenoiser(nn.Module):
             is_map = isinstance(noise, Tensor) and noise.ndim == 3
             batched = noise.unsqueeze(0) if is_map else noise  # type: ignore[union-attr]
             return self(noisy.unsqueeze(0), batched, turns=turns).squeeze(0)
+        check_image(noisy, "noisy", empty=True)
+        if len(noisy) == 0:
+            return noisy.clone()
         check_photograph(noisy, "noisy")
         dtype = self.log_bandwidths.dtype
         image = noisy.to(dtype)

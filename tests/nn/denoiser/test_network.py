@@ -437,3 +437,9 @@ def test_weights_in_half_precision_denoise_colours(dtype: torch.dtype) -> None:
     with torch.no_grad():
         result = NonlocalDenoiser.trained(dtype=dtype)(noisy, 0.1)
     assert (result - 0.5).std() < 0.04
+
+
+def test_an_empty_batch_stays_empty() -> None:
+    assert TRAINED_ONE(CAT[:0], 0.1).shape == CAT[:0].shape
+    with pytest.raises(ValueError, match="noisy must hold at least one pixel"):
+        TRAINED_ONE(CAT[:, :, :0], 0.1)

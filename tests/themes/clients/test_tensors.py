@@ -144,7 +144,7 @@ def test_shapes_alone_are_enough(options: dict[str, Any], dtype: torch.dtype) ->
 # --- empty batches and memory formats
 
 
-@pytest.mark.client("empty batches", "yes; edits, looks, strokes and the denoiser refuse them")
+@pytest.mark.client("empty batches", "yes; edits, looks and strokes refuse them")
 def test_empty_batches_stay_empty() -> None:
     none = image()[:0]
     layer = NonlocalFilter(ALPHA, learn=("alpha", "residual"), residual=0.5, **OPTIONS)
