@@ -9,7 +9,7 @@ fields and moves the notes, piexif knows fixed lists of fields, and Exiv2 is und
 
 import io
 import struct
-from collections.abc import Container, Iterable, Sequence
+from collections.abc import Callable, Container, Iterable, Sequence
 from itertools import product
 from typing import NamedTuple, TypeVar
 
@@ -23,6 +23,7 @@ from nlfilter_torch.photo.files.metadata import CENTIMETRES
 from nlfilter_torch.photo.files.tables import (
     EXIF,
     INTEGERS,
+    LONG,
     ORIENTATION,
     POINTERS,
     RESOLUTION,
@@ -122,6 +123,25 @@ def read_upright(block: bytes | None, orientation: int | None = None, size: tupl
     only = all(field.code == ORIENTATION for field in fields) and not _thumbnail(tables)
     left_out = ["damaged fields of EXIF"] * damaged + ["the place of the subject, as the picture is turned"] * lost
     return Upright(orientation, None if only else PREFIX + bytes(tables.data), tuple(left_out))
+
+
+def with_description(block: bytes | None, changed: Callable[[bytes], bytes]) -> bytes | None:
+    """A block with other descriptions of the picture, each of which is as long at most; empty ones are removed."""
+    tables = parsed(block)
+    if tables is None:
+        return block
+    fields = [field for field in tables.fields(tables.first) if field.code == Base.ImageDescription]
+    texts = [tables.raw(field).rstrip(b"\0") for field in fields]
+    new = [changed(text) for text in texts]
+    if new == texts:
+        return block
+    if not any(new):
+        _drop(tables, (Base.ImageDescription,))
+        return PREFIX + bytes(tables.data) if tables.fields(tables.first) else None
+    for field, text in zip(fields, new, strict=True):
+        tables.data[field.place : field.end] = text.ljust(field.count, b"\0")
+        tables.data[field.entry + 4 : field.entry + 8] = tables.packed(LONG, min(len(text) + 1, field.count))
+    return PREFIX + bytes(tables.data)
 
 
 def of_part(block: bytes | None, size: tuple[int, int]) -> bytes | None:

@@ -102,7 +102,7 @@ def read_channels(path: Path, *, bytes_per_pixel: int, memory: int | None) -> De
     """Read upright channels (H, W, S) in the stored dtype, and metadata; see :func:`read_photograph`."""
     head = first_bytes(path)
     check_size = partial(_check_size, path, bytes_per_pixel, memory)
-    if codecs.is_raw(path):
+    if codecs.is_raw(path) or (tiff.is_tiff(head) and tiff.holds_raw(path)):
         decoded = codecs.read_raw(path, check_size)
     elif codecs.is_heic(head):
         decoded = codecs.read_heic(path, check_size)

@@ -64,11 +64,12 @@ class Tag:
         """Number of values."""
         return len(self.data) // LENGTHS[self.kind]
 
-    def stored(self, order: str) -> tuple[int, int, int, bytes, bool]:
-        """The tag in a byte order, as tifffile takes it."""
+    def in_order(self, order: str) -> bytes:
+        """The values in a byte order."""
+        if order == self.order:
+            return self.data
         unit = LENGTHS[self.kind] // (2 if self.kind in FRACTIONS else 1)
-        data = self.data if order == self.order else np.frombuffer(self.data, f"V{unit}").view(f"u{unit}")
-        return self.code, self.kind, 0, data if isinstance(data, bytes) else data.byteswap().tobytes(), True
+        return np.frombuffer(self.data, f"V{unit}").view(f"u{unit}").byteswap().tobytes()
 
 
 class FilePart(NamedTuple):

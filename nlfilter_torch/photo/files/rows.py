@@ -22,6 +22,7 @@ import psutil
 
 from nlfilter_torch.photo.declared.rows import NodataRows, RowSource, Stored
 from nlfilter_torch.photo.files import tiff
+from nlfilter_torch.photo.files.codecs import is_raw
 from nlfilter_torch.photo.files.exif import of_part, upright
 from nlfilter_torch.photo.files.formats import (
     TooLarge,
@@ -136,7 +137,7 @@ def open_picture(path: Path, memory: int) -> Iterator[StoredPicture]:
     with ExitStack() as stack:
         if is_zarr(path):
             stored = _open_zarr(path)
-        elif tiff.is_tiff(first_bytes(path)):
+        elif tiff.is_tiff(first_bytes(path)) and not is_raw(path) and not tiff.holds_raw(path):
             stored = _open_tiff(path, stack)
         else:
             stored = _open_codec(path, memory, stack)
@@ -211,7 +212,7 @@ def usual_memory(most: int = sys.maxsize) -> int:
 def _open_tiff(path: Path, stack: ExitStack) -> StoredPicture:
     with decoding(path):
         rows = stack.enter_context(TiffRows(path))
-    tiff.warn_of_pages(path)
+    rows.warn_of_pages()
     source: RowSource = rows
     if rows.turned:
         source = upright_copy(rows, rows.orientation, max(rows.segment[0], COPIED), stack)

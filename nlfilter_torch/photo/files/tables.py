@@ -17,7 +17,8 @@ MAKER_NOTE = Base.MakerNote
 RESOLUTION = (Base.XResolution, Base.YResolution, Base.ResolutionUnit)
 POINTERS = (EXIF, GPS, INTEROP)  # fields that point to a nested table
 LENGTHS = {kind: struct.calcsize("<" + form) for kind, form in TIFF.DATA_FORMATS.items()}  # of a value
-SHORT, LONG, RATIONAL, LONG8 = DATATYPE.SHORT, DATATYPE.LONG, DATATYPE.RATIONAL, DATATYPE.LONG8
+BYTE, SHORT, LONG, RATIONAL = DATATYPE.BYTE, DATATYPE.SHORT, DATATYPE.LONG, DATATYPE.RATIONAL
+UNDEFINED, LONG8 = DATATYPE.UNDEFINED, DATATYPE.LONG8
 #: Unsigned types, as :mod:`struct` calls them.
 INTEGERS: dict[int, str] = {
     DATATYPE.BYTE: "B",

@@ -3,14 +3,18 @@
 import logging
 import math
 import os
+import re
 import struct
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from mmap import ACCESS_READ, mmap
 from pathlib import Path
 from typing import BinaryIO
 
+import imagecodecs
 import numpy as np
 import tifffile
+from numpy.typing import NDArray
 
 from nlfilter_torch.core.warning import warn
 from nlfilter_torch.photo.declared.rows import Stored
@@ -18,6 +22,7 @@ from nlfilter_torch.photo.files import exif as exif_tags
 from nlfilter_torch.photo.files import exif_in_tiff
 from nlfilter_torch.photo.files.metadata import (
     GROUND,
+    OF_A_DEPTH,
     STORAGE_TAGS,
     CheckSize,
     Decoded,
@@ -33,16 +38,29 @@ from nlfilter_torch.photo.files.metadata import (
     turned_tag,
     upright_packet,
 )
-from nlfilter_torch.photo.files.tables import LONG, ORIENTATION, RATIONAL, RESOLUTION, SHORT, TiffTables
+from nlfilter_torch.photo.files.tables import (
+    BYTE,
+    EXIF,
+    LONG,
+    ORIENTATION,
+    RATIONAL,
+    RESOLUTION,
+    SHORT,
+    UNDEFINED,
+    Field,
+    TiffTables,
+)
 
 # tifffile logs problems with a file. Without a handler Python would print them beside our error message.
 logging.getLogger("tifffile").addHandler(logging.NullHandler())
-XMP, SUB_FILES = 700, 330  # tags
+XMP, PROFILE, SUB_FILES = 700, 34675, 330  # tags
+RAW = (32803, 34892)  # colours of RAW files: behind a filter of colours, and linear
 TILE_SIZE = 256  # side of the tiles that are written, and of the chunks of zarr arrays
 MAX_CLASSIC_BYTES = 4_000_000_000  # bytes of pixels above which a BigTIFF is written
 _ASSOCIATED = tifffile.EXTRASAMPLE.ASSOCALPHA
 Resolution = tuple[float | tuple[int, int], float | tuple[int, int]]  # across and down
 MOST_PAGES = 100  # that are counted
+FEW_BITS = (1, 2, 4)  # per channel, which are read as 8
 CACHED_BANDS = 2  # cached bands of strips or tiles: rows shared by two tiles of a picture span at most two
 
 
@@ -51,38 +69,54 @@ def is_tiff(head: bytes) -> bool:
     return head[:4] in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 
 
-def read(path: Path, check_size: CheckSize) -> Decoded:
-    """Read the first page."""
-    with decoding(path), TiffRows(path) as rows:
+def read(path: Path, check_size: CheckSize, number: int = 0) -> Decoded:
+    """Read a picture, see :class:`TiffRows`."""
+    with decoding(path), TiffRows(path, number) as rows:
         check_size((rows.shape[1], rows.shape[0]), double=rows.dtype == np.float64)
         ends = (at + count for at, count in zip(rows.page.dataoffsets, rows.page.databytecounts, strict=True) if count)
         if max(ends, default=0) > path.stat().st_size:  # decoders of JPEG fill what is missing
             raise EOFError("it ends too early")
-        channels = np.asarray(rows.page.asarray())
+        channels = rows.whole if rows.by_libtiff else np.asarray(rows.page.asarray())
         if rows.page.axes == "SYX":
             channels = np.moveaxis(channels, 0, -1)
-        warn_of_pages(path)
-        return Decoded(plain_channels(rows.page, channels.reshape(rows.shape)), rows.orientation, rows.metadata)
+        rows.warn_of_pages()
+        plain = plain_channels(rows.page, channels.reshape(*rows.shape[:2], -1))
+        return Decoded(plain, rows.orientation, rows.metadata)
+
+
+def pictures(file: tifffile.TiffFile) -> list[tifffile.TiffPage]:
+    """The pictures of a file, of at most :data:`MOST_PAGES` pages, without masks and reduced versions.
+
+    Where the first page is a reduced version, the full ones may be nested in it, as in RAW files. If there are only
+    reduced versions, the largest of them.
+    """
+    first = file.pages.first
+    pages = [first]
+    with suppress(Exception):  # no such page, or damage behind the first one, which alone is needed
+        for number in range(1, MOST_PAGES):
+            page = file.pages[number]
+            if isinstance(page, tifffile.TiffPage):
+                pages.append(page)
+    nested: list[tifffile.TiffPage] = []
+    if first.is_reduced or first.is_mask:
+        with suppress(Exception):
+            nested = [page for page in first.pages or () if isinstance(page, tifffile.TiffPage)]
+    full = [page for page in (*nested, *pages) if not (page.is_reduced or page.is_mask)]
+    return full or [max((*pages, *nested), key=lambda page: page.imagelength * page.imagewidth)]
 
 
 def count_pages(path: Path) -> int:
-    """Number of pictures in a TIFF file, at most :data:`MOST_PAGES`, not counting masks and reduced versions."""
-    count = 1
+    """Number of pictures in a TIFF file, see :func:`pictures`."""
     with path.open("rb") as stream, tifffile.TiffFile(stream, name=str(path)) as file:
-        try:
-            for number in range(1, MOST_PAGES):
-                page = file.pages[number]
-                count += not (isinstance(page, tifffile.TiffPage) and (page.is_reduced or page.is_mask))
-        except Exception:  # no such page, or damage behind the first one, which alone is needed
-            return count
-    return count
+        return len(pictures(file))
 
 
-def warn_of_pages(path: Path) -> None:
-    """Warn if a file has several pages, of which only the first is read."""
-    if (count := count_pages(path)) > 1:
-        least = "at least " if count == MOST_PAGES else ""
-        warn(f"{path} has {least}{count} pages, of which only the first is read; save the others as files of their own")
+def holds_raw(path: Path) -> bool:
+    """Whether the picture of a TIFF file is that of a RAW file, to be developed."""
+    with decoding(path), path.open("rb") as stream, tifffile.TiffFile(stream, name=str(path)) as file:
+        return file.pages.first.photometric in RAW or (
+            file.pages.first.is_reduced and pictures(file)[0].photometric in RAW
+        )
 
 
 def check_page(path: Path, page: tifffile.TiffPage) -> None:
@@ -90,11 +124,13 @@ def check_page(path: Path, page: tifffile.TiffPage) -> None:
     kinds = tifffile.PHOTOMETRIC
     by_jpeg = page.compression in (tifffile.COMPRESSION.JPEG, tifffile.COMPRESSION.OJPEG)
     handled = {kinds.MINISWHITE, kinds.MINISBLACK, kinds.RGB} | ({kinds.YCBCR} if by_jpeg else set())
+    if page.samplesperpixel == 1 and page.colormap is not None and page.dtype is not None and page.dtype.kind in "bu":
+        handled.add(kinds.PALETTE)
     if page.photometric not in handled:
         name = page.photometric.name if isinstance(page.photometric, kinds) else page.photometric
         raise UnhandledImage(f"{path} is stored in {name} colours, which are not supported; convert it to grey or RGB")
     bits = page.bitspersample if isinstance(page.bitspersample, int) else max(page.bitspersample)
-    if page.dtype is None or bits != 8 * page.dtype.itemsize:
+    if page.dtype is None or (bits != 8 * page.dtype.itemsize and bits not in FEW_BITS):
         raise UnhandledImage(
             f"{path} has {bits} bits per channel, which is not supported; convert it to 8 or 16 bits or floats"
         )
@@ -107,37 +143,117 @@ def check_page(path: Path, page: tifffile.TiffPage) -> None:
 
 
 def _native(page: tifffile.TiffPage) -> np.dtype[np.generic]:
-    """The dtype of the pixels of a checked page, in native byte order."""
+    """The dtype of the plain channels of a checked page, in native byte order."""
+    if page.photometric == tifffile.PHOTOMETRIC.PALETTE or page.bitspersample in FEW_BITS:
+        return np.dtype(np.uint8)
     return np.dtype(page.dtype).newbyteorder("=")
 
 
+def _palette(page: tifffile.TiffPage) -> NDArray[np.uint8]:
+    """The colours (n, 3) of a page with a palette, at 8 bits as all readers have them."""
+    colours = np.asarray(page.colormap).T
+    # Some programs write 8 bits where the standard asks for 16.
+    return (colours if colours.max(initial=0) < 256 else colours >> 8).astype(np.uint8)
+
+
 def plain_channels(page: tifffile.TiffPage, channels: Stored) -> Stored:
-    """Convert channels (H, W, S) of a page, or some of its rows, to black as 0 and no premultiplied alpha."""
+    """Convert channels (H, W, S) of a page, or some of its rows: no palette, black as 0, no premultiplied alpha."""
+    if page.photometric == tifffile.PHOTOMETRIC.PALETTE:
+        palette = _palette(page)
+        return palette[np.minimum(channels[..., 0], len(palette) - 1).astype(np.intp)]
     channels = channels.astype(_native(page), copy=True)
+    if page.bitspersample in FEW_BITS and page.compression != tifffile.COMPRESSION.OJPEG:
+        channels = np.multiply(channels, 255 // (2**page.bitspersample - 1), dtype=np.uint8)
     if page.photometric == tifffile.PHOTOMETRIC.MINISWHITE:
         white = np.iinfo(channels.dtype.name).max if channels.dtype.kind == "u" else 1
         channels[..., :1] = white - channels[..., :1]
     return _unmultiplied(channels) if _ASSOCIATED in page.extrasamples else channels
 
 
-def read_metadata(file: tifffile.TiffFile, stream: BinaryIO, depth: str) -> tuple[int, Metadata]:
-    """Read the orientation of the first page of a file, and the metadata of the upright picture of that depth."""
-    profile = file.pages.first.tags.get(34675)
-    icc = profile.value if profile is not None and isinstance(profile.value, bytes) else None
+def _by_libtiff(page: tifffile.TiffPage) -> bool:
+    """Whether a page is compressed in a way that tifffile does not decode: old JPEG, and rare ones."""
+    unknown = page.compression not in tifffile.TIFF.DECOMPRESSORS
+    return isinstance(page.index, int) and (page.compression == tifffile.COMPRESSION.OJPEG or unknown)
+
+
+#: Tags that describe a stack, or how another program stores its pictures, by their numbers.
+OF_STACKS = {297: "page numbers", 400: "settings of a fax", 34412: "LSM", 43314: "NIH Image", 51123: "Micro-Manager"}
+OF_STACKS |= dict.fromkeys((50838, 50839), "ImageJ") | dict.fromkeys((33471, 33560), "SIS")
+OF_STACKS |= dict.fromkeys(range(33628, 33632), "MetaMorph") | dict.fromkeys((34361, 34362), "FluoView")
+OF_STACKS |= dict.fromkeys((33421, 33422, *range(50706, 50742), *range(50778, 50782), *range(50827, 50835)), "DNG")
+OF_STACKS |= dict.fromkeys(range(50879, 51120), "DNG") | dict.fromkeys(range(65420, 65460), "NDPI")
+#: Programs whose descriptions state how many pictures there are, and of what size, as tifffile calls them.
+PROGRAMS = (
+    *("ome", "svs", "scn", "qpi", "bif", "philips", "metaseries", "fluoview", "micromanager", "scanimage", "stk"),
+    *("lsm", "nih", "indica", "ndpi", "avs", "sis", "eer"),
+)
+KEPT_OF_IMAGEJ = (b"ImageJ", b"unit", b"yunit", b"zunit")  # lines of its description that are true of any picture
+
+
+def _true_description(text: bytes, page: tifffile.TiffPage) -> tuple[bytes, str | None]:
+    """A description without statements about geometry, and who made those that are lost, or None."""
+    if text.startswith(b"ImageJ="):
+        lines = [line for line in text.splitlines() if line.split(b"=")[0] in KEPT_OF_IMAGEJ]
+        return b"".join(line + b"\n" for line in lines if len(lines) > 1), "ImageJ"
+    if re.fullmatch(rb"shape=\([\d, ]*\)\s*", text):
+        return b"", None
+    if text.startswith(b'{"shape":'):
+        rest = re.sub(rb'"(?:shape|axes)":\s*(?:\[[^\]]*\]|"[^"]*")\s*,?\s*', b"", text)
+        return (b"" if rest.strip() == b"{}" else re.sub(rb",\s*}\s*$", b"}", rest)), None
+    program = next((name for name in PROGRAMS if getattr(page, f"is_{name}")), None)
+    return (text, None) if program is None else (b"", program.upper())
+
+
+def _own_fields(tables: TiffTables, page: tifffile.TiffPage) -> tuple[list[Field], int | None]:
+    """The fields of a page, those that it shares with the first one, and its orientation if it has its own.
+
+    The EXIF block in ``tables`` becomes that of the page, if it has one.
+    """
+    first = tables.fields(tables.first)
+    if page.offset == tables.first:
+        return first, None
+    own = tables.fields(page.offset)
+    if any(field.code == EXIF for field in own):
+        tables.first = page.offset
+    taken = {*RESOLUTION, *GROUND, *OF_A_DEPTH, *(field.code for field in own)}
+    turns = [tables.number(field) for field in own if field.code == ORIENTATION]
+    shared = [field for field in first if field.code not in taken]
+    return own + shared, exif_tags.exif_orientation(turns[0]) if turns else None
+
+
+def read_metadata(file: tifffile.TiffFile, page: tifffile.TiffPage, stream: BinaryIO) -> tuple[int, Metadata]:
+    """Read the orientation of a page of a file, and the metadata of the upright picture."""
+    named = list[str | None]()
+
+    def true_description(text: bytes) -> bytes:
+        true, lost = _true_description(text, file.pages.first)
+        named.append(lost and f"the description of the file for {lost}")
+        return true
+
     with mmap(stream.fileno(), 0, access=ACCESS_READ) as data:
         tables = TiffTables(data)
-        fields = tables.fields(tables.first)
+        fields, orientation = _own_fields(tables, page)
         block, moved = exif_in_tiff.block_of(tables)
-        orientation, exif, damaged = exif_tags.read_upright(block)
-        stored = [
-            field for field in fields if field.code not in (*exif_in_tiff.DESCRIPTIVE, *STORAGE_TAGS, XMP, SUB_FILES)
+        block = exif_tags.with_description(block, true_description)
+        orientation, exif, damaged = exif_tags.read_upright(block, orientation)
+        apart = (*exif_in_tiff.DESCRIPTIVE, *STORAGE_TAGS, XMP, SUB_FILES)
+        stored = [field for field in fields if field.code not in apart]
+        tags = [
+            Tag(field.code, field.kind, tables.raw(field), tables.order)
+            for field in stored
+            if field.code not in OF_STACKS
         ]
-        tags = [Tag(field.code, field.kind, tables.raw(field), tables.order) for field in stored]
+        icc = next((tables.raw(f) for f in fields if f.code == PROFILE and f.kind in (BYTE, UNDEFINED)), None)
         packet = next((tables.raw(field) for field in fields if field.code == XMP), None)
         ratios = {field.code: tables.ratio(field) for field in fields if field.code in RESOLUTION[:2]}
         units = [tables.number(field) for field in fields if field.code == RESOLUTION[2]]
     packet, left_out = upright_packet(packet, orientation)
-    left_out += [exif_in_tiff.MOVED] * moved + ["smaller versions and masks"] * any(f.code == SUB_FILES for f in fields)
+    left_out += [name for name in named if name]
+    left_out += [f"the tags of {OF_STACKS[field.code]}" for field in stored if field.code in OF_STACKS]
+    left_out += [exif_in_tiff.MOVED] * moved
+    left_out += ["smaller versions and masks"] * (
+        page.offset != tables.first or any(f.code == SUB_FILES for f in fields)
+    )
     scale = exif_tags.IN_INCHES.get((units or [tifffile.RESUNIT.INCH])[0] or 0)
     pair = None if scale is None or len(ratios) < 2 else sound([ratios[code] * scale for code in RESOLUTION[:2]])
     if units == [1] and set(ratios.values()) == {1.0}:  # says nothing
@@ -145,14 +261,14 @@ def read_metadata(file: tifffile.TiffFile, stream: BinaryIO, depth: str) -> tupl
     if orientation > 1:
         left_out += [f"the TIFF tag {tag.code}, as the picture is turned" for tag in tags if tag.code in GROUND]
         tags = [turned_tag(tag, orientation) for tag in tags if tag.code not in GROUND]
-    height, width = file.pages.first.imagelength, file.pages.first.imagewidth
+    height, width = page.imagelength, page.imagewidth
     size = (width, height) if orientation >= 5 else (height, width)
     extras = Extras(
         packet,
         None if pair is None else turned_pair(pair, orientation),
         tuple(tags),
         size if tags else None,
-        depth if tags else "",
+        _native(page).name if tags else "",
         left_out=(*left_out, *damaged),
     )
     return orientation, Metadata(icc, exif, extras)
@@ -179,13 +295,12 @@ def write(stream: BinaryIO, picture: Stored | Iterable[Stored], header: Header) 
     extras = metadata.extras
     kept = extras.tags_for(header.shape[:2], dtype.name)
     head = exif_in_tiff.opening(metadata.exif, kept[0].order if kept else "<", big)
-    tags = [tag.stored(head.order) for tag in (*head.tags, *kept) if tag.code not in RESOLUTION]
+    tags = {tag.code: tag for tag in (*kept, *head.tags) if tag.code not in RESOLUTION}
     if extras.xmp is not None:
-        tags.append((XMP, 1, 0, extras.xmp, True))
+        tags[XMP] = Tag(XMP, BYTE, extras.xmp, head.order)
     resolution, unit = _resolution(extras, kept)
     # tifffile does not write nested tables, so a placeholder tag with the next lower number reserves space for each.
     places = [(code - 1, LONG, 1, 0, True) for code in head.nested]
-    start = stream.tell()
     with tifffile.TiffWriter(stream, bigtiff=big, byteorder=head.order) as file:  # type: ignore[arg-type]
         stream.write(head.body)
         file.write(
@@ -202,17 +317,26 @@ def write(stream: BinaryIO, picture: Stored | Iterable[Stored], header: Header) 
             compression="zlib",
             predictor=bool(np.issubdtype(dtype, np.integer)),
             iccprofile=metadata.icc,
-            extratags=[(ORIENTATION, SHORT, 1, 1, True), *tags, *places],
+            # As bytes, since tifffile would change the count of some types; the type is set afterwards.
+            extratags=[
+                (ORIENTATION, SHORT, 1, 1, True),
+                *((tag.code, UNDEFINED, 0, tag.in_order(head.order), True) for tag in tags.values()),
+                *places,
+            ],
             metadata=None,
             software=False,
             resolution=resolution,
             resolutionunit=unit,
         )
-    stream.seek(start)
-    with tifffile.TiffFile(stream) as written:
-        positions = {code: written.pages.first.tags[code - 1].offset for code in head.nested}
+    stream.flush()
+    with mmap(stream.fileno(), 0, access=ACCESS_READ) as data:
+        tables = TiffTables(data)
+        positions = {field.code: field.entry for field in tables.fields(tables.first)}
     for code, offset in head.nested.items():
-        exif_in_tiff.point(stream, head.order, big, positions[code], code, offset)
+        exif_in_tiff.point(stream, head.order, big, positions[code - 1], code, offset)
+    for tag in tags.values():
+        stream.seek(positions[tag.code] + 2)
+        stream.write(struct.pack(head.order + ("HQ" if big else "HI"), tag.kind, tag.count))
     return extras.lacking_tags(kept) + [exif_in_tiff.MOVED] * head.moved
 
 
@@ -239,39 +363,66 @@ def _unmultiplied(channels: Stored) -> Stored:
 
 
 class TiffRows:
-    """The first page of a TIFF file, upright, as rows (H, W, S).
+    """A picture of a TIFF file, upright, as rows (H, W, S).
 
     Attributes:
         shape: (H, W, S).
         dtype: dtype in native byte order.
         metadata: profile, EXIF and the rest.
         alpha: whether the last channel is transparency.
+        pages: number of pictures in the file, see :func:`pictures`.
     """
 
-    def __init__(self, path: Path) -> None:
-        """Open the file and read the header; raises UnhandledImage if the picture is of an unsupported kind."""
-        self.path = path
+    def __init__(self, path: Path, number: int = 0) -> None:
+        """Open the file and read the header of its picture of that number, of which 0 is the first.
+
+        Raises:
+            UnhandledImage: if the picture is of an unsupported kind.
+        """
+        self.path, self.number = path, number
         self.stream: BinaryIO = path.open("rb")
         try:
             self.file = tifffile.TiffFile(self.stream, name=str(path))
-            page = self.file.pages.first
-            check_page(path, page)
-            self.orientation, self.metadata = read_metadata(self.file, self.stream, _native(page).name)
+            found = pictures(self.file)
+            self.page, self.pages = found[number], len(found)
+            check_page(path, self.page)
+            self.orientation, self.metadata = read_metadata(self.file, self.page, self.stream)
         except BaseException:
             self.stream.close()
             raise
-        self.page = page
+        page = self.page
         self.stamp = self._look()
-        self.shape = (page.imagelength, page.imagewidth, page.samplesperpixel)
+        self.by_libtiff = _by_libtiff(page)
+        self.stored = page.samplesperpixel  # 1 of a picture with a palette
+        samples = 3 if page.photometric == tifffile.PHOTOMETRIC.PALETTE else self.stored
+        self.shape = (page.imagelength, page.imagewidth, samples)
         self.dtype = _native(page)
         self.alpha = bool(page.extrasamples)
         # (height, width) of a strip or tile; the declared height of a strip may exceed the picture's.
         self.segment = (page.tilelength, page.tilewidth) if page.is_tiled else (page.rowsperstrip, page.imagewidth)
+        if self.by_libtiff:
+            self.segment = self.shape[:2]
         self.segment = (min(self.segment[0], self.shape[0]), self.segment[1])
         self.bands: dict[int, Stored] = {}
 
-    def __reduce__(self) -> tuple[type["TiffRows"], tuple[Path]]:
-        return TiffRows, (self.path.absolute(),)  # another process opens the file again
+    def __reduce__(self) -> tuple[type["TiffRows"], tuple[Path, int]]:
+        return TiffRows, (self.path.absolute(), self.number)  # another process opens the file again
+
+    def warn_of_pages(self) -> None:
+        """Warn if the file has several pictures, of which only one is read."""
+        if self.pages > 1:
+            least = "at least " if self.pages == MOST_PAGES else ""
+            warn(
+                f"{self.path} has {least}{self.pages} pages, of which only the first is read; save the others as files "
+                "of their own"
+            )
+
+    @property
+    def whole(self) -> Stored:
+        """All stored channels (H, W, S), decoded by libtiff."""
+        with mmap(self.stream.fileno(), 0, access=ACCESS_READ) as data:
+            channels = np.asarray(imagecodecs.tiff_decode(data, self.page.index))
+        return channels.reshape(*self.shape[:2], -1)
 
     def __enter__(self) -> "TiffRows":
         return self
@@ -288,7 +439,7 @@ class TiffRows:
     def cached(self) -> int:
         """Bytes of decoded strips or tiles that are cached while rows are read."""
         rows = 0 if self._raw else (CACHED_BANDS + 1) * self.segment[0]
-        return rows * self.shape[1] * self.shape[2] * self.dtype.itemsize
+        return rows * self.shape[1] * self.stored * np.dtype(self.page.dtype).itemsize
 
     def __getitem__(self, rows: slice) -> Stored:
         """Read the rows from ``rows.start`` to ``rows.stop``.
@@ -310,14 +461,19 @@ class TiffRows:
     def _raw(self) -> bool:
         """Whether the file stores the rows uncompressed and contiguous."""
         contiguous: bool = self.page.is_contiguous and self.page.planarconfig == tifffile.PLANARCONFIG.CONTIG
-        return contiguous and self.page.compression == tifffile.COMPRESSION.NONE and not self.page.is_tiled
+        return (
+            not self.by_libtiff
+            and contiguous
+            and self.page.compression == tifffile.COMPRESSION.NONE
+            and not self.page.is_tiled
+        )
 
     def _read_raw(self, first: int, last: int) -> Stored:
-        length = self.shape[1] * self.shape[2] * self.dtype.itemsize
+        length = self.shape[1] * self.stored * np.dtype(self.page.dtype).itemsize
         self.stream.seek(self.page.dataoffsets[0] + first * length)
         data = self.stream.read((last - first) * length)
         stored = np.dtype(self.page.dtype).newbyteorder(self.file.byteorder)
-        return np.frombuffer(data, stored).reshape(last - first, *self.shape[1:])
+        return np.frombuffer(data, stored).reshape(last - first, self.shape[1], self.stored)
 
     def _decode(self, first: int, last: int) -> Stored:
         height = self.segment[0]
@@ -332,7 +488,9 @@ class TiffRows:
 
     def _band(self, band: int) -> Stored:
         """Decode one row of tiles, or one strip, (h, W, S)."""
-        height, width, samples = self.shape
+        if self.by_libtiff:
+            return self.whole
+        height, width, samples = *self.shape[:2], self.stored
         top = band * self.segment[0]
         result = np.full((min(self.segment[0], height - top), width, samples), self.page.nodata, self.page.dtype)
         down, across = -(-height // self.segment[0]), -(-width // self.segment[1])
