@@ -99,6 +99,7 @@ QUICK := \
 	'denoising --quick --megapixel' \
 	'denoising --quick --patterns --methods noisy ours' \
 	'real_noise --quick' \
+	'self_calibration --quick' \
 	'looks --quick' \
 	'detail --quick' \
 	'detail --quick --scales' \

@@ -17,6 +17,7 @@ from .filtering.refine import refine as refine
 from .filtering.scribbles import propagate_strokes as propagate_strokes
 from .filtering.spectral import captured_energy as captured_energy
 from .filtering.spectral import spectral_filter as spectral_filter
+from .filtering.sure import sure as sure
 from .nn.affinity import NonlocalAffinity as NonlocalAffinity
 from .nn.block import NonlocalBlock as NonlocalBlock
 from .nn.denoiser.estimate import noise_profile as noise_profile

@@ -9,12 +9,14 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from typing import cast
 
 import torch
 from torch import Tensor
 
 from nlfilter_torch.core.blocks import weighted
 from nlfilter_torch.core.checks import (
+    check_count,
     check_fits,
     check_instance,
     check_number,
@@ -27,6 +29,7 @@ from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.core.symmetric_matrix import SymmetricMatrix
 from nlfilter_torch.core.torch_internals import is_hidden
 from nlfilter_torch.filtering.filters import detail_layers
+from nlfilter_torch.filtering.sure import Build, Noise, layer_divergences
 from nlfilter_torch.operator.operator import NonlocalOperator
 
 Loss = Callable[[Tensor, Tensor], Tensor]
@@ -49,25 +52,34 @@ SETTLED = 1e-9
 
 @full_precision
 def fit_alpha(
-    operator: NonlocalOperator,
+    operator: NonlocalOperator | Build,
     image: Tensor,
-    target: Tensor,
+    target: Tensor | None = None,
     *,
+    noise: Noise | None = None,
     order: int = 3,
     mask: Tensor | None = None,
     ridge: float = 0.0,
     shared: bool = False,
     rounding: float | None = None,
     loss: Loss | None = None,
+    probes: int = 1,
+    generator: torch.Generator | None = None,
 ) -> Tensor:
-    """Find the sliders that bring ``polynomial_filter(operator, image, alpha)`` closest to ``target``.
+    """Find the sliders that bring ``polynomial_filter(operator, image, alpha)`` closest to ``target``, or to the truth.
 
-    Paper: inverts eq. (12). Solved in float64 for images of any dtype.
+    Paper: inverts eq. (12). Solved in float64 for images of any dtype. With ``noise`` in place of ``target``, the
+    sliders are those with the smallest error that :func:`sure` estimates for an image of such noise, which is quadratic
+    in them, too.
 
     Args:
-        operator: W.
+        operator: W. With ``noise`` also a function that takes the image and builds W: that W depends on the noise, too,
+            then counts, as it must if the guide is the noisy image. The function must hold its landmarks, as by
+            ``landmarks=operator``.
         image: y, (B, C, H, W), before the edit.
         target: (B, C, H, W), after it; channels have equal weight.
+        noise: in place of ``target``: standard deviation of the image's white noise, a number, (B,), or a map
+            (B, 1 or C, H, W); or a :class:`~nlfilter_torch.NoiseProfile`. A constant for gradients.
         order: k, at least 1; k+1 sliders are found.
         mask: (B, 1, H, W) or (1, 1, H, W), non-negative weights of the pixels; None weighs all equally. Points that
             represent several pixels count for as many.
@@ -79,6 +91,9 @@ def fit_alpha(
         loss: ``loss(filtered, target)``, a number to be minimised by L-BFGS from the least-squares solution; None
             returns that solution. Where ``mask`` is 0 both arguments are the target, and between that and its
             largest value they are blended.
+        probes: with ``noise``, the number of random fields with which derivatives are estimated, unless W is given and
+            the noise is white: then the trace is exact.
+        generator: of the probes; None draws the same in every call.
 
     Returns:
         alpha, (B, k+1), or (1, k+1) if ``shared``, in the image's dtype, with the smallest mean squared error or
@@ -87,7 +102,8 @@ def fit_alpha(
 
     Raises:
         TypeError, ValueError: if ``image``, ``target`` or ``mask`` do not fit together, ``mask`` is negative or all
-            zero for an image, ``order`` is not a positive integer, or ``ridge`` or ``rounding`` is negative.
+            zero for an image, ``order`` is not a positive integer, ``noise``, ``ridge`` or ``rounding`` is negative, or
+            not exactly one of ``target`` and ``noise`` is given.
 
     Example:
         >>> from nlfilter_torch import nonlocal_operator, polynomial_filter
@@ -97,22 +113,34 @@ def fit_alpha(
         >>> [round(a, 2) for a in fit_alpha(operator, image, edited, order=2)[0].tolist()]
         [3.0, 1.0, 1.2]
     """
+    if noise is not None and target is None:
+        return _fit_to_noise(
+            operator,
+            image,
+            noise,
+            order=order,
+            mask=mask,
+            ridge=ridge,
+            shared=shared,
+            alone=rounding is None and loss is None,
+            probes=probes,
+            generator=generator,
+        )
+    if target is None or noise is not None:
+        raise ValueError(
+            f"target must be given, or else noise, got {'neither' if noise is None else 'both'}; pass one of them"
+        )
     check_instance(operator, NonlocalOperator, "operator", "make it with nonlocal_operator")
-    check_instance(shared, bool, "shared", "pass True or False")
+    operator = cast(NonlocalOperator, operator)
     if loss is not None and not callable(loss):
         raise TypeError(f"loss must be a function of two images, got {type(loss).__name__}; pass a function or None")
     if loss is not None:
         operator.communicator.check_whole("a loss")
-    check_order(order)
-    check_fits(image, operator.size, "image", "operator", operator.factor)
+    layers, weights = _checked_layers(operator, image, order, mask, ridge, shared)
     batch = max(image.shape[0], operator.factor.shape[0])
     check_fits(target, tuple(image.shape[2:]), "target", "image", image, channels=image.shape[1], batch=batch)
-    _check_not_negative(ridge, "ridge")
     if rounding is not None:
         _check_not_negative(rounding, "rounding")
-
-    layers = detail_layers(operator, image.to(operator.factor), order=order).double()  # (B, k+1, C, H, W)
-    weights = _pixel_weights(mask, operator, layers).flatten(1)
     aims = target.detach().double().flatten(1)
     if rounding is None:
         zone = _roundings(aims, weights, operator.communicator)
@@ -133,6 +161,56 @@ def fit_alpha(
     if loss is not None:
         change = problem.descend(change, loss, target.double(), mask)
     return (1.0 + change).to(image.dtype)
+
+
+def _checked_layers(
+    operator: NonlocalOperator, image: Tensor, order: int, mask: Tensor | None, ridge: float, shared: bool
+) -> tuple[Tensor, Tensor]:
+    """Check what both kinds of fits take; layers (B, k+1, C, H, W) in float64, and weights (B or 1, P)."""
+    check_instance(shared, bool, "shared", "pass True or False")
+    check_order(order)
+    check_fits(image, operator.size, "image", "operator", operator.factor)
+    _check_not_negative(ridge, "ridge")
+    layers = detail_layers(operator, image.to(operator.factor), order=order).double()
+    return layers, _pixel_weights(mask, operator, layers).flatten(1)
+
+
+def _fit_to_noise(
+    operator: NonlocalOperator | Build,
+    image: Tensor,
+    noise: Noise,
+    *,
+    order: int,
+    mask: Tensor | None,
+    ridge: float,
+    shared: bool,
+    alone: bool,
+    probes: int,
+    generator: torch.Generator | None,
+) -> Tensor:
+    """:func:`fit_alpha` without a target, and, if ``alone``, without what only a target allows."""
+    if not alone:
+        raise ValueError("rounding and loss must be None with noise, got one of them; they need a target")
+    check_count(probes, "probes")
+    built = operator if isinstance(operator, NonlocalOperator) else operator(image)
+    check_instance(built, NonlocalOperator, "operator", "make it with nonlocal_operator, or pass a function that does")
+    layers, weights = _checked_layers(built, image, order, mask, ridge, shared)
+    shares = weights.unflatten(1, (image.shape[1], -1))
+    divergence = layer_divergences(
+        operator, image.to(built.factor), noise, shares, order, probes=probes, generator=generator
+    )
+    problem = _Problem(
+        layers=layers.flatten(2),
+        edit=torch.zeros_like(layers[:, 0]).flatten(1),
+        dead_zone=None,
+        weights=weights,
+        ridge=ridge,
+        shared=shared,
+        precision=built.factor.dtype,
+        communicator=built.communicator,
+        divergence=divergence,
+    )
+    return (1.0 + problem.fit()).to(image.dtype)
 
 
 @torch.no_grad()
@@ -197,7 +275,8 @@ class _Problem:
         ridge: see :func:`fit_alpha`.
         shared: one change for all images.
         precision: dtype in which the layers were computed.
-        among: ranks that the rows of the images are spread over.
+        communicator: ranks that the rows of the images are spread over.
+        divergence: (B, k+1), half the slope of a term that is linear in the change; None is 0.
     """
 
     layers: Tensor
@@ -208,6 +287,7 @@ class _Problem:
     shared: bool
     precision: torch.dtype
     communicator: Communicator
+    divergence: Tensor | None = None
 
     def fit(self) -> Tensor:
         """Least-squares change (B, k+1) with the dead zone.
@@ -273,6 +353,8 @@ class _Problem:
         errors = self._errors(change)
         products = self._products if self.dead_zone is None else self._weighed(self.weights * (errors != 0.0))
         slope = self.communicator.sum((self.layers @ (self.weights * errors).unsqueeze(2)).squeeze(2))
+        if self.divergence is not None:
+            slope = slope - self.divergence
         slope = self._pool(slope) - self.ridge * change
         scale, inverse = self._inverse(products)
         return scale * (inverse @ (scale * slope).unsqueeze(2)).squeeze(2)

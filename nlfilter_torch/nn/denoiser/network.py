@@ -20,7 +20,7 @@ from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.core.torch_internals import in_format_of, outside_transforms, refuse_transforms
 from nlfilter_torch.core.workers import threads_for
 from nlfilter_torch.filtering.filters import detail_layers
-from nlfilter_torch.nn.denoiser.noise import noise_map
+from nlfilter_torch.filtering.noise import noise_map
 from nlfilter_torch.nn.denoiser.profile import NoiseProfile, join_colours, split_colours, split_noise
 from nlfilter_torch.nn.denoiser.tiles import in_tiles
 from nlfilter_torch.nn.denoiser.weights import read_weights

@@ -1,15 +1,14 @@
-"""The noise of a photograph: maps of its level, and its estimation from the flattest windows."""
+"""The noise of a photograph: its estimation from the flattest windows."""
 
 from dataclasses import dataclass
-from typing import TypeGuard
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from nlfilter_torch.core.blocks import mirrored, order_by, reflected
-from nlfilter_torch.core.checks import check_image, check_same_size, check_values
-from nlfilter_torch.core.precision import full_precision, per_image, squarable, working_dtype
+from nlfilter_torch.core.checks import check_image
+from nlfilter_torch.core.precision import full_precision, squarable, working_dtype
 from nlfilter_torch.operator.features import reduce_channels
 from nlfilter_torch.operator.options import GuideChannels
 
@@ -55,27 +54,6 @@ class Noise:
         light = F.avg_pool2d(image.detach(), 5, 1, padding=2, count_include_pad=False).clamp(0, 1)
         floor, gain = (value.to(image).view(-1, 1, 1, 1) for value in (self.floor, self.gain))
         return (floor + gain * light).sqrt()
-
-
-def is_noise_map(noise: object, size: tuple[int, int]) -> TypeGuard[Tensor]:
-    """Whether this is a map for an image (H, W), and not a level for each image, (B, 1, 1, 1)."""
-    return isinstance(noise, Tensor) and noise.ndim == 4 and (noise.numel() != len(noise) or size == (1, 1))
-
-
-def noise_map(noise: float | Tensor, image: Tensor, name: str = "noise") -> Tensor:
-    """Expand noise levels, a number, (B,) or a map (B, 1 or C, H, W), to a map; errors call them ``name``."""
-    if is_noise_map(noise, (image.shape[-2], image.shape[-1])):
-        check_image(noise, name, batch=image.shape[0])
-        check_same_size(noise, (image.shape[-2], image.shape[-1]), name, "image")
-        if noise.shape[1] not in (1, image.shape[1]):
-            raise ValueError(
-                f"{name} must have 1 channel or as many as the image, {image.shape[1]}, got {noise.shape[1]}; select 1"
-            )
-        check_values(noise.flatten(), name, "not negative", noise.numel())
-        return noise.to(image).expand(image.shape[0], -1, -1, -1)
-    check_values(noise, name, "not negative", image.shape[0])
-    levels = per_image(noise, image, 4)
-    return levels.expand(image.shape[0], 1, *image.shape[-2:])
 
 
 @full_precision

@@ -16,9 +16,10 @@ from nlfilter_torch.core.checks import check_count
 from nlfilter_torch.core.precision import per_image
 from nlfilter_torch.core.torch_internals import cached_constants
 from nlfilter_torch.filtering.filters import weigh_layers
+from nlfilter_torch.filtering.noise import is_noise_map
 from nlfilter_torch.nn.denoiser.estimate import white_profile
 from nlfilter_torch.nn.denoiser.network import NonlocalDenoiser, deviation_of, level_planes
-from nlfilter_torch.nn.denoiser.noise import Noise, is_noise_map
+from nlfilter_torch.nn.denoiser.noise import Noise
 from nlfilter_torch.nn.denoiser.profile import NoiseProfile
 from nlfilter_torch.nn.denoiser.tiles import STEP
 from nlfilter_torch.operator.options import Completion, FilterOptions, GuideChannels, Sampling

@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch import NonlocalDenoiser
+from nlfilter_torch.filtering.noise import noise_map
 from nlfilter_torch.nn.denoiser import tiles
-from nlfilter_torch.nn.denoiser.noise import noise_map
 from nlfilter_torch.nn.denoiser.tiles import in_tiles
 
 

@@ -1,0 +1,36 @@
+"""Random fields have the levels of the noise that they probe."""
+
+import torch
+
+from nlfilter_torch import NoiseProfile, profile_of_difference
+from nlfilter_torch.filtering.noise import drawn, is_noise_map, noise_map, variance_of
+from tests.problems import noise, seeded
+
+
+def test_maps_of_levels() -> None:
+    image = noise(2, 3, 4, 5)
+    levels = noise(2, 1, 4, 5, seed=1)
+    assert is_noise_map(levels, (4, 5))
+    assert not is_noise_map(torch.ones(2, 1, 1, 1), (4, 5))
+    assert torch.equal(noise_map(levels, image), levels)
+    variance = variance_of(torch.tensor([0.1, 0.2]), image)
+    torch.testing.assert_close(variance[1], torch.full_like(variance[1], 0.04))
+    field = drawn(levels, image, seeded())
+    torch.testing.assert_close(field.abs(), levels.expand_as(image))
+    volume = noise(1, 1, 3, 4, 5)
+    assert noise_map(volume, volume).shape == volume.shape
+
+
+def test_fields_of_a_profile_have_its_levels_at_every_scale() -> None:
+    factors = torch.tensor([1.0, 1.5, 2.2, 2.6, 2.7])
+    for channels in (1, 3):
+        white = NoiseProfile.white(torch.tensor([0.05]), channels=channels)
+        profile = NoiseProfile(white.levels * factors.view(1, -1, 1, 1), white.light)
+        image = torch.full((1, channels, 256, 256), 0.5)
+        field = drawn(profile, image, seeded(3))
+        measured = profile_of_difference(image + field, image)
+        assert torch.equal(field, drawn(profile, image, seeded(3)))
+        planes = 1 if channels == 1 else 2
+        ratios = (measured.levels / profile.levels)[0, :, :planes, 2:4]
+        torch.testing.assert_close(ratios, torch.ones_like(ratios), rtol=0, atol=0.12)
+        torch.testing.assert_close(variance_of(profile, image).mean().sqrt(), field.std(), rtol=0.05, atol=0)
