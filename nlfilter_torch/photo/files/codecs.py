@@ -6,7 +6,8 @@ are not written, and need the extras ``raw`` and ``heic``.
 
 import io
 import struct
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from mmap import ACCESS_READ, mmap
 from pathlib import Path
 from typing import BinaryIO
@@ -22,6 +23,7 @@ from nlfilter_torch.photo.files.metadata import (
     DEPTH,
     FURTHER_PICTURES,
     GAIN_MAP,
+    HDR,
     CheckSize,
     Decoded,
     Extras,
@@ -103,14 +105,13 @@ def _webp_size(chunks: dict[bytes, bytes]) -> tuple[int, int]:
 def read_avif(path: Path, data: bytes | mmap, check_size: CheckSize) -> Decoded:
     """Read an AVIF file."""
     _check_avif_size(path, data)
-    with quiet():
+    with quiet(), _parsing(path, data, "libavif"):
         image = AvifImagePlugin.AvifImageFile(path)
     with image:
         if (frames := image.n_frames) > 1:
             raise UnhandledImage(f"{path} is an animation of {frames} frames; save one of them as a picture")
         check_size(image.size)
-        if "icc_profile" not in image.info:
-            _check_colours(path, data)
+        _check_colours(path, data, "icc_profile" in image.info)
         # The block as stored: image.info may hold one that Pillow wrote anew.
         block, orientation = image._decoder.get_info()[4:6]
         upright = exif_tags.read_upright(block, orientation)
@@ -135,11 +136,48 @@ def _check_avif_size(path: Path, data: bytes | mmap) -> None:
         )
 
 
-def _check_colours(path: Path, data: bytes | mmap) -> None:
-    """Check the colours of an AVIF file without a profile, see :func:`check_colour_numbers`."""
+def _check_colours(path: Path, data: bytes | mmap, profiled: bool) -> None:
+    """Check the colours of an AVIF file, see :func:`_check_numbers`."""
     _, marker, numbers = data[:HEAD].partition(b"colrnclx")
     if marker and len(numbers) >= 4:
-        check_colour_numbers(path, *struct.unpack(">HH", numbers[:4]))
+        primaries, transfer = struct.unpack(">HH", numbers[:4])
+        _check_numbers(path, primaries, transfer, profiled)
+
+
+def _check_numbers(path: Path, primaries: int, transfer: int, profiled: bool) -> None:
+    """Check the numbers of colours, see :func:`check_colour_numbers`; a profile comes before them, but for HDR."""
+    if not profiled or transfer in HDR:
+        check_colour_numbers(path, primaries, transfer)
+
+
+@contextmanager
+def _parsing(path: Path, data: bytes | mmap, library: str) -> Iterator[None]:
+    """Report that a library fails to parse a file as its limit where all boxes of the file are whole.
+
+    Raises:
+        UnhandledImage: then. Otherwise, the library's error is raised.
+    """
+    try:
+        yield
+    except MemoryError:
+        raise
+    except Exception as error:
+        place = 0
+        while place + 8 <= len(data):
+            size, name = struct.unpack_from(">I4s", data, place)
+            if size == 1 and place + 16 <= len(data):
+                (size,) = struct.unpack_from(">Q", data, place + 8)
+            elif size == 0:  # up to the end
+                size = len(data) - place
+            if size < 8 or not name.isalnum():
+                raise
+            place += size
+        if place != len(data):
+            raise
+        raise UnhandledImage(
+            f"{path} is stored in a way that {library}, which reads it, does not support ({error}); convert it to PNG "
+            "or TIFF"
+        ) from error
 
 
 def _bits_of_avif(data: bytes | mmap) -> int:
@@ -234,13 +272,15 @@ def read_heic(path: Path, check_size: CheckSize) -> Decoded:
             f"{path} is an HEIC file and needs the package pillow-heif, which is not installed; "
             "install nlfilter-torch[heic]"
         ) from error
-    with decoding(path):
-        picture = pillow_heif.open_heif(path, convert_hdr_to_8bit=False)
+    with decoding(path), path.open("rb") as stream, mmap(stream.fileno(), 0, access=ACCESS_READ) as data:
+        with _parsing(path, data, "libheif"):
+            picture = pillow_heif.open_heif(path, convert_hdr_to_8bit=False)
         check_size(picture.size)
         info = picture.info
         numbers = info.get("nclx_profile")
-        if numbers and not info.get("icc_profile"):
-            check_colour_numbers(path, numbers["color_primaries"], numbers["transfer_characteristics"])
+        if numbers:
+            profiled = bool(info.get("icc_profile"))
+            _check_numbers(path, numbers["color_primaries"], numbers["transfer_characteristics"], profiled)
         channels = np.asarray(picture)
         if channels.dtype == np.uint16:  # the lower bits are empty
             channels = np.rint(channels * (65535 / (65536 - (1 << (16 - info["bit_depth"]))))).astype(np.uint16)

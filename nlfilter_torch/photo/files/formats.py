@@ -27,6 +27,7 @@ from nlfilter_torch.photo.files.metadata import (
     Header,
     Metadata,
     UnhandledImage,
+    check_profile,
     decoding,
     note_left_out,
 )
@@ -90,7 +91,7 @@ def first_bytes(path: Path) -> bytes:
         raise ValueError(f"{path} is a pipe, a socket or a device, not a file; save the picture in a file first")
     try:
         with path.open("rb") as stream:
-            head = stream.read(32)
+            head = stream.read(64)
     except PermissionError as error:
         raise ValueError(f"{path} cannot be read: {error.strerror}; check its permissions, or copy it") from error
     if not head:
@@ -111,6 +112,7 @@ def read_channels(path: Path, *, bytes_per_pixel: int, memory: int | None) -> De
     else:
         with path.open("rb") as stream, mmap(stream.fileno(), 0, access=ACCESS_READ) as data, decoding(path):
             decoded = _read_mapped(path, data, check_size)
+    check_profile(path, decoded.metadata.icc)
     return decoded._replace(channels=exif_tags.upright(decoded.channels, decoded.orientation), orientation=1)
 
 
@@ -118,7 +120,7 @@ def _read_mapped(path: Path, data: mmap, check_size: CheckSize) -> Decoded:
     """Read a PNG, JPEG, WebP or AVIF file that is mapped into memory."""
     if (picture := open_mapped(path, data)) is not None:
         check_size(picture.size)
-        channels = picture.decode(data) if isinstance(picture, png.Png) else picture.decode(path)
+        channels = picture.decode(data) if isinstance(picture, png.Png) else picture.decode()
         return Decoded(channels, picture.orientation, picture.metadata)
     head = data[:32]
     if codecs.is_webp(head):

@@ -12,6 +12,7 @@ import imagecodecs
 import numpy as np
 from PIL import JpegImagePlugin
 
+from nlfilter_torch.core.warning import warn
 from nlfilter_torch.photo.declared.rows import Stored
 from nlfilter_torch.photo.files import exif as exif_tags
 from nlfilter_torch.photo.files.metadata import (
@@ -96,6 +97,7 @@ class Jpeg:
     """A JPEG file whose pixels are not decoded yet.
 
     Attributes:
+        path: the file.
         size: (width, height).
         samples: channels, 1 or 3.
         whole: whether it has an end.
@@ -104,6 +106,7 @@ class Jpeg:
         metadata: of the upright picture.
     """
 
+    path: Path
     size: tuple[int, int]
     samples: int
     whole: bool
@@ -116,19 +119,30 @@ class Jpeg:
         """Of the channels."""
         return np.dtype(np.uint8)
 
-    def decode(self, path: Path) -> Stored:
-        """The channels (H, W, S) as stored."""
+    def _opened(self) -> JpegImagePlugin.JpegImageFile:
         # Not Image.open, which refuses pictures of more than 179 megapixels whatever the memory.
         with quiet():
-            image = JpegImagePlugin.JpegImageFile(path)
-        with image:
-            return np.asarray(image).reshape(self.size[1], self.size[0], self.samples)
+            return JpegImagePlugin.JpegImageFile(self.path)
+
+    def decode(self) -> Stored:
+        """The channels (H, W, S) as stored; raises OSError if some are missing."""
+        with self._opened() as image:
+            channels = np.asarray(image).reshape(self.size[1], self.size[0], self.samples)
+        self._warn_of_end()
+        return channels
 
     def decode_into(self, data: bytes | mmap, out: Stored) -> None:
-        """Decode the channels (H, W, S) into an array, such as a file mapped into memory."""
-        if not self.whole:  # libjpeg fills what is missing
-            raise EOFError("it ends too early")
+        """Decode the channels (H, W, S) into an array, such as a file mapped into memory; raises as :meth:`decode`."""
+        if not self.whole:  # libjpeg fills what is missing, Pillow does not
+            with self._opened() as image:
+                image.draft(image.mode, (1, 1))  # an eighth of the sides
+                image.load()
         imagecodecs.jpeg8_decode(data, out=out[..., 0] if self.samples == 1 else out)
+        self._warn_of_end()
+
+    def _warn_of_end(self) -> None:
+        if not self.whole:
+            warn(f"{self.path} has no end, so its last rows may be damaged: look at them, or copy it again")
 
 
 def open_jpeg(path: Path, data: bytes | mmap) -> Jpeg:
@@ -152,7 +166,7 @@ def open_jpeg(path: Path, data: bytes | mmap) -> Jpeg:
     contents = [(part.marker, bytes(data[part.start : part.stop])) for part in parts if part.marker not in (EOI, SOS)]
     orientation, metadata = _metadata(contents, b"" if end is None else data[end.start : end.start + BEHIND])
     progressive = frame.marker not in PLAIN_FRAMES
-    return Jpeg((width, height), samples, end is not None, progressive, orientation, metadata)
+    return Jpeg(path, (width, height), samples, end is not None, progressive, orientation, metadata)
 
 
 def _metadata(contents: list[tuple[int, bytes]], behind: bytes) -> tuple[int, Metadata]:

@@ -3,7 +3,9 @@
 That is colour profile, EXIF, XMP, print resolution, tags of TIFF, and what is not copied.
 """
 
+import io
 import re
+import struct
 import sys
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
@@ -14,6 +16,7 @@ from pathlib import Path
 from typing import NamedTuple, Protocol
 
 import numpy as np
+from PIL import ImageCms
 from PIL.ExifTags import Base
 from tifffile import DATATYPE, TIFF
 
@@ -224,7 +227,7 @@ def decoding(path: Path) -> Iterator[None]:
     """Report any error in the block as a damaged file, since decoders have no common base class for errors."""
     try:
         yield
-    except (MemoryError, UnhandledImage):
+    except (MemoryError, UnhandledImage, Warning):  # warnings that are errors are not damage
         raise
     except Exception as error:
         reason = str(error) or type(error).__name__
@@ -353,8 +356,42 @@ GAMMA = 1 / 2.2
 NEAR_GAMMA = 0.05  # share
 
 
-def check_colour_numbers(path: Path, primaries: int, transfer: int) -> None:
-    """Warn if colours described by these numbers are not close to sRGB.
+#: Chromaticities, x and y, of red, green and blue in profiles with these primaries, as adapted to their white (D50).
+IN_PROFILES = {
+    1: ((0.6485, 0.3309), (0.3212, 0.5979), (0.1559, 0.0660)),
+    9: ((0.7084, 0.2935), (0.1902, 0.7754), (0.1293, 0.0471)),
+    12: ((0.6820, 0.3194), (0.2846, 0.6746), (0.1559, 0.0661)),
+}
+
+
+def has_primaries(profile: bytes, primaries: int) -> bool:
+    """Whether a colour profile has the primaries of a number of H.273, of those in :data:`IN_PROFILES`."""
+    try:
+        opened = ImageCms.ImageCmsProfile(io.BytesIO(profile)).profile
+    except (OSError, ValueError):  # no profile
+        return False
+    colorants = (opened.red_colorant, opened.green_colorant, opened.blue_colorant)
+    wanted = IN_PROFILES.get(primaries)
+    if wanted is None or not all(colorants):
+        return False
+    given = [colorant[1][:2] for colorant in colorants if colorant]
+    return bool(np.abs(np.subtract(given, wanted)).max() < NEAR_SRGB)
+
+
+def check_profile(path: Path, profile: bytes | None) -> None:
+    """Raise UnhandledImage if a colour profile says, by its tag of numbers, that the picture is an HDR picture."""
+    if profile is None or len(profile) < 132:
+        return
+    (count,) = struct.unpack_from(">I", profile, 128)
+    for place in range(132, min(132 + 12 * count, len(profile) - 11), 12):
+        name, start = struct.unpack_from(">4sI", profile, place)
+        numbers = profile[start + 8 : start + 10]
+        if name == b"cicp" and len(numbers) == 2 and numbers[1] in HDR:
+            check_colour_numbers(path, *numbers)
+
+
+def check_colour_numbers(path: Path, primaries: int, transfer: int, unless: str = "") -> None:
+    """Warn if colours described by these numbers are not close to sRGB; ``unless`` is which output says them.
 
     Raises:
         UnhandledImage: if they are those of an HDR picture.
@@ -368,7 +405,7 @@ def check_colour_numbers(path: Path, primaries: int, transfer: int) -> None:
         PRIMARIES.get(primaries, f"primaries number {primaries}"),
         TRANSFERS.get(transfer, f"transfer function number {transfer}"),
     )
-    _warn_of_colours(path, [name for name in names if name is not None])
+    _warn_of_colours(path, [name for name in names if name is not None], unless)
 
 
 def check_png_colours(path: Path, gamma: float | None, chromaticities: Sequence[float] | None) -> None:
@@ -381,9 +418,9 @@ def check_png_colours(path: Path, gamma: float | None, chromaticities: Sequence[
     _warn_of_colours(path, unusual)
 
 
-def _warn_of_colours(path: Path, unusual: Sequence[str]) -> None:
+def _warn_of_colours(path: Path, unusual: Sequence[str], unless: str = "") -> None:
     if unusual:
         warn(
-            f"{path} has {' and '.join(unusual)} without a colour profile, which the output will not say, so that its "
-            "colours will look different; convert the photograph to sRGB, or embed a profile, before the edit"
+            f"{path} has {' and '.join(unusual)} without a colour profile, which the output will not say{unless}, so "
+            "that its colours will look different; convert the photograph to sRGB, or embed a profile, before the edit"
         )

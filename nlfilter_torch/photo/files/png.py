@@ -8,7 +8,7 @@ import struct
 import tempfile
 import zlib
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from mmap import ACCESS_READ, mmap
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
@@ -16,10 +16,12 @@ from typing import BinaryIO, NamedTuple
 import imagecodecs
 import numpy as np
 
+from nlfilter_torch.core.warning import warn
 from nlfilter_torch.photo.declared.rows import Stored
 from nlfilter_torch.photo.files import exif as exif_tags
 from nlfilter_torch.photo.files.metadata import (
     CENTIMETRES,
+    HDR,
     Extras,
     FilePart,
     Header,
@@ -28,6 +30,7 @@ from nlfilter_torch.photo.files.metadata import (
     bands,
     check_colour_numbers,
     check_png_colours,
+    has_primaries,
     release,
     sound,
     turned_pair,
@@ -48,8 +51,10 @@ ADAM7 = (
     (0, 1, 2, 2),
     (1, 0, 2, 1),
 )  # y, x, steps
-# Chunks that describe the pixels of the file. Colours are checked, see _check_colours.
-STORAGE_CHUNKS = (b"IHDR", b"PLTE", b"tRNS", b"IDAT", b"IEND", b"gAMA", b"cHRM", b"sRGB", b"cICP")
+# Chunks that describe the pixels of the file. Colours are checked, see _profile.
+STORAGE_CHUNKS = (b"IHDR", b"PLTE", b"tRNS", b"IDAT", b"IEND", b"gAMA", b"cHRM", b"sRGB")
+HDR_PROFILES = {b"ITUR_2100_PQ": 16, b"ITUR_2100_HLG": 18}  # by the names that they have in HDR files of PNG
+BEHIND = 1 << 20  # bytes behind the end that are looked at
 PIXEL_CHUNKS = (b"IHDR", b"PLTE", b"tRNS", b"IDAT", b"IEND")
 TEXTS = (b"tEXt", b"zTXt", b"iTXt")
 READ = (b"iCCP", b"eXIf", b"pHYs", b"acTL", b"fcTL", b"fdAT")
@@ -62,23 +67,31 @@ LONGEST_PNG = 1_000_000  # pixels; a limit of libpng
 
 
 class Chunk(NamedTuple):
-    """The name of a chunk, and the place of its content."""
+    """The name of a chunk, the place of its content, and whether its checksum is right."""
 
     name: bytes
     start: int
     stop: int
+    sound: bool = True
 
 
 def chunks(data: bytes | mmap) -> Iterator[Chunk]:
-    """The chunks of a file; raises ValueError where one is cut short or has a wrong checksum."""
+    """The chunks of a file.
+
+    Raises:
+        EOFError: where one is cut short.
+        ValueError: where one without which there is no picture has a wrong checksum.
+    """
     place = len(SIGNATURE)
     with memoryview(data) as view:
         while place + 8 <= len(data):
             length, name = struct.unpack_from(">I4s", data, place)
-            chunk = Chunk(name, place + 8, place + 8 + length)
-            if chunk.stop + 4 > len(data):
+            stop = place + 8 + length
+            if stop + 4 > len(data):
                 raise EOFError("it ends too early")
-            if zlib.crc32(view[place + 4 : chunk.stop]) != struct.unpack_from(">I", data, chunk.stop)[0]:
+            sound = zlib.crc32(view[place + 4 : stop]) == struct.unpack_from(">I", data, stop)[0]
+            chunk = Chunk(name, place + 8, stop, sound)
+            if not sound and chr(name[0]).isupper():  # critical, according to the standard
                 raise ValueError(f"wrong checksum in the chunk {name.decode('latin-1')}")
             yield chunk
             place = chunk.stop + 4
@@ -97,7 +110,7 @@ class Png:
         in_passes: whether it is interlaced, so that decoding needs memory for all pixels.
         orientation: EXIF orientation.
         metadata: of the upright picture.
-        parts: all chunks.
+        parts: all sound chunks.
     """
 
     size: tuple[int, int]
@@ -142,7 +155,8 @@ def open_png(path: Path, data: bytes | mmap) -> Png:
         UnhandledImage: if it is an animation, or an HDR picture.
         ValueError, EOFError: if it is damaged.
     """
-    parts = tuple(chunks(data))
+    found = list(chunks(data))
+    parts = tuple(chunk for chunk in found if chunk.sound)
     names = [chunk.name for chunk in parts]
     if not parts or names[0] != b"IHDR" or b"IDAT" not in names:
         raise ValueError("it has no picture")
@@ -156,40 +170,70 @@ def open_png(path: Path, data: bytes | mmap) -> Png:
     by_name = dict(contents)
     if b"acTL" in by_name and (frames := struct.unpack_from(">I", by_name[b"acTL"])[0]) > 1:
         raise UnhandledImage(f"{path} is an animation of {frames} frames; save one of them as a picture")
-    if b"iCCP" not in by_name:
-        _check_colours(path, by_name)
-    orientation, metadata = _metadata(contents)
+    damaged = [f"the chunk {chunk.name.decode('latin-1')}" for chunk in found if not chunk.sound]
+    end = found[-1].stop + 4
+    behind = bytes(data[end : end + BEHIND]) if names[-1] == b"IEND" else b""
+    profile = _profile(path, by_name, damaged)
+    orientation, metadata = _metadata(contents, damaged, ["the bytes behind the picture"] * bool(behind.strip(b"\0")))
+    metadata = replace(metadata, icc=profile)
+    if damaged:
+        warn(f"{path} is damaged in {', '.join(damaged)}, which the picture is read without")
     samples = SAMPLES.get(kind, 1) + (b"tRNS" in names and kind not in (4, 6))
     dtype = np.dtype(np.uint16 if bits == 16 else np.uint8)
     return Png((width, height), samples, dtype, bool(interlace), orientation, metadata, parts)
 
 
-def _check_colours(path: Path, contents: dict[bytes, bytes]) -> None:
-    """Check the colours of a file without a profile, see :func:`check_png_colours`."""
-    if numbers := contents.get(b"cICP"):
-        check_colour_numbers(path, *numbers[:2])
-    elif b"sRGB" not in contents:
-        gamma = contents.get(b"gAMA")
-        corners = contents.get(b"cHRM")
+def _profile(path: Path, contents: dict[bytes, bytes], damaged: list[str]) -> bytes | None:
+    """The colour profile, or None; colours without one are checked.
+
+    The numbers of cICP come before the profile, that before sRGB, and that before gAMA and cHRM, according to the
+    standard. A profile that contradicts the numbers is left out.
+
+    Raises:
+        UnhandledImage: if it is an HDR picture.
+    """
+    profile = None
+    if content := contents.get(b"iCCP"):
+        name, _, packed = content.partition(b"\0")
+        for prefix, transfer in HDR_PROFILES.items():
+            if name.startswith(prefix):
+                check_colour_numbers(path, 2, transfer)
+        try:
+            profile = _inflated(packed[1:])
+        except (ValueError, zlib.error):
+            damaged.append("the chunk iCCP")
+    if len(numbers := contents.get(b"cICP", b"")) == 4:
+        if profile is not None and numbers[1] not in HDR and has_primaries(profile, numbers[0]):
+            return profile
+        check_colour_numbers(path, numbers[0], numbers[1], " unless it is a PNG file")
+        return None
+    if profile is None and b"sRGB" not in contents:
+        gamma, corners = contents.get(b"gAMA", b""), contents.get(b"cHRM", b"")
         check_png_colours(
             path,
-            None if gamma is None else struct.unpack(">I", gamma)[0] / 100_000,
-            None if corners is None else [number / 100_000 for number in struct.unpack(">8I", corners)],
+            struct.unpack(">I", gamma)[0] / 100_000 if len(gamma) == 4 else None,
+            [number / 100_000 for number in struct.unpack(">8I", corners)] if len(corners) == 32 else None,
         )
+    return profile
 
 
-def _metadata(contents: list[tuple[bytes, bytes]]) -> tuple[int, Metadata]:
-    """The orientation, and the metadata of the upright picture."""
-    by_name = dict(contents)
-    texts = {key: text for name, content in contents for key, text in _text(name, content)}
+def _metadata(contents: list[tuple[bytes, bytes]], damaged: list[str], left_out: list[str]) -> tuple[int, Metadata]:
+    """The orientation, and the metadata of the upright picture without its profile; names what is ``damaged``."""
+    by_name, texts = dict(contents), dict[bytes, bytes]()
+    for name, content in contents:
+        try:
+            texts.update(_text(name, content))
+        except (ValueError, zlib.error):
+            damaged.append(_described(name, content))
     exif, packet = by_name.get(b"eXIf"), texts.get(XMP_TEXT)
-    orientation, exif, damaged = exif_tags.read_upright(exif or _from_hexadecimal(texts.get(RAW_KEY + b"exif")))
-    packet, left_out = upright_packet(packet or _from_hexadecimal(texts.get(RAW_KEY + b"xmp")), orientation)
+    orientation, exif, unsound = exif_tags.read_upright(exif or _from_hexadecimal(texts.get(RAW_KEY + b"exif")))
+    packet, stated = upright_packet(packet or _from_hexadecimal(texts.get(RAW_KEY + b"xmp")), orientation)
+    left_out = [*stated, *left_out]
     kept = []
     for name, content in contents:
         if name in STORAGE_CHUNKS or name in READ or (name in TEXTS and _key(content) in KEYS):
             continue
-        if chr(name[3]).islower():  # safe to copy, according to the standard
+        if name == b"cICP" or chr(name[3]).islower():  # safe to copy, according to the standard
             kept.append(FilePart("PNG", _described(name, content), struct.pack(">4s", name) + content))
         else:
             left_out.append(_described(name, content))
@@ -199,10 +243,7 @@ def _metadata(contents: list[tuple[bytes, bytes]]) -> tuple[int, Metadata]:
         dpi = sound(turned_pair((across * INCH, down * INCH), orientation)) if unit == 1 else None
         if unit == 0 and across != down:
             left_out.append("the aspect of pixels")
-    icc = None
-    if profile := by_name.get(b"iCCP"):
-        icc = _inflated(profile.partition(b"\0")[2][1:])
-    return orientation, Metadata(icc, exif, Extras(packet, dpi, parts=tuple(kept), left_out=(*left_out, *damaged)))
+    return orientation, Metadata(None, exif, Extras(packet, dpi, parts=tuple(kept), left_out=(*left_out, *unsound)))
 
 
 def _key(content: bytes) -> bytes:

@@ -32,7 +32,7 @@ from nlfilter_torch.photo.files.formats import (
     read_channels,
     write_file,
 )
-from nlfilter_torch.photo.files.metadata import NO_METADATA, Header, Metadata, bands, decoding
+from nlfilter_torch.photo.files.metadata import NO_METADATA, Header, Metadata, bands, check_profile, decoding
 from nlfilter_torch.photo.files.tiff import TiffRows
 from nlfilter_torch.photo.files.writing import (
     FileRows,
@@ -212,6 +212,7 @@ def usual_memory(most: int = sys.maxsize) -> int:
 def _open_tiff(path: Path, stack: ExitStack) -> StoredPicture:
     with decoding(path):
         rows = stack.enter_context(TiffRows(path))
+    check_profile(path, rows.metadata.icc)
     rows.warn_of_pages()
     source: RowSource = rows
     if rows.turned:
@@ -237,6 +238,7 @@ def _unpacked(path: Path, stack: ExitStack) -> StoredPicture | None:
         picture = open_mapped(path, data)
         if picture is None or picture.in_passes:
             return None
+        check_profile(path, picture.metadata.icc)
         scratch = temporary_rows((picture.size[1], picture.size[0], picture.samples), picture.dtype, stack)
         with scratch.array() as out:
             picture.decode_into(data, out)

@@ -246,3 +246,41 @@ def test_without_the_extra_it_says_so(
     monkeypatch.setitem(sys.modules, package, None)
     with pytest.raises(ValueError, match=rf"which is not installed; install nlfilter-torch\[{extra}\]"):
         read_photograph(tmp_path / name)
+
+
+def test_what_libraries_do_not_parse_is_no_damage(tmp_path: Path) -> None:
+    heif = pytest.importorskip("pillow_heif")
+    write_photograph(photograph(np.full((16, 16, 3), 90, np.uint8)), tmp_path / "in.avif")
+    whole = (tmp_path / "in.avif").read_bytes()
+    heif.from_pillow(Image.fromarray(SCENE)).save(tmp_path / "in.heic")
+    for name, stored in (("in.avif", whole), ("in.heic", (tmp_path / "in.heic").read_bytes())):
+        (tmp_path / name).write_bytes(stored.replace(b"pitm", b"pxtm"))
+        with pytest.raises(
+            ValueError, match=r"is stored in a way that lib(avif|heif), which reads it, does not support"
+        ):
+            read_photograph(tmp_path / name)
+        (tmp_path / name).write_bytes(stored[: len(stored) // 2].replace(b"pitm", b"pxtm"))
+        with pytest.raises(ValueError, match="is damaged or cut short"):
+            read_photograph(tmp_path / name)
+
+
+def test_hdr_of_avif_is_refused_whatever_the_profile(tmp_path: Path) -> None:
+    Image.fromarray(SCENE).save(tmp_path / "in.avif", icc_profile=SRGB_PROFILE)
+    stored = (tmp_path / "in.avif").read_bytes()
+    place = stored.index(b"colrnclx") + 8
+    for numbers in ((9, 16), (9, 18)):
+        (tmp_path / "in.avif").write_bytes(stored[:place] + struct.pack(">HH", *numbers) + stored[place + 4 :])
+        with pytest.raises(ValueError, match=r"in\.avif is an HDR picture \((PQ|HLG)\), which is not supported"):
+            read_photograph(tmp_path / "in.avif")
+    (tmp_path / "in.avif").write_bytes(stored[:place] + struct.pack(">HH", 12, 13) + stored[place + 4 :])
+    assert read_photograph(tmp_path / "in.avif").icc == SRGB_PROFILE
+
+
+def test_the_primary_picture_of_heic_is_read(tmp_path: Path) -> None:
+    heif = pytest.importorskip("pillow_heif")
+    pictures = heif.from_pillow(Image.fromarray(SCENE[:32, :32]))
+    pictures.add_from_pillow(Image.fromarray(SCENE))
+    pictures.save(tmp_path / "in.heic", primary_index=1)
+    opened = read_photograph(tmp_path / "in.heic")
+    assert opened.size == SCENE.shape[:2]
+    assert opened.extras.left_out == ("further pictures",)

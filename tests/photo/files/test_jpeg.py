@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from nlfilter_torch.photo.files import rows
 from nlfilter_torch.photo.files.jpeg import open_jpeg, write_jpeg
 from nlfilter_torch.photo.files.metadata import Extras, Header, Metadata
 from nlfilter_torch.photo.picture.photographs import read_photograph, write_photograph
-from tests.files import cat
+from tests.files import cat, rows_of
 from tests.pairwise import each_value
 
 GAIN_MAP = b'<x:xmpmeta><rdf:Description hdrgm:Version="1.0" GCamera:MotionPhoto="1" xmp:Rating="4"/></x:xmpmeta>'
@@ -88,3 +89,18 @@ def test_noise_of_every_shape_is_written(shape: tuple[int, int, int]) -> None:
     stream = io.BytesIO()
     write_jpeg(stream, [values], Header(shape, np.dtype("uint8"), False, Metadata()))
     assert np.asarray(imagecodecs.jpeg8_decode(stream.getvalue())).size == values.size
+
+
+def test_a_file_without_an_end_is_read_if_no_row_is_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In memory and in tiles alike."""
+    whole, path = encoded(), tmp_path / "in.jpg"
+    path.write_bytes(whole)
+    wanted = rows_of(path)
+    for limit in (rows.TILED_MEMORY, 1000):
+        monkeypatch.setattr(rows, "TILED_MEMORY", limit)
+        path.write_bytes(whole[:-2] + bytes(4000))
+        with pytest.warns(UserWarning, match=r"in\.jpg has no end, so its last rows may be damaged: look at them, or"):
+            np.testing.assert_array_equal(rows_of(path), wanted)
+        path.write_bytes(whole[: len(whole) * 2 // 3])
+        with pytest.raises(ValueError, match=r"in\.jpg is damaged or cut short"):
+            rows_of(path)
