@@ -4,7 +4,7 @@ The groups are for cross-validation: methods are compared by how well they predi
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -32,14 +32,24 @@ def connected(masks: Tensor, scribbles: Tensor) -> Tensor:
         masks: of K regions, (B, K, H, W).
         scribbles: weights of those on the regions, (B, K, H, W), above 0 where painted.
     """
-    painted = scribbles > 0
-    inside = (masks >= INSIDE_MASK) | painted
-    parts = [_parts(*planes) for planes in zip(inside.flatten(0, 1), painted.flatten(0, 1), strict=True)]
-    own, others = (torch.stack(planes).view_as(inside).to(masks) for planes in zip(*parts, strict=True))
+    own, others = _parts(masks, scribbles, lambda own, _: SMALL_PIECE * own.sum())
     for _ in range(SOFT_BORDER):
         wider = torch.where(others > 0, 0.0, _widened(own))
         others, own = torch.where(wider > 0, 0.0, _widened(others)), wider
     return own > 0
+
+
+@torch.no_grad()
+def without_specks(masks: Tensor, scribbles: Tensor) -> Tensor:
+    """Which pixels do not belong to specks, (B, K, H, W) of bool: to what is smaller than the scribbles on its region.
+
+    Specks are not connected with a scribble, nor within a soft border of what is large enough. The arguments are those
+    of :func:`connected`.
+    """
+    own, large = _parts(masks, scribbles, lambda _, scribbled: scribbled.sum())
+    kept = F.max_pool2d(own.maximum(large), 2 * SOFT_BORDER + 1, 1, SOFT_BORDER) > 0
+    specks = ((masks >= INSIDE_MASK) & ~kept).to(masks)
+    return kept | (F.max_pool2d(specks, 2 * SOFT_BORDER + 1, 1, SOFT_BORDER) == 0)
 
 
 @torch.no_grad()
@@ -57,12 +67,20 @@ def _numbered(inside: Tensor) -> Tensor:
     return torch.from_numpy(label(inside.cpu().numpy(), connectivity=1)).to(inside.device)
 
 
-def _parts(inside: Tensor, painted: Tensor) -> tuple[Tensor, Tensor]:
-    """The connected components (H, W) that hold a painted pixel, and other ones that are not small beside them."""
-    numbers = _numbered(inside)
-    own = torch.isin(numbers, numbers[painted].unique()) & inside
-    large = numbers.flatten().bincount() >= SMALL_PIECE * own.sum()
-    return own, inside & ~own & large[numbers]
+def _parts(masks: Tensor, scribbles: Tensor, least: Callable[[Tensor, Tensor], Tensor]) -> tuple[Tensor, Tensor]:
+    """The components of masks that hold a scribble, and other large ones, (B, K, H, W) of 0 and 1 each.
+
+    ``least`` gives the number of pixels of large ones, from those that hold a scribble and the scribbles, (H, W).
+    """
+    parts = []
+    for mask, painted in zip(masks.flatten(0, 1), scribbles.flatten(0, 1), strict=True):
+        inside = (mask >= INSIDE_MASK) | (painted > 0)
+        numbers = _numbered(inside)
+        own = torch.isin(numbers, numbers[painted > 0].unique()) & inside
+        large = numbers.flatten().bincount() >= least(own, painted)
+        parts.append((own, inside & ~own & large[numbers]))
+    own, large = (torch.stack(planes).view_as(masks).to(masks) for planes in zip(*parts, strict=True))
+    return own, large
 
 
 def _widened(planes: Tensor) -> Tensor:

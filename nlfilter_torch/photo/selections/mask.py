@@ -36,7 +36,7 @@ from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles, parts_in_bl
 from nlfilter_torch.photo.picture.source import Fitted, Reduced, Source, at, kept
 from nlfilter_torch.photo.picture.viewing import viewed_size
 from nlfilter_torch.photo.selections.by_hand import ByHand, check_drawn
-from nlfilter_torch.photo.selections.connected import Extent, connected
+from nlfilter_torch.photo.selections.connected import Extent, connected, without_specks
 from nlfilter_torch.photo.selections.matting import linear_mask, linear_models, solve_linear
 from nlfilter_torch.photo.selections.rough_mask import RoughMasks
 from nlfilter_torch.photo.selections.scribbled_colours import EPSILON, SOLVED_PIXELS, trimap_share
@@ -45,6 +45,7 @@ from nlfilter_torch.photo.selections.stray import without_strays
 VIEWED = VIEWING_SIZE.default_number  # megapixels; larger pictures are first reduced to this size
 FLOATS_PER_PIXEL = 80  # estimated working memory per pixel of the reduced picture, in addition to its operator
 ODDS, STEEPNESS = 1.5, 1.4  # of the curve from the solution along borders, too low halfway, to masks
+VISIBLE = 0.05  # masks up to this are 0, and change no more from twice this on
 MOST_WAITING = 2  # threads: operations on so few pixels are not worth dividing between two
 
 
@@ -72,7 +73,8 @@ def region_mask(
     scribbles separate the two, and the cut between them follows borders of the picture. An even area with a scribble,
     such as a sky, belongs to the region as a whole. Points along the borders of the picture also count as background
     unless they resemble the region or are part of such an area, so one scribble is enough. The borders of the mask are
-    then aligned with those of the picture.
+    then aligned with those of the picture. What would be selected by less than 0.05 is 0, up to 0.1 it is less than
+    computed. Specks that are smaller than the scribbles and not connected with one are left out.
     Where a scribble that is at least three times as long as wide leaves its object, it does not count: at most 30 % of
     it, in one or two pieces of a very different colour, that no other scribble is meant for.
     :func:`diffusion_mask` is the paper's mask, which selects everything similar to one region.
@@ -95,7 +97,7 @@ def region_mask(
         reach: in [0, 1), probability that a random walk over similar pixels continues after each step; larger values
             include less similar pixels.
         extent: ``"object"`` selects only what is connected with a scribble of it, ``"near"`` also what is similar and
-            nearby, ``"everywhere"`` what is similar at any distance.
+            nearby, ``"everywhere"`` what is similar at any distance, specks included.
         photometric_bandwidth: in hundredths of Lab: 0.08 is 8 units.
         spatial_bandwidth: in pixels; None is 0.3 of the short side, ``math.inf`` no limit: similar pixels anywhere.
         patch_size: width of the compared patches.
@@ -390,11 +392,12 @@ def _computed_regions(
     if marked is not None:
         functions = functions * marked[:, :, None, None, None]
     regions = Regions(image, steps, functions, scribbles, boxes=boxes)
-    if settings.extent != "object":
+    if everywhere:
         return regions
     if limits is not None:  # without a scribble, all that is found in a box belongs to the object
         front = torch.where(front.amax((2, 3), keepdim=True) > 0, front, held(limits, small.size).to(front))
-    return replace(regions, functions=functions * connected(regions.reduced_masks(), front).unsqueeze(2))
+    belongs = (connected if settings.extent == "object" else without_specks)(regions.reduced_masks(), front)
+    return replace(regions, functions=functions * belongs.unsqueeze(2))
 
 
 def _filled(scribbles: Scribbles, marked: Tensor) -> Scribbles:
@@ -499,7 +502,9 @@ def _against(inside: list[Scribbles], number: int, background: list[Scribbles]) 
 
 
 def calibrated(mask: Tensor) -> Tensor:
-    """Mask of a solution along borders: a curve on which 0 and 1 stay as they are."""
+    """Mask of a solution along borders: a curve on which 0 and 1 stay as they are, and what is hardly visible is 0."""
     mask = mask.clamp(0.0, 1.0)
     inside, outside = ODDS * mask**STEEPNESS, (1 - mask) ** STEEPNESS
-    return inside / (inside + outside)
+    mask = inside / (inside + outside)
+    rise = (mask / VISIBLE - 1).clamp(0.0, 1.0)
+    return mask * rise.square() * (3 - 2 * rise)

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from nlfilter_torch.photo import defocus, enhance, recolor, region_mask
-from nlfilter_torch.photo.selections.connected import SOFT_BORDER, connected
+from nlfilter_torch.photo.selections.connected import SOFT_BORDER, connected, without_specks
 from tests.problems import box, inverse, noise, oriented, paint
 from tests.strokes import SIZE as DOTTED
 from tests.strokes import dots, groups_of
@@ -45,6 +45,20 @@ def test_only_what_is_connected_belongs_to_the_object() -> None:
     for number in range(8):
         turned = connected(oriented(masks.clamp(max=1), number), oriented(STROKE, number))
         assert torch.equal(inverse(turned.float(), number) > 0, belongs)
+
+
+def test_specks_are_what_is_smaller_than_the_scribbles_and_apart() -> None:
+    speck, large, hair = box(5, 50, 3, 3, size=SIZE), box(40, 40, 5, 6, size=SIZE), box(15, 10, 1, 2, size=SIZE)
+    haze = 0.2 * box(0, 20, 48, 20, size=SIZE)
+    masks = (LEFT + speck + large + hair + haze).clamp(max=1)
+    stays = without_specks(masks, STROKE)
+    assert stays[LEFT + large + hair > 0].all()
+    assert not stays[..., 1:12, 46:58].any()  # the speck with its soft border
+    assert stays[..., 24:, 20:40].all()
+    assert without_specks(masks, box(22, 8, 3, 3, size=SIZE))[speck > 0].all()  # as large as the scribble
+    for number in range(8):
+        turned = without_specks(oriented(masks, number), oriented(STROKE, number))
+        assert torch.equal(inverse(turned.float(), number) > 0, stays)
 
 
 def test_each_region_is_connected_by_itself() -> None:
