@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from nlfilter_torch.core.warning import warn
 from nlfilter_torch.photo.files.formats import first_bytes
-from nlfilter_torch.photo.files.writing import check_file, claimed, link_target, part_beside
+from nlfilter_torch.photo.files.metadata import note_left_out
+from nlfilter_torch.photo.files.writing import check_file, file_beside, link_target
 
 if TYPE_CHECKING:
     from av.container import InputContainer, OutputContainer
@@ -58,6 +59,11 @@ def check_film_output(path: Path) -> str:
     if kind is None:
         raise ValueError(f"{path} must end in .mp4, .m4v or .mov, got {path.suffix!r}; choose one of these")
     return kind
+
+
+def _is_cover(stream: "Stream") -> bool:
+    """Whether a stream is a single picture beside the film."""
+    return bool(stream.disposition & stream.disposition.attached_pic)
 
 
 def _av() -> ModuleType:
@@ -178,21 +184,17 @@ class Film:
         kind = check_film_output(path)
         av = _av()
         path = link_target(path)
-        with part_beside(path) as beside:
-            beside.touch(exist_ok=False)
-            with claimed(beside):
-                options = {"movflags": "+faststart" + ("+use_metadata_tags" if kind == "mov" else "")}
-                try:
-                    with av.open(str(beside), "w", format=kind, options=options) as output:
-                        count = _Transcoder(self, output, path, _encoder(self, output, path)).run(edit, begin)
-                except av.error.FFmpegError as error:
-                    if isinstance(error, OSError) and error.filename:
-                        raise
-                    raise OSError(
-                        f"{path} cannot be written: {error.strerror}; free some space there, or choose another file "
-                        "type"
-                    ) from error
-                beside.replace(path)
+        with file_beside(path) as beside:
+            options = {"movflags": "+faststart" + ("+use_metadata_tags" if kind == "mov" else "")}
+            try:
+                with av.open(str(beside), "w", format=kind, options=options) as output:
+                    count = _Transcoder(self, output, path, _encoder(self, output, path)).run(edit, begin)
+            except av.error.FFmpegError as error:
+                if isinstance(error, OSError) and error.filename:
+                    raise
+                raise OSError(
+                    f"{path} cannot be written: {error.strerror}; free some space there, or choose another file type"
+                ) from error
         return count
 
 
@@ -213,9 +215,7 @@ def open_film(path: Path) -> Iterator[Film]:
     with container:
         if not container.streams:
             raise ValueError(f"{path} cannot be read as a film, or is cut short; copy it again or convert it")
-        streams = [
-            stream for stream in container.streams.video if not stream.disposition & stream.disposition.attached_pic
-        ]
+        streams = [stream for stream in container.streams.video if not _is_cover(stream)]
         if not streams or streams[0].codec_context is None or not streams[0].codec_context.pix_fmt:
             raise ValueError(f"{path} holds no video stream that can be decoded; choose a file with video")
         stored = path.stat().st_size
@@ -258,6 +258,9 @@ class _Transcoder:
         self._add_copies()
         entries = {key: text for key, text in source.metadata.items() if key not in CONTAINER_METADATA}
         self.output.metadata.update(entries)
+        chapters = source.chapters()
+        if chapters:
+            self.output.set_chapters(chapters)
         source.seek(0)  # the header is written with the first packet, which may be a sound packet
         self.target.set_display_matrix(next(map(display_matrix, self.film.frames()), None))
         source.seek(0)
@@ -275,12 +278,23 @@ class _Transcoder:
         if count == 0:
             raise ValueError(f"{self.film.path} holds no frame that can be decoded; copy it again from its source")
         self._write(self.target.encode(None))
+        # A chapter's title is a packet of a stream of data.
+        dropped = [
+            "the cover picture, which a .mov file cannot hold"
+            if _is_cover(stream)
+            else f"the {stream.type} stream {stream.index}"
+            for stream in source.streams
+            if stream.index not in (self.film.stream.index, *self.copied)
+            and not (stream.type == "data" and stream.frames == len(chapters) > 0)
+        ]
+        note_left_out(self.path, dropped)
         return count
 
     def _add_copies(self) -> None:
-        """Add a stream for each of sound and subtitles."""
+        """Add a stream for each of sound, subtitles and cover pictures."""
         for stream in self.film.container.streams:
-            if stream.type not in COPIED_STREAMS or stream.codec_context is None:
+            kept = stream.type in COPIED_STREAMS or (_is_cover(stream) and self.output.format.name == "mp4")
+            if not kept or stream.codec_context is None:
                 continue
             try:
                 copy = self.output.add_stream_from_template(stream)
@@ -290,10 +304,13 @@ class _Transcoder:
                     "use the file type of that film, or convert it"
                 ) from error
             copy.metadata.update(stream.metadata)
+            copy.disposition = stream.disposition
             self.copied[stream.index] = copy
 
     def _copy(self, packet: "Packet[Stream]") -> None:
-        """Write a packet of sound or subtitles as it is."""
+        """Write a packet of sound or subtitles, or a cover picture, as it is."""
+        if packet.size and _is_cover(packet.stream):
+            packet.pts = packet.dts = 0  # it has no time
         if packet.dts is not None:
             packet.stream = self.copied[packet.stream.index]
             self.output.mux(packet)

@@ -38,6 +38,7 @@ from nlfilter_torch.photo.files.writing import (
     FileRows,
     check_file,
     claimed,
+    copy_modes,
     link_target,
     name_beside,
     part_beside,
@@ -48,6 +49,7 @@ if TYPE_CHECKING:
     from zarr import Array
 
 ZARR = ".zarr"
+ZARR_FILES = ("zarr.json", ".zarray")  # that describe an array
 # Bytes that a command may use if no limit is given.
 FIFTH = psutil.virtual_memory().total // 5
 WHOLE_MEMORY = min(FIFTH, 2_000_000_000)  # a photograph that needs more is edited in tiles
@@ -123,7 +125,7 @@ def is_zarr(path: Path) -> bool:
 
 
 def _holds_zarr(path: Path) -> bool:
-    return any((path / name).is_file() for name in ("zarr.json", ".zarray"))
+    return any((path / name).is_file() for name in ZARR_FILES)
 
 
 @contextmanager
@@ -337,6 +339,8 @@ def _write_zarr(
             store=beside, shape=shape, chunks=chunks, dtype=dtype, attributes=like.attributes or {}
         )
         with claimed(beside):
+            if path.exists():
+                shutil.copymode(path, beside)  # none who may not read the former array may read this one
             if fill is not None:
                 fill(beside)
             else:
@@ -345,6 +349,7 @@ def _write_zarr(
                     write_band(array, start, band)
                     start += len(band)
             if path.exists():
+                copy_modes(path, beside, next(path / name for name in ZARR_FILES if (path / name).is_file()))
                 path.replace(replaced)
             try:
                 beside.replace(path)

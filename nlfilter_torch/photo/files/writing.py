@@ -70,15 +70,29 @@ def open_beside(path: str | Path) -> Iterator[BinaryIO]:
     >>> [file.name for file in folder.iterdir()]
     ['note.txt']
     """
-    path = link_target(path)
+    with file_beside(link_target(path)) as beside, beside.open("r+b") as stream:
+        yield stream
+
+
+@contextmanager
+def file_beside(path: Path) -> Iterator[Path]:
+    """Make an empty file that is renamed to ``path``, which is no link, when the block succeeds, else removed.
+
+    It gets the permissions of the file that it replaces, and until then none but its owner can read it.
+    """
     with part_beside(path) as beside:
-        beside.touch(exist_ok=False)
+        beside.touch(mode=0o600 if path.exists() else 0o666, exist_ok=False)
         with claimed(beside):
-            with beside.open("r+b") as stream:
-                yield stream
+            yield beside
             if path.exists():
                 shutil.copymode(path, beside)
             beside.replace(path)
+
+
+def copy_modes(folder: Path, target: Path, like: Path) -> None:
+    """Give a folder, and what is in it, the permissions of another one, and of a file ``like`` in that."""
+    for part in (target, *target.rglob("*")):
+        shutil.copymode(folder if part.is_dir() else like, part)
 
 
 @contextmanager

@@ -1,12 +1,15 @@
 """Files of films keep their sound, times, rotation and colour properties."""
 
+import io
 import weakref
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
 import av
 import numpy as np
 import pytest
+from PIL import Image
 
 from nlfilter_torch.photo.files.films import changes_between, open_film, stored_format
 from tests.films import crop, facts, write
@@ -178,3 +181,57 @@ def test_transparency_is_refused(tmp_path: Path) -> None:
     )
     with pytest.raises(ValueError, match="has transparency or a palette, which are not supported"), open_film(path):
         pass
+
+
+def test_chapters_and_covers_are_kept_and_other_streams_named(tmp_path: Path) -> None:
+    cover, source, target = io.BytesIO(), tmp_path / "film.mp4", tmp_path / "out.mp4"
+    Image.new("RGB", (32, 32), (200, 10, 10)).save(cover, "JPEG")
+    with av.open(str(write(tmp_path / "plain.mp4"))) as film, av.open(str(source), "w") as file:
+        copies = {stream.index: file.add_stream_from_template(stream) for stream in film.streams}
+        picture = file.add_stream("mjpeg", rate=1)
+        picture.width, picture.height, picture.pix_fmt = 32, 32, "yuvj420p"
+        picture.disposition = av.stream.Disposition.attached_pic
+        second = file.add_stream_from_template(film.streams.video[0])
+        times = ((0, 100, "one"), (100, 333, "two"))
+        file.set_chapters(
+            [
+                {"id": i, "start": start, "end": end, "time_base": Fraction(1, 1000), "metadata": {"title": title}}
+                for i, (start, end, title) in enumerate(times)
+            ]
+        )
+        for packet in film.demux():
+            if packet.dts is not None:
+                packet.stream = copies[packet.stream.index]
+                file.mux(packet)
+        film.seek(0)
+        for packet in film.demux(film.streams.video[0]):
+            if packet.dts is not None:
+                packet.stream = second
+                file.mux(packet)
+        packet = av.Packet(cover.getvalue())
+        packet.stream, packet.pts, packet.dts, packet.time_base = picture, 0, 0, Fraction(1)
+        file.mux(packet)
+    with av.open(str(source)) as film:
+        chapters = film.chapters()
+        named = next(stream.index for stream in film.streams.video[1:] if not stream.disposition)
+    assert [chapter["metadata"]["title"] for chapter in chapters] == ["one", "two"]
+    with pytest.warns(UserWarning, match=f"out.mp4 is written without .*: the video stream {named}$"):
+        copy(source, target)
+    with av.open(str(target)) as film:
+        assert film.chapters() == chapters
+        (kept,) = [stream for stream in film.streams.video if stream.disposition & stream.disposition.attached_pic]
+        assert bytes(next(film.demux(kept))) == cover.getvalue()
+    with pytest.warns(
+        UserWarning, match=f"the video stream {named}, the cover picture, which a .mov file cannot hold$"
+    ):
+        copy(source, tmp_path / "out.mov")
+
+
+def test_a_film_keeps_the_permissions_of_the_one_that_it_replaces(tmp_path: Path) -> None:
+    source, target = write(tmp_path / "film.mp4", 2, sound=None), tmp_path / "out.mp4"
+    for mode in (0o600, 0o640):
+        target.touch()
+        target.chmod(mode)
+        copy(source, target)
+        assert target.stat().st_mode & 0o777 == mode
+        assert target.stat().st_size > 100

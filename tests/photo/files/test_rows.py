@@ -1,5 +1,6 @@
 """Memory and temporary files that commands may use to read pictures in parts, and where arrays are written."""
 
+import sys
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -156,3 +157,16 @@ def test_rows_are_written_with_a_note_on_what_is_left_out(tmp_path: Path, name: 
         rows = iter([(slice(0, 200), np.asarray(stored.rows[slice(0, 200)]))])
         with pytest.warns(UserWarning, match="is written without some metadata of the input: the comment"):
             write_picture(tmp_path / name, rows, "uint8", stored)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="has no such permissions")
+def test_a_zarr_array_keeps_the_permissions_of_the_one_that_it_replaces(tmp_path: Path) -> None:
+    path, picture = tmp_path / "out.zarr", cat()
+    for folder, file in ((0o700, 0o600), (0o750, 0o640)):
+        if path.exists():
+            path.chmod(folder)
+            (path / "zarr.json").chmod(file)
+        write_picture(path, iter([(slice(0, 200), picture)]), "uint8", StoredPicture(picture, False, 0))
+    for part in (path, *path.rglob("*")):
+        assert part.stat().st_mode & 0o777 == (0o750 if part.is_dir() else 0o640)
+    np.testing.assert_array_equal(rows_of(path), picture)
