@@ -96,7 +96,7 @@ def rms(difference: Tensor, where: Tensor) -> float:
 
 
 def measure_recolor(
-    composite: Composite, number: int, count: int, seed: int, *, keep: bool, extent: Extent = "near"
+    composite: Composite, number: int, count: int, seed: int, *, keep: bool, extent: Extent = "object"
 ) -> dict[str, float]:
     """Measure one recolouring: shares in percent, and errors."""
     scene = tinted(composite, number)
@@ -265,8 +265,8 @@ def main(arguments: list[str] | None = None) -> None:
     print(f"{chosen.count} composites of {chosen.size[0]}x{chosen.size[1]} ({chosen.kind} set)")
     single = [measure_recolor(scene, i, 1, first + 10 * i, keep=False) for i, scene in scenes]
     report("recolor, one scribble", single, {"covered": "covered", "outside": "outside", "border": "border"})
-    object_alone = [measure_recolor(scene, i, 1, first + 10 * i, keep=False, extent="object") for i, scene in scenes]
-    report("recolor, one scribble, this object", object_alone, {"covered": "covered", "outside": "outside"})
+    alike = [measure_recolor(scene, i, 1, first + 10 * i, keep=False, extent="near") for i, scene in scenes]
+    report("recolor, one scribble, all alike", alike, {"covered": "covered", "outside": "outside"})
     report("recolor, hats beside a face", [measure_hat(tint) for tint in HATS], {})
     two = [measure_recolor(scene, i, 2, first + 10 * i, keep=True) for i, scene in scenes]
     report("recolor, two and one to keep", two, {"covered": "covered", "outside": "outside, keep", "border": "border"})

@@ -293,7 +293,7 @@ RECOLOR = Edit(
             panel=FILTER_PANEL,
             per_image=True,
         ),
-        EXTENT,
+        replace(EXTENT, default="object"),
         number(
             "brightness",
             1.0,

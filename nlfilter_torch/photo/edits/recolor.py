@@ -1,7 +1,7 @@
 """Recolouring of objects by strokes of colour. Paper: Sec. V-A, Figs. 14, 15."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import ClassVar
 
@@ -19,11 +19,11 @@ from nlfilter_torch.photo.picture.colour import dot, merge_luminance, split_lumi
 from nlfilter_torch.photo.picture.drawn import Drawn
 from nlfilter_torch.photo.picture.in_memory import edited
 from nlfilter_torch.photo.picture.pixels import Box, M, whole_image
-from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles, middles_of
+from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles, blocks_at, middles_of
 from nlfilter_torch.photo.picture.source import Fitted, Pixels, Source, at
 from nlfilter_torch.photo.selections.border_colours import Sides, colours_beside, refine_mask
 from nlfilter_torch.photo.selections.connected import Extent
-from nlfilter_torch.photo.selections.hues import shade
+from nlfilter_torch.photo.selections.hues import pieces_of, shade
 from nlfilter_torch.photo.selections.mask import ObjectEdit, Regions, background_of, boxed, fit_regions
 from nlfilter_torch.photo.selections.painted import Painted
 
@@ -60,7 +60,8 @@ def recolor(
 
     Paper: Sec. V-A, with :func:`region_mask` in place of k-means, for any number of colours. Where hues and saturations
     around a pixel are not among those under the stroke, it stays unchanged even if its brightness and texture are
-    similar. Dark shade of the object's hue in the object, up to 3 % of the short side wide, takes the new colour, too.
+    similar. A side of the object in shade, which has its hue up to the border, takes the new colour, too, and so do its
+    dark folds.
 
     Args:
         image: (B, 3, H, W), RGB in [0, 1].
@@ -80,7 +81,8 @@ def recolor(
             theirs in proportion, 0 keeps the luminance of the image; highlights stay white.
         reach: in [0, 1), probability that a walk over similar pixels continues after each step; larger includes less
             similar pixels.
-        extent: that of :func:`region_mask`: what is similar nearby, the object under a stroke alone, or everywhere.
+        extent: ``"object"`` recolours only the object under a stroke, of which narrow things may hide parts, ``"near"``
+            all that is similar nearby, ``"everywhere"`` at any distance.
         photometric_bandwidth: in hundredths of Lab: 0.08 is 8 units.
         spatial_bandwidth: in pixels; None is 1.2 of the short side, ``math.inf`` no limit.
         patch_size: width of the compared patches.
@@ -132,8 +134,8 @@ class Recolor(ObjectEdit):
         if painted is None:
             return Fitted(whole_image)
         matches = acts(torch.as_tensor(self.brightness), 0.0)
-        shown, valid, groups = painted.grouped(matches)
-        under, old = groups.means(source.size)
+        shown, valid, groups = painted.grouped(source.size, matches)
+        under, old = groups.means()
         brightening = Brightening.of(under, shown, self.brightness) if matches else None
         brightness = under if brightening is None else brightening.new
         colours = with_room(split_colours(shown)[1] if matches else shown, brightness)
@@ -146,7 +148,11 @@ class Recolor(ObjectEdit):
             boxes = boxes_of(drawn.box, source.size, source.batch, 1).expand(-1, len(groups.inside), -1)
             check_scribbles_in(boxes[:, :1], [painted.strokes], source.size, "strokes")
         selection = self.selection_in(source.size)
+        if self.extent == "object":  # whose pieces may be apart, behind an arm or a strap
+            selection = replace(selection, extent="near")
         objects = fit_regions(source, groups.inside, kept, selection, by_hand, boxes, alone=False)
+        if self.extent == "object":
+            objects = replace(objects, functions=objects.functions * _own(objects, source.size).unsqueeze(2))
         change = Recoloring(colours, old, valid, under, brightening)
         reduced, masks = change.compared(objects.reduced), objects.reduced_masks()
         shares = [refine_mask(reduced, share) for share in change.shares(masks).split(1, dim=1)]
@@ -205,10 +211,21 @@ class RecoloredPixels:
         finished = partial(self.objects.finished, pixels=pixels)
         by_hue = []
         for planes, scribbles in zip(self.by_hue, self.objects.scribbles if self.by_hue else [], strict=True):
-            factor, enclosed = self.objects.rows(planes, pixels).split(1, dim=1)
+            factor, shaded = self.objects.rows(planes, pixels).split(1, dim=1)
             front, back = scribbles.planes(pixels).split(1, dim=1)
-            by_hue.append((torch.lerp(factor, torch.ones_like(factor), front), enclosed * (1 - back)))
+            by_hue.append((torch.lerp(factor, torch.ones_like(factor), front), shaded * (1 - back)))
         return self.change(pixels.image, self.objects.computed(pixels), sides, finished, by_hue)
+
+
+def _own(objects: Regions, size: tuple[int, int]) -> Tensor:
+    """Which pixels (B, K, h, w) of the reduced picture belong to the object under the strokes of each colour."""
+    masks, painted = objects.reduced_masks(), []
+    shape = (masks.shape[-2], masks.shape[-1])
+    for scribbles in objects.scribbles:
+        weights = scribbles.weights[:, 0].detach()
+        empty = weights.new_zeros(len(weights), shape[0] * shape[1])
+        painted.append(empty.index_add(1, blocks_at(scribbles.places, size, shape), weights).unflatten(1, shape))
+    return pieces_of(masks, torch.stack(painted, dim=1))
 
 
 def with_room(chroma: Tensor, brightness: Tensor) -> Tensor:
@@ -355,14 +372,14 @@ class Recoloring:
     def corrected(
         self, luminance: Tensor, chroma: Tensor, shares: Tensor, by_hue: Sequence[tuple[Tensor, Tensor]]
     ) -> Tensor:
-        """Shares (B, K, H, W), each times a factor (B, 1, H, W), and of shade as much as they enclose, (B, 1, H, W)."""
+        """Shares (B, K, H, W), each times a factor (B, 1, H, W), and with shade where there is some, (B, 1, H, W)."""
         if not by_hue:
             return shares
         shares = shares * torch.cat([factor for factor, _ in by_hue], dim=1)
         shades = torch.cat(
             [
-                enclosed * shade(luminance, chroma, self.under[:, k, :, None, None], self.old[:, k, :, None, None])
-                for k, (_, enclosed) in enumerate(by_hue)
+                within * shade(luminance, chroma, self.under[:, k, :, None, None], self.old[:, k, :, None, None])
+                for k, (_, within) in enumerate(by_hue)
             ],
             dim=1,
         )

@@ -4,21 +4,28 @@ A mask follows brightness and texture, too, and selects grey shadows and brown w
 counts less if the hues and saturations around a pixel are not among those under the stroke, above all where the mask is
 in doubt. Means over the surroundings decide, not single pixels: a white highlight belongs to the paint around it.
 
-The shade in folds is often so dark that no mask selects it. Where selected pixels enclose darker ones of a similar hue
-that are no less saturated, these are selected, too.
+The side of an object in shade is often so dark that no mask selects it. Areas of its hue that are connected with what
+is selected, and end where that hue ends, are selected, too, as far as they are dark. A shadow on wood beside a red
+saucer has the hue of the saucer, but fades into wood of nearly that hue: it is not.
 """
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
-import torch.nn.functional as F
+from numpy.typing import NDArray
+from scipy.ndimage import binary_dilation, binary_erosion, binary_fill_holes, distance_transform_edt
+from skimage.measure import label
+from skimage.segmentation import expand_labels
 from torch import Tensor
 
 from nlfilter_torch.core.precision import squarable
+from nlfilter_torch.core.torch_internals import is_unreadable
 from nlfilter_torch.operator.features import blur
 from nlfilter_torch.photo.declared.parameters import MASK
 from nlfilter_torch.photo.picture.colour import dot, split_luminance
 from nlfilter_torch.photo.picture.resizing import block_means, enlarged
+from nlfilter_torch.photo.selections.connected import INSIDE_MASK, connected
 from nlfilter_torch.photo.selections.scribbled_colours import (
     EPSILON,
     SIMILAR_SHARE,
@@ -26,6 +33,8 @@ from nlfilter_torch.photo.selections.scribbled_colours import (
     density,
     every_nth,
 )
+
+Mask = NDArray[np.bool_]
 
 NUM_COLOURS = 128  # approximate number of scribbled pixels that all are compared with
 DARK_LUMINANCE = 0.02  # luminance below which hue and saturation are uncertain
@@ -37,12 +46,16 @@ LEAST_SIGMA = 3.0  # the least of it, in pixels: wider than a soft border, whose
 # Mean likeness of the surroundings up to which what a mask of 1 selects does not count, and from which on it does.
 UNLIKE, ALIKE = 0.02, 0.2
 DOUBT = 0.9  # by how much these grow as the mask approaches 0
-WIDEST = 0.03  # width of shade that is enclosed, as a share of the short side
 # What is shade: luminance and saturation relative to those under the stroke, and cosine of the angle between hues. The
 # first number is where the step between shade and other things begins, and the second where it ends.
-SHADED = (0.5, 0.8)
-SATURATED = (0.5, 0.9)
+SHADED = (0.7, 1.0)
+SATURATED = (0.2, 0.4)  # glossy paint reflects the sky
 SAME_HUE = (0.75, 0.9)
+# Of areas in shade: pixels that thinner ones than twice that are no sides of an object, pixels beyond them that are
+# compared, and their mean likeness from which on an area goes on. Chosen on choosing composites and one photograph.
+THIN, BEYOND, OPEN = 2, 4, 0.3
+# Widest gap, as a share of the short side, between equally large pieces of an object, and between any: a strap, an arm.
+GAP, WIDEST_GAP = 0.03, 0.08
 #: Bandwidth in which colours are compared with those of scribbles to keep: that of masks, as both say what is alike.
 KEPT_BANDWIDTH: float = MASK.defaults["photometric_bandwidth"]
 
@@ -84,23 +97,88 @@ def relative_chroma(colours: Tensor) -> Tensor:
 def corrections(
     image: Tensor, mask: Tensor, share: Tensor, samples: HueSamples, kept: tuple[Tensor, Tensor] | None
 ) -> Tensor:
-    """Factor of a share, and how much of a pixel the corrected share encloses, in [0, 1], (B, 2, h, w).
+    """Factor of a share, and where shade belongs to the object, in [0, 1], (B, 2, h, w).
 
     Args:
         image: the reduced picture, (B, 3, h, w).
         mask: of the object, (B, 1, h, w).
         share: of the pixels, to correct; sharper than the mask, (B, 1, h, w).
         samples: of the scribbles on the object.
-        kept: colours (B, 3, n) and weights (B, 1, n) of scribbles on the background, the like of which is not enclosed.
+        kept: colours (B, 3, n) and weights (B, 1, n) of scribbles on the background, the like of which is no shade.
     """
-    factor = trusted(mask, samples.likeness(image))
-    within = enclosed(share * factor)
+    alike = samples.likeness(image)
+    factor = trusted(mask, alike)
     if kept is not None:
         sample, shares = every_nth(*kept, NUM_COLOURS)
         places, points = (colours_in_lab(colours) for colours in (image.flatten(2), sample))
         near = density(places, points, shares, image.new_tensor(KEPT_BANDWIDTH)).unflatten(2, image.shape[-2:])
-        within = within * (1 - (near / SIMILAR_SHARE).clamp(max=1.0))
-    return torch.cat([factor, within], dim=1)
+        alike = alike * (near < EPSILON)  # shade is far darker: even a remote likeness tells
+    return torch.cat([factor, shaded_parts(share * factor, alike)], dim=1)
+
+
+@torch.no_grad()
+def shaded_parts(core: Tensor, alike: Tensor) -> Tensor:
+    """Where shade belongs to what is selected, ``core``, (B, 1, h, w): 1 or 0; ``alike`` is likeness of hue, likewise.
+
+    None if values cannot be read.
+    """
+    if is_unreadable(core):
+        return torch.zeros_like(core)
+    inside, same = core >= INSIDE_MASK, alike >= 1
+    added = connected(torch.maximum(core, same.to(core)), inside.to(core)) & same & ~inside
+    parts = [
+        _closed_off(*(plane.squeeze(0).cpu().numpy() for plane in planes))
+        for planes in zip(added, inside, alike, strict=True)
+    ]
+    return torch.stack(parts).unsqueeze(1).to(core)
+
+
+def _closed_off(added: Mask, core: Mask, alike: NDArray[np.float64]) -> Tensor:
+    """The wide areas of (h, w) beside what is selected beyond which pixels are not alike, and the gaps that they close.
+
+    None is more than half as large as what is selected, which they could not be a side of.
+    """
+    numbers = label(added)
+    beyond = np.where(added | binary_dilation(core, iterations=BEYOND), 0, expand_labels(numbers, BEYOND)).ravel()
+    areas, around = np.bincount(numbers.ravel()), np.bincount(beyond, minlength=numbers.max() + 1)
+    going_on = np.bincount(beyond, alike.ravel(), len(around)) / around.clip(1)
+    wide = np.bincount(numbers.ravel(), binary_erosion(added, iterations=THIN).ravel()) > 0
+    closed = wide & (going_on < OPEN) & (2 * areas <= core.sum())
+    reach = round(GAP * min(core.shape) / 2)
+    folds = binary_erosion(binary_dilation(core, iterations=reach), iterations=reach + reach // 2)
+    whole = binary_fill_holes(core | folds | (added & closed[numbers]))
+    return torch.from_numpy(binary_dilation(whole & ~core))
+
+
+@torch.no_grad()
+def pieces_of(masks: Tensor, painted: Tensor) -> Tensor:
+    """Which pixels (B, K, h, w) of masks belong to the object under strokes, ``painted`` (B, K, h, w), as bool.
+
+    An arm or a strap before an object hides part of it. Pieces of a mask belong to it if they are connected with a
+    stroke, or if the gap between is narrow, which is judged by how much smaller the piece is than the rest. All do
+    if values cannot be read.
+    """
+    if is_unreadable(masks):
+        return torch.ones_like(masks, dtype=torch.bool)
+    inside = (masks >= INSIDE_MASK) | (painted > 0)
+    planes = (part.flatten(0, 1).cpu().numpy() for part in (inside, painted > 0))
+    pieces = [_beside(*pair) for pair in zip(*planes, strict=True)]
+    return connected(masks, torch.stack(pieces).view_as(masks).to(masks))
+
+
+def _beside(inside: Mask, own: Mask) -> Tensor:
+    """What is painted, (h, w), with the pieces of a mask that belong to it."""
+    numbers = label(inside)
+    areas = np.bincount(numbers.ravel()).clip(1)
+    while own.any():
+        gaps = np.full(len(areas), np.inf)
+        np.minimum.at(gaps, numbers.ravel(), distance_transform_edt(~own).ravel())
+        near = gaps <= min(inside.shape) * np.minimum(GAP * np.sqrt(own.sum() / areas), WIDEST_GAP)
+        near[0] = False
+        if (near[numbers] <= own).all():
+            break
+        own = own | near[numbers]
+    return torch.from_numpy(own)
 
 
 def trusted(mask: Tensor, alike: Tensor) -> Tensor:
@@ -115,17 +193,6 @@ def trusted(mask: Tensor, alike: Tensor) -> Tensor:
     doubt = DOUBT * (1 - certainty)
     factor = ramp(likeness - doubt, UNLIKE, ALIKE)
     return enlarged(factor, (size[0] / coarse.shape[-2], size[1] / coarse.shape[-1]), (0, 0), size)
-
-
-def enclosed(share: Tensor) -> Tensor:
-    """How much a share (B, 1, h, w) encloses: it and its gaps up to :data:`WIDEST`, without those at its border."""
-    radius = round(WIDEST * min(share.shape[-2:]) / 2)
-    margin = radius // 2  # nooks along the border of the object are not part of it
-    wide = F.pad(share, (2 * radius + margin,) * 4)
-    for sign, reach in ((1, radius), (-1, radius + margin)):
-        side = 2 * reach + 1
-        wide = sign * F.max_pool2d(F.max_pool2d(sign * wide, (side, 1), 1), (1, side), 1)
-    return wide
 
 
 def shade(luminance: Tensor, chroma: Tensor, scribbled_luminance: Tensor, scribbled_chroma: Tensor) -> Tensor:

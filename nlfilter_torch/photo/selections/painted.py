@@ -53,7 +53,7 @@ class Painted:
         """The strokes, and what is painted on the mask, as far as there are any."""
         return [scribbles for scribbles in (self.strokes, self.on_mask) if scribbles is not None]
 
-    def grouped(self, matches: bool) -> tuple[Tensor, Tensor, "Groups"]:
+    def grouped(self, size: tuple[int, int], matches: bool) -> tuple[Tensor, Tensor, "Groups"]:
         """Return the colours (B, K, 3), which of them are valid, (B, K), and the pixels of each.
 
         Colours are chroma, or RGB if their brightness counts.
@@ -67,7 +67,7 @@ class Painted:
         regions, colours, valid = group_colours(shown if matches else split_luminance(shown)[1], weights)
         parts = regions.squeeze(2).split([len(drawn.places) for drawn in marks], dim=2)
         weighted = [drawn.weighted(part) for drawn, part in zip(marks, parts, strict=True)]
-        strokes = None if self.strokes is None else weighted[0]
+        strokes = None if self.strokes is None else without_strays(weighted[0], size, of_one_colour=True)
         return colours, valid & painted.unsqueeze(1), Groups(strokes, None if self.on_mask is None else weighted[-1])
 
 
@@ -85,14 +85,14 @@ class Groups:
             return []
         return [self.strokes.weighted(part) for part in self.strokes.weights.split(1, dim=1)]
 
-    def means(self, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
-        """Mean luminance (B, K, 1) and chroma (B, K, 3) of a picture (H, W) under each colour.
+    def means(self) -> tuple[Tensor, Tensor]:
+        """Mean luminance (B, K, 1) and chroma (B, K, 3) of the picture under each colour.
 
         What is painted on the mask counts for colours without strokes on an object.
         """
         weights, images = list[Tensor](), list[Tensor]()
         if self.strokes is not None:
-            weights.append(without_strays(self.strokes, size).weights)
+            weights.append(self.strokes.weights)
             images.append(self.strokes.image)
         if self.on_mask is not None:
             alone = 1.0 if not weights else (weights[0] <= 0).all(2, keepdim=True).to(weights[0])
@@ -116,7 +116,7 @@ class Groups:
         """
         if self.strokes is None:
             return []
-        colours, weights = outwards(without_strays(self.strokes, size), size)
+        colours, weights = outwards(self.strokes, size)
         opposed = outwards(kept[0], size) if kept else None
         samples = [HueSamples.of(colours, part) for part in weights.split(1, dim=1)]
         return [

@@ -208,19 +208,23 @@ LARGEST_AREA = 0.04  # of the picture that a stroke covers; larger areas are rou
 ELONGATED = 5.0  # least squared border of a stroke, relative to four times its area: three times as long as wide
 COMPACT = 0.75  # share of the smaller part that lies in two pieces
 STRAY_LIGHTNESS = 0.5  # weight of differences in lightness, much of which is shading
+SHARED = 0.2  # of a stroke that has colours of another one, which are then meant
 DIVIDING_STEPS = 8  # of the division in two
 
 
-def without_strays(scribbles: Scribbles, size: tuple[int, int]) -> Scribbles:
-    """Scribbles of a picture (H, W) without the stray parts of each connected stroke, whose weights become 0."""
-    stray = strays(scribbles, size)
+def without_strays(scribbles: Scribbles, size: tuple[int, int], *, of_one_colour: bool = False) -> Scribbles:
+    """Scribbles of a picture (H, W) without the stray parts of each connected stroke, whose weights become 0.
+
+    If things ``of_one_colour`` are meant, what a stroke shares with another one is, and all else on it is stray.
+    """
+    stray = strays(scribbles, size, of_one_colour=of_one_colour)
     if not bool(stray.any()):
         return scribbles
     return scribbles.weighted(scribbles.weights.masked_fill(stray, 0.0))
 
 
 @torch.no_grad()
-def strays(scribbles: Scribbles, size: tuple[int, int]) -> Tensor:
+def strays(scribbles: Scribbles, size: tuple[int, int], *, of_one_colour: bool = False) -> Tensor:
     """Which pixels of scribbles are stray, (B, K, n); without a gradient. None are if values cannot be read."""
     if is_unreadable(scribbles.weights) or is_unreadable(scribbles.image):
         return torch.zeros_like(scribbles.weights, dtype=torch.bool)
@@ -233,11 +237,11 @@ def strays(scribbles: Scribbles, size: tuple[int, int]) -> Tensor:
     stray = np.zeros_like(painted)
     for image, points in enumerate(colours.mT.cpu().numpy()):
         for region, covered in enumerate(painted[image]):
-            stray[image, region, covered] = _of_region(points[covered], at[covered], shape)
+            stray[image, region, covered] = _of_region(points[covered], at[covered], shape, of_one_colour)
     return torch.from_numpy(stray).to(scribbles.weights.device)
 
 
-def _of_region(points: Numbers, at: Cells, shape: tuple[int, int]) -> NDArray[np.bool_]:
+def _of_region(points: Numbers, at: Cells, shape: tuple[int, int], of_one_colour: bool) -> NDArray[np.bool_]:
     """Which pixels of a region with colours (n, 3), in cells (n,), are stray, (n,)."""
     cells, back, counts = np.unique(at, return_inverse=True, return_counts=True)
     if len(cells) < FEWEST:
@@ -256,6 +260,12 @@ def _of_region(points: Numbers, at: Cells, shape: tuple[int, int]) -> NDArray[np
                     parts.append((kept[part], stroke))
                     kept = kept[~part]
         middles.append(np.median(means[kept], axis=0))
+    for stroke in range(1, len(middles) + 1) if of_one_colour else ():
+        own = np.flatnonzero(strokes == stroke)
+        others = np.array(middles[: stroke - 1] + middles[stroke:]).reshape(-1, 3)
+        apart = (np.linalg.norm(means[own, None] - others, axis=2) > GAP).all(1)
+        if len(others) and apart.mean() <= 1 - SHARED:
+            ignored[own[apart]] = True
     for places, stroke in parts:  # what another stroke is meant for is not stray
         others = np.array(middles[: stroke - 1] + middles[stroke:]).reshape(-1, 3)
         distances = np.linalg.norm(np.median(means[places], axis=0) - others, axis=1)

@@ -3,7 +3,15 @@
 import torch
 
 from nlfilter_torch.photo.picture.colour import split_luminance
-from nlfilter_torch.photo.selections.hues import HueSamples, corrections, enclosed, relative_chroma, shade, trusted
+from nlfilter_torch.photo.selections.hues import (
+    HueSamples,
+    corrections,
+    pieces_of,
+    relative_chroma,
+    shade,
+    shaded_parts,
+    trusted,
+)
 
 RED, WOOD, GREY = (0.6, 0.1, 0.1), (0.5, 0.3, 0.15), (0.4, 0.4, 0.4)
 
@@ -51,23 +59,50 @@ def test_a_highlight_belongs_to_the_paint_around_it() -> None:
     assert corrections(image, mask, mask, of_red(), None)[:, 0].min() == 1
 
 
-def test_gaps_up_to_a_width_are_enclosed_and_none_at_the_border_of_the_picture() -> None:
-    share = torch.ones(1, 1, 200, 240)
-    share[..., 100:104], share[..., 150:170], share[..., :2] = 0, 0, 0
-    closed = enclosed(share)
-    assert closed.shape == share.shape
-    assert closed[..., 1:-1, 90:140].min() == 1
-    assert closed[..., 150:170].max() == closed[..., :2].max() == 0
-    assert closed[..., 0, :].max() == closed[..., 149].max() == 0  # nor along borders of the share
+def test_a_side_in_shade_belongs_to_the_object_up_to_where_its_hue_ends() -> None:
+    core, alike = torch.zeros(2, 1, 120, 140), torch.zeros(2, 1, 120, 140)
+    core[..., 20:100, 20:80] = 1
+    alike[..., 20:100, 20:110] = 1
+    alike[1, ..., 110:130] = 0.6  # there, likeness fades
+    within = shaded_parts(core, alike)
+    assert within[0, :, 22:98, 82:108].min() == 1
+    assert within[0, :, :, 114:].max() == within[1, :, 22:98, 90:].max() == 0
 
 
-def test_scribbles_to_keep_are_not_enclosed() -> None:
-    image, share = filled(*RED, size=(200, 240)).clone(), torch.ones(1, 1, 200, 240, dtype=torch.float64)
-    image[..., 100:104] *= 0.3
-    share[..., 100:104] = 0
-    kept = (0.3 * colour(*RED), torch.ones(1, 1, 1, dtype=torch.float64))
-    assert corrections(image, share, share, of_red(), None)[:, 1, 1:-1, 100:104].min() == 1
-    assert corrections(image, share, share, of_red(), kept)[:, 1, :, 100:104].max() == 0
+def test_shade_is_no_rim_and_not_far_larger_than_the_object() -> None:
+    core, alike = torch.zeros(2, 1, 120, 140), torch.zeros(2, 1, 120, 140)
+    core[..., 20:100, 20:80] = 1
+    alike[0, :, 20:100, 20:83] = alike[1, :, 20:100, 20:130] = 1
+    assert shaded_parts(core, alike)[:, :, 22:98, 82:].max() == 0
+
+
+def test_dark_folds_in_an_object_are_looked_at() -> None:
+    core = torch.ones(1, 1, 200, 240)
+    core[..., 100:104], core[..., 150:170], core[..., :2] = 0, 0, 0
+    within = shaded_parts(core, torch.zeros_like(core))
+    assert within[..., 5:-5, 101:103].min() == 1
+    assert within[..., 152:168].max() == within[..., :2].max() == 0
+
+
+def test_what_is_like_a_scribble_to_keep_is_no_shade() -> None:
+    image, share = filled(*GREY, size=(120, 140)).clone(), torch.zeros(1, 1, 120, 140, dtype=torch.float64)
+    image[..., 40:80], image[..., 80:98] = filled(*RED)[..., :1, :1], 0.6 * filled(*RED)[..., :1, :1]
+    share[..., 40:80] = 1
+    kept = (0.6 * colour(*RED), torch.ones(1, 1, 1, dtype=torch.float64))
+    assert corrections(image, share, share, of_red(), None)[:, 1, 5:-5, 85:95].min() == 1
+    assert corrections(image, share, share, of_red(), kept)[:, 1, 5:-5, 85:95].max() == 0
+
+
+def test_pieces_behind_an_arm_belong_to_the_object_and_others_do_not() -> None:
+    masks, painted = torch.zeros(1, 2, 200, 240), torch.zeros(1, 2, 200, 240)
+    masks[..., 20:180, 20:90] = 1
+    masks[..., 20:100, 100:130] = 1  # a smaller piece behind an arm
+    masks[..., 20:180, 150:230] = 1  # something else
+    painted[..., 100, 40:60] = 1
+    belongs = pieces_of(masks, painted)
+    assert bool(belongs[..., 20:180, 20:90].all() & belongs[..., 20:100, 100:130].all())
+    assert not belongs[..., 150:230].any()
+    assert not pieces_of(masks, torch.zeros_like(painted)).any()
 
 
 def test_shade_is_darker_of_a_similar_hue_and_no_less_saturated() -> None:

@@ -26,11 +26,11 @@ def read(images: torch.Tensor, mask: torch.Tensor, added: torch.Tensor | None) -
 def test_each_colour_has_its_pixels_and_the_mean_under_its_strokes() -> None:
     painted = read(IMAGE, STROKE, torch.cat([torch.where(STROKE > 0, RED, BLUE), STROKE + BRUSH], dim=1))
     assert painted is not None
-    shown, valid, groups = painted.grouped(matches=True)
+    shown, valid, groups = painted.grouped(SIZE, matches=True)
     order = shown[0, :, 0].argsort(descending=True)  # red first
     torch.testing.assert_close(shown[0, order], torch.eye(3)[[0, 2]])
     assert valid.all()
-    luminance, chroma = groups.means(SIZE)
+    luminance, chroma = groups.means()
     for number, mask in zip(order, (STROKE, BRUSH), strict=True):
         wanted = (IMAGE * mask).sum((0, 2, 3)) / mask.sum()
         torch.testing.assert_close(luminance[0, number] + chroma[0, number], wanted)

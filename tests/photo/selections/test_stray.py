@@ -131,6 +131,17 @@ def drawn(
     return Job("", "", image, torch.tensor(colour).view(1, 3, 1, 1), as_mask(clean), as_mask(line(at, size, 3)))
 
 
+def test_what_two_strokes_of_one_colour_share_is_meant() -> None:
+    image = scene()
+    first, second = box(30, 25, 4, 60, SIZE), box(60, 72, 4, 50, SIZE)  # two thirds of the second one lie beside it
+    scribbles = read_regions(InMemory(image), first + second, "scribbles")[0]
+    stray = strays(scribbles, SIZE, of_one_colour=True)[0, 0]
+    columns, rows = scribbles.places % SIZE[1], scribbles.places // SIZE[1]
+    assert stray[(rows >= 60) & (columns >= 92 + BESIDE)].all()
+    assert not stray[columns < 90 - BESIDE].any()
+    assert not strays(scribbles, SIZE).all()
+
+
 @pytest.mark.parametrize("case", [gap_in_a_suit, bar_beside_the_sky, hat_on_a_face])
 def test_recolouring_on_photographs_does_not_follow_strays(case: Callable[[], Job]) -> None:
     job = case()
