@@ -159,7 +159,9 @@ def main(arguments: list[str] | None = None) -> int:
     chosen = parser.parse_args(arguments)
     with ExitStack() as stack:
         for module in ("selections.painted", "selections.mask") if chosen.plain else ():
-            stack.enter_context(mock.patch(f"nlfilter_torch.photo.{module}.without_strays", lambda drawn, _, **__: drawn))
+            stack.enter_context(
+                mock.patch(f"nlfilter_torch.photo.{module}.without_strays", lambda drawn, _, **__: drawn)
+            )
         first = FIRST_SEED[chosen.set] + FIRST
         number = 1 if chosen.quick else COUNT
         rows = list(on_composites(number, first, sources(None, chosen.set)))
