@@ -24,6 +24,7 @@ myst_links_external_new_tab = False
 
 autodoc_member_order = "bysource"
 autodoc_typehints = "none"  # the docstrings give shapes and ranges; signatures would drown in unions
+autodoc_mock_imports = ["deepinv"]  # optional, with a build of torchvision for the installed torch
 napoleon_google_docstring = True
 napoleon_numpy_docstring = False
 python_use_unqualified_type_names = True
@@ -31,7 +32,7 @@ python_use_unqualified_type_names = True
 # A reference from a docstring that leads nowhere is an error, but for other libraries and for what is not public.
 nitpicky = True
 nitpick_ignore_regex = [
-    ("py:.*", r"(collections|torch|numpy|matplotlib)\..*"),
+    ("py:.*", r"(collections|torch|numpy|matplotlib|deepinv)\..*"),
     ("py:mod", r"nlfilter_torch(\.\w+)+"),
     ("py:class", r"nlfilter_torch(\.[a-z_]+)+\.\w+"),
 ]

@@ -1,5 +1,7 @@
 """Settings and fixtures shared by every test."""
 
+from collections.abc import Iterator
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -47,3 +49,23 @@ def session(tmp_path: Path) -> "Session":
 
     write_photograph(Photograph(cat()), tmp_path / "cat.png")
     return Session(tmp_path, tmp_path / "cat.png")
+
+
+@pytest.fixture
+def deepinv() -> Iterator[None]:
+    """Skip the test unless deepinv is installed.
+
+    It imports torchvision, whose compiled part does not load beside another build of torch than the one it was made
+    for. Two operators of that part, which deepinv does not call, are then declared for the import to succeed.
+    """
+    if find_spec("deepinv") is None:
+        pytest.skip("deepinv is not installed")
+    try:
+        import torchvision  # noqa: F401
+    except RuntimeError:
+        operators = torch.library.Library("torchvision", "DEF")
+        for name in ("nms", "qnms"):
+            operators.define(name + "(Tensor dets, Tensor scores, float iou_threshold) -> Tensor")
+        yield
+    else:
+        yield

@@ -41,7 +41,9 @@ class Problem:
 
     @property
     def rounding(self) -> float:
-        return ROUNDING[self.image.dtype]
+        """Of eigenvalues; those of W are multiplied by g in the prior."""
+        g = self.strength * float(self.promised.step)
+        return ROUNDING[self.image.dtype] * (1 + g / 50)
 
     def truth(self) -> Truth:
         unit = torch.eye(SIDE**2, dtype=torch.float64)
