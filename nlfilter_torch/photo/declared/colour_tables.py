@@ -5,6 +5,8 @@ colour to the next. Imports neither torch nor, before it is needed, NumPy.
 """
 
 import math
+import re
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from nlfilter_torch.photo.declared.declaration import MAX_NODES
@@ -18,32 +20,120 @@ if TYPE_CHECKING:
 Lattice = tuple[float, ...]  # changes of colours, as the parameter of ``look`` has them
 EXPORT = "export a 3-D table of colours from 0 to 1"
 MOST_HALD_LEVEL = math.isqrt(MAX_NODES)
+CURVES, COLOURS = "LUT_1D", "LUT_3D"  # the tables of a .cube file
+MOST_CURVE_NODES = 65536
+NUMBER = re.compile(r"\d{1,9}(?:\.\d*)?")  # of nodes; some programs write 33.0
 CUBE_NODES, HALD_LEVEL = 33, 8  # of the tables that are written
 WHITE_16 = 65535
 
 
+@dataclass
+class Cube:
+    """What a ``.cube`` file holds.
+
+    Attributes:
+        sizes: of the table of curves, which comes first and may be missing, and of the table of colours.
+        ranges: colours, (3,) each, from which and to which the tables reach.
+        rows: of all tables.
+    """
+
+    sizes: dict[str, int] = field(default_factory=lambda: {CURVES: 0, COLOURS: 0})
+    ranges: dict[str, tuple[list[float], list[float]]] = field(
+        default_factory=lambda: {table: ([0.0] * 3, [1.0] * 3) for table in (CURVES, COLOURS)}
+    )
+    rows: list[list[float]] = field(default_factory=list)
+
+    def accept(self, words: list[str], name: str) -> None:
+        """Accept a line of keywords; those of other programs are ignored.
+
+        Raises:
+            ValueError: if the line says that the table is of another kind.
+        """
+        keyword, values, place = words[0].upper(), words[1:], f"{words[0]} of {name}"
+        table = keyword[:6]
+        if keyword in ("DOMAIN_MIN", "DOMAIN_MAX"):
+            for ends in self.ranges.values():
+                ends[keyword == "DOMAIN_MAX"][:] = _numbers(values, 3, place)
+        elif keyword == f"{table}_INPUT_RANGE" and table in self.ranges:
+            least, most = _numbers(values, 2, place)
+            self.ranges[table] = ([least] * 3, [most] * 3)
+        elif keyword == f"{table}_SIZE" and table in self.sizes:
+            most_nodes = MAX_NODES if table == COLOURS else MOST_CURVE_NODES
+            size = float(values[0]) if len(values) == 1 and NUMBER.fullmatch(values[0]) else 0.0
+            if size != int(size) or not 2 <= size <= most_nodes:
+                raise ValueError(
+                    f"{place} must be a whole number from 2 to {most_nodes}, got {' '.join(values)}; "
+                    "export a table of such a size"
+                )
+            self.sizes[table] = int(size)
+        elif "VIDEO_RANGE" in keyword:
+            raise ValueError(f"{name} must be a table for colours of full range, got a line {keyword[:40]}; {EXPORT}")
+
+    def table(self) -> "NDArray[np.floating]":
+        """The colours (n^3, 3) for colours from 0 to 1, in the order of files.
+
+        The table itself if it has that range and no curves, else what curves and table give at the nodes of the largest
+        table that a look can have.
+        """
+        import numpy as np
+
+        curves, size = self.sizes[CURVES], self.sizes[COLOURS]
+        rows = np.array(self.rows)
+        colours = rows[curves:]
+        if not curves and self.ranges[COLOURS] == ([0.0] * 3, [1.0] * 3):
+            return colours
+        nodes = np.linspace(0, 1, MAX_NODES)[:, None].repeat(3, 1)
+        if curves:
+            places = _places(nodes, self.ranges[CURVES], curves)
+            nodes = np.stack([np.interp(places[:, c], np.arange(curves), rows[:curves, c]) for c in range(3)], axis=1)
+        if not size:
+            red, green, blue = nodes.T
+            mixed = np.meshgrid(blue, green, red, indexing="ij")
+            return np.stack(mixed[::-1], axis=-1).reshape(-1, 3)
+        places = _places(nodes, self.ranges[COLOURS], size)
+        red, green, blue = np.maximum(0, 1 - np.abs(places.T[..., None] - np.arange(size)))  # weights, (n, size) each
+        table = colours.reshape(size, size, size, 3)
+        return np.einsum("kc,jb,ia,cbad->kjid", blue, green, red, table, optimize=True).reshape(-1, 3)
+
+
+def _places(
+    colours: "NDArray[np.floating]", ends: tuple[list[float], list[float]], size: int
+) -> "NDArray[np.floating]":
+    """Where colours (n, 3) lie among the nodes of a table, from 0 to its size less 1; those outside at its ends."""
+    import numpy as np
+
+    least, most = np.array(ends)
+    return np.clip((colours - least) / (most - least), 0, 1) * (size - 1)
+
+
 def lattice_of_cube(text: str, name: str) -> Lattice:
-    """The lattice of a table in a ``.cube`` file.
+    """The lattice of a table in a ``.cube`` file: of colours, of a curve for each channel, or of colours after curves.
 
     Raises:
-        ValueError: if it is not a 3-D table of colours from 0 to 1. ``name`` is the file's name in the message.
+        ValueError: if it holds no table. ``name`` is the file's name in the message.
     """
-    size, rows = 0, list[list[float]]()
-    for number, line in enumerate(text.splitlines(), 1):
-        words = line.split("#")[0].split()
+    cube = Cube()
+    # Some programs end texts as CP/M did. Unicode has more ends of lines, which may be in a title.
+    for number, line in enumerate(re.split(r"\r\n|\r|\n", text.rstrip("\0\x1a \t\r\n")), 1):
+        words = re.split("#|//", line)[0].split()
         if not words:
             continue
         if words[0][0].isalpha() and words[0].lower() not in ("nan", "inf", "infinity"):
-            size = _size(words, size, name)
+            cube.accept(words, name)
         else:
-            rows.append(_numbers(words, 3, f"line {number} of {name}"))
-    if not size:
+            cube.rows.append(_numbers(words, 3, f"line {number} of {name}"))
+    curves, size = cube.sizes[CURVES], cube.sizes[COLOURS]
+    if not curves and not size:
         raise ValueError(f"{name} must have a line LUT_3D_SIZE, got none; {EXPORT}")
-    if len(rows) != size**3:
-        raise ValueError(f"{name} must hold {size}^3 = {size**3} colours, got {len(rows)}; export it again")
-    import numpy as np
-
-    return lattice_of_table(np.array(rows))
+    if len(cube.rows) != curves + size**3:
+        wanted = f"{size}^3 = {size**3} colours" if not curves else f"{curves} + {size}^3 colours"
+        raise ValueError(f"{name} must hold {wanted}, got {len(cube.rows)}; export it again")
+    for least, most in cube.ranges.values():
+        if not all(start < end for start, end in zip(least, most, strict=True)):
+            raise ValueError(
+                f"{name} must be for colours from a least to a greater one, got {least} to {most}; {EXPORT}"
+            )
+    return lattice_of_table(cube.table())
 
 
 def lattice_of_hald(picture: "Values", name: str) -> Lattice:
@@ -95,38 +185,6 @@ def hald_of(table: "NDArray[np.floating]") -> "NDArray[np.uint16]":
     side = math.isqrt(len(table[0])) ** 3
     levels = np.clip(np.rint(table_rows(table) * WHITE_16), 0, WHITE_16)
     return levels.reshape(side, side, 3).astype(np.uint16)
-
-
-def _size(words: list[str], size: int, name: str) -> int:
-    """The size of the table after a line of keywords.
-
-    Raises:
-        ValueError: if the line says that the table is of another kind.
-    """
-    keyword, place, rest = words[0].upper(), f"{words[0]} of {name}", " ".join(words[1:])
-    if keyword in ("DOMAIN_MIN", "DOMAIN_MAX"):
-        wanted = "1 1 1" if keyword == "DOMAIN_MAX" else "0 0 0"
-        _check_ends(words[1:], wanted, place)
-    elif keyword == "LUT_3D_INPUT_RANGE":
-        _check_ends(words[1:], "0 1", place)
-    elif keyword.startswith("LUT_1D"):
-        raise ValueError(f"{name} must be a 3-D table, got a 1-D table; {EXPORT}")
-    elif keyword == "LUT_3D_SIZE":
-        if len(words) != 2 or not words[1].isdecimal() or not 2 <= int(words[1]) <= MAX_NODES:
-            raise ValueError(
-                f"{place} must be a whole number from 2 to {MAX_NODES}, got {rest}; export a table of such a size"
-            )
-        return int(words[1])
-    elif keyword != "TITLE":
-        raise ValueError(f"{name} must be a table of colours, got a line {words[0][:40]}; {EXPORT}")
-    return size
-
-
-def _check_ends(words: list[str], wanted: str, place: str) -> None:
-    """Raise unless a table is for colours from 0 to 1."""
-    ends = [float(end) for end in wanted.split()]
-    if any(abs(value - end) > 1e-6 for value, end in zip(_numbers(words, len(ends), place), ends, strict=True)):
-        raise ValueError(f"{place} must be {wanted}, got {' '.join(words)}; {EXPORT}")
 
 
 def _numbers(words: list[str], count: int, place: str) -> list[float]:
