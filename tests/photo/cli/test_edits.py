@@ -1,6 +1,7 @@
 """Commands of edits: their options and help, and notes on options without an effect."""
 
 import inspect
+from dataclasses import replace
 from pathlib import Path
 from typing import get_args
 
@@ -128,7 +129,9 @@ def test_options_of_an_edit_with_two_kinds_of_scribbles() -> None:
     assert (region.metavar, region.help) == options.REGIONS["mask"]
     assert keep_option.help == "Pixels to keep."
     colours = Edit("tint", "", (), scribbles=(Scribble("mask", "Colour", "colours"), keep), map_help="A map.")
-    assert list(scribble_options(colours)) == ["strokes", "region", "keep", "mask", "colour", "show", "map"]
+    marked = ["strokes", "region", "keep", "mask", "colour"]
+    assert list(scribble_options(colours)) == [*marked, "source_colour", "show", "map"]
+    assert list(scribble_options(replace(colours, coloured=True))) == [*marked, "show", "map"]
     assert not scribble_options(Edit("plain", "", ()))
     parameters = list(inspect.signature(command(edit)).parameters)
     assert parameters[:7] == ["source", "target", "strokes", "region", "keep", "mask", "show"]
