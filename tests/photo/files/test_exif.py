@@ -3,13 +3,17 @@
 import contextlib
 import struct
 from pathlib import Path
+from typing import Any
 
+import hypothesis
+import hypothesis.strategies as some
 import numpy as np
 import pytest
 import torch
 from PIL import ExifTags, Image, ImageOps
 
-from nlfilter_torch.photo.files.exif import read_upright, upright
+from nlfilter_torch.photo.files.exif import PREFIX, parsed, read_upright, upright
+from nlfilter_torch.photo.files.tables import LENGTHS
 from nlfilter_torch.photo.picture.photographs import read_photograph, write_photograph
 from tests.files import exif_block, photograph, same, stored_values, tags
 from tests.pairwise import each_value
@@ -161,3 +165,51 @@ def test_the_place_of_the_subject_turns_with_the_picture() -> None:
             assert tags(unsized.block)[1][SUBJECT_AREA] == (9, 5, 4, 2)
         else:
             assert unsized.left_out == ("the place of the subject, as the picture is turned",)
+
+
+@some.composite
+def fields(draw: some.DrawFn, codes: range | tuple[int, ...]) -> list[tuple[int, int, bytes]]:
+    """Fields of a table, with types and values of EXIF."""
+    chosen = sorted(draw(some.sets(some.sampled_from(codes), min_size=1, max_size=4)))
+    kinds = [draw(some.integers(1, 12)) for _ in chosen]
+    lengths = [LENGTHS[kind] * draw(some.integers(1, 4)) for kind in kinds]
+    values = [draw(some.binary(min_size=length, max_size=length)) for length in lengths]
+    return list(zip(chosen, kinds, values, strict=True))
+
+
+def block_with(order: str, first: list[tuple[int, int, bytes]], detail: list[tuple[int, int, bytes]]) -> bytes:
+    """An EXIF block with those fields."""
+
+    def table(entries: list[tuple[int, int, bytes]], start: int) -> bytes:
+        head, values = struct.pack(order + "H", len(entries)), b""
+        for code, kind, data in entries:
+            count = len(data) // LENGTHS[kind]
+            if len(data) > 4:
+                place = start + 6 + 12 * len(entries) + len(values)
+                values, data = values + data + bytes(len(data) % 2), struct.pack(order + "I", place)
+            head += struct.pack(order + "HHI", code, kind, count) + data.ljust(4, b"\0")
+        return head + bytes(4) + values
+
+    pointer = (34665, 4, bytes(4))
+    inner = 8 + len(table(sorted([*first, pointer]), 8))
+    whole = table(sorted([*first, (34665, 4, struct.pack(order + "I", inner))]), 8) + table(detail, inner)
+    return PREFIX + (b"II*\0" if order == "<" else b"MM\0*") + struct.pack(order + "I", 8) + whole
+
+
+@hypothesis.settings(max_examples=30, deadline=None)
+@hypothesis.given(
+    order=some.sampled_from("<>"),
+    first=fields((315, 316, 33432, 40091)),
+    detail=fields(range(50000, 50010)),
+    suffix=some.sampled_from([".jpg", ".png", ".webp", ".avif", ".tif"]),
+)
+def test_fields_of_any_type_and_count_come_out_as_they_went_in(
+    tmp_path_factory: pytest.TempPathFactory, order: str, first: Any, detail: Any, suffix: str
+) -> None:
+    path = tmp_path_factory.getbasetemp() / f"any{suffix}"
+    write_photograph(photograph(stored_values(3, "uint8"), exif=block_with(order, first, detail)), path)
+    tables = parsed(read_photograph(path).exif)
+    assert tables is not None
+    assert tables.order == order
+    found = [(field.code, field.kind, tables.raw(field)) for field in tables.walk() if field.code not in (274, 34665)]
+    assert sorted(found) == sorted([*first, *detail])
