@@ -35,7 +35,7 @@ from nlfilter_torch.photo.declared.parameters import EDITS, MASK
 from nlfilter_torch.photo.declared.presets import Recipe, find_recipe
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.declared.strokes import Mark
-from nlfilter_torch.photo.edits.applying import apply_recipe
+from nlfilter_torch.photo.edits.recipe import apply_recipe
 from nlfilter_torch.photo.picture.drawn import colour_of
 from nlfilter_torch.photo.picture.painting import cover
 from nlfilter_torch.photo.picture.resizing import resize

@@ -6,7 +6,6 @@ from .declared.steps import Step as Step
 from .declared.strokes import Region as Region
 from .declared.strokes import Stroke as Stroke
 from .edits.abstract import abstract as abstract
-from .edits.applying import apply_recipe as apply_recipe
 from .edits.applying import apply_step as apply_step
 from .edits.colorize import colorize as colorize
 from .edits.defocus import defocus as defocus
@@ -16,6 +15,7 @@ from .edits.fit_look import FittedLook as FittedLook
 from .edits.fit_look import fit_look as fit_look
 from .edits.frames import filter_frames as filter_frames
 from .edits.look import apply_look as apply_look
+from .edits.recipe import apply_recipe as apply_recipe
 from .edits.recipe import stream as stream
 from .edits.recolor import recolor as recolor
 from .edits.sharpen import sharpen as sharpen

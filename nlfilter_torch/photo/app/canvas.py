@@ -33,7 +33,7 @@ class Canvas:
 
     def __init__(self, brush: Brush, token: str, draw: Draw, lay: Callable[[], None], choosing: str) -> None:
         self.pictures: dict[str, bytes] = {}
-        self.histogram = ""
+        self.histogram = self.histogram_before = ""
         self.clipped = self.clipped_before = (0.0, 0.0)  # shares of white and of black, after and before the edit
         self.pick: Callable[[float, float], None] | None = None
         self._session: Session | None = None
@@ -118,6 +118,7 @@ class Canvas:
         self._photo.style(f"width: var(--photo-width, {fitting})")
         ui.run_javascript(f"closeup.open({width}, {height}, '/picture/{self._token}')")
         self.pictures["before"] = drawing.picture(before)
+        self.histogram_before = drawing.histogram_svg(before)
         self.clipped_before = drawing.clipped_shares(before)
         self._show("before", self._before)
 

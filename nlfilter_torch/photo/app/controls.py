@@ -85,8 +85,12 @@ class Control:
         """
         if value == self.slider.none:
             return "all"
-        places = len(f"{self.slider.step:g}".partition(".")[2])
-        return f"{value:.{places}f} {SYMBOLS.get(self.parameter.unit, '')}".rstrip()
+        return f"{digits(value, self.slider.step)} {SYMBOLS.get(self.parameter.unit, '')}".rstrip()
+
+
+def digits(value: float, step: float) -> str:
+    """A value of a slider as text, with the places that its step has."""
+    return f"{value:.{len(f'{step:g}'.partition('.')[2])}f}"
 
 
 LAYERS = (

@@ -13,17 +13,13 @@ from nlfilter_torch.photo.declared.strokes import Mark
 from nlfilter_torch.photo.edits.applying import left_by_crop
 from nlfilter_torch.photo.edits.parts import Parts, Rectangle
 from nlfilter_torch.photo.files.formats import check_memory
-from nlfilter_torch.photo.picture.developing import (
-    develop_image,
-    in_light,
-    limits_of,
-    part_of_planes,
-    reframed,
-)
+from nlfilter_torch.photo.picture.developing import limits_of, part_of_planes, reframed
 from nlfilter_torch.photo.picture.in_memory import InMemory
+from nlfilter_torch.photo.picture.light import develop_image, in_light, lit_photograph
 from nlfilter_torch.photo.picture.painting import TensorPainter
-from nlfilter_torch.photo.picture.photographs import Photograph, cut_photograph, lit_photograph
+from nlfilter_torch.photo.picture.photographs import Photograph, cut_photograph
 from nlfilter_torch.photo.picture.resizing import resize
+from nlfilter_torch.photo.picture.source import Cache
 
 DEVELOPING = -1  # the place before all steps, of a slider that moves
 
@@ -49,6 +45,7 @@ class Developed:
     before: Tensor
     preview: Preview
     parts: Parts
+    _areas: Cache = field(default_factory=dict)  # of ``before``
     _counted: dict[tuple[Mark, ...], bool] = field(default_factory=dict)  # whether strokes reach pixels that count
 
     @staticmethod
@@ -101,7 +98,7 @@ class Developed:
     def approximate(self, development: Development, original: Preview) -> Tensor:
         """The preview, quickly, as it would be developed in another way, from the preview of the photograph itself."""
         if development.geometry == self.development.geometry:
-            return in_light(self.before, development, limits_of(original.pixels))
+            return in_light(self.before, development, limits_of(original.pixels), self._areas)
         return develop_image(original.pixels, development)
 
     def change_in(self, development: Development, original: Preview) -> Tensor:

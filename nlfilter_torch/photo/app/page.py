@@ -170,7 +170,7 @@ class Editor:
             self._panel.follow()
             return False
         try:
-            recipe = session.developing(values, self.proportions.aspect(session.whole_size))
+            recipe = session.developing(values, self.proportions.aspect(session.turned_size))
         except ValueError as error:  # the middle of the crop would be outside
             self._tasks.show_error(str(error))
             self._panel.follow()
@@ -181,6 +181,13 @@ class Editor:
             self.proportions.kept |= {recipe.develop.crop}
         self.replace(recipe, None if complete else DEVELOPING)
         return True
+
+    def turn(self, quarters: int) -> None:
+        """Turn the photograph clockwise by quarters of a circle; the crop shows the same."""
+        session = self._opened("to turn")
+        if session is not None:
+            self.proportions = Proportions()
+            self.replace(replace(session.recipe, develop=session.recipe.develop.quartered(quarters)), None)
 
     def toggle_pick(self) -> None:
         """Let the next click on the photograph choose what is grey, or no longer."""
@@ -223,7 +230,7 @@ class Editor:
         """Show the frame of the crop as it is now."""
         await self._tasks.run("Working", self._canvas.draw_whole)
         if self.is_cropping and self.session is not None and not self._client.is_deleted:
-            height, width = self.session.whole_size
+            height, width = self.session.turned_size
             aspect = self.proportions.aspect((height, width))
             with self._client:
                 self._canvas.show_crop(None if aspect is None else aspect * height / width)
@@ -395,6 +402,7 @@ class Editor:
     def _show(self) -> None:
         """Show the picture that the canvas has taken, and its histogram."""
         self._canvas.show()
+        self._panel.draw_tones(self._canvas.histogram_before)
         self._panel.draw_levels(self._canvas.histogram, self._canvas.clipped, self._canvas.clipped_before)
 
     def _take(self, picture: Tensor) -> None:

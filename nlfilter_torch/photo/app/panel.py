@@ -221,6 +221,11 @@ class Panel:
         self._clipped.set_text("Clipped: " + ", ".join(texts) + warning)
         self._clipped.classes(add="warning" if worse else "", remove="" if worse else "warning")
 
+    def draw_tones(self, histogram: str) -> None:
+        """Show the histogram of the photograph before the edit."""
+        for tab in self._tabs.values():
+            tab.draw_tones(histogram)
+
     def draw_response(self, svg: str) -> None:
         """Show the response of the sliders for the layers."""
         for tab in self._tabs.values():

@@ -19,15 +19,15 @@ from nlfilter_torch.photo.declared.parameters import EDITS
 from nlfilter_torch.photo.declared.presets import Recipe, on_frame
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.declared.strokes import Mark, Region, thin
-from nlfilter_torch.photo.edits.applying import apply_recipe
 from nlfilter_torch.photo.edits.parts import Parts, Rectangle
-from nlfilter_torch.photo.edits.recipe import edit_rows
+from nlfilter_torch.photo.edits.recipe import apply_recipe, edit_rows
 from nlfilter_torch.photo.files import tiff
 from nlfilter_torch.photo.files.exif import read_upright
 from nlfilter_torch.photo.files.formats import BITS, DEPTHS, SUFFIXES, check_memory, first_bytes, type_of
 from nlfilter_torch.photo.files.rows import TILED_MEMORY, WHOLE_MEMORY, usual_memory
 from nlfilter_torch.photo.files.writing import open_beside
-from nlfilter_torch.photo.picture.developing import balance_of, in_light, limits_of, turned_canvas
+from nlfilter_torch.photo.picture.developing import limits_of, turned_canvas
+from nlfilter_torch.photo.picture.light import balance_of, in_light
 from nlfilter_torch.photo.picture.photographs import (
     Photograph,
     check_output,
@@ -151,6 +151,11 @@ class Session:
         return self.original.photograph.size
 
     @property
+    def turned_size(self) -> tuple[int, int]:
+        """(height, width) of it turned by quarters of a circle."""
+        return self.recipe.develop.frame(self.whole_size).turned
+
+    @property
     def crop(self) -> Crop:
         """The edges of what is kept of :attr:`uncropped`."""
         return self.recipe.develop.frame(self.whole_size).edges
@@ -209,8 +214,8 @@ class Session:
         before, reach = self.developed.before, POINTED
         column, row = (min(max(math.floor(at), 0), n - 1) for at, n in zip((x, y), before.shape[:1:-1], strict=True))
         part = before[..., max(0, row - reach) : row + reach + 1, max(0, column - reach) : column + reach + 1]
-        temperature, tint = balance_of(part)
-        return {"temperature": temperature, "tint": tint}
+        warmth, tint = balance_of(part)
+        return {"temperature": None, "warmth": warmth, "tint": tint}
 
     def commit(self) -> None:
         """Complete a change, so that it can be undone."""

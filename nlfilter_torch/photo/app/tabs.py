@@ -9,9 +9,10 @@ from nicegui import ui
 from torch import Tensor
 
 from nlfilter_torch.photo.app import controls, drawing
-from nlfilter_torch.photo.app.controls import Choice, Control, Slider, SteadySlider, show_pressed
+from nlfilter_torch.photo.app.controls import Choice, Control, Slider, SteadySlider, digits, show_pressed
+from nlfilter_torch.photo.app.curve import CurveEditor
 from nlfilter_torch.photo.app.tools import BRUSH_RADIUS, BRUSHES, FREE, PALETTE, PROPORTIONS, Brush, Proportions
-from nlfilter_torch.photo.declared.development import DEVELOP, WHOLE_CROP
+from nlfilter_torch.photo.declared.development import AUTO, DEVELOP, WHOLE_CROP
 from nlfilter_torch.photo.declared.json_values import Value
 from nlfilter_torch.photo.declared.parameters import EDITS
 from nlfilter_torch.photo.declared.presets import LOOKS, PRESETS, PURPOSES, Recipe
@@ -23,7 +24,8 @@ from nlfilter_torch.photo.picture.resizing import resize
 BANDWIDTH = 20.0  # grey levels, the start when the bandwidth is not automatic
 THUMBNAIL = 160  # pixels of the longest side, twice as many as on the page
 AMOUNT = "amount"
-UNITS_OF_DEVELOPMENT = {"exposure": " stops", "straighten": "\u00b0"}
+UNITS_OF_DEVELOPMENT = {"exposure": " stops", "temperature": " K", "straighten": "\u00b0"}
+COLOURS, GEOMETRY = ("temperature", "warmth", "tint", "vibrance", "saturation"), ("straighten",)  # groups of sliders
 BY_HAND = "Brush (B) and Eraser (E) paint on the mask itself; S is the first tool again."
 
 
@@ -71,6 +73,9 @@ class EditedPage(Protocol):
     def hold(self, name: str) -> None:
         """Let the crop keep proportions from now on, and cut it to them."""
 
+    def turn(self, quarters: int) -> None:
+        """Turn the photograph clockwise by quarters of a circle."""
+
     def toggle_pick(self) -> None:
         """Let the next click on the photograph choose what is grey, or no longer."""
 
@@ -99,6 +104,9 @@ class EditTab:
 
     def draw_response(self, svg: str) -> None:
         """Show the response of the sliders, in a tab that has a place for it."""
+
+    def draw_tones(self, histogram: str) -> None:
+        """Show the histogram of the photograph before the edit, in a tab that has a place for it."""
 
     def _build(self) -> None:
         ui.label(EDITS[self._edit].hint).classes("hint")
@@ -163,18 +171,20 @@ class DevelopControl(Control):
 
     def read(self, recipe: Recipe) -> float:
         """The slider's value for an edit."""
-        return float(getattr(recipe.develop, self.parameter.name))
+        value = getattr(recipe.develop, self.parameter.name)
+        return value if isinstance(value, float) else self.slider.none or 0.0
 
     def usual(self, recipe: Recipe) -> float:
         """The slider's value at the start."""
-        return self.parameter.default_number
+        return self.read(Recipe())
 
     def show(self, value: float) -> str:
         """The value as text."""
-        return super().show(value) + UNITS_OF_DEVELOPMENT.get(self.parameter.name, "")
+        return digits(value, self.slider.step) + UNITS_OF_DEVELOPMENT.get(self.parameter.name, "")
 
 
 DEVELOP_CONTROLS = tuple(DevelopControl(DEVELOP.name, p, p.slider, p.help) for p in DEVELOP if p.slider is not None)
+UNGROUPED = [c.parameter.name for c in DEVELOP_CONTROLS if c.parameter.name not in COLOURS + GEOMETRY]
 
 
 class DevelopTab(EditTab):
@@ -183,19 +193,35 @@ class DevelopTab(EditTab):
     def follow(self) -> None:
         """Show the current edit."""
         super().follow()
-        for button, is_on in ((self._crop, self._page.is_cropping), (self._pick, self._page.is_picking)):
+        develop = self._page.recipe().develop
+        for button, is_on in (
+            (self._crop, self._page.is_cropping),
+            (self._pick, self._page.is_picking),
+            (self._auto, develop.temperature == AUTO),
+        ):
             show_pressed(button, is_on)
-        self._whole.set_enabled(self._page.recipe().develop.crop != WHOLE_CROP)
+        self._curve.follow(develop.curve)
+        self._whole.set_enabled(develop.crop != WHOLE_CROP)
         self._proportions.set_value(self._page.proportions.name)
 
     def _build(self) -> None:
         ui.label(DEVELOP.hint).classes("hint")
-        self._sliders = [Slider(control, self._page.recipe, self._develop) for control in DEVELOP_CONTROLS]
-        self._pick = ui.button("Grey point", icon="colorize", on_click=self._page.toggle_pick).props(
-            "flat dense no-caps"
-        )
-        self._pick.tooltip("Click on something that is grey or white: the white balance makes it so")
+        self._build_sliders(set(UNGROUPED))
+        self._curve = CurveEditor(lambda curve, complete: self._develop("", {"curve": curve}, complete))
+        ui.label("Colour").classes("group")
+        with ui.row().classes("w-full items-center no-wrap gap-2"):
+            self._auto = ui.button("Auto", icon="wb_auto", on_click=self._toggle_auto).props("flat dense no-caps")
+            self._auto.tooltip("Estimate the light of the photograph, and make it white")
+            self._pick = ui.button("Grey point", icon="colorize", on_click=self._page.toggle_pick)
+            self._pick.props("flat dense no-caps")
+            self._pick.tooltip("Click on something that is grey or white: the white balance makes it so")
+        self._build_sliders(set(COLOURS))
         ui.label("Crop").classes("group")
+        with ui.row().classes("w-full items-center no-wrap gap-2"):
+            for label, icon, quarters in (("Turn left", "rotate_left", 3), ("Turn right", "rotate_right", 1)):
+                turn = ui.button(label, icon=icon, on_click=partial(self._page.turn, quarters))
+                turn.props("flat dense no-caps").tooltip("By 90 degrees")
+        self._build_sliders(set(GEOMETRY))
         with ui.row().classes("w-full items-center no-wrap gap-2 q-mt-xs"):
             self._crop = ui.button("Crop", icon="crop", on_click=self._page.toggle_crop).props("flat dense no-caps")
             self._crop.tooltip("Drag a frame over the whole photograph; Escape ends it")
@@ -204,6 +230,19 @@ class DevelopTab(EditTab):
             self._proportions.tooltip("Width to height of the crop, which it keeps while its frame is dragged")
             self._proportions.on_value_change(lambda event: self._hold(event.value))
             self._whole = ui.button("Whole picture", on_click=self._uncrop).props("flat dense no-caps")
+
+    def _build_sliders(self, names: set[str]) -> None:
+        """Build the sliders of some values."""
+        controls = [control for control in DEVELOP_CONTROLS if control.parameter.name in names]
+        self._sliders += [Slider(control, self._page.recipe, self._develop) for control in controls]
+
+    def draw_tones(self, histogram: str) -> None:
+        """Show the histogram of the photograph before the edit behind the curve."""
+        self._curve.draw_tones(histogram)
+
+    def _toggle_auto(self) -> None:
+        is_auto = self._page.recipe().develop.temperature == AUTO
+        self._page.develop({"temperature": None if is_auto else AUTO, "warmth": 0.0, "tint": 0.0}, True)
 
     def _develop(self, _: str, values: Mapping[str, Value], complete: bool) -> None:
         """Change some values."""

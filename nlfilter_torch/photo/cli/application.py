@@ -27,7 +27,10 @@ from nlfilter_torch.version import __version__
 
 NAME = "nlfilter-torch"
 FULL = (errno.ENOSPC, errno.EDQUOT)
-DEVELOP_OPTIONS = ("--exposure", "--temperature", "--tint", "--straighten", "--crop", "--aspect")  # options of develop
+DEVELOP_OPTIONS = (  # options of develop that other programs have everywhere
+    *("--exposure", "--highlights", "--shadows", "--temperature", "--tint", "--saturation"),
+    *("--rotate", "--straighten", "--crop", "--aspect"),
+)
 #: What other programs call an option: our options, of which those of the command are named, or a sentence.
 OTHER_NAMES: Mapping[str, tuple[str, ...] | str] = {
     "--sigma": ("--noise-level", "--bandwidth", "--radius", "--tolerance"),
@@ -81,7 +84,6 @@ OTHER_NAMES: Mapping[str, tuple[str, ...] | str] = {
     "--brightness": ("--exposure",),
     "--wb": ("--temperature", "--tint"),
     "--white-balance": ("--temperature", "--tint"),
-    "--rotate": ("--straighten",),
     "--ev": ("--exposure",),
     "--ratio": ("--aspect",),
     "--proportions": ("--aspect",),
@@ -99,13 +101,13 @@ OTHER_NAMES: Mapping[str, tuple[str, ...] | str] = {
 OTHER_COMMANDS: Mapping[str, str] = {
     "bw": "apply IN OUT mono",
     "monochrome": "apply IN OUT mono",
-    "saturation": "apply IN OUT vivid",
+    "saturation": "develop IN OUT --saturation 0.3",
     "crop": "develop IN OUT --crop X,Y,W,H",
     "straighten": "develop IN OUT --straighten DEGREES",
-    "rotate": "develop IN OUT --straighten DEGREES",
+    "rotate": "develop IN OUT --rotate 90",
     "exposure": "develop IN OUT --exposure STOPS",
     "brightness": "develop IN OUT --exposure STOPS",
-    "white-balance": "develop IN OUT --temperature T --tint T",
+    "white-balance": "develop IN OUT --temperature KELVIN --tint T",
     "contrast": "tone IN OUT --contrast FACTOR",
     "enhance": "detail IN OUT --preset crisp",
     "clarity": "detail IN OUT --preset crisp",

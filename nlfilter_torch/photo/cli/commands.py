@@ -13,6 +13,7 @@ from nlfilter_torch.photo.cli.edits import (
     check_usual,
     edit_photograph,
     other_recipe,
+    parsed,
     preset_option,
     step_of,
     typed_options,
@@ -69,10 +70,11 @@ def develop(
 ) -> None:
     """Develop a photograph; the help is that of the declaration."""
     sides = None if aspect is None else options.parse_aspect(aspect)
+    development = Development(**{name: parsed(value, DEVELOP[name]) for name, value in values.items()})
 
     from nlfilter_torch.photo.cli.jobs import develop_file
 
-    develop_file(Recipe((), Development(**values)), crop, sides, source, target, files)
+    develop_file(Recipe((), development), crop, sides, source, target, files)
 
 
 Edits = Annotated[

@@ -28,13 +28,8 @@ from nlfilter_torch.photo.files.rows import (
     write_picture,
 )
 from nlfilter_torch.photo.picture.edit import Rows
-from nlfilter_torch.photo.picture.photographs import (
-    Photograph,
-    check_output,
-    develop_photograph,
-    read_photograph,
-    write_photograph,
-)
+from nlfilter_torch.photo.picture.light import develop_photograph
+from nlfilter_torch.photo.picture.photographs import Photograph, check_output, read_photograph, write_photograph
 from nlfilter_torch.photo.picture.pictures import Picture, mask_plane
 from nlfilter_torch.photo.picture.sampling import Report
 from nlfilter_torch.photo.picture.tiles import Passes, Processes, Statistics, Tiling
@@ -320,5 +315,5 @@ class FileEdit(ABC):
     def note_developing(self, size: tuple[int, int], channels: int) -> None:
         """Print the notes about how a photograph (H, W) with that number of channels is developed."""
         if self.develop.balances and channels < 3:
-            options.note(f"{self.source} is grey: temperature and tint change nothing")
+            options.note(f"{self.source} is grey: white balance changes nothing")
         note_cropped(self.develop, self.cropped_away(size))

@@ -232,15 +232,23 @@ def step_of(edit: Edit, options_of_edit: Mapping[str, Value]) -> Step:
     for parameter in edit:
         if parameter.name not in options_of_edit:
             continue
-        value = options_of_edit[parameter.name]
-        if isinstance(value, str) and parameter.kind == "sliders":
-            value = options.parse_sliders(value, f"--{parameter.name}")
-        elif isinstance(value, str) and (parameter.words or parameter.kind == "number"):
-            value = options.parse_number(value, parameter)
-        elif isinstance(value, int) and parameter.kind == "odd":
-            options.check_odd(value, parameter)
-        values[parameter.name] = value
+        values[parameter.name] = parsed(options_of_edit[parameter.name], parameter)
     return Step(edit.name, (), **values)
+
+
+def parsed(value: Any, parameter: Parameter) -> Any:
+    """The value of an option, of which text stands for lists and for numbers that may be words.
+
+    Raises:
+        ValueError: if it is invalid; values that typer has checked are not checked again.
+    """
+    if isinstance(value, str) and parameter.kind == "sliders":
+        return options.parse_sliders(value, f"--{parameter.name}")
+    if isinstance(value, str) and (parameter.words or parameter.kind == "number"):
+        return options.parse_number(value, parameter)
+    if isinstance(value, int) and parameter.kind == "odd":
+        options.check_odd(value, parameter)
+    return value
 
 
 def edit_photograph(

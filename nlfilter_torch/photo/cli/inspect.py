@@ -25,7 +25,7 @@ from nlfilter_torch.photo.cli.editing import viewed_within_memory
 from nlfilter_torch.photo.cli.progress import steps
 from nlfilter_torch.photo.declared.presets import find_recipe
 from nlfilter_torch.photo.declared.steps import Step
-from nlfilter_torch.photo.edits.applying import apply_recipe
+from nlfilter_torch.photo.edits.recipe import apply_recipe
 from nlfilter_torch.photo.edits.recolor import recolor
 from nlfilter_torch.photo.files.writing import check_folder, open_beside
 from nlfilter_torch.photo.picture.photographs import read_photograph

@@ -34,8 +34,8 @@ from nlfilter_torch.photo.declared.development import Development
 from nlfilter_torch.photo.declared.presets import Recipe, find_recipe
 from nlfilter_torch.photo.declared.rows import WHITE, is_hidden
 from nlfilter_torch.photo.declared.steps import Step
-from nlfilter_torch.photo.edits.applying import apply_recipe, edit_of, left_by_crop
-from nlfilter_torch.photo.edits.recipe import edit_regions, edit_tiling
+from nlfilter_torch.photo.edits.applying import edit_of, left_by_crop
+from nlfilter_torch.photo.edits.recipe import apply_recipe, edit_regions, edit_tiling
 from nlfilter_torch.photo.files.rows import StoredPicture, open_picture
 from nlfilter_torch.photo.picture.changes import blend_edited
 from nlfilter_torch.photo.picture.drawn import Painter

@@ -151,13 +151,14 @@ def parse_number(text: str, parameter: Parameter) -> float | str:
     except ValueError:
         value = math.nan
     name, unit = f"--{parameter.name.replace('_', '-')}", UNIT_NAMES[parameter.unit][0]
+    of_unit, usual = f" of {unit}" if unit else "", "20" if unit else "5500"
     words = "".join(f", or {word}" for word in parameter.words)
     if not 0 < value < math.inf:
-        raise ValueError(f"{name} must be a positive number of {unit}, such as 20{words}, got {text!r}")
+        raise ValueError(f"{name} must be a positive number{of_unit}, such as {usual}{words}, got {text!r}")
     if not parameter.low <= value <= parameter.high:
         raise ValueError(
-            f"{name} must be from {parameter.low:g} to {parameter.high:.0f} {unit}{words}, got {text!r}; "
-            "20 suits most photographs"
+            f"{name} must be from {parameter.low:g} to {parameter.high:.0f}{unit and ' '}{unit}{words}, got {text!r}; "
+            f"{usual} suits most photographs"
         )
     return value
 

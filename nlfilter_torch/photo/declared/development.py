@@ -1,4 +1,4 @@
-"""How a photograph is developed before the steps of an edit: exposure, white balance, straightening and crop.
+"""How a photograph is developed before the steps of an edit: light, white balance, colours, turning and crop.
 
 A recipe holds it once, beside its steps. The strokes of all steps are stored in coordinates of the original picture,
 and :class:`Frame` is the one place that maps them to the developed picture and back. Does not import torch.
@@ -18,12 +18,25 @@ WHOLE_CROP: Crop = (0.0, 0.0, 1.0, 1.0)
 ROUNDING = 1e-9  # pixels, within which an edge is that of a pixel
 SAME = 0.01  # pixels, by which the sides of a crop that was moved may differ
 
+TURNS = (0, 90, 180, 270)  # degrees
+EVEN_CURVE: tuple[float, ...] = (0.0, 0.25, 0.5, 0.75, 1.0)  # the curve that changes nothing
+NEUTRAL = 6500.0  # kelvin of the light for which a file is balanced
+AUTO = "auto"
+
+
+def _amount(name: str, help: str) -> Parameter:
+    """A number from -1 to 1 that changes nothing at 0."""
+    return Parameter(name, "number", 0.0, help, -1, 1, idle=0.0, slider=Slider(name.capitalize(), -1, 1, 0.01))
+
+
 #: Declared as an edit is, though it is no step: it comes first, and once.
 DEVELOP = Edit(
     "develop",
-    """Develop a photograph: exposure and white balance in linear light, then straighten and crop.
+    """Develop a photograph: turn and crop it, and set its light, white balance and colours.
 
-    Example: `nlfilter-torch develop in.jpg out.jpg --exposure 0.5 --temperature 0.1 --straighten 1.5`
+    Example: `nlfilter-torch develop in.jpg out.jpg --exposure 0.5 --highlights -0.6 --shadows 0.4 --straighten 1.5`
+
+    By lamplight: `nlfilter-torch develop in.jpg out.jpg --temperature 4000`, or `--temperature auto`
 
     Cut a tenth off at the left and at the bottom: `nlfilter-torch develop in.jpg out.jpg --crop 10%,0%,90%,90%`
     """,
@@ -39,26 +52,57 @@ DEVELOP = Edit(
             metavar="STOPS",
             slider=Slider("Exposure", -3, 3, 0.05),
         ),
+        _amount("contrast", "Difference of light and dark, by a curve about middle grey: 1 is strong, -1 is flat."),
+        _amount(
+            "highlights",
+            "Brightness of light areas, from -1 to 1: below 0 skies get darker. Detail and edges stay as they are.",
+        ),
+        _amount(
+            "shadows",
+            "Brightness of dark areas, from -1 to 1: above 0 they get lighter. Detail and edges stay as they are.",
+        ),
+        _amount("whites", "Brightness of the lightest tones, up to white: above 0 more become white."),
+        _amount("blacks", "Brightness of the darkest tones, down to black: below 0 more become black."),
         Parameter(
             "temperature",
             "number",
-            0.0,
-            "White balance from blue, -1, to amber, 1: values above 0 make a cold photograph warmer. Grey photographs "
-            "stay grey.",
-            -1,
+            None,
+            "White balance in kelvin, the colour temperature of the light that the photograph was taken in: below 6500 "
+            "it becomes bluer, above it more amber. auto estimates the light. Default: as it is.",
+            2000,
+            15000,
+            optional=True,
+            words=(AUTO,),
+            metavar="KELVIN",
+            slider=Slider("Temperature", 2000, 12000, 50, none=NEUTRAL),
+        ),
+        _amount(
+            "warmth",
+            "White balance from blue, -1, to amber, 1, added to temperature: values above 0 make a cold photograph "
+            "warmer. Grey photographs stay grey.",
+        ),
+        _amount("tint", "White balance from green, -1, to magenta, 1: a greenish photograph becomes neutral above 0."),
+        _amount("vibrance", "Strength of pale colours, from -1 to 1; strong colours change little."),
+        _amount("saturation", "Strength of all colours: -1 is grey, 1 is twice as strong. Brightness stays."),
+        Parameter(
+            "curve",
+            "sliders",
+            EVEN_CURVE,
+            "Tone curve: the brightness that evenly spaced tones from black to white become, each from 0 to 1, such as "
+            "0,0.2,0.5,0.8,1.",
+            0,
             1,
-            idle=0.0,
-            slider=Slider("Temperature", -1, 1, 0.01),
+            idle=EVEN_CURVE,
         ),
         Parameter(
-            "tint",
-            "number",
-            0.0,
-            "White balance from green, -1, to magenta, 1: a greenish photograph becomes neutral above 0.",
-            -1,
-            1,
-            idle=0.0,
-            slider=Slider("Tint", -1, 1, 0.01),
+            "rotate",
+            "count",
+            0,
+            "Degrees by which the photograph is turned clockwise: 90, 180 or 270.",
+            0,
+            270,
+            idle=0,
+            metavar="DEGREES",
         ),
         Parameter(
             "straighten",
@@ -76,7 +120,7 @@ DEVELOP = Edit(
             "crop",
             "sliders",
             WHOLE_CROP,
-            "What is kept of the straightened photograph: left, top, right and bottom edge, as shares of its width and "
+            "What is kept of the turned photograph: left, top, right and bottom edge, as shares of its width and "
             "height from 0 to 1. It shrinks about its middle if it has empty corners.",
             0,
             1,
@@ -100,41 +144,72 @@ def check_value(name: str, value: object, place: str = "") -> None:
                 f"{called} must be the left, top, right and bottom edge as shares from 0 to 1, left below right and "
                 f"top below bottom, got {shown(list(value) if isinstance(value, tuple) else value)}; correct it"
             )
-    elif not DEVELOP[name].is_valid(value):
+    elif name == "rotate" and (isinstance(value, bool) or value not in TURNS):
+        raise ValueError(f"{called} must be 0, 90, 180 or 270 degrees, got {shown(value)}; see straighten for others")
+    elif not DEVELOP[name].is_valid(value) or (
+        isinstance(value, list | tuple) and not all(is_within(number, 0, 1) for number in value)
+    ):
         raise ValueError(f"{called} must be {DEVELOP[name].wanted}, got {shown(value)}; correct it")
 
 
 @dataclass(frozen=True)
 class Development:
-    """Exposure, white balance, straightening and crop of a photograph; by default nothing changes.
+    """Light, white balance, colours, turning and crop of a photograph; by default nothing changes.
+
+    Highlights and shadows come first, on the light that the photograph has; then exposure and white balance, the tones
+    from blacks to curve, and the colours.
 
     Attributes:
         exposure: stops, -5 to 5; 1 doubles the light.
-        temperature: -1 (blue) to 1 (amber).
+        warmth: white balance, -1 (blue) to 1 (amber).
         tint: -1 (green) to 1 (magenta).
         straighten: degrees, -45 to 45, by which the picture is rotated clockwise about its middle.
-        crop: left, top, right and bottom edge as shares of the rotated picture, which keeps its size. A crop with empty
+        crop: left, top, right and bottom edge as shares of the turned picture, which keeps its size. A crop with empty
             corners is shrunk about its middle until it has none.
+        rotate: 0, 90, 180 or 270 degrees, clockwise, before it is straightened.
+        temperature: kelvin of the light that the photograph was taken in, 2000 to 15000; None is 6500, which changes
+            nothing, and ``"auto"`` estimates the light from the picture.
+        contrast: -1 to 1, of all tones about middle grey.
+        highlights: -1 to 1, of areas that are light, without changing their detail.
+        shadows: -1 to 1, of areas that are dark.
+        whites: -1 to 1, of the lightest tones.
+        blacks: -1 to 1, of the darkest tones.
+        curve: what 2 to 100 evenly spaced tones from 0 to 1 become, from 0 to 1.
+        vibrance: -1 to 1, of pale colours.
+        saturation: -1 (grey) to 1 (twice), of all colours.
 
     Raises:
         ValueError: if a value is out of range.
 
     Example:
-        >>> Development(straighten=10.0).frame((100, 150)).size
-        (80, 120)
+        >>> Development(straighten=10.0).frame((100, 150)).size, Development(rotate=90).frame((100, 150)).size
+        ((80, 120), (150, 100))
     """
 
     exposure: float = DEVELOP["exposure"].default_number
-    temperature: float = DEVELOP["temperature"].default_number
+    warmth: float = DEVELOP["warmth"].default_number
     tint: float = DEVELOP["tint"].default_number
     straighten: float = DEVELOP["straighten"].default_number
     crop: Crop = WHOLE_CROP
+    rotate: int = 0
+    temperature: float | str | None = None
+    contrast: float = DEVELOP["contrast"].default_number
+    highlights: float = DEVELOP["highlights"].default_number
+    shadows: float = DEVELOP["shadows"].default_number
+    whites: float = DEVELOP["whites"].default_number
+    blacks: float = DEVELOP["blacks"].default_number
+    curve: tuple[float, ...] = EVEN_CURVE
+    vibrance: float = DEVELOP["vibrance"].default_number
+    saturation: float = DEVELOP["saturation"].default_number
 
     def __post_init__(self) -> None:
         """Check all values, and make them numbers of the declared type."""
         for name, value in vars(self).items():
             check_value(name, value)
-            object.__setattr__(self, name, tuple(map(float, value)) if name == "crop" else float(value))
+            if isinstance(value, list | tuple):
+                object.__setattr__(self, name, tuple(map(float, value)))
+            elif value is not None and not isinstance(value, str):
+                object.__setattr__(self, name, int(value) if name == "rotate" else float(value))
 
     @property
     def is_idle(self) -> bool:
@@ -144,17 +219,32 @@ class Development:
     @property
     def balances(self) -> bool:
         """Whether the white balance changes."""
-        return bool(self.temperature or self.tint)
+        return bool(self.warmth or self.tint) or self.temperature not in (None, NEUTRAL)
 
     @property
-    def changes_tones(self) -> bool:
-        """Whether exposure or white balance change."""
-        return bool(self.exposure) or self.balances
+    def colours(self) -> bool:
+        """Whether the strength of colours changes."""
+        return bool(self.vibrance or self.saturation)
+
+    @property
+    def bends(self) -> bool:
+        """Whether tones change by a curve, the same for all pixels."""
+        return bool(self.contrast or self.whites or self.blacks) or self.curve != EVEN_CURVE
+
+    @property
+    def shades(self) -> bool:
+        """Whether light or dark areas change."""
+        return bool(self.highlights or self.shadows)
+
+    @property
+    def changes_light(self) -> bool:
+        """Whether anything but the geometry changes."""
+        return self != self.geometry
 
     @property
     def geometry(self) -> "Development":
-        """Straightening and crop alone."""
-        return Development(straighten=self.straighten, crop=self.crop)
+        """Turning, straightening and crop alone."""
+        return Development(rotate=self.rotate, straighten=self.straighten, crop=self.crop)
 
     def frame(self, size: tuple[int, int]) -> "Frame":
         """Where the developed picture lies in a picture (H, W).
@@ -162,16 +252,17 @@ class Development:
         Raises:
             ValueError: if the middle of the crop is outside the rotated picture.
         """
-        height, width = size
+        quarters = self.rotate // 90
+        height, width = turned = size[::-1] if quarters % 2 else size
         left, top, right, bottom = self.crop
         if self.straighten == 0:
             first = min(round(left * width), width - 1), min(round(top * height), height - 1)
             last = max(round(right * width), first[0] + 1), max(round(bottom * height), first[1] + 1)
-            return Frame(size, 0.0, first[1], first[0], last[1] - first[1], last[0] - first[0])
+            return Frame(size, 0.0, first[1], first[0], last[1] - first[1], last[0] - first[0], quarters)
         angle = math.radians(self.straighten)
         middle = (left + right - 1) / 2 * width, (top + bottom - 1) / 2 * height  # from that of the picture
         half = (right - left) / 2 * width, (bottom - top) / 2 * height
-        share = min(1.0, *(_reach(middle, (x * half[0], y * half[1]), angle, size) for x in (-1, 1) for y in (-1, 1)))
+        share = min(1.0, *(_reach(middle, (x * half[0], y * half[1]), angle, turned) for x in (-1, 1) for y in (-1, 1)))
         if share <= 0:
             raise ValueError(
                 f"crop must have its middle within the photograph turned by {self.straighten:g} degrees, got "
@@ -179,12 +270,25 @@ class Development:
             )
         columns, rows = (_inside(m + n / 2, share * h) for m, n, h in zip(middle, (width, height), half, strict=True))
         if not (columns and rows):
-            columns, rows = _thin(columns, rows, middle, angle, size)
-        return Frame(size, angle, rows.start, columns.start, len(rows), len(columns))
+            columns, rows = _thin(columns, rows, middle, angle, turned)
+        return Frame(size, angle, rows.start, columns.start, len(rows), len(columns), quarters)
+
+    def quartered(self, quarters: int) -> "Development":
+        """The same, turned clockwise by more quarters of a circle, with the crop that shows the same.
+
+        >>> turned = Development(crop=(0.0, 0.25, 1.0, 1.0)).quartered(1)
+        >>> turned.rotate, turned.crop
+        (90, (0.0, 0.0, 0.75, 1.0))
+        """
+        left, top, right, bottom = self.crop
+        for _ in range(quarters % 4):
+            left, top, right, bottom = 1 - bottom, left, 1 - top, right
+        return replace(self, rotate=(self.rotate + 90 * quarters) % 360, crop=(left, top, right, bottom))
 
     def to_json(self, indent: str = "", *, complete: bool = False) -> str:
         """Format it as a JSON object, without defaults unless ``complete``."""
-        entries = {n: v for n, v in vars(self).items() if complete or v != getattr(AS_IT_IS, n)}
+        entries = {p.name: getattr(self, p.name) for p in DEVELOP}
+        entries = {n: v for n, v in entries.items() if complete or v != getattr(AS_IT_IS, n)}
         lines = ",\n".join(f'{indent}  "{name}": {json.dumps(value)}' for name, value in entries.items())
         return f"{{\n{lines}\n{indent}}}"
 
@@ -214,6 +318,8 @@ AS_IT_IS = Development()
 class Frame:
     """Where a developed picture lies in its original: a rectangle of the original rotated about its middle.
 
+    The original is turned by quarters first; what follows counts in the turned picture.
+
     Attributes:
         original: (H, W) of the original.
         angle: of the turn, clockwise, in radians.
@@ -221,6 +327,7 @@ class Frame:
         left: its first column.
         height: its height.
         width: its width.
+        quarters: of a circle by which the original is turned clockwise before, 0 to 3.
     """
 
     original: tuple[int, int]
@@ -229,6 +336,12 @@ class Frame:
     left: int
     height: int
     width: int
+    quarters: int = 0
+
+    @property
+    def turned(self) -> tuple[int, int]:
+        """(H, W) of the original after the quarters."""
+        return self.original[::-1] if self.quarters % 2 else self.original
 
     @property
     def size(self) -> tuple[int, int]:
@@ -242,7 +355,7 @@ class Frame:
         >>> Development(crop=(0.52, 0.0, 1.0, 1.0)).frame((10, 20)).edges
         (0.5, 0.0, 1.0, 1.0)
         """
-        height, width = self.original
+        height, width = self.turned
         bottom, right = self.top + self.height, self.left + self.width
         return self.left / width, self.top / height, right / width, bottom / height
 
@@ -252,7 +365,7 @@ class Frame:
         >>> AS_IT_IS.frame((10, 20)).trimmed(1.0).placed((0.13, 0.0, 0.63, 1.0))
         (0.15, 0.0, 0.65, 1.0)
         """
-        height, width = self.original
+        height, width = self.turned
         left, top, right, bottom = crop
         if max(abs((right - left) * width - self.width), abs((bottom - top) * height - self.height)) > SAME:
             return crop
@@ -278,7 +391,7 @@ class Frame:
     @property
     def is_whole(self) -> bool:
         """Whether it is the original itself."""
-        return self.angle == 0 and self.size == self.original
+        return self.angle == self.quarters == 0 and self.size == self.original
 
     @property
     def scale(self) -> float:
@@ -293,7 +406,9 @@ class Frame:
         """
         if self.is_whole:
             return x, y
-        height, width = self.original
+        height, width = self.turned
+        for _ in range(self.quarters):
+            x, y = 1 - y, x
         column, row = rotated((x - 0.5) * width, (y - 0.5) * height, self.angle)
         return (column + width / 2 - self.left) / self.width, (row + height / 2 - self.top) / self.height
 
@@ -301,10 +416,13 @@ class Frame:
         """Where a point of the developed picture is in the original, the inverse of :meth:`inward`."""
         if self.is_whole:
             return x, y
-        height, width = self.original
+        height, width = self.turned
         column, row = self.left + x * self.width - width / 2, self.top + y * self.height - height / 2
         column, row = rotated(column, row, -self.angle)
-        return column / width + 0.5, row / height + 0.5
+        x, y = column / width + 0.5, row / height + 0.5
+        for _ in range(self.quarters):
+            x, y = y, 1 - x
+        return x, y
 
     def mark_inward(self, mark: Mark) -> Mark:
         """A mark in coordinates of the original, in those of the developed picture."""

@@ -1,6 +1,6 @@
 """Edits of pictures larger than memory, in tiles of rows: one step, or a whole edit as saved by the editor."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 
@@ -8,13 +8,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from nlfilter_torch.core.checks import check_photograph
 from nlfilter_torch.core.workers import single_threaded
+from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.declared.rows import RowSource
 from nlfilter_torch.photo.declared.steps import Step, acting_steps
-from nlfilter_torch.photo.edits.applying import fit_step, scribbles_of
+from nlfilter_torch.photo.edits.applying import apply_step, fit_step, left_by_crop, scribbles_of
 from nlfilter_torch.photo.picture.changes import blend_edited
+from nlfilter_torch.photo.picture.developing import develop_planes, limits_of
 from nlfilter_torch.photo.picture.drawn import Drawn
-from nlfilter_torch.photo.picture.painting import RowPainter
+from nlfilter_torch.photo.picture.in_memory import InMemory
+from nlfilter_torch.photo.picture.light import develop_image
+from nlfilter_torch.photo.picture.painting import RowPainter, TensorPainter
 from nlfilter_torch.photo.picture.pictures import Picture, Rows, RowTarget, Tile, mask_of
 from nlfilter_torch.photo.picture.sampling import Report, in_silence
 from nlfilter_torch.photo.picture.tiled import Tiled
@@ -166,3 +171,56 @@ def stream(
     with single_threaded(tiled.passes.workers(1)):
         fitted = fit_step(step, tiled, drawn, generator=generator)
     fill(target, tiled.rows(fitted))
+
+
+def apply_recipe(
+    recipe: Recipe,
+    image: Tensor,
+    report: Callable[[int, int], object] | None = None,
+    *,
+    weights: Tensor | None = None,
+    generator: torch.Generator | None = None,
+) -> Tensor:
+    """Edit a photograph as ``nlfilter-torch apply`` does.
+
+    Args:
+        recipe: the steps to apply, after the image is developed.
+        image: (B, C, H, W) in [0, 1], C = 1 or 3.
+        report: called before each step with how many are done, and of how many.
+        weights: how much pixels count, (B or 1, 1, H, W) from 0 to 1, such as :attr:`Photograph.weights`; None is 1
+            each.
+        generator: source of randomness for the landmarks; None draws the same for every step and call.
+
+    Returns:
+        (B, C, H, W), with C = 3 if a step added colour, and smaller if the recipe crops or straightens; the image
+        itself if nothing has an effect. Values may leave [0, 1]; between steps they are limited to it, or to the range
+        of the image if that is larger.
+        Differentiable in the image.
+
+    Raises:
+        ValueError: if a step cannot be applied to such an image.
+
+    Example:
+        >>> from nlfilter_torch.photo import Recipe, Step
+        >>> image = torch.rand(1, 3, 24, 24, generator=torch.Generator().manual_seed(0))
+        >>> recipe = Recipe((Step("detail", alpha=(3.0, 1.0)), Step("tone"), Step("detail", alpha=(0.5, 1.0))))
+        >>> apply_recipe(recipe, image).shape, apply_recipe(Recipe(), image) is image
+        (torch.Size([1, 3, 24, 24]), True)
+    """
+    if not recipe.develop.is_idle:
+        check_photograph(image, "image")
+        size = image.shape[-2], image.shape[-1]
+        image = develop_image(image, recipe.develop)
+        frame = recipe.develop.frame(size)
+        recipe = recipe.on_developed(size)
+        weights = None if weights is None else develop_planes(weights, frame).clamp(0, 1)
+        if weights is not None and not frame.is_whole:
+            source, painter = InMemory(image, weights=weights), TensorPainter()
+            recipe = Recipe(tuple(left_by_crop(step, source, painter) for step in recipe.steps))
+    result, steps = image, recipe.acting
+    for done, step in enumerate(steps):
+        if report is not None:
+            report(done, len(steps))
+        before = image if result is image else result.clamp(*limits_of(image))
+        result = apply_step(step, before, weights=weights, generator=generator)
+    return result

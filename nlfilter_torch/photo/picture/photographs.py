@@ -27,7 +27,7 @@ from nlfilter_torch.photo.files.formats import (
     write_file,
 )
 from nlfilter_torch.photo.files.metadata import NO_EXTRAS, Extras, Header, Metadata
-from nlfilter_torch.photo.picture.developing import develop_planes, finished, in_light, limits_of
+from nlfilter_torch.photo.picture.developing import develop_planes, finished, limits_of
 from nlfilter_torch.photo.picture.pictures import Picture, put_back, stored_as, transparency
 from nlfilter_torch.photo.picture.pixels import STRIP
 
@@ -217,22 +217,8 @@ def depth_in(target: Path, depth: str) -> Depth:
     return cast(Depth, depth if depth in depths else depths[-1])
 
 
-def develop_photograph(photograph: Photograph, development: Development) -> Photograph:
-    """Develop a photograph, as :func:`develop_image` does its pixels.
-
-    Transparency and pixels without data follow. Metadata that hold for the whole picture only, such as the place of the
-    subject, are left out if it is cropped.
-
-    Raises:
-        ValueError: if the middle of the crop is outside the turned picture.
-    """
-    if development.is_idle:
-        return photograph
-    return lit_photograph(cut_photograph(photograph, development), development, photograph)
-
-
 def cut_photograph(photograph: Photograph, development: Development) -> Photograph:
-    """Straighten and crop a photograph; raises as :func:`develop_photograph`."""
+    """Turn, straighten and crop a photograph; raises as :func:`develop_photograph`."""
     frame = development.frame(photograph.size)
     if frame.is_whole:
         return photograph
@@ -240,22 +226,15 @@ def cut_photograph(photograph: Photograph, development: Development) -> Photogra
     return replace(cut, exif=of_part(photograph.exif, frame.size[::-1]))
 
 
-def lit_photograph(cut: Photograph, development: Development, original: Photograph) -> Photograph:
-    """Change exposure and white balance of a photograph that was cut from the original."""
-    if not development.changes_tones:
-        return cut
-    return replace(cut, pixels=in_light(cut.pixels, development, limits_of(original.pixels)))
-
-
 def _cropped(photograph: Photograph, frame: Frame) -> Photograph:
+    """A photograph that is turned by quarters and cropped."""
     alpha, hidden = photograph.alpha, photograph.hidden
     if hidden is not None:
         rows, columns = (slice(start, start + n) for start, n in ((frame.top, frame.height), (frame.left, frame.width)))
-        inside = np.zeros_like(hidden.places)
-        inside[rows, columns] = True
-        hidden = replace(
-            hidden, places=hidden.places[rows, columns].copy(), colours=hidden.colours[inside[hidden.places]]
-        )
+        numbers = np.full(hidden.places.shape, -1)  # of the hidden pixels
+        numbers[hidden.places] = np.arange(len(hidden.colours))
+        numbers = np.rot90(numbers, -frame.quarters)[rows, columns]
+        hidden = replace(hidden, places=numbers >= 0, colours=hidden.colours[numbers[numbers >= 0]])
     return replace(
         photograph,
         pixels=develop_planes(photograph.pixels, frame).contiguous(),

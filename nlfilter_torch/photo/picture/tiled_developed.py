@@ -1,6 +1,6 @@
 """A picture larger than memory as it is developed: its rows, computed when they are read.
 
-A picture is straightened through two temporary files, since a row of it crosses many rows of the original.
+A picture is turned through two temporary files, since a row of it crosses many rows of the original.
 """
 
 from collections.abc import Iterator
@@ -16,8 +16,10 @@ from nlfilter_torch.core.workers import in_order
 from nlfilter_torch.photo.declared.development import Development, Frame
 from nlfilter_torch.photo.declared.rows import WHITE, RowSource, Stored
 from nlfilter_torch.photo.files.writing import FileRows
-from nlfilter_torch.photo.picture.developing import bands_of, finished, in_light, turned_band
-from nlfilter_torch.photo.picture.pictures import Picture, Rows, Tile, transparency
+from nlfilter_torch.photo.picture.developing import bands_of, finished, turned_band
+from nlfilter_torch.photo.picture.light import Light, fit_light
+from nlfilter_torch.photo.picture.pictures import Picture, Rows, transparency
+from nlfilter_torch.photo.picture.tiled import Tiled
 from nlfilter_torch.photo.picture.tiles import TILE_PIXELS, Passes, between_steps, intermediate, tile_by_tile
 
 
@@ -35,27 +37,31 @@ def developed_rows(
         nodata: the value of pixels without data, if the last channel marks these.
 
     Raises:
-        ValueError: if it is straightened for several processes, which cannot share its temporary file, or the middle of
+        ValueError: if it is turned for several processes, which cannot share its temporary file, or the middle of
             the crop is outside.
         OSError: if a temporary file does not fit.
     """
     picture, floats = Picture(source, name), between_steps(passes, source)
     picture.accept_any_scale()  # until it is edited
     frame = development.frame(picture.size)
-    if frame.angle and passes.processes is not None:
+    is_turned = bool(frame.angle or frame.quarters)
+    if is_turned and passes.processes is not None:
+        name = "straighten" if frame.angle else "rotate"
         raise ValueError(
-            f"straighten must be 0 with --workers or --cluster, got {development.straighten:g}; leave these out"
+            f"{name} must be 0 with --workers or --cluster, got {getattr(development, name):g}; leave these out"
         )
-    limits = picture.limits if frame.angle or development.changes_tones else (0.0, 1.0)
+    limits = picture.limits if is_turned or development.changes_light else (0.0, 1.0)
     with ExitStack() as stack:
-        if frame.angle:
+        if is_turned:
             source = stack.enter_context(_turned(picture, frame, floats, limits, nodata))
         elif not frame.is_whole:
             source = CroppedRows(source, frame)
-        if development.changes_tones:
+        if development.changes_light:
             framed = Picture(source, name)
             framed.accept_any_scale()
-            source = LitRows(floats, framed, development, limits)
+            least, most = (torch.tensor(end, dtype=framed.dtype) for end in limits)
+            light = fit_light(Tiled(framed, floats), development, (least, most))
+            source = LitRows(floats, framed, light)
         yield source
 
 
@@ -84,12 +90,11 @@ class CroppedRows:
 
 @dataclass(frozen=True)
 class LitRows:
-    """The rows of a picture whose values are within ``limits``, with another exposure and white balance."""
+    """The rows of a picture in another light."""
 
     passes: Passes
     picture: Picture
-    development: Development
-    limits: tuple[float, float]
+    light: Light
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -103,19 +108,14 @@ class LitRows:
 
     def __getitem__(self, rows: slice) -> Stored:
         """The rows from ``rows.start`` to ``rows.stop``."""
-        return tile_by_tile(self.passes, self.picture, self.lit).part(rows.start, rows.stop)[0]
-
-    def lit(self, tile: Tile) -> Tensor:
-        """The changed colours (1, C, h, W) of a tile."""
-        least, most = map(torch.tensor, self.limits)
-        return in_light(tile.image, self.development, (least, most))
+        return tile_by_tile(self.passes, self.picture, self.light).part(rows.start, rows.stop)[0]
 
 
 @contextmanager
 def _turned(
     picture: Picture, frame: Frame, floats: Passes, limits: tuple[float, float], nodata: float | None
 ) -> Iterator[FileRows]:
-    """The rows of a picture that is straightened and cropped, as floats in a temporary file."""
+    """The rows of a picture that is turned and cropped, as floats in a temporary file."""
     with ExitStack() as stack:
         with intermediate(_as_floats(picture, floats.kind), picture.size, floats.folder) as whole:
             bands = _bands(whole, frame, picture, limits, nodata, floats)
@@ -137,13 +137,18 @@ def _bands(
     """The rows (h, w, S) of the developed picture."""
     hidden = None if nodata is None else nodata / WHITE.get(picture.kind, 1)
     bands = bands_of(frame)
-    turned = in_order(turned_band, bands, passes.workers(1), partial(_part, whole), frame)
+    turned = in_order(turned_band, bands, passes.workers(1), partial(_part, whole, frame), frame)
     for rows, band in zip(bands, turned, strict=True):
-        passes.report("Straightening", rows.start, frame.height)
+        passes.report("Turning", rows.start, frame.height)
         planes = finished(band, picture.colours, limits, hidden)
         yield slice(rows.start, rows.stop), np.ascontiguousarray(planes[0].permute(1, 2, 0).numpy())
 
 
-def _part(whole: FileRows, rows: range, columns: range) -> Tensor:
-    """A part (1, S, h, w) of stored rows."""
-    return torch.from_numpy(whole.part(rows, columns)).permute(2, 0, 1)[None]
+def _part(whole: FileRows, frame: Frame, rows: range, columns: range) -> Tensor:
+    """A part (1, S, h, w) of stored rows, after the quarters of a turn."""
+    height, width = frame.turned
+    for _ in range(frame.quarters):
+        rows, columns = range(width - columns.stop, width - columns.start), rows
+        height, width = width, height
+    part = torch.from_numpy(whole.part(rows, columns)).permute(2, 0, 1)[None]
+    return part.rot90(-frame.quarters, (2, 3))

@@ -61,6 +61,10 @@ class Controls:
         """Show or hide the frame of the crop."""
         self.developed.append("crop")
 
+    def turn(self, quarters: int) -> None:
+        """Turn the photograph."""
+        self.developed.append(quarters)
+
     def toggle_pick(self) -> None:
         """Let the next click choose what is grey, or no longer."""
         self.developed.append("pick")
@@ -92,9 +96,13 @@ class Controls:
         (button,) = [b for b in self.of(ui.button) if b.text == label]
         return bool(button.props["aria-pressed"] == "true")
 
-    def click(self, label: str) -> None:
-        """Click a button by its text or by its label for screen readers."""
+    def button(self, label: str) -> ui.button:
+        """A button by its text or by its label for screen readers."""
         (button,) = [b for b in self.of(ui.button) if label in (b.text, b.props.get("aria-label"))]
-        for listener in button._event_listeners.values():
+        return button
+
+    def click(self, label: str) -> None:
+        """Click a button."""
+        for listener in self.button(label)._event_listeners.values():
             if listener.type == "click":
                 listener.handler(None)

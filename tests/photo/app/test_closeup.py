@@ -18,8 +18,8 @@ from nlfilter_torch.photo.app.session import Session
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.declared.strokes import Stroke
-from nlfilter_torch.photo.edits.applying import apply_recipe
 from nlfilter_torch.photo.edits.parts import Rectangle
+from nlfilter_torch.photo.edits.recipe import apply_recipe
 from nlfilter_torch.photo.picture.photographs import Photograph, read_photograph, write_photograph
 from tests.problems import cat
 

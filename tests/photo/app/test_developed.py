@@ -13,9 +13,9 @@ from nlfilter_torch.photo.declared.development import Development
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.declared.strokes import Stroke
-from nlfilter_torch.photo.edits.applying import apply_recipe
 from nlfilter_torch.photo.edits.parts import Rectangle
-from nlfilter_torch.photo.picture.developing import balance_of, develop_image
+from nlfilter_torch.photo.edits.recipe import apply_recipe
+from nlfilter_torch.photo.picture.light import balance_of, develop_image
 from nlfilter_torch.photo.picture.photographs import Photograph, read_photograph, write_photograph
 from nlfilter_torch.photo.picture.resizing import resize
 from tests.browser import difference
@@ -136,7 +136,7 @@ def test_a_photograph_of_floats_is_straightened_in_its_own_light(tmp_path: Path)
 
 
 def test_a_point_becomes_grey(session: Session) -> None:
-    session.load(Recipe((), Development(temperature=-0.5, tint=0.3, crop=(0.2, 0.0, 1.0, 1.0))))
+    session.load(Recipe((), Development(warmth=-0.5, tint=0.3, crop=(0.2, 0.0, 1.0, 1.0))))
     session.render()
     means = avg_pool2d(session.developed.before, 5)
     least = int((means.amax(1) - means.amin(1)).argmin())  # the least saturated of the places
@@ -144,7 +144,7 @@ def test_a_point_becomes_grey(session: Session) -> None:
     session.load(session.developing(session.balance(column + 2, row + 2)))
     place = session.render()[..., row : row + 5, column : column + 5].mean((0, 2, 3))
     assert place.amax() - place.amin() < 0.01
-    assert session.recipe.develop.temperature > -0.4
+    assert session.recipe.develop.warmth > -0.4
     assert session.balance(-5, -5) == session.balance(0.9, 0.9)
     assert session.balance(1e4, 1e4) == session.balance(149.5, 99.5)
     with pytest.raises(ValueError, match="a grey point must have red, green and blue light"):

@@ -9,7 +9,7 @@ from nlfilter_torch.photo.app.library import Library
 from nlfilter_torch.photo.app.session import Session
 from nlfilter_torch.photo.cli import main
 from nlfilter_torch.photo.declared.presets import Recipe
-from nlfilter_torch.photo.edits.applying import apply_recipe
+from nlfilter_torch.photo.edits.recipe import apply_recipe
 from nlfilter_torch.photo.picture.photographs import Photograph, read_photograph, write_photograph
 from tests.problems import LINE, cat, difference
 

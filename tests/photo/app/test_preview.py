@@ -17,7 +17,8 @@ from nlfilter_torch.photo.declared.parameters import EDITS
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.declared.strokes import Region, Stroke
-from nlfilter_torch.photo.edits.applying import PreparedStep, apply_recipe, apply_step
+from nlfilter_torch.photo.edits.applying import PreparedStep, apply_step
+from nlfilter_torch.photo.edits.recipe import apply_recipe
 from nlfilter_torch.photo.picture.resizing import resize
 from nlfilter_torch.photo.picture.source import seeded
 from nlfilter_torch.photo.picture.viewing import viewed_size

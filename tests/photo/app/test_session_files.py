@@ -13,7 +13,7 @@ from nlfilter_torch.__main__ import main
 from nlfilter_torch.operator.features import reduce_channels
 from nlfilter_torch.photo.app.session import Session, reduced_size
 from nlfilter_torch.photo.declared.presets import find_recipe
-from nlfilter_torch.photo.edits.applying import apply_recipe
+from nlfilter_torch.photo.edits.recipe import apply_recipe
 from nlfilter_torch.photo.picture.photographs import HiddenPixels, Photograph, read_photograph, write_photograph
 from nlfilter_torch.photo.picture.resizing import resize
 from tests.problems import LINE, cat, difference

@@ -16,7 +16,7 @@ from nlfilter_torch.photo.declared.development import Development
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.declared.strokes import Stroke
-from nlfilter_torch.photo.edits.applying import apply_recipe
+from nlfilter_torch.photo.edits.recipe import apply_recipe
 from nlfilter_torch.photo.picture.photographs import Photograph, read_photograph, write_photograph
 from tests.pairwise import each_value
 from tests.problems import cat, colour, difference
@@ -84,7 +84,7 @@ def test_apply_refuses_what_is_no_edit(tmp_path: Path, capsys: pytest.CaptureFix
 
 
 SIZE = (300, 420)  # more than a block that is turned at once
-ALL = ["--exposure", "0.5", "--temperature", "0.2", "--straighten", "3", "--crop", "5%,0%,95%,90%"]
+ALL = ["--exposure", "0.5", "--warmth", "0.2", "--straighten", "3", "--crop", "5%,0%,95%,90%"]
 
 
 def written(path: Path, kind: str) -> Path:
@@ -202,8 +202,8 @@ def test_bad_options(photo: Path, capsys: pytest.CaptureFixture[str]) -> None:
 def test_notes(tmp_path: Path, tiled: bool, capsys: pytest.CaptureFixture[str]) -> None:
     source, target = tmp_path / "in.png", tmp_path / "out.png"
     source.write_bytes(imagecodecs.png_encode(np.full((20, 30), 90, np.uint8)))
-    assert main(["develop", str(source), str(target), "--temperature", "0.5"]) == 0
-    assert "in.png is grey: temperature and tint change nothing" in capsys.readouterr().err
+    assert main(["develop", str(source), str(target), "--warmth", "0.5"]) == 0
+    assert "in.png is grey: white balance changes nothing" in capsys.readouterr().err
     assert (imagecodecs.png_decode(target.read_bytes()) == 90).all()
     for options, is_idle in (([], True), (["--aspect", "3:2"], True), (["--aspect", "1:1"], False)):
         assert main(["develop", str(source), str(target), *options]) == 0

@@ -87,7 +87,7 @@ def test_a_mask_of_another_size_is_refused_without_notes(photo: Path, capsys: py
 def test_what_a_file_cannot_hold_is_refused_without_notes(photo: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_photograph(Photograph(torch.full((1, 1, 9, 20), 0.4)), photo)
     target = photo.with_name("out.jpg")
-    assert "out.jpg" in refusal(capsys, "develop", photo, target, "--temperature", "0.5", "--depth", "16")
+    assert "out.jpg" in refusal(capsys, "develop", photo, target, "--warmth", "0.5", "--depth", "16")
 
 
 def test_options_without_effect_are_named(photo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -40,8 +40,8 @@ HINTS = [
     (["sharpen", "a.png", "b.png", "--strength", "3"], "No such option: --strength; here it is --amount"),
     (
         ["detail", "a.png", "b.png", "--rotate", "2"],
-        "No such option: --rotate; nlfilter-torch develop has --exposure, --temperature, --tint, --straighten, "
-        "--crop and --aspect",
+        "No such option: --rotate; nlfilter-torch develop has --exposure, --highlights, --shadows, --temperature, "
+        "--tint, --saturation, --rotate, --straighten, --crop and --aspect",
     ),
     (["develop", "a.png", "b.png", "--ratio", "1:1"], "No such option: --ratio; here it is --aspect"),
     (

@@ -164,6 +164,14 @@ def test_bad_entries() -> None:
 
 
 def test_bad_values_in_python() -> None:
-    with pytest.raises(ValueError, match="temperature must be a number from -1 to 1, got 3; correct it"):
-        Development(temperature=3)
+    with pytest.raises(ValueError, match="warmth must be a number from -1 to 1, got 3; correct it"):
+        Development(warmth=3)
+    with pytest.raises(
+        ValueError, match=r'temperature must be a number from 2000 to 15000, or "auto", or null, got 0\.5'
+    ):
+        Development(temperature=0.5)
+    with pytest.raises(ValueError, match="rotate must be 0, 90, 180 or 270 degrees, got 45; see straighten for others"):
+        Development(rotate=45)
+    with pytest.raises(ValueError, match="curve must be a list of 2 to 100 numbers from 0 to 1, got"):
+        Development(curve=(0.0, 1.5))
     assert Development(crop=WHOLE_CROP).is_idle

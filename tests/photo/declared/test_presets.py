@@ -10,7 +10,7 @@ import torch
 from nlfilter_torch.photo.cli import main
 from nlfilter_torch.photo.declared.presets import CHARACTERS, LOOKS, PRESETS, PURPOSES, Recipe, find_recipe
 from nlfilter_torch.photo.declared.steps import Step
-from nlfilter_torch.photo.edits.applying import apply_recipe
+from nlfilter_torch.photo.edits.recipe import apply_recipe
 from nlfilter_torch.photo.picture.photographs import Photograph, read_photograph, write_photograph
 from tests.recipes import INSIDE, KEEP, WHOLE
 

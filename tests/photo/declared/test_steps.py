@@ -9,7 +9,7 @@ import torch
 from nlfilter_torch.photo.declared.parameters import EDITS
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.declared.steps import Step, acting_steps, json_of, working_bytes
-from nlfilter_torch.photo.edits.applying import apply_recipe
+from nlfilter_torch.photo.edits.recipe import apply_recipe
 from tests.recipes import BLUE, COLORIZE, DEFOCUS, DETAIL, IN, RECOLOR, WHOLE
 
 

@@ -26,13 +26,13 @@ from nlfilter_torch.photo.declared.strokes import Stroke
 from nlfilter_torch.photo.edits.applying import (
     EDIT_OF,
     PreparedStep,
-    apply_recipe,
     apply_step,
     edit_of,
     filter_key,
     scribbles_of,
     viewed_stride,
 )
+from nlfilter_torch.photo.edits.recipe import apply_recipe
 from nlfilter_torch.photo.picture.colour import edit_luminance
 from nlfilter_torch.photo.picture.painting import TensorPainter
 from tests.strokes import mask_of, paint

@@ -11,7 +11,7 @@ from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.declared.strokes import Stroke
 from nlfilter_torch.photo.edits import recipe as whole_edit
-from nlfilter_torch.photo.edits.applying import apply_recipe
+from nlfilter_torch.photo.edits.recipe import apply_recipe
 from nlfilter_torch.photo.picture.tiles import Passes
 from nlfilter_torch.photo.selections.matting import pyramid_levels
 from tests.problems import cat, difference

@@ -1,8 +1,8 @@
-"""Exposure and white balance against plain arithmetic; turning against kornia at once; ranges and gradients."""
+"""Turning against kornia at once and against numpy; strokes in place; errors and gradients."""
 
 import math
+from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
 from kornia.geometry import rotate
@@ -12,50 +12,12 @@ from nlfilter_torch.photo.declared.development import Development
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.declared.strokes import Stroke
-from nlfilter_torch.photo.edits.applying import apply_recipe
-from nlfilter_torch.photo.picture.developing import develop_image, develop_planes, gains_of, reframed
+from nlfilter_torch.photo.edits.recipe import apply_recipe
+from nlfilter_torch.photo.picture.developing import develop_planes, reframed, turned_canvas
+from nlfilter_torch.photo.picture.light import develop_image
 from nlfilter_torch.photo.picture.resizing import resize
 from tests.pairwise import each_value
 from tests.problems import colour
-
-
-def linear(values: np.ndarray) -> np.ndarray:
-    """The light of values of sRGB."""
-    return np.where(values > 0.04045, ((values + 0.055) / 1.055) ** 2.4, values / 12.92)
-
-
-def encoded(light: np.ndarray) -> np.ndarray:
-    return np.where(light > 0.0031308, 1.055 * light ** (1 / 2.4) - 0.055, 12.92 * light)
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_exposure_and_white_balance_are_factors_of_light(dtype: torch.dtype) -> None:
-    image = colour("chelsea", 40, 60).to(dtype)
-    development = Development(exposure=-0.7, temperature=0.4, tint=-0.3)
-    gains = np.array([2 ** (0.75 * 0.4), 2 ** (0.5 * 0.3), 2 ** (-0.75 * 0.4)])
-    gains *= 2**-0.7 / (gains @ [0.2126, 0.7152, 0.0722])
-    assert gains_of(development) == pytest.approx(gains)
-    wanted = encoded(linear(image.double().numpy()) * gains[:, None, None]).clip(0, 1)
-    assert np.abs(develop_image(image, development).numpy() - wanted).max() < 2e-6
-
-
-def test_white_balance_keeps_the_luminance_of_grey_and_grey_pictures() -> None:
-    development = Development(temperature=0.8, tint=0.5)
-    warm = linear(develop_image(torch.full((1, 3, 2, 2), 0.3), development).double().numpy())
-    assert np.dot([0.2126, 0.7152, 0.0722], warm[0, :, 0, 0]) == pytest.approx(float(linear(np.array(0.3))), abs=1e-6)
-    assert warm[0, 0, 0, 0] > warm[0, 1, 0, 0] > warm[0, 2, 0, 0]  # amber
-    grey = torch.rand(1, 1, 3, 4, generator=torch.Generator().manual_seed(0))
-    assert torch.allclose(develop_image(grey, development), grey, atol=1e-6)
-
-
-def test_values_above_white_are_not_lost() -> None:
-    wide = torch.tensor([0.0, 0.2, 0.9, 5.0]).view(1, 1, 1, 4)
-    darker = develop_image(wide, Development(exposure=-3.0))
-    assert darker[0, 0, 0, 3] > 1.5  # and not the value of white
-    assert torch.allclose(develop_image(darker, Development(exposure=3.0)), wide, atol=1e-5)
-    assert develop_image(wide[..., :3], Development(exposure=3.0)).max() == 1
-    both = torch.cat([wide, wide.clamp(0, 1)])  # one picture of a batch does not change the other
-    assert torch.equal(develop_image(both, Development(exposure=1.0))[1], develop_image(both[1:], Development(1.0))[0])
 
 
 def test_turned_as_kornia_does_at_once() -> None:
@@ -66,6 +28,26 @@ def test_turned_as_kornia_does_at_once() -> None:
     edited = develop_image(image, Development(straighten=7.0))
     assert edited.shape[-2:] == frame.size
     assert (edited - wanted).abs().max() < 1e-3
+
+
+@pytest.mark.parametrize("quarters", [1, 2, 3])
+def test_quarters_of_a_turn_move_pixels(quarters: int) -> None:
+    image = colour("chelsea", 30, 40)
+    turned = image.rot90(-quarters, (2, 3))
+    assert torch.equal(develop_image(image, Development(rotate=90 * quarters)), turned)
+    crop = Development(rotate=90 * quarters, crop=(0.1, 0.2, 0.8, 0.9))
+    assert torch.equal(develop_image(image, crop), develop_image(turned, replace(crop, rotate=0)))
+    both = Development(rotate=90 * quarters, straighten=6.0)
+    assert torch.equal(develop_image(image, both), develop_image(turned, Development(straighten=6.0)))
+    assert turned_canvas(image, both).shape == turned.shape
+    frame = crop.frame((30, 40))
+    column, row = frame.inward((12 + 0.5) / 40, (17 + 0.5) / 30)
+    place = int(row * frame.height), int(column * frame.width)
+    assert torch.equal(develop_image(image, crop)[..., *place], image[..., 17, 12])
+    assert frame.outward(column, row) == pytest.approx((12.5 / 40, 17.5 / 30))
+    again = Development(crop=(0.1, 0.2, 0.8, 0.9)).quartered(quarters)
+    shown = develop_image(image, Development(crop=(0.1, 0.2, 0.8, 0.9)))
+    assert torch.equal(develop_image(image, again), shown.rot90(-quarters, (2, 3)))
 
 
 def test_a_point_is_where_its_stroke_is() -> None:
@@ -99,14 +81,14 @@ def test_only_grey_and_rgb_are_developed(channels: int) -> None:
         rf"image must have shape \(B, C, H, W\) with 1 or 3 channels, got \(1, {channels}, 5, 6\); pass grey or RGB"
     )
     with pytest.raises(ValueError, match=sentence):
-        develop_image(torch.zeros(1, channels, 5, 6), Development(temperature=1.0))
+        develop_image(torch.zeros(1, channels, 5, 6), Development(warmth=1.0))
     with pytest.raises(TypeError, match="image must have a floating-point dtype"):
         develop_image(torch.zeros(1, 3, 5, 6, dtype=torch.uint8), Development(exposure=1.0))
 
 
 def test_gradients() -> None:
     image = torch.rand(1, 3, 5, 6, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    for development in (Development(-0.5, 0.3, 0.1), Development(straighten=5.0)):
+    for development in (Development(-0.5, 0.3, 0.1), Development(straighten=5.0, rotate=270)):
         assert gradcheck(lambda values, d=development: develop_image(values, d), (0.1 + 0.5 * image).requires_grad_())
 
 

@@ -5,8 +5,8 @@ import pytest
 import torch
 
 from nlfilter_torch.photo.declared.development import Development
-from nlfilter_torch.photo.picture.developing import develop_image
-from nlfilter_torch.photo.picture.photographs import HiddenPixels, Photograph, develop_photograph
+from nlfilter_torch.photo.picture.light import develop_image, develop_photograph
+from nlfilter_torch.photo.picture.photographs import HiddenPixels, Photograph
 from tests.problems import colour
 
 SIZE = (40, 60)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from nlfilter_torch.photo.declared.development import Development
-from nlfilter_torch.photo.picture.developing import develop_image
+from nlfilter_torch.photo.picture.light import develop_image
 from nlfilter_torch.photo.picture.tiled_developed import developed_rows
 from nlfilter_torch.photo.picture.tiles import Passes
 from tests.pairwise import each_value
@@ -20,7 +20,17 @@ ALL = Development(0.3, 0.2, -0.1, 4.0, (0.1, 0.0, 1.0, 0.8))
 @pytest.mark.parametrize(
     ("development", "dtype"),
     each_value(
-        [Development(), ALL, ALL.geometry, Development(-1.0), Development(crop=ALL.crop)], ["float32", "float64"]
+        [
+            Development(),
+            ALL,
+            ALL.geometry,
+            Development(-1.0),
+            Development(crop=ALL.crop),
+            Development(rotate=90, contrast=0.5, crop=ALL.crop),
+            Development(rotate=270, straighten=3.0, curve=(0.1, 1.0)),
+            Development(0.2, saturation=0.5, vibrance=-0.3),
+        ],
+        ["float32", "float64"],
     ),
 )
 def test_rows_are_those_of_the_image(development: Development, dtype: str, tmp_path: Path) -> None:
@@ -32,6 +42,16 @@ def test_rows_are_those_of_the_image(development: Development, dtype: str, tmp_p
         for part in (slice(0, 1), slice(31, 77), slice(0, rows.shape[0])):
             assert np.array_equal(rows[part], wanted[part])
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("size", [(90, 120), (700, 800)])
+def test_areas_of_rows_are_those_of_the_image(size: tuple[int, int], tmp_path: Path) -> None:
+    picture = cat(*size).astype("float32")
+    development = Development(0.2, shadows=0.8, highlights=-0.6, temperature="auto")
+    wanted = rows_of(develop_image(from_rows(picture), development))
+    with developed_rows(development, Passes("float32", folder=tmp_path), picture, "scan.tif") as rows:
+        assert np.abs(rows[0 : size[0]] - wanted).max() < 2e-4
+        assert np.abs(rows[0 : size[0]] - picture).max() > 0.05
 
 
 def test_a_few_rows_at_a_time(tmp_path: Path) -> None:

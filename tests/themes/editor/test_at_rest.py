@@ -7,7 +7,7 @@ from playwright.sync_api import Browser
 from nlfilter_torch.photo.app.preview import PIXELS
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.declared.steps import Step
-from nlfilter_torch.photo.edits.applying import apply_recipe
+from nlfilter_torch.photo.edits.recipe import apply_recipe
 from nlfilter_torch.photo.picture.photographs import Photograph, read_photograph, write_photograph
 from nlfilter_torch.photo.picture.resizing import resize
 from tests.browser import Tab, running

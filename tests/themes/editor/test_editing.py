@@ -10,7 +10,8 @@ from nlfilter_torch.photo.cli import main
 from nlfilter_torch.photo.declared.presets import Recipe, find_recipe
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.declared.strokes import Region, Stroke
-from nlfilter_torch.photo.edits.applying import apply_recipe, apply_step
+from nlfilter_torch.photo.edits.applying import apply_step
+from nlfilter_torch.photo.edits.recipe import apply_recipe
 from nlfilter_torch.photo.picture.photographs import read_photograph
 from tests.browser import Tab, difference
 from tests.problems import cat

@@ -16,7 +16,7 @@ from playwright.sync_api import Browser, Page, expect
 
 from nlfilter_torch.photo.declared.presets import Recipe, find_recipe
 from nlfilter_torch.photo.declared.steps import Step
-from nlfilter_torch.photo.edits.applying import apply_recipe
+from nlfilter_torch.photo.edits.recipe import apply_recipe
 from nlfilter_torch.photo.picture.photographs import Photograph, read_photograph, write_photograph
 from tests.browser import TIMEOUT, Editor, Tab, difference
 from tests.problems import cat
