@@ -100,6 +100,7 @@ QUICK := \
 	'denoising --quick --patterns --methods noisy ours' \
 	'real_noise --quick' \
 	'self_calibration --quick' \
+	'coverage --quick' \
 	'looks --quick' \
 	'detail --quick' \
 	'detail --quick --scales' \

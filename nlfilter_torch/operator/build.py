@@ -22,6 +22,7 @@ from nlfilter_torch.core.precision import full_precision, trainable, uncompiled,
 from nlfilter_torch.core.torch_internals import is_hidden, outside_transforms, refuse_transforms
 from nlfilter_torch.core.warning import warn
 from nlfilter_torch.operator.counting import assign_among_counted, extended, hidden_points
+from nlfilter_torch.operator.coverage import TRIED, cover
 from nlfilter_torch.operator.eigenvalue_bound import exceeds, is_bounded, limiter, slack
 from nlfilter_torch.operator.features import (
     GuideFeatures,
@@ -37,6 +38,7 @@ from nlfilter_torch.operator.operator import Kernel, NonlocalOperator
 from nlfilter_torch.operator.options import (
     AUTO,
     Assignment,
+    Auto,
     Completion,
     FilterOptions,
     GuideChannels,
@@ -45,6 +47,7 @@ from nlfilter_torch.operator.options import (
     bandwidths_of,
     check_bandwidths,
     check_options,
+    first_count,
     landmark_count,
 )
 from nlfilter_torch.operator.orientation import Layout
@@ -60,6 +63,7 @@ from nlfilter_torch.operator.traps import (
     LARGEST_SHARE,
     LEAST_POINTS,
     SAMPLED,
+    SampledRows,
     sampled_points,
     share_above,
     warn_of_long_patches,
@@ -88,7 +92,7 @@ def nonlocal_operator(
     patch_size: int = FilterOptions.patch_size,
     photometric_bandwidth: float | Tensor | Literal["auto"] = AUTO,
     spatial_bandwidth: SpatialBandwidth | None = None,
-    num_landmarks: int = FilterOptions.num_landmarks,
+    num_landmarks: int | Auto = FilterOptions.num_landmarks,
     landmarks: Landmarks = FilterOptions.landmarks,
     completion: Completion = FilterOptions.completion,
     guide_channels: GuideChannels = FilterOptions.guide_channels,
@@ -116,7 +120,9 @@ def nonlocal_operator(
         spatial_bandwidth: h_x in pixels, a positive number or a tensor of shape () or (B,), or two of them, for
             vertical and horizontal distances (of volumes three, for depth first); None leaves out the spatial term, so
             that W is fully nonlocal.
-        num_landmarks: M; reduced with a warning where the image has fewer pixels.
+        num_landmarks: M; reduced with a warning where the image has fewer pixels. ``"auto"`` takes as many, up to 1000,
+            as cover all but 3 % of the points (:meth:`NonlocalOperator.badly_covered`) in the worst image of a batch,
+            and warns if these are not enough; not with a group.
         landmarks: ``"kmeans"``, ``"uniform"`` (the paper's grid) or ``"random"``, chosen anew in every call. Or an
             operator built before, whose landmarks are kept: for a guide of the same size, the assignment of pixels to
             landmarks is held, and the landmarks move smoothly with guide and bandwidths; for any other, its landmarks
@@ -157,11 +163,13 @@ def nonlocal_operator(
         >>> bool((operator.row_sums() - 1).abs().max() < 1e-4)
         True
     """
+    count, covering = first_count(num_landmarks)
     options = FilterOptions(  # written out: older versions of torch's compiler do not know ``locals()``
         patch_size=patch_size,
         photometric_bandwidth=photometric_bandwidth,
         spatial_bandwidth=spatial_bandwidth,
-        num_landmarks=num_landmarks,
+        num_landmarks=count,
+        covering=covering,
         landmarks=landmarks,
         completion=completion,
         guide_channels=guide_channels,
@@ -201,7 +209,7 @@ _checked_uncompiled = uncompiled(_checked)
 
 def _is_uncompiled(options: FilterOptions, weights: Tensor | None) -> bool:
     """Whether an operator depends on what cannot be compiled."""
-    return options.generator is not None or options.group is not None or weights is not None
+    return options.covering or options.generator is not None or options.group is not None or weights is not None
 
 
 def operator_from_guide(guide: Tensor, options: FilterOptions, weights: Tensor | None = None) -> NonlocalOperator:
@@ -299,7 +307,7 @@ def operator_from_features(
     *,
     size: tuple[int, ...],
     weights: Tensor | None = None,
-    num_landmarks: int = FilterOptions.num_landmarks,
+    num_landmarks: int | Auto = FilterOptions.num_landmarks,
     landmarks: Landmarks = FilterOptions.landmarks,
     completion: Completion = FilterOptions.completion,
     tolerance: float | None = FilterOptions.tolerance,
@@ -321,7 +329,7 @@ def operator_from_features(
         weights: (N,) or (B, N): how many identical pixels each point represents, 0 for points that do not count, which
             are filtered from those that do. With ``"kmeans"``, landmarks are drawn in proportion to the weights,
             averaged over a batch. None means one each. Constant for gradients.
-        num_landmarks: M; reduced with a warning where there are fewer points.
+        num_landmarks: M; reduced with a warning where there are fewer points; or ``"auto"``.
         landmarks: as for :func:`nonlocal_operator`; features have the meaning and scale of ``features``.
         completion: as for :func:`nonlocal_operator`.
         tolerance: as for :func:`nonlocal_operator`.
@@ -341,6 +349,7 @@ def operator_from_features(
         >>> bool((smoothed - 1).abs().max() < 1e-4)
         True
     """
+    num_landmarks, covering = first_count(num_landmarks)
     options = FilterOptions.of(locals())
     operator = _from_points(features, size, options, weights)
     _warn_of_coverage(operator)
@@ -439,14 +448,13 @@ def _assemble(
     points, tolerance = math.prod(whole), options.tolerance
     if hidden is not None and communicator.size == 1:
         points = int((~hidden).sum(1).min())
-    count = landmark_count(options, points)
     if features.shape[0] == 0:
-        return _empty(features, size, count, options.completion, recipe)
+        return _empty(features, size, landmark_count(options, points), options.completion, recipe)
     assignment = None
     if chosen is None:
+        choose = _covering if options.covering else _landmarks
         layout = None if recipe is None else recipe.layout
-        wanted = options if count == options.num_landmarks else replace(options, num_landmarks=count)
-        chosen, assignment = _landmarks(features, whole, wanted, communicator, weights, layout)
+        chosen, assignment = choose(features, whole, options, communicator, weights, layout, points)
     inverse = inverse_cholesky(chosen)
     sample = None
     if communicator.size == 1 and not torch.compiler.is_compiling():  # ranks send nothing that only diagnostics need
@@ -465,7 +473,7 @@ def _assemble(
     remainder = scaling * (scaling * diagonal)  # in this order: without completion d^2 may overflow
     gram = PixelMatrix(factor, scaling, remainder, weights, communicator).gram_below
     allowed = slack(factor.dtype, worst)
-    if watched and is_bounded(options.landmarks, points, count) and exceeds(gram, balancing.moment, allowed):
+    if watched and is_bounded(options.landmarks, points, chosen.shape[2]) and exceeds(gram, balancing.moment, allowed):
         limit = limiter(gram, matrix.moment(scaling), allowed)
         factor, kernel = limit.to(factor) @ factor, replace(kernel, limiter=limit.to(factor))
         before = tuple(torch.linalg.solve(limit.detach(), total) for total in before)  # preserves u . total
@@ -499,12 +507,62 @@ def _landmarks(
     communicator: Communicator,
     weights: Tensor | None,
     layout: Layout | None,
+    points: int,
 ) -> tuple[Tensor, Assignment | None]:
-    """:func:`landmarks_by`, from the points that count alone where weights are 0."""
-    chosen = isinstance(options.landmarks, str)
-    if weights is None or communicator.size > 1 or not chosen or (layout is None and hidden_points(weights) is None):
+    """:func:`landmarks_by`, at most as many as ``points`` that count, and from these alone where weights are 0."""
+    count = landmark_count(options, points)
+    options = options if count == options.num_landmarks else replace(options, num_landmarks=count)
+    named = isinstance(options.landmarks, str)
+    if weights is None or communicator.size > 1 or not named or (layout is None and hidden_points(weights) is None):
         return landmarks_by(features, size, options, communicator, weights, layout)
     return assign_among_counted(features, size, options, weights, layout)
+
+
+def _covering(
+    features: Tensor,
+    size: tuple[int, ...],
+    options: FilterOptions,
+    communicator: Communicator,
+    weights: Tensor | None,
+    layout: Layout | None,
+    points: int,
+) -> tuple[Tensor, Assignment | None]:
+    """:func:`_landmarks`, as many as cover the points."""
+    if not isinstance(options.landmarks, str):  # given ones, whose number is known
+        return _landmarks(features, size, options, communicator, weights, layout, points)
+    if communicator.size > 1 or is_hidden(features):
+        raise ValueError(
+            "num_landmarks must be a number with a group or for values that are not known, got 'auto'; take that of an "
+            "operator of a reduced image"
+        )
+    state = None if options.generator is None else options.generator.get_state()
+
+    def trial(count: int) -> tuple[float, tuple[Tensor, Assignment | None]]:
+        if options.generator is not None and state is not None:
+            options.generator.set_state(state)  # the last trial gives what its number gives when asked for at once
+        wanted = replace(options, num_landmarks=count, covering=False)
+        result = _landmarks(features, size, wanted, communicator, weights, layout, points)
+        return _badly_covered(features.detach(), wanted, weights, result[0].detach()), result
+
+    return cover(trial, points)
+
+
+@torch.no_grad()
+def _badly_covered(features: Tensor, options: FilterOptions, weights: Tensor | None, landmarks: Tensor) -> float:
+    """Share of the points of the worst image that landmarks (B, D, M) cover badly, without an operator of all points.
+
+    The filter of some points, each of which stands for as many others, gives the balancing; see
+    :meth:`NonlocalOperator.badly_covered` for the rest.
+    """
+    points = features.shape[2]
+    places, sample = (sampled_points(points, count).to(features.device) for count in (TRIED, SAMPLED))
+    counted = features.new_ones(len(features), points) if weights is None else weights.expand(len(features), -1)
+    stands_for = counted[:, places] * (points / len(places))
+    few = _assemble(features[:, :, places], (1, len(places)), options, weights=stands_for, chosen=landmarks)
+    kept = features[:, :, sample]
+    columns, weight, every = few.at(kept), counted[:, sample], points / len(sample)
+    rows = SampledRows(kept, columns.factor, columns.scaling, columns.remainder, weight, every)
+    return float(rows.badly_covered().max())
 
 
 def _least(weights: Tensor | None, communicator: Communicator) -> Tensor | None:

@@ -89,7 +89,10 @@ GuideChannels = Literal["luminance", "all"]
 SpatialBandwidth = float | Tensor | tuple[float | Tensor, ...] | list[float | Tensor]
 Completion = Literal["diagonal", "none"]
 
-AUTO: Literal["auto"] = "auto"  # photometric bandwidth: estimate it from the guide
+Auto = Literal["auto"]
+
+AUTO: Auto = "auto"  # photometric bandwidth: estimate it from the guide; number of landmarks: as many as needed
+FIRST = 64  # landmarks that are tried first
 SAMPLING: Sampling = "kmeans"  # how landmarks are chosen by default
 SAMPLINGS = (
     "choose one of these, or pass features (B, D, M) or an operator, and pass the number of landmarks as num_landmarks"
@@ -112,6 +115,7 @@ class FilterOptions:
     guide_channels: GuideChannels = "luminance"
     patch_weights: Tensor | None = None
     num_landmarks: int = 100
+    covering: bool = False  # num_landmarks="auto": it is the first number that is tried
     landmarks: Landmarks = SAMPLING
     completion: Completion = "diagonal"
     tolerance: float | None = None
@@ -147,6 +151,14 @@ class FilterOptions:
 def bandwidths_of(spatial: SpatialBandwidth | str | None) -> tuple[Any, ...]:
     """The bandwidth of all distances, or those along each axis."""
     return tuple(spatial) if isinstance(spatial, tuple | list) else (spatial,)
+
+
+def first_count(num_landmarks: int | Auto) -> tuple[int, bool]:
+    """The number of landmarks, or the first that is tried, and whether more are to cover the points."""
+    if not isinstance(num_landmarks, str):
+        return num_landmarks, False
+    check_choice(num_landmarks, "num_landmarks", (AUTO,), "pass it or a number")
+    return FIRST, True
 
 
 def check_options(options: FilterOptions) -> None:

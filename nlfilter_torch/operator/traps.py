@@ -94,13 +94,13 @@ GOLDEN = 0.6180339887498949  # whose multiples, without their whole parts, sprea
 HALF = 0.5  # share of its weight by which the row of a badly covered point is off
 
 
-def sampled_points(points: int) -> Tensor:
+def sampled_points(points: int, count: int = SAMPLED) -> Tensor:
     """Numbers (S,) of the points whose features are kept, spread over all ``points``; always the same, on the CPU."""
     with torch.device("cpu"):
-        if points <= 2 * SAMPLED:
+        if points <= 2 * count:
             return torch.arange(points)
-        starts = torch.arange(SAMPLED + 1) * points // SAMPLED
-        return starts[:-1] + (torch.arange(SAMPLED).double() * GOLDEN % 1 * starts.diff()).long()
+        starts = torch.arange(count + 1) * points // count
+        return starts[:-1] + (torch.arange(count).double() * GOLDEN % 1 * starts.diff()).long()
 
 
 def share_above(values: Tensor, limit: float, weights: Tensor | None) -> Tensor:
