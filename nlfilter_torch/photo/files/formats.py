@@ -103,12 +103,15 @@ def read_channels(path: Path, *, bytes_per_pixel: int, memory: int | None) -> De
     """Read upright channels (H, W, S) in the stored dtype, and metadata; see :func:`read_photograph`."""
     head = first_bytes(path)
     check_size = partial(_check_size, path, bytes_per_pixel, memory)
-    if codecs.is_raw(path) or (tiff.is_tiff(head) and tiff.holds_raw(path)):
+    if codecs.is_raw(path):
         decoded = codecs.read_raw(path, check_size)
     elif codecs.is_heic(head):
         decoded = codecs.read_heic(path, check_size)
     elif tiff.is_tiff(head):
-        decoded = tiff.read(path, check_size)
+        try:
+            decoded = tiff.read(path, check_size)
+        except tiff.RawPicture:
+            decoded = codecs.read_raw(path, check_size)
     else:
         with path.open("rb") as stream, mmap(stream.fileno(), 0, access=ACCESS_READ) as data, decoding(path):
             decoded = _read_mapped(path, data, check_size)

@@ -139,8 +139,11 @@ def open_picture(path: Path, memory: int) -> Iterator[StoredPicture]:
     with ExitStack() as stack:
         if is_zarr(path):
             stored = _open_zarr(path)
-        elif tiff.is_tiff(first_bytes(path)) and not is_raw(path) and not tiff.holds_raw(path):
-            stored = _open_tiff(path, stack)
+        elif tiff.is_tiff(first_bytes(path)) and not is_raw(path):
+            try:
+                stored = _open_tiff(path, stack)
+            except tiff.RawPicture:
+                stored = _open_codec(path, memory, stack)
         else:
             stored = _open_codec(path, memory, stack)
         if stored.cached > memory:

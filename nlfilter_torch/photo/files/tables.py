@@ -112,14 +112,13 @@ class TiffTables:
         """The valid fields of the table at an offset; none if there is no table."""
         top, count = self._length(start)
         inline, number = (8, "Q") if self.big else (4, "I")
-        fields = []
+        fields, head, whole = [], struct.Struct(f"{self.order}HH{number}"), len(self.data)
         for entry in range(top, top + count * self.step, self.step):
-            code, kind = struct.unpack_from(self.order + "HH", self.data, entry)
-            values = self.unpack(number, entry + 4)
-            place = entry + 4 + inline
-            if LENGTHS.get(kind, 0) * values > inline:
+            code, kind, values = head.unpack_from(self.data, entry)
+            place, length = entry + 4 + inline, LENGTHS.get(kind, 0) * values
+            if length > inline:
                 place = self.unpack(number, place)
-            if kind in LENGTHS and place + LENGTHS[kind] * values <= len(self.data):
+            if kind in LENGTHS and place + length <= whole:
                 fields.append(Field(code, kind, values, entry, place))
         return fields
 

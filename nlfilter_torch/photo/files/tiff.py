@@ -84,39 +84,47 @@ def read(path: Path, check_size: CheckSize, number: int = 0) -> Decoded:
         return Decoded(plain, rows.orientation, rows.metadata)
 
 
-def pictures(file: tifffile.TiffFile) -> list[tifffile.TiffPage]:
-    """The pictures of a file, of at most :data:`MOST_PAGES` pages, without masks and reduced versions.
+def _pages(file: tifffile.TiffFile) -> Iterator[tifffile.TiffPage]:
+    """The pages of a file, at most :data:`MOST_PAGES`; before them those nested in a first page that is reduced.
 
-    Where the first page is a reduced version, the full ones may be nested in it, as in RAW files. If there are only
-    reduced versions, the largest of them.
+    There the full picture may be, as in RAW files.
     """
     first = file.pages.first
-    pages = [first]
-    with suppress(Exception):  # no such page, or damage behind the first one, which alone is needed
+    # No such page, or damage behind the first one, which alone is needed.
+    with suppress(Exception):
+        nested = first.pages if first.is_reduced or first.is_mask else None
+        yield from (page for page in nested or () if isinstance(page, tifffile.TiffPage))
+    yield first
+    with suppress(Exception):
         for number in range(1, MOST_PAGES):
             page = file.pages[number]
             if isinstance(page, tifffile.TiffPage):
-                pages.append(page)
-    nested: list[tifffile.TiffPage] = []
-    if first.is_reduced or first.is_mask:
-        with suppress(Exception):
-            nested = [page for page in first.pages or () if isinstance(page, tifffile.TiffPage)]
-    full = [page for page in (*nested, *pages) if not (page.is_reduced or page.is_mask)]
-    return full or [max((*pages, *nested), key=lambda page: page.imagelength * page.imagewidth)]
+                yield page
+
+
+def find_picture(file: tifffile.TiffFile, number: int = 0) -> tuple[tifffile.TiffPage, int]:
+    """The picture of that number in a file, and how many there are, without masks and reduced versions.
+
+    If there are only these, the largest of them is the picture.
+    """
+    found, count, largest = None, 0, file.pages.first
+    for page in _pages(file):
+        if not (page.is_reduced or page.is_mask):
+            found = page if count == number else found
+            count += 1
+        elif page.imagelength * page.imagewidth > largest.imagelength * largest.imagewidth:
+            largest = page
+    return found or largest, max(count, 1)
 
 
 def count_pages(path: Path) -> int:
-    """Number of pictures in a TIFF file, see :func:`pictures`."""
+    """Number of pictures in a TIFF file, see :func:`find_picture`."""
     with path.open("rb") as stream, tifffile.TiffFile(stream, name=str(path)) as file:
-        return len(pictures(file))
+        return find_picture(file)[1]
 
 
-def holds_raw(path: Path) -> bool:
-    """Whether the picture of a TIFF file is that of a RAW file, to be developed."""
-    with decoding(path), path.open("rb") as stream, tifffile.TiffFile(stream, name=str(path)) as file:
-        return file.pages.first.photometric in RAW or (
-            file.pages.first.is_reduced and pictures(file)[0].photometric in RAW
-        )
+class RawPicture(UnhandledImage):
+    """The picture of a TIFF file is that of a RAW file, to be developed."""
 
 
 def check_page(path: Path, page: tifffile.TiffPage) -> None:
@@ -126,6 +134,8 @@ def check_page(path: Path, page: tifffile.TiffPage) -> None:
     handled = {kinds.MINISWHITE, kinds.MINISBLACK, kinds.RGB} | ({kinds.YCBCR} if by_jpeg else set())
     if page.samplesperpixel == 1 and page.colormap is not None and page.dtype is not None and page.dtype.kind in "bu":
         handled.add(kinds.PALETTE)
+    if page.photometric in RAW:
+        raise RawPicture(f"{path} is a RAW file; give it the suffix of one, such as .dng")
     if page.photometric not in handled:
         name = page.photometric.name if isinstance(page.photometric, kinds) else page.photometric
         raise UnhandledImage(f"{path} is stored in {name} colours, which are not supported; convert it to grey or RGB")
@@ -370,7 +380,7 @@ class TiffRows:
         dtype: dtype in native byte order.
         metadata: profile, EXIF and the rest.
         alpha: whether the last channel is transparency.
-        pages: number of pictures in the file, see :func:`pictures`.
+        pages: number of pictures in the file, see :func:`find_picture`.
     """
 
     def __init__(self, path: Path, number: int = 0) -> None:
@@ -383,8 +393,7 @@ class TiffRows:
         self.stream: BinaryIO = path.open("rb")
         try:
             self.file = tifffile.TiffFile(self.stream, name=str(path))
-            found = pictures(self.file)
-            self.page, self.pages = found[number], len(found)
+            self.page, self.pages = find_picture(self.file, number)
             check_page(path, self.page)
             self.orientation, self.metadata = read_metadata(self.file, self.page, self.stream)
         except BaseException:

@@ -17,7 +17,8 @@ from nlfilter_torch.photo.cli import main
 from nlfilter_torch.photo.files.codecs import is_heic
 from nlfilter_torch.photo.files.formats import TooLarge
 from nlfilter_torch.photo.picture.photographs import read_photograph, write_photograph
-from tests.files import PROFILE, camera_block, exif_block, fields_of, photograph, stored_values, tags
+from nlfilter_torch.photo.picture.pictures import stored_as
+from tests.files import PROFILE, camera_block, exif_block, fields_of, photograph, rows_of, stored_values, tags
 
 
 @pytest.mark.parametrize("channels", [1, 3, 4])
@@ -133,6 +134,16 @@ def test_raw_is_developed_at_sixteen_bits(tmp_path: Path) -> None:
     np.testing.assert_allclose(turned, np.rot90(pixels, -1), atol=1e-6)
     with pytest.raises(TooLarge, match="80x64 pixels"):
         read_photograph(tmp_path / "in.dng", bytes_per_pixel=100, memory=1000)
+
+
+def test_raw_is_developed_whatever_the_suffix_and_in_tiles_too(tmp_path: Path) -> None:
+    pytest.importorskip("rawpy")
+    for suffix in (".dng", ".tif"):
+        write_dng(tmp_path / f"in{suffix}", SCENE)
+    wanted = read_photograph(tmp_path / "in.dng")
+    assert torch.equal(read_photograph(tmp_path / "in.tif").pixels, wanted.pixels)
+    for suffix in (".dng", ".tif"):
+        np.testing.assert_array_equal(rows_of(tmp_path / f"in{suffix}"), stored_as(wanted.pixels, "uint16"))
 
 
 def test_a_command_takes_raw(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
