@@ -26,6 +26,10 @@ detail in.png more.jpeg --landmarks 20
 develop in.png light.png --exposure +1
 develop in.png crop.png --crop 10,10,20,20
 develop in.png crop.png --crop 10%,10%,80%,80%
+develop in.png turned.png --rotate 90 --crop 0,40,30,30
+develop in.png warm.png --temperature 5500
+develop in.png balanced.png --temperature auto
+develop in.png strong.png --saturation 0.2
 mask in.png mask.png --region 20,20
 mask in.png mask.png --region 50%,50% --cutout alone.png
 """
@@ -55,6 +59,10 @@ ANSWERED = {
     "detail in.png out.png --landmarks many": "--landmarks must be an integer",
     "tone in.png out.png --contrast 20%": "(contrast of the smooth shading: 1 leaves it unchanged",
     "develop in.png out.png --exposure 1EV": "(brightness in stops: 1 doubles the light",
+    "develop in.png out.png --white-balance auto": "here it is --temperature (white balance in kelvin",
+    "develop in.png out.png --kelvin 5500": "here it is --temperature",
+    "develop in.png out.png --rotate 45": "see straighten for others",
+    "develop in.png out.png --temperature 0.2": "--temperature must be",
     "develop in.png out.png --ev 0.5": "here it is --exposure",
     "develop in.png out.png --crop 0.1,0.1,0.9,0.9": "such as 10%,0%,80%,100%",
     "develop in.png out.png --aspect 16/9": "such as 3:2",

@@ -257,7 +257,8 @@ class RecipeJob(FileEdit):
             return self
         develop = self.develop
         if self.crop is not None:
-            develop = replace(develop, crop=options.parse_crop(self.crop, size))
+            turned = size[::-1] if develop.rotate % 180 else size
+            develop = replace(develop, crop=options.parse_crop(self.crop, turned))
         if self.aspect is not None:
             develop = replace(develop, crop=develop.frame(size).trimmed(self.aspect).edges)
         recipes = [replace(recipe, develop=develop) for recipe in self.recipes]
