@@ -220,9 +220,8 @@ class NonlocalFilter(nn.Module):
         arguments = locals()
         super().__init__()
         names = check_learn(learn, (*LEARNABLE, *BUILDING))
-        self.affinity = NonlocalAffinity(
-            hold=hold, learn=[name for name in BUILDING if name in names], **vars(FilterOptions.of(arguments))
-        )
+        own = {name: value for name, value in arguments.items() if name in vars(FilterOptions())}
+        self.affinity = NonlocalAffinity(hold=hold, learn=[name for name in BUILDING if name in names], **own)
         self.sliders = PolynomialSliders(alpha, residual=residual, learn=[name for name in LEARNABLE if name in names])
 
     def renew(
