@@ -100,6 +100,9 @@ class AtOnce(Tasks):
     def __init__(self, tasks: list[Awaitable[None]]) -> None:
         self.start = tasks.append
 
+    def say(self, who: object, doing: str = "") -> None:
+        """Show nothing."""
+
     async def run(self, doing: str, work: Callable[..., Any], *arguments: Any, progress: object = None) -> Any:
         """Run something."""
         return work(*arguments)

@@ -27,6 +27,7 @@ class Canvas:
         choosing: JavaScript that lets a person choose a photograph.
 
     Attributes:
+        place: what holds the picture.
         pictures: image files, by their kind.
         pick: is called with the next point (x, y) that is clicked, in pixels of the preview, or None.
     """
@@ -44,7 +45,7 @@ class Canvas:
         self._mask_shown: bytes | None = None  # the mask that was shown last
         self._step = DETAIL.name  # the step whose strokes are shown
         self._line: list[tuple[float, float]] = []  # of the stroke that is being drawn
-        with ui.element("div").classes("canvas"):
+        with ui.element("div").classes("canvas") as self.place:
             self._build_welcome(choosing)
             self._build_photo()
             self._crop_tool = CropTool()
@@ -55,7 +56,7 @@ class Canvas:
         with ui.element("button").classes("welcome").props('type="button"') as self._welcome:
             ui.icon("photo", size="64px")
             ui.label("Open a photograph to begin").classes("text-h6 q-mt-sm")
-            ui.label("Click here, or drop one: PNG, JPEG, TIFF, WebP or AVIF.").classes("hint")
+            ui.label("Click here, or drop one: PNG, JPEG, TIFF, WebP, AVIF or HEIC.").classes("hint")
             ui.label("It stays on this machine.").classes("hint")
         self._welcome.on("click", js_handler=choosing)
 
@@ -80,7 +81,7 @@ class Canvas:
 
     def _build_bar(self) -> None:
         with ui.row().classes("bar"):
-            ui.label("Before").classes("hint wide")
+            ui.label("Before").classes("hint")
             wipe = ui.slider(min=0, max=100, value=0).style("max-width: 320px")
             wipe.props('dense aria-label="Before and after"')
             wipe.on("update:model-value", js_handler="(share) => closeup.wipe(share)")
@@ -105,6 +106,11 @@ class Canvas:
         self._show("before", self._photo)
         self._welcome.set_visibility(False)
         self._photo.set_visibility(True)
+
+    def wait(self, is_waiting: bool) -> None:
+        """Show that the photograph is not there yet, or not as it is edited; without one, ask for it afterwards."""
+        self._welcome.set_visibility(self._session is None and not is_waiting)
+        self._photo.classes(add="waiting" if is_waiting else "", remove="" if is_waiting else "waiting")
 
     def frame(self) -> None:
         """Show the photograph as it is straightened and cropped now, with its preview before the edit."""

@@ -131,6 +131,7 @@ class Closeup:
     async def _work(self) -> None:
         """Make pieces until the visible part is covered."""
         self._working = True
+        self._tasks.say(self, "Full size\u2026")
         try:
             while (piece := self._next()) is not None:
                 session, part = piece
@@ -147,6 +148,7 @@ class Closeup:
                     self._add(part, content)
         finally:
             self._working = False
+            self._tasks.say(self)
 
     def _is_outdated(self, session: Session, recipe: Recipe) -> bool:
         return self._held or self.session is not session or session.recipe.effect != recipe.effect

@@ -1,6 +1,7 @@
 """The open photograph as it is developed, and what the editor shows of it."""
 
 from dataclasses import dataclass, field
+from functools import cached_property, partial
 from pathlib import Path
 
 from torch import Tensor
@@ -18,7 +19,6 @@ from nlfilter_torch.photo.picture.in_memory import InMemory
 from nlfilter_torch.photo.picture.light import develop_image, in_light, lit_photograph
 from nlfilter_torch.photo.picture.painting import TensorPainter
 from nlfilter_torch.photo.picture.photographs import Photograph, cut_photograph
-from nlfilter_torch.photo.picture.resizing import resize
 from nlfilter_torch.photo.picture.source import Cache
 
 DEVELOPING = -1  # the place before all steps, of a slider that moves
@@ -26,25 +26,25 @@ DEVELOPING = -1  # the place before all steps, of a slider that moves
 
 @dataclass(frozen=True, eq=False)
 class Developed:
-    """A photograph as it is developed.
+    """A photograph as it is developed; its light changes in the preview alone until all of its pixels are needed.
 
     Attributes:
         development: how.
         frame: where it lies in the original.
-        photograph: its pixels.
+        source: the photograph as it is.
+        name: that of its file.
         cut: it in the light of the original, with which the edit is compared.
         before: the pixels of that, reduced to the size of the preview.
         preview: its preview.
-        parts: parts of it at full size.
     """
 
     development: Development
     frame: Frame
-    photograph: Photograph
+    source: Photograph
+    name: str
     cut: Photograph
     before: Tensor
     preview: Preview
-    parts: Parts
     _areas: Cache = field(default_factory=dict)  # of ``before``
     _counted: dict[tuple[Mark, ...], bool] = field(default_factory=dict)  # whether strokes reach pixels that count
 
@@ -52,29 +52,46 @@ class Developed:
     def of(photograph: Photograph, name: str, pixels: int) -> "Developed":
         """A photograph as it is, whose file is called ``name``; its preview has at most so many pixels."""
         preview = Preview(photograph.pixels, pixels)
-        frame, parts = AS_IT_IS.frame(photograph.size), parts_of(photograph, name)
-        return Developed(AS_IT_IS, frame, photograph, photograph, preview.pixels, preview, parts)
+        frame = AS_IT_IS.frame(photograph.size)
+        return Developed(AS_IT_IS, frame, photograph, name, photograph, preview.pixels, preview)
 
-    def changed(self, original: Photograph, name: str, pixels: int, development: Development) -> "Developed":
-        """The original photograph, developed in another way.
+    @cached_property
+    def photograph(self) -> Photograph:
+        """The photograph at full size; computed when it is needed."""
+        return lit_photograph(self.cut, self.development, self.source)
+
+    @cached_property
+    def parts(self) -> Parts:
+        """Parts of it at full size."""
+        return Parts(self.photograph.pixels[0].permute(1, 2, 0).numpy(), self.name)
+
+    def close(self) -> None:
+        """Remove the temporary files of the parts, if there are any."""
+        if "parts" in vars(self):
+            self.parts.close()
+
+    def changed(self, pixels: int, development: Development) -> "Developed":
+        """The original photograph, developed in another way; its preview has at most so many pixels.
 
         Raises:
             ValueError: if the middle of the crop is outside.
             MemoryError: if there is no room for it.
         """
+        original = self.source
         frame = development.frame(original.size)
-        check_memory(Path(name), original.size[1], original.size[0], DEVELOPING_BYTES)
+        check_memory(Path(self.name), original.size[1], original.size[0], DEVELOPING_BYTES)
         is_cut = development.geometry == self.development.geometry
         cut = self.cut if is_cut else cut_photograph(original, development)
-        edited = lit_photograph(cut, development, original)
-        preview = Preview(edited.pixels, pixels)
-        if is_cut:
-            before = self.before
-        elif cut is edited:
-            before = preview.pixels
-        else:
-            before = resize(cut.pixels.float(), preview.size)
-        return Developed(development, frame, edited, cut, before, preview, parts_of(edited, name))
+        before = self.before if is_cut else Preview(cut.pixels, pixels).pixels
+        areas = self._areas if is_cut else {}
+        light = partial(in_light, development=development, limits=self._limits)
+        preview = Preview(cut.pixels, pixels, light(before, cache=areas), light)
+        return Developed(development, frame, original, self.name, cut, before, preview, areas)
+
+    @cached_property
+    def _limits(self) -> tuple[Tensor, Tensor]:
+        """Of the original."""
+        return limits_of(self.source.pixels)
 
     def counted(self, step: Step) -> Step:
         """A step of this photograph, without its strokes if those of its objects cover only pixels that do not count.
@@ -85,8 +102,8 @@ class Developed:
         if not objects or self.frame.is_whole:
             return step
         if objects not in self._counted:
-            weights = self.photograph.weights
-            source = InMemory(self.photograph.pixels, weights=weights)
+            weights = self.cut.weights
+            source = InMemory(self.cut.pixels, weights=weights)
             left = step if weights is None else left_by_crop(step, source, TensorPainter())
             self._counted[objects] = bool(left.strokes)
         return step if self._counted[objects] else step.changed(strokes=())
@@ -98,7 +115,7 @@ class Developed:
     def approximate(self, development: Development, original: Preview) -> Tensor:
         """The preview, quickly, as it would be developed in another way, from the preview of the photograph itself."""
         if development.geometry == self.development.geometry:
-            return in_light(self.before, development, limits_of(original.pixels), self._areas)
+            return in_light(self.before, development, self._limits, self._areas)
         return develop_image(original.pixels, development)
 
     def change_in(self, development: Development, original: Preview) -> Tensor:
@@ -108,8 +125,3 @@ class Developed:
             return original.pixels.new_zeros(())
         frame = development.frame(original.size)
         return reframed(preview.edited - preview.pixels.clamp(0, 1), self.frame, frame, frame.size)
-
-
-def parts_of(photograph: Photograph, name: str) -> Parts:
-    """The parts of a photograph, whose file is called ``name``."""
-    return Parts(photograph.pixels[0].permute(1, 2, 0).numpy(), name)

@@ -18,20 +18,35 @@ BETWEEN_TEXTS = 0.5  # seconds between two texts of the progress
 LASTING = 10.0  # seconds that an error is shown
 QUALITY, LEAST_QUALITY = 95, 50  # of JPEG files; below, the damage is visible
 SHORTEST = 16  # pixels of the longest side
-PHOTOGRAPHS = "PNG, JPEG, TIFF, WebP or AVIF"
+PHOTOGRAPHS = "PNG, JPEG, TIFF, WebP, AVIF or HEIC"
 EXISTS = "A file of that name is there already."
 
 
 class Tasks:
-    """The work of the page that is being built, with a sign that it goes on, in the open element."""
+    """The work of the page that is being built, with a sign that it goes on, in the open element.
+
+    Attributes:
+        sign: the sign, which can be moved to another element.
+    """
 
     def __init__(self) -> None:
         self._client = ui.context.client
         self._error: ui.notification | None = None
-        with ui.row().classes("items-center gap-2 no-wrap working") as self._working:
+        self._going_on: dict[object, str] = {}  # what is shown, by who does it
+        with ui.row().classes("items-center gap-2 no-wrap working").props("role=status") as self.sign:
             ui.spinner(size="20px", color="white")
-            self._doing = ui.label("").classes("hint")
-        self._working.set_visibility(False)
+            self._doing = ui.label("")
+        self.sign.set_visibility(False)
+
+    def say(self, who: object, doing: str = "") -> None:
+        """Show what goes on at once, until the same object says that nothing does."""
+        if doing:
+            self._going_on[who] = doing
+        else:
+            self._going_on.pop(who, None)
+        if self._going_on:
+            self._doing.set_text(next(reversed(self._going_on.values())))
+        self.sign.set_visibility(bool(self._going_on))
 
     def start(self, work: Awaitable[None]) -> None:
         """Run a task in the background, and report its failure."""
@@ -57,13 +72,12 @@ class Tasks:
         task = asyncio.ensure_future(asyncio.to_thread(work, *arguments))
         done, _ = await asyncio.wait({task}, timeout=PATIENCE)
         if not done:
-            self._doing.set_text(f"{doing}\u2026")
-            self._working.set_visibility(True)
+            self.say(task, f"{doing}\u2026")
             while not task.done():
                 await asyncio.wait({task}, timeout=BETWEEN_TEXTS)
                 known = "" if progress is None else str(progress)
-                self._doing.set_text(f"{doing}: {known}" if known else f"{doing}\u2026")
-            self._working.set_visibility(False)
+                self.say(task, f"{doing}: {known}" if known else f"{doing}\u2026")
+            self.say(task)
         return await task
 
     def show_error(self, sentence: str) -> None:
@@ -264,7 +278,7 @@ def _kinds(accept: str) -> str:
     >>> _kinds(".json,.cube,.png,application/json")
     '.json, .cube or .png'
     """
-    if accept == "image/*":
+    if accept.startswith("image/*"):
         return PHOTOGRAPHS
     *endings, last = [kind for kind in accept.split(",") if kind.startswith(".")]
     return f"{', '.join(endings)} or {last}"

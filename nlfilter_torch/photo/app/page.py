@@ -32,6 +32,7 @@ from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.declared.strokes import sliders_of
 
 LARGEST_PRESET = 20_000_000  # bytes
+PHOTOGRAPH_KINDS = "image/*,.heic,.heif"  # browsers do not call the latter images
 PRESET_KINDS = ".json,.cube,.png,.tif,.tiff,.jpg,.jpeg,application/json"
 REPLACING = (
     "Colorize is for grey photographs: the colours of this one would all be replaced by those that you paint. "
@@ -54,6 +55,7 @@ class Editor:
         self._picturing = 0  # how often they were drawn, so that browsers do not show others
         self._wanted: list[int | None] = []  # at most one picture to draw next: the place of a step that moves, or None
         self._drawing = False
+        self._responding = self._response_wanted = False  # whether the response of the sliders is computed, and again
         self._framed: object = None  # what canvas and closeup show
         self.is_cropping = False
         self.proportions = Proportions()
@@ -71,10 +73,13 @@ class Editor:
         with ui.element("div").classes("editor"):
             with ui.element("div").classes("viewer"):
                 self._canvas = Canvas(self.brush, self._token, self._draw, self._lay, self._upload.choosing)
-            with ui.column().classes("panel"):
+            with ui.column().classes("panel") as self._side:
                 handle = ui.button(icon="drag_handle").props('flat dense aria-label="Show or hide the controls"')
                 handle.classes("handle").on("click", js_handler="() => page.fold()")
                 self._panel = Panel(self, self._switch)
+        self._tasks.sign.move(self._canvas.place)
+        if image is not None or address:
+            self._wait("Opening\u2026")
         ui.keyboard(on_key=self._key)
         ui.on("closeup", lambda event: self._look(event.args))
         ui.on("stroke_dropped", self._canvas.drop_stroke)
@@ -83,6 +88,12 @@ class Editor:
         ui.on("crop", lambda event: self._crop(event.args))
         ui.on("crop_done", lambda: self.toggle_crop() if self.is_cropping else None)
         self._client.on_connect(lambda: self._begin(image, address))
+
+    def _wait(self, doing: str = "") -> None:
+        """Show that the picture is not there yet, or not as it is edited, and let the controls rest; "" ends this."""
+        self._tasks.say(self, doing)
+        self._canvas.wait(bool(doing))
+        self._side.props("inert" if doing else "", remove="" if doing else "inert")
 
     def recipe(self) -> Recipe:
         """The current edit."""
@@ -127,9 +138,9 @@ class Editor:
             ui.space()
             self._tasks = Tasks()
             show_error = self._tasks.show_error
-            self._upload = Upload(self._take_photograph, "image/*", LARGEST_UPLOAD, show_error)
+            self._upload = Upload(self._take_photograph, PHOTOGRAPH_KINDS, LARGEST_UPLOAD, show_error)
             presets = Upload(self._take_preset, PRESET_KINDS, LARGEST_PRESET, show_error)
-            kinds = f"A PNG, JPEG, TIFF, WebP or AVIF file of at most {LARGEST_UPLOAD / 1e9:g} GB"
+            kinds = f"A PNG, JPEG, TIFF, WebP, AVIF or HEIC file of at most {LARGEST_UPLOAD / 1e9:g} GB"
             _button("Open", "folder_open", kinds, js=self._upload.choosing)
             self._undo_button = _button("Undo", "undo", "Ctrl+Z", self._undo)
             self._redo_button = _button("Redo", "redo", "Ctrl+Shift+Z", self._redo)
@@ -370,25 +381,31 @@ class Editor:
                 if moving is None:
                     self._frame()
                 self._show()
+                self._wait()
                 if moving is None and self.session is not None and self._pictured is not self.session.developed:
-                    await self._draw_looks(self.session.developed)
-                    self._panel.follow()
+                    self._pictured = self.session.developed
+                    self._tasks.start(self._draw_looks(self.session.developed))
                 if self._panel.tab == DETAIL.name:
-                    await self._respond()
+                    self._tasks.start(self._respond())
                 self._canvas.draw_mask(moving=moving is not None)
                 self._canvas.draw_strokes()
         finally:
             self._drawing = False
+            self._wait()
         if self.session is not None:
             self._at_rest.drawn(self.session)
 
     async def _draw_looks(self, developed: Developed) -> None:
         """Draw thumbnails of the photograph, as it is developed, under each look."""
-        pictures = await self._tasks.run("Working", thumbnails, developed.preview.pixels)
-        if self.session is not None and self.session.developed is developed:  # still
-            self._pictured = developed
+        try:
+            pictures = await self._tasks.run("Looks", thumbnails, developed.preview.pixels)
+        except BaseException:
+            self._pictured = None  # so that they are drawn again
+            raise
+        if self.session is not None and self.session.developed is developed and not self._client.is_deleted:  # still
             self._picturing += 1
             self._canvas.pictures |= {f"look-{look}": content for look, content in pictures.items()}
+            self._panel.follow()
 
     def _lay(self) -> None:
         """Show the mask and the strokes of the open tab."""
@@ -432,15 +449,20 @@ class Editor:
 
     async def _respond(self) -> None:
         """Show the response of the sliders for the layers."""
-        if self.session is None:
+        self._response_wanted = True
+        if self._responding:
             return
-        detail = self.session.recipe.current(DETAIL.name)
-        curves = [
-            (OUTSIDE, detail["alpha"]),
-            *((INSIDE, row) for row in sliders_of(detail.strokes, detail.sliders_inside)),
-        ]
-        eigenvalues = await self._tasks.run("Working", self.session.eigenvalues, detail)
-        self._panel.draw_response(drawing.response_svg(eigenvalues, curves))
+        self._responding = True
+        try:
+            while self._response_wanted and self.session is not None:
+                self._response_wanted = False
+                detail = self.session.recipe.current(DETAIL.name)
+                regions = sliders_of(detail.strokes, detail.sliders_inside)
+                curves = [(OUTSIDE, detail["alpha"]), *((INSIDE, row) for row in regions)]
+                eigenvalues = await self._tasks.run("Working", self.session.eigenvalues, detail)
+                self._panel.draw_response(drawing.response_svg(eigenvalues, curves))
+        finally:
+            self._responding = False
 
     def _switch(self, tab: str) -> None:
         """Show what belongs to a tab that was opened."""
@@ -475,7 +497,12 @@ class Editor:
             await self._open(self._photographs.open_upload, copy, file.name)
 
     async def _open(self, find: Callable[[*Arguments], Session], *place: *Arguments) -> None:
-        self.session = session = await self._tasks.run("Opening", find, *place)
+        self._wait("Opening\u2026")
+        try:
+            self.session = session = await self._tasks.run("Opening", find, *place)
+        except BaseException:
+            self._wait()
+            raise
         if self._client.is_deleted:
             return
         self._title.set_text(session.name)
@@ -487,9 +514,7 @@ class Editor:
             self.proportions = Proportions()
             self._canvas.await_click(None)
             self._canvas.open(session)
-        await self._draw_looks(session.developed)
-        if self.session is not session or self._client.is_deleted:  # meanwhile
-            return
+        self._wait("Opening\u2026" if session.recipe == Recipe() else "Applying the edit\u2026")
         self.follow()
         with self._client:
             ui.navigate.history.replace(f"/?photo={quote(session.address)}")

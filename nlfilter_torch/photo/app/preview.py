@@ -198,6 +198,8 @@ class Preview:
     Args:
         photograph: (1, C, H, W), in [0, 1] except for files of floats.
         pixels: the largest number of pixels in the preview, approximately.
+        reduced: the photograph in the size of the preview, in another light; None is computed.
+        light: this change of light, or None.
 
     Attributes:
         size: (height, width) of the preview.
@@ -205,15 +207,23 @@ class Preview:
         stride: sampling step of the preview relative to the photograph.
     """
 
-    def __init__(self, photograph: Tensor, pixels: int = PIXELS) -> None:
+    def __init__(
+        self,
+        photograph: Tensor,
+        pixels: int = PIXELS,
+        reduced: Tensor | None = None,
+        light: Callable[[Tensor], Tensor] | None = None,
+    ) -> None:
         whole = (photograph.shape[-2], photograph.shape[-1])
         self.size = viewed_size(whole, pixels / MEGAPIXEL)
         self.stride = math.sqrt(whole[0] * whole[1] / (self.size[0] * self.size[1]))
         self.photograph = photograph
-        self.pixels = resize(photograph.float(), self.size) if self.size != whole else photograph.float()
+        if reduced is None:
+            reduced = resize(photograph.float(), self.size) if self.size != whole else photograph.float()
+        self.pixels, self._light = reduced, light
         self.edited: Tensor | None = None
         self._layers: Layers | None = None
-        self._working = range_of(InMemory(photograph.float()))
+        self._working = range_of(InMemory(photograph.float() if light is None else self.pixels))
         self._source = InMemory(self.pixels, {})  # with the filter of the masks
         self._compared_by: Key = ()  # the settings of that filter
         self._masks: tuple[Key, Tensor] | None = None
@@ -249,7 +259,8 @@ class Preview:
         stride = max(1, round(viewed[0] / self.size[0]))
         if stride == 1:
             return 1, self.pixels
-        return stride, resize(self.photograph.float(), (self.size[0] * stride, self.size[1] * stride))
+        shown = resize(self.photograph.float(), (self.size[0] * stride, self.size[1] * stride))
+        return stride, shown if self._light is None else self._light(shown)
 
     def _viewed(self, step: Step) -> tuple[int, int]:
         """(H, W) of the photograph at the viewing size of a step."""

@@ -80,7 +80,7 @@ class Session:
         self.address = ""
         self.recipe = self.saved = self._shown = Recipe()  # the last one is the last committed edit
         self._sidecar: Sidecar | None = None
-        self._outdated: list[Parts] = []  # of other developments
+        self._outdated: list[Developed] = []  # of other developments
         self._drawing = threading.Lock()  # previews cache what they compute, so they draw one picture at a time
         self._fitting = threading.Lock()  # the same holds for parts at full size
         self._at_rest: tuple[object, Tensor] | None = None  # the last result, for other tabs
@@ -128,7 +128,7 @@ class Session:
     @property
     def size(self) -> tuple[int, int]:
         """(height, width) of the developed photograph."""
-        return self.developed.photograph.size
+        return self.developed.frame.size
 
     def _develop(self, development: Development) -> Developed:
         """The photograph under a development; takes a second per ten megapixels unless it is the one shown.
@@ -138,7 +138,7 @@ class Session:
         """
         if self.developed.development == development:
             return self.developed
-        return self.developed.changed(self.original.photograph, self.name, self._pixels, development)
+        return self.developed.changed(self._pixels, development)
 
     def step_in_view(self, edit: str) -> Step:
         """The chosen step of an edit, with its strokes in coordinates of the developed photograph."""
@@ -307,7 +307,7 @@ class Session:
             else:
                 developed, start = self._develop(recipe.develop), None
                 if developed is not self.developed:
-                    self._outdated.append(self.developed.parts)
+                    self._outdated.append(self.developed)
                     self.developed = developed
             steps = self._on(developed, recipe, developed.preview.size)
             return developed.preview.render(steps, moving, start)
@@ -404,7 +404,7 @@ class Session:
                 f"the name must not be that of the photograph, got {name!r}: its edit is kept, and would be "
                 "applied again; choose another name"
             )
-        check_output(target, self.developed.photograph)
+        check_output(target, self.developed.cut)
         return target
 
     def check_preset(self, name: str) -> Path:
@@ -452,7 +452,7 @@ class Session:
 
     def check_cutout(self, name: str) -> Path:
         """:meth:`target` of a name under which an object can be cut out; raises ValueError for others."""
-        target, photograph = self.target(name), self.developed.photograph
+        target, photograph = self.target(name), self.developed.cut
         if target.resolve() == self.path:
             raise ValueError(f"the name must not be that of the photograph, got {name!r}; choose another name")
         check_output(target, transparent(photograph, target))

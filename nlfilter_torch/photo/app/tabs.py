@@ -291,7 +291,7 @@ class DetailTab(EditTab):
 
     def _build(self) -> None:
         names = {name: f"{name}: {PURPOSES[name]}" for name in PRESETS}
-        self._presets = ui.select(names, label="Start from", on_change=lambda event: self._choose(event.value))
+        self._presets = ui.select(names, label="Preset", on_change=lambda event: self._choose(event.value))
         self._presets.props("dense outlined options-dense").classes("w-full")
         self._box = ui.column().classes("w-full gap-1")
         self._response = ui.html("", sanitize=False).classes("w-full q-mt-sm")
@@ -300,16 +300,16 @@ class DetailTab(EditTab):
         self._build_brush(EDITS[self._edit].hint)
 
     def _build_bandwidth(self) -> None:
-        self._automatic = ui.checkbox("What counts as detail: automatic", value=True)
+        self._automatic = ui.checkbox("Edge threshold: automatic", value=True)
         self._automatic.props("dense").classes("q-mt-xs")
         self._automatic.on_value_change(lambda event: self._let_choose(bool(event.value)))
         with ui.column().classes("control gap-0") as self._by_hand:
-            ui.label("Largest difference that counts as detail").tooltip(
-                "How different two places may be and still count as alike, in grey levels of 255. Small values affect "
-                "only fine texture, large ones treat much as detail."
+            ui.label("Edge threshold").tooltip(
+                "Differences beyond it are edges, and stay as they are; smaller ones are detail, which the sliders "
+                "change. In grey levels of 255."
             )
             self._bandwidth = SteadySlider(min=2, max=80, step=1, value=BANDWIDTH)
-            self._bandwidth.props('dense label aria-label="Bandwidth"')
+            self._bandwidth.props('dense label aria-label="Edge threshold"')
             self._bandwidth.on("change", lambda event: self._set_bandwidth(float(event.args)))
             self._bandwidth.on_reset(lambda: self._set_bandwidth(BANDWIDTH))
 
@@ -346,7 +346,7 @@ class DetailTab(EditTab):
             self._started = None
         self._presets.set_value(self._started if self._started in same else None)
         changed = self._started is not None and self._started not in same
-        self._presets.props(f'label="{f"Started from {self._started}, then changed" if changed else "Start from"}"')
+        self._presets.props(f'label="{f"Preset {self._started}, changed" if changed else "Preset"}"')
 
     def _let_choose(self, automatic: bool) -> None:
         """Let the bandwidth be chosen from the photograph, or by hand."""

@@ -61,6 +61,7 @@ class Page:
     def __init__(self, session: Session) -> None:
         self.told: list[str] = []
         self.works: list[Awaitable[None]] = []
+        self.said: list[str] = []
         self.parts: list[Rectangle] = []
         self.before_work: Callable[[], None] = lambda: None
         self.closeup = Closeup(self, self.told.append)
@@ -68,6 +69,9 @@ class Page:
 
     def start(self, work: Awaitable[None]) -> None:
         self.works.append(work)
+
+    def say(self, who: object, doing: str = "") -> None:
+        self.said.append(doing)
 
     async def run(self, doing: str, work: Callable[..., Any], *arguments: object, progress: Progress) -> Any:
         self.before_work()

@@ -42,10 +42,10 @@ def test_a_preset_is_chosen_and_named(shown: Controls, tab: DetailTab) -> None:
     assert change == ("detail", {**preset_entries("crisp"), "inside": None}, True)
     shown.show(tab, PRESETS["crisp"])
     assert tab._presets.value == "crisp"
-    assert tab._presets.props["label"] == "Start from"
+    assert tab._presets.props["label"] == "Preset"
     shown.show(tab, Recipe((PRESETS["crisp"].steps[0].changed(bandwidth=33.0),)))
     assert tab._presets.value is None
-    assert tab._presets.props["label"] == "Started from crisp, then changed"
+    assert tab._presets.props["label"] == "Preset crisp, changed"
     assert len(shown.changes) == 1
 
 

@@ -59,6 +59,18 @@ def test_work_that_takes_long_is_shown_with_its_progress(
     assert not sign.visible
 
 
+def test_what_goes_on_is_shown_until_all_of_it_ends(tasks: Tasks, client: Client) -> None:
+    tasks.say("page", "Opening\u2026")
+    assert tasks.sign.visible
+    tasks.say("part", "Full size\u2026")
+    assert texts(client) == ["Full size\u2026"]
+    tasks.say("part")
+    assert texts(client) == ["Opening\u2026"]
+    assert tasks.sign.visible
+    tasks.say("page")
+    assert not tasks.sign.visible
+
+
 def test_errors_are_shown_until_something_succeeds(tasks: Tasks, client: Client) -> None:
     tasks.start(fail_with(ValueError("the name must be one of a file")))
     assert errors(client) == ["the name must be one of a file"]

@@ -17,7 +17,7 @@ REFUSED = [
         "max-file-size",
         "a.png must be at most 20 MB; make it smaller, or use the command line",
     ),
-    ("image/*", 1, "accept", "a.png must be a PNG, JPEG, TIFF, WebP or AVIF file; choose another"),
+    ("image/*", 1, "accept", "a.png must be a PNG, JPEG, TIFF, WebP, AVIF or HEIC file; choose another"),
     (".json,.cube,application/json", 1, "accept", "a.png must be a .json or .cube file; choose another"),
     ("image/*", 1, "dialog", "a.png is not opened while a dialog is; close it, and drop the file again"),
 ]

@@ -189,15 +189,15 @@ def test_preset_and_response(opened: Tab) -> None:
     flat = curve.get_attribute("points")
     assert flat
     before = opened.source()
-    opened.choose("Start from", "crisp")
+    opened.choose("Preset", "crisp")
     opened.wait_for_picture(before)
     expect(opened.page.get_by_text("2.20 ×").first).to_be_visible()
     expect(curve).not_to_have_attribute("points", flat)
     expect(opened.page.get_by_text("crisp:").first).to_be_visible()  # the name stays
     before = opened.source()
-    opened.drag(opened.slider("Bandwidth"), 0.3, 0.6)
+    opened.drag(opened.slider("Edge threshold"), 0.3, 0.6)
     opened.wait_for_picture(before)
-    expect(opened.page.get_by_text("Started from crisp, then changed")).to_be_visible()
+    expect(opened.page.get_by_text("Preset crisp, changed")).to_be_visible()
 
 
 def test_histogram_and_clipping(opened: Tab) -> None:

@@ -18,8 +18,31 @@ from nlfilter_torch.photo.declared.presets import Recipe, find_recipe
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.edits.recipe import apply_recipe
 from nlfilter_torch.photo.picture.photographs import Photograph, read_photograph, write_photograph
-from tests.browser import TIMEOUT, Editor, Tab, difference
+from tests.browser import TIMEOUT, Editor, Tab, difference, running
 from tests.problems import cat
+
+WATCHED = """window.seen = { welcome: false, signs: new Set() };
+const look = () => { const shown = (place) => document.querySelector(place)?.checkVisibility();
+  if (shown('.welcome')) seen.welcome = true;
+  if (shown('.working')) seen.signs.add(document.querySelector('.working').innerText.trim());
+  requestAnimationFrame(look); }; requestAnimationFrame(look)"""
+
+
+def test_a_page_that_opens_a_photograph_says_so_and_asks_for_none(browser: Browser, tmp_path: Path) -> None:
+    write_photograph(Photograph(cat(4)), tmp_path / "cat.png")
+    (tmp_path / "cat.png.edit.json").write_text(Recipe((Step("tone", contrast=1.3),)).to_json())
+    with running(tmp_path, "cat.png") as editor:
+        tab = Tab(browser.new_page(viewport={"width": 1280, "height": 900}))
+        tab.page.add_init_script(WATCHED)
+        tab.page.goto(editor.with_token())
+        expect(tab.page.locator(".panel[inert]")).to_have_count(0)
+        tab.wait_for_picture()
+        welcome, signs = tab.page.evaluate("[seen.welcome, [...seen.signs]]")
+        assert not welcome
+        assert "Opening\u2026" in signs
+        assert "Applying the edit\u2026" in signs
+        assert not tab.photo.evaluate("image => image.parentElement.classList.contains('waiting')")
+        tab.page.close()
 
 
 def test_errors_leave_when_something_succeeds(opened: Tab, folder: Path) -> None:
@@ -62,7 +85,7 @@ def test_before_a_photograph_one_is_chosen_or_dropped(tab: Tab, folder: Path) ->
     assert not dropped(page, {"edit.json": Recipe((Step("detail", alpha=(3.0, 1.0, 1.0, 1.0)),)).to_json().encode()})
     tab.wait_for_picture(before)
     assert not dropped(page, {"notes.txt": b"dear diary"})
-    expect(page.get_by_text("notes.txt must be a PNG, JPEG, TIFF, WebP or AVIF file")).to_be_visible()
+    expect(page.get_by_text("notes.txt must be a PNG, JPEG, TIFF, WebP, AVIF or HEIC file")).to_be_visible()
     assert dropped(page, {})  # text, which fields take
     page.get_by_role("button", name="Save photo").click()
     expect(page.get_by_role("dialog")).to_be_visible()

@@ -7,6 +7,9 @@ import { watchSliders } from "./sliders.js";
 /** Names of the files that are loaded as edits or looks. */
 const EDITS = /\.(json|cube)$/iu;
 
+/** Whether a file is a photograph; browsers know no type of HEIC files. */
+const isPhotograph = (file) => file.type.startsWith("image/") || /\.hei[cf]$/iu.test(file.name);
+
 /** The page, as the server and the controls use it. */
 class Page {
   /** Whether the edit has changed since a file was written; the server sets it. */
@@ -32,7 +35,7 @@ class Page {
 
   /** Send the first photograph of some files, or the first edit, and tell the upload what is not opened. */
   #take(files) {
-    const photograph = files.find((file) => file.type.startsWith("image/"));
+    const photograph = files.find(isPhotograph);
     const file = photograph ?? files.find(({ name }) => EDITS.test(name)) ?? files[0];
     if (!file) {
       return;
