@@ -21,9 +21,8 @@ from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.declared.strokes import Mark, Region, thin
 from nlfilter_torch.photo.edits.parts import Parts, Rectangle
 from nlfilter_torch.photo.edits.recipe import apply_recipe, edit_rows
-from nlfilter_torch.photo.files import tiff
 from nlfilter_torch.photo.files.exif import read_upright
-from nlfilter_torch.photo.files.formats import BITS, DEPTHS, SUFFIXES, check_memory, first_bytes, type_of
+from nlfilter_torch.photo.files.formats import BITS, DEPTHS, SUFFIXES, check_memory, count_pages, type_of
 from nlfilter_torch.photo.files.rows import TILED_MEMORY, WHOLE_MEMORY, usual_memory
 from nlfilter_torch.photo.files.writing import open_beside
 from nlfilter_torch.photo.picture.developing import limits_of, turned_canvas
@@ -75,7 +74,7 @@ class Session:
         except (ValueError, OSError, MemoryError) as error:
             raise type(error)(str(error).replace(str(path), name or str(path))) from error
         self.folder, self.path, self.name = folder, path.resolve(), name or path.name
-        self.pages = tiff.count_pages(path) if tiff.is_tiff(first_bytes(path)) else 1
+        self.pages = count_pages(path)
         self.original = self.developed = Developed.of(photograph, self.name, pixels)
         self.address = ""
         self.recipe = self.saved = self._shown = Recipe()  # the last one is the last committed edit

@@ -2,7 +2,7 @@
 
 import sys
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, replace
 from os.path import realpath
@@ -16,7 +16,16 @@ from nlfilter_torch.photo.cli.processes import zarr_processes
 from nlfilter_torch.photo.cli.progress import stages, steps
 from nlfilter_torch.photo.declared.development import AS_IT_IS, Development
 from nlfilter_torch.photo.declared.steps import Step, working_bytes
-from nlfilter_torch.photo.files.formats import LOSSY, Depth, TooLarge, check_depth, check_memory, check_type, type_of
+from nlfilter_torch.photo.files.formats import (
+    LOSSY,
+    Depth,
+    TooLarge,
+    check_depth,
+    check_memory,
+    check_type,
+    count_pages,
+    type_of,
+)
 from nlfilter_torch.photo.files.rows import (
     TILED_MEMORY,
     WHOLE_MEMORY,
@@ -29,7 +38,13 @@ from nlfilter_torch.photo.files.rows import (
 )
 from nlfilter_torch.photo.picture.edit import Rows
 from nlfilter_torch.photo.picture.light import develop_photograph
-from nlfilter_torch.photo.picture.photographs import Photograph, check_output, read_photograph, write_photograph
+from nlfilter_torch.photo.picture.photographs import (
+    Photograph,
+    check_output,
+    read_photograph,
+    write_photograph,
+    write_photographs,
+)
 from nlfilter_torch.photo.picture.pictures import Picture, mask_plane
 from nlfilter_torch.photo.picture.sampling import Report
 from nlfilter_torch.photo.picture.tiles import Passes, Processes, Statistics, Tiling
@@ -282,18 +297,14 @@ class FileEdit(ABC):
         check_quality(target, files.quality)
         check_processes(self.source, target, files.workers, files.cluster)
         allowed, kind = allowed_memory(files.memory), None if files.depth is None else options.DTYPES[files.depth]
+        if files.pages:
+            self._run_pages()
+            return
         with steps(3) as begin:
             begin("Reading")
             photograph = read_if_it_fits(self.source, target, self.bytes_per_pixel, files.memory)
             if photograph is not None:
-                size = photograph.size
-                edit = self.at_size(size)
-                photograph = develop_photograph(photograph, edit.develop)
-                output = photograph if kind is None else replace(photograph, depth=kind)
-                check_output(target, output)
-                edit.note_developing(size, photograph.pixels.shape[1])
-                begin("Editing")
-                output = output.with_pixels(edit.on_developed(size).edited(photograph))
+                output = self._edited_in_memory(photograph, begin)
                 begin("Writing")
                 write_photograph(output, target, quality=files.quality)
                 return
@@ -311,6 +322,40 @@ class FileEdit(ABC):
             job = Job(picture, stored, allowed - picture.cached, limit, report, stack, processes)
             with edit.tiling(job) as tiling:
                 write_picture(Path(target), tiling, stored, like, files.quality, tiling.fill)
+
+    def _edited_in_memory(self, photograph: Photograph, begin: Callable[[str], None], page: str = "") -> Photograph:
+        """What is to be written of a photograph; calls ``begin`` before it is edited."""
+        size, depth = photograph.size, self.files.depth
+        edit = self.at_size(size)
+        photograph = develop_photograph(photograph, edit.develop)
+        output = photograph if depth is None else replace(photograph, depth=options.DTYPES[depth])
+        check_output(self.target, output)
+        edit.note_developing(size, photograph.pixels.shape[1])
+        begin(f"Editing{page}")
+        return output.with_pixels(edit.on_developed(size).edited(photograph))
+
+    def _run_pages(self) -> None:
+        """Edit all pages of a TIFF file, and write them as they are edited."""
+        source, target = Path(self.source), Path(self.target)
+        if type_of(target) != "TIFF" or self.writes_aside:
+            got = "--show or --map" if self.writes_aside else target
+            raise ValueError(f"--pages must be used with a TIFF file as OUT and without --show and --map, got {got}")
+        count, memory = 1 if is_zarr(source) else count_pages(source), allowed_memory(self.files.memory)
+        with steps(count) as begin:
+            pages = (
+                self._edited_in_memory(
+                    read_photograph(source, bytes_per_pixel=self.bytes_per_pixel, memory=memory, page=number),
+                    begin,
+                    f" page {number + 1}",
+                )
+                for number in range(count)
+            )
+            write_photographs(pages, target, count)
+
+    @property
+    def writes_aside(self) -> bool:
+        """Whether it writes more pictures than the output."""
+        return False
 
     def note_developing(self, size: tuple[int, int], channels: int) -> None:
         """Print the notes about how a photograph (H, W) with that number of channels is developed."""

@@ -84,6 +84,11 @@ class EditJob(FileEdit):
         """Whether the edit adds colours to a grey photograph."""
         return self.step.declared.coloured
 
+    @property
+    def writes_aside(self) -> bool:
+        """Whether it writes more pictures than the output."""
+        return self.show is not None or self.map is not None
+
     def edited(self, photograph: Photograph) -> Tensor:
         """The edited pixels of a photograph in memory, (1, C, H, W)."""
         rows = rows_in_memory(photograph, self.source)

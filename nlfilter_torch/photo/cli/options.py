@@ -214,6 +214,14 @@ Full = Annotated[
 ]
 
 
+Pages = Annotated[
+    bool,
+    typer.Option(
+        "--pages",
+        help="Edit all pages of a TIFF file, one after the other in memory, and write them to another TIFF file.",
+        rich_help_panel=FILES_PANEL,
+    ),
+]
 Force = Annotated[
     bool,
     typer.Option(
@@ -274,6 +282,7 @@ class PhotographOptions:
 
     depth: OutputDepth = None
     quality: Quality = None
+    pages: Pages = False
     force: Force = False
     memory: Memory = None
     workers: Workers = None

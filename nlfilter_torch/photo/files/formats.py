@@ -99,7 +99,12 @@ def first_bytes(path: Path) -> bytes:
     return head
 
 
-def read_channels(path: Path, *, bytes_per_pixel: int, memory: int | None) -> Decoded:
+def count_pages(path: Path) -> int:
+    """Number of pictures in a file: of a TIFF file without masks and reduced versions, else 1."""
+    return tiff.count_pages(path) if tiff.is_tiff(first_bytes(path)) and not codecs.is_raw(path) else 1
+
+
+def read_channels(path: Path, *, bytes_per_pixel: int, memory: int | None, page: int | None = None) -> Decoded:
     """Read upright channels (H, W, S) in the stored dtype, and metadata; see :func:`read_photograph`."""
     head = first_bytes(path)
     check_size = partial(_check_size, path, bytes_per_pixel, memory)
@@ -109,7 +114,7 @@ def read_channels(path: Path, *, bytes_per_pixel: int, memory: int | None) -> De
         decoded = codecs.read_heic(path, check_size)
     elif tiff.is_tiff(head):
         try:
-            decoded = tiff.read(path, check_size)
+            decoded = tiff.read(path, check_size, page)
         except tiff.RawPicture:
             decoded = codecs.read_raw(path, check_size)
     else:
@@ -147,6 +152,17 @@ def _check_size(
 ) -> None:
     """Check the memory that a picture of (width, height) needs; twice as much for 64-bit pixels."""
     check_memory(path, *size, bytes_per_pixel * (1 + double), memory)
+
+
+def write_pages(path: Path, pages: Iterable[tuple[Stored, Header]], count: int) -> None:
+    """Write ``count`` pages (H, W, S) of about the same size, as they arrive, to a TIFF file, as :func:`write_file`."""
+    left_out = list[str]()
+    with open_beside(path) as stream:
+        for number, (picture, header) in enumerate(pages):
+            extras = header.metadata.extras
+            left_out += [*extras.left_out, *(part.name for part in extras.parts if part.kind != "TIFF")]
+            left_out += tiff.write(stream, picture, header, number, count)
+    note_left_out(path, left_out)
 
 
 def write_file(path: Path, picture: Stored | Iterable[Stored], header: Header, quality: int | None = None) -> None:

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from mmap import ACCESS_READ, mmap
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import imagecodecs
 import numpy as np
@@ -69,9 +69,9 @@ def is_tiff(head: bytes) -> bool:
     return head[:4] in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 
 
-def read(path: Path, check_size: CheckSize, number: int = 0) -> Decoded:
-    """Read a picture, see :class:`TiffRows`."""
-    with decoding(path), TiffRows(path, number) as rows:
+def read(path: Path, check_size: CheckSize, number: int | None = None) -> Decoded:
+    """Read the picture of a number, see :class:`TiffRows`; None is the first, with a warning if there are more."""
+    with decoding(path), TiffRows(path, number or 0) as rows:
         check_size((rows.shape[1], rows.shape[0]), double=rows.dtype == np.float64)
         ends = (at + count for at, count in zip(rows.page.dataoffsets, rows.page.databytecounts, strict=True) if count)
         if max(ends, default=0) > path.stat().st_size:  # decoders of JPEG fill what is missing
@@ -79,7 +79,8 @@ def read(path: Path, check_size: CheckSize, number: int = 0) -> Decoded:
         channels = rows.whole if rows.by_libtiff else np.asarray(rows.page.asarray())
         if rows.page.axes == "SYX":
             channels = np.moveaxis(channels, 0, -1)
-        rows.warn_of_pages()
+        if number is None:
+            rows.warn_of_pages()
         plain = plain_channels(rows.page, channels.reshape(*rows.shape[:2], -1))
         return Decoded(plain, rows.orientation, rows.metadata)
 
@@ -114,6 +115,10 @@ def find_picture(file: tifffile.TiffFile, number: int = 0) -> tuple[tifffile.Tif
             count += 1
         elif page.imagelength * page.imagewidth > largest.imagelength * largest.imagewidth:
             largest = page
+    if number >= max(count, 1):
+        raise UnhandledImage(
+            f"page must be less than the number of pictures, {max(count, 1)}, got {number}; count from 0"
+        )
     return found or largest, max(count, 1)
 
 
@@ -214,14 +219,17 @@ def _true_description(text: bytes, page: tifffile.TiffPage) -> tuple[bytes, str 
     return (text, None) if program is None else (b"", program.upper())
 
 
-def _own_fields(tables: TiffTables, page: tifffile.TiffPage) -> tuple[list[Field], int | None]:
-    """The fields of a page, those that it shares with the first one, and its orientation if it has its own.
+def _own_fields(
+    tables: TiffTables, page: tifffile.TiffPage, front: tifffile.TiffPage
+) -> tuple[list[Field], int | None]:
+    """The fields of a page, those that it shares with a reduced version in front, and its orientation if it has one.
 
-    The EXIF block in ``tables`` becomes that of the page, if it has one.
+    The EXIF block in ``tables`` becomes that of the page, if it has one, or shares nothing.
     """
+    if page.offset == front.offset or not (front.is_reduced or front.is_mask):
+        tables.first = page.offset
+        return tables.fields(page.offset), None
     first = tables.fields(tables.first)
-    if page.offset == tables.first:
-        return first, None
     own = tables.fields(page.offset)
     if any(field.code == EXIF for field in own):
         tables.first = page.offset
@@ -233,16 +241,16 @@ def _own_fields(tables: TiffTables, page: tifffile.TiffPage) -> tuple[list[Field
 
 def read_metadata(file: tifffile.TiffFile, page: tifffile.TiffPage, stream: BinaryIO) -> tuple[int, Metadata]:
     """Read the orientation of a page of a file, and the metadata of the upright picture."""
-    named = list[str | None]()
+    named, front = list[str | None](), file.pages.first
 
     def true_description(text: bytes) -> bytes:
-        true, lost = _true_description(text, file.pages.first)
+        true, lost = _true_description(text, page if tables.first == page.offset else front)
         named.append(lost and f"the description of the file for {lost}")
         return true
 
     with mmap(stream.fileno(), 0, access=ACCESS_READ) as data:
         tables = TiffTables(data)
-        fields, orientation = _own_fields(tables, page)
+        fields, orientation = _own_fields(tables, page, front)
         block, moved = exif_in_tiff.block_of(tables)
         block = exif_tags.with_description(block, true_description)
         orientation, exif, damaged = exif_tags.read_upright(block, orientation)
@@ -262,7 +270,7 @@ def read_metadata(file: tifffile.TiffFile, page: tifffile.TiffPage, stream: Bina
     left_out += [f"the tags of {OF_STACKS[field.code]}" for field in stored if field.code in OF_STACKS]
     left_out += [exif_in_tiff.MOVED] * moved
     left_out += ["smaller versions and masks"] * (
-        page.offset != tables.first or any(f.code == SUB_FILES for f in fields)
+        front.is_reduced or front.is_mask or any(f.code == SUB_FILES for f in fields)
     )
     scale = exif_tags.IN_INCHES.get((units or [tifffile.RESUNIT.INCH])[0] or 0)
     pair = None if scale is None or len(ratios) < 2 else sound([ratios[code] * scale for code in RESOLUTION[:2]])
@@ -293,25 +301,36 @@ def _tiles(rows: Iterable[Stored], width: int) -> Iterator[Stored]:
             yield padded[..., 0] if padded.shape[2] == 1 else padded
 
 
-def write(stream: BinaryIO, picture: Stored | Iterable[Stored], header: Header) -> list[str]:
+def write(
+    stream: BinaryIO, picture: Stored | Iterable[Stored], header: Header, page: int = 0, pages: int = 1
+) -> list[str]:
     """Write a picture (H, W, S), or its rows (h, W, S) as they arrive, in tiles, compressed without loss.
 
-    Large files become BigTIFF. Returns the names of metadata that are left out.
+    Large files become BigTIFF. Pages after the first, of as many of about that size as ``pages``, are appended, without
+    the nested tables of their EXIF blocks. Returns the names of metadata that are left out.
     """
     metadata, dtype = header.metadata, header.dtype
     shape = header.shape[:2] if header.shape[2] == 1 else header.shape
-    big = math.prod(header.shape) * dtype.itemsize > MAX_CLASSIC_BYTES
+    big = pages * math.prod(header.shape) * dtype.itemsize > MAX_CLASSIC_BYTES
     is_whole = isinstance(picture, np.ndarray)
     extras = metadata.extras
     kept = extras.tags_for(header.shape[:2], dtype.name)
     head = exif_in_tiff.opening(metadata.exif, kept[0].order if kept else "<", big)
+    left_out = extras.lacking_tags(kept) + [exif_in_tiff.MOVED] * head.moved
+    if page:
+        left_out += ["EXIF of pages after the first"] * bool(head.nested)
+        stream.seek(0)
+        first = TiffTables(stream.read(16))
+        stream.seek(0)
+        big, head = first.big, exif_in_tiff.Opening(first.order, b"", head.tags, {})
     tags = {tag.code: tag for tag in (*kept, *head.tags) if tag.code not in RESOLUTION}
     if extras.xmp is not None:
         tags[XMP] = Tag(XMP, BYTE, extras.xmp, head.order)
     resolution, unit = _resolution(extras, kept)
     # tifffile does not write nested tables, so a placeholder tag with the next lower number reserves space for each.
     places = [(code - 1, LONG, 1, 0, True) for code in head.nested]
-    with tifffile.TiffWriter(stream, bigtiff=big, byteorder=head.order) as file:  # type: ignore[arg-type]
+    form: dict[str, Any] = {"append": True} if page else {"bigtiff": big, "byteorder": head.order}
+    with tifffile.TiffWriter(stream, **form) as file:
         stream.write(head.body)
         file.write(
             picture.reshape(shape) if isinstance(picture, np.ndarray) else _tiles(picture, header.shape[1]),
@@ -341,13 +360,16 @@ def write(stream: BinaryIO, picture: Stored | Iterable[Stored], header: Header) 
     stream.flush()
     with mmap(stream.fileno(), 0, access=ACCESS_READ) as data:
         tables = TiffTables(data)
+        if page:
+            stream.seek(0)
+            tables.first = tifffile.TiffFile(stream).pages[page].offset
         positions = {field.code: field.entry for field in tables.fields(tables.first)}
     for code, offset in head.nested.items():
         exif_in_tiff.point(stream, head.order, big, positions[code - 1], code, offset)
     for tag in tags.values():
         stream.seek(positions[tag.code] + 2)
         stream.write(struct.pack(head.order + ("HQ" if big else "HI"), tag.kind, tag.count))
-    return extras.lacking_tags(kept) + [exif_in_tiff.MOVED] * head.moved
+    return left_out
 
 
 def _resolution(extras: Extras, tags: Iterable[Tag]) -> tuple[Resolution | None, int | None]:
@@ -421,10 +443,7 @@ class TiffRows:
         """Warn if the file has several pictures, of which only one is read."""
         if self.pages > 1:
             least = "at least " if self.pages == MOST_PAGES else ""
-            warn(
-                f"{self.path} has {least}{self.pages} pages, of which only the first is read; save the others as files "
-                "of their own"
-            )
+            warn(f"{self.path} has {least}{self.pages} pages, of which only the first is read; --pages edits all")
 
     @property
     def whole(self) -> Stored:

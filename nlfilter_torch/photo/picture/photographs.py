@@ -3,6 +3,7 @@
 Needs the ``cli`` extra (Pillow, tifffile, imagecodecs, psutil).
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import cast
@@ -25,6 +26,7 @@ from nlfilter_torch.photo.files.formats import (
     read_channels,
     type_of,
     write_file,
+    write_pages,
 )
 from nlfilter_torch.photo.files.metadata import NO_EXTRAS, Extras, Header, Metadata
 from nlfilter_torch.photo.picture.developing import develop_planes, finished, limits_of
@@ -104,7 +106,9 @@ class Photograph:
         return replace(self, pixels=pixels.detach().to(self.pixels), icc=icc)
 
 
-def read_photograph(path: str | Path, *, bytes_per_pixel: int = 0, memory: int | None = None) -> Photograph:
+def read_photograph(
+    path: str | Path, *, bytes_per_pixel: int = 0, memory: int | None = None, page: int | None = None
+) -> Photograph:
     """Read an image file.
 
     Args:
@@ -115,6 +119,7 @@ def read_photograph(path: str | Path, *, bytes_per_pixel: int = 0, memory: int |
         bytes_per_pixel: Memory that editing will need per pixel in float32, checked before decoding; doubled for files
             of 64-bit floats.
         memory: Bytes that may be used; None is the free memory.
+        page: Number of a picture in a TIFF file, from 0; None is the first, with a warning if there are more.
 
     Returns:
         The photograph, turned upright.
@@ -125,7 +130,7 @@ def read_photograph(path: str | Path, *, bytes_per_pixel: int = 0, memory: int |
         TooLarge: ``bytes_per_pixel`` for all pixels exceeds the memory. It is a MemoryError.
     """
     path = Path(path)
-    decoded = read_channels(path, bytes_per_pixel=bytes_per_pixel, memory=memory)
+    decoded = read_channels(path, bytes_per_pixel=bytes_per_pixel, memory=memory, page=page)
     channels, metadata = decoded.channels, decoded.metadata
     depth = check_depth(path, channels.dtype)
     planes, hidden = _planes_of(channels, metadata.extras.nodata, str(path))
@@ -177,6 +182,16 @@ def write_photograph(photograph: Photograph, path: str | Path, *, quality: int |
         check_count(quality, "quality", most=100)
     path = Path(path)
     check_output(path, photograph)
+    write_file(path, *_stored(photograph), quality)
+
+
+def write_photographs(photographs: Iterable[Photograph], path: Path, count: int) -> None:
+    """Write ``count`` photographs, as they arrive, as the pages of a TIFF file; see :func:`write_photograph`."""
+    write_pages(path, map(_stored, photographs), count)
+
+
+def _stored(photograph: Photograph) -> tuple[Stored, Header]:
+    """The channels (H, W, S) of a photograph in a file, and what the file says of them."""
     planes = [photograph.pixels] if photograph.alpha is None else [photograph.pixels, photograph.alpha]
     rows = max(1, STRIP // photograph.size[1])
     parts = zip(*(plane.split(rows, dim=2) for plane in planes), strict=True)
@@ -184,8 +199,7 @@ def write_photograph(photograph: Photograph, path: str | Path, *, quality: int |
     if photograph.hidden is not None:
         photograph.hidden.put_back(channels)
     height, width, samples = channels.shape
-    header = Header((height, width, samples), channels.dtype, photograph.alpha is not None, photograph.metadata)
-    write_file(path, channels, header, quality)
+    return channels, Header((height, width, samples), channels.dtype, photograph.alpha is not None, photograph.metadata)
 
 
 def check_output(path: str | Path, photograph: Photograph) -> str:

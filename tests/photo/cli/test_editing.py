@@ -308,3 +308,25 @@ def test_quality_of_jpeg(memory: list[str], tmp_path: Path, capsys: pytest.Captu
     assert refusal(capsys, "sharpen", photo, tmp_path / "out.png", "--quality", "80").startswith(
         "--quality must be used with a JPEG, WebP or AVIF file, got 80 for "
     )
+
+
+def test_all_pages_of_a_stack_are_edited_on_request(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Each page as it would be alone."""
+    picture = skimage.data.chelsea()[:48, :64]
+    pages = [picture, 255 - picture, picture[:40]]
+    with tifffile.TiffWriter(tmp_path / "in.tif") as file:
+        for page in pages:
+            file.write(page, photometric="rgb", metadata=None)
+    assert detail(tmp_path / "in.tif", tmp_path / "out.tif", "--pages", "--depth", 16) == 0
+    for number, page in enumerate(pages):
+        tifffile.imwrite(tmp_path / "alone.tif", page, photometric="rgb", metadata=None)
+        assert detail(tmp_path / "alone.tif", tmp_path / "alone_out.tif", "--depth", 16) == 0
+        wanted, found = read_photograph(tmp_path / "alone_out.tif"), read_photograph(tmp_path / "out.tif", page=number)
+        assert torch.equal(found.pixels, wanted.pixels)
+        assert found.depth == "uint16"
+    with tifffile.TiffFile(tmp_path / "out.tif") as file:
+        assert len(file.pages) == 3
+    capsys.readouterr()
+    assert detail(tmp_path / "in.tif", tmp_path / "out.png", "--pages") == 2
+    assert "--pages must be used with a TIFF file as OUT and without --show" in capsys.readouterr().err
+    assert not (tmp_path / "out.png").exists()

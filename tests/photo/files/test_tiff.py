@@ -21,8 +21,8 @@ from nlfilter_torch.photo.files.metadata import Extras, Header, Metadata, Tag
 from nlfilter_torch.photo.files.rows import open_picture
 from nlfilter_torch.photo.files.tables import LENGTHS, TiffTables
 from nlfilter_torch.photo.files.tiff import TiffRows
-from nlfilter_torch.photo.picture.photographs import read_photograph, write_photograph
-from tests.files import cat, photograph, rows_of, same, stored_values
+from nlfilter_torch.photo.picture.photographs import read_photograph, write_photograph, write_photographs
+from tests.files import camera_block, cat, photograph, rows_of, same, stored_values, tags
 
 
 @pytest.mark.parametrize("tag", [(274, 2, 4, "top"), (274, 5, 1, (1, 0)), (274, 3, 2, (6, 1)), (34675, 3, 1, 5)])
@@ -59,7 +59,7 @@ def test_stored_kinds_are_made_plain(tmp_path: Path) -> None:
     tifffile.imwrite(tmp_path / "big.tif", rgba, photometric="rgb", extrasamples=[2], bigtiff=True, **bare)
     same(read_photograph(tmp_path / "big.tif"), photograph(rgba))
     tifffile.imwrite(tmp_path / "pages.tif", np.stack([rgba, rgba // 2]), photometric="rgb", extrasamples=[2], **bare)
-    with pytest.warns(UserWarning, match="pages.tif has 2 pages, of which only the first is read; save the others"):
+    with pytest.warns(UserWarning, match="pages.tif has 2 pages, of which only the first is read; --pages edits all"):
         same(read_photograph(tmp_path / "pages.tif"), photograph(rgba))
     rgb = Image.fromarray(np.full((16, 16, 3), 90, np.uint8))
     rgb.save(tmp_path / "jpeg.tif", compression="jpeg")
@@ -327,6 +327,43 @@ def test_the_stack_of_another_program_becomes_one_picture(tmp_path: Path) -> Non
         with contextlib.nullcontext() if name == "shaped" else pytest.warns(UserWarning, match="the description"):
             write_photograph(opened, tmp_path / "out.tif")
         np.testing.assert_array_equal(tifffile.imread(tmp_path / "out.tif"), stack[0])
+
+
+def test_pages_are_read_by_their_numbers_with_their_own_descriptions(tmp_path: Path) -> None:
+    with tifffile.TiffWriter(tmp_path / "in.tif") as file:
+        for number, picture in enumerate((FULL, SMALL)):
+            file.write(picture, description=f"picture {number}", **PLAIN)
+        file.write(SMALL[:10], **REDUCED)
+    for page, picture in enumerate((FULL, SMALL)):
+        opened = read_photograph(tmp_path / "in.tif", page=page)
+        assert torch.equal(opened.pixels, photograph(picture).pixels)
+        assert tags(opened.exif)[0][270] == f"picture {page}"
+    with pytest.raises(ValueError, match="page must be less than the number of pictures, 2, got 2; count from 0"):
+        read_photograph(tmp_path / "in.tif", page=2)
+
+
+@pytest.mark.parametrize("big", [False, True])
+def test_photographs_are_written_as_pages(tmp_path: Path, big: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each has its size, depth, and tags of its own, whatever the byte order of the first one."""
+    monkeypatch.setattr(tiff, "MAX_CLASSIC_BYTES", 0 if big else 1 << 30)
+    wanted = [
+        replace(
+            photograph(values, exif=camera_block(order, False)),
+            extras=Extras(tags=(Tag(65000, 5, np.arange(4, dtype=order + "u4").tobytes(), order),), size=(1, 1)),
+        )
+        for values, order in ((FULL, ">"), (SMALL[..., :1].astype(np.uint16), "<"))
+    ]
+    with pytest.warns(UserWarning, match="without .*EXIF of pages after the first$"):
+        write_photographs(iter(wanted), tmp_path / "out.tif", 2)
+    with tifffile.TiffFile(tmp_path / "out.tif") as file:
+        assert len(file.pages) == 2
+        assert file.is_bigtiff == big
+        assert [page.tags[65000].value for page in file.pages] == [(0, 1, 2, 3)] * 2
+        assert [page.tags[271].value for page in file.pages] == ["Maker"] * 2
+    for number, page in enumerate(wanted):
+        opened = read_photograph(tmp_path / "out.tif", page=number)
+        assert torch.equal(opened.pixels, page.pixels)
+        assert opened.depth == page.depth
 
 
 ORDERS = [("<", False), (">", False), ("<", True), (">", True)]
