@@ -25,6 +25,8 @@ from .nn.denoiser.network import NonlocalDenoiser as NonlocalDenoiser
 from .nn.denoiser.noise import estimate_noise as estimate_noise
 from .nn.denoiser.profile import NoiseProfile as NoiseProfile
 from .nn.denoiser.profile import profile_of_difference as profile_of_difference
+from .nn.layer_fit import LayerFit as LayerFit
+from .nn.layer_fit import fit_layer as fit_layer
 from .nn.masks import DiffusionMask as DiffusionMask
 from .nn.masks import SegmentMask as SegmentMask
 from .nn.portable import Portable as Portable

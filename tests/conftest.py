@@ -9,6 +9,8 @@ import pytest
 import torch
 from hypothesis import HealthCheck, settings
 
+from tests.torchvision import make_importable
+
 if TYPE_CHECKING:
     from nlfilter_torch.photo.app.session import Session
 
@@ -53,19 +55,9 @@ def session(tmp_path: Path) -> "Session":
 
 @pytest.fixture
 def deepinv() -> Iterator[None]:
-    """Skip the test unless deepinv is installed.
-
-    It imports torchvision, whose compiled part does not load beside another build of torch than the one it was made
-    for. Two operators of that part, which deepinv does not call, are then declared for the import to succeed.
-    """
+    """Skip the test unless deepinv is installed."""
     if find_spec("deepinv") is None:
         pytest.skip("deepinv is not installed")
-    try:
-        import torchvision  # noqa: F401
-    except RuntimeError:
-        operators = torch.library.Library("torchvision", "DEF")
-        for name in ("nms", "qnms"):
-            operators.define(name + "(Tensor dets, Tensor scores, float iou_threshold) -> Tensor")
-        yield
-    else:
-        yield
+    operators = make_importable()
+    yield
+    del operators
