@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from mmap import ACCESS_READ, mmap
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import BinaryIO
 
 import imagecodecs
 import numpy as np
@@ -329,8 +329,8 @@ def write(
     resolution, unit = _resolution(extras, kept)
     # tifffile does not write nested tables, so a placeholder tag with the next lower number reserves space for each.
     places = [(code - 1, LONG, 1, 0, True) for code in head.nested]
-    form: dict[str, Any] = {"append": True} if page else {"bigtiff": big, "byteorder": head.order}
-    with tifffile.TiffWriter(stream, **form) as file:
+    order = None if page else head.order
+    with tifffile.TiffWriter(stream, bigtiff=big and not page, byteorder=order, append=page > 0) as file:  # type: ignore[arg-type]
         stream.write(head.body)
         file.write(
             picture.reshape(shape) if isinstance(picture, np.ndarray) else _tiles(picture, header.shape[1]),
@@ -440,16 +440,28 @@ class TiffRows:
         return TiffRows, (self.path.absolute(), self.number)  # another process opens the file again
 
     def warn_of_pages(self) -> None:
-        """Warn if the file has several pictures, of which only one is read."""
+        """Warn if the file has several pictures, with pages of their own or not, of which only one is read."""
+        stated = re.search(r"images=(\d+)", self.page.imagej_description or "")
+        if stated is not None and int(stated[1]) > self.pages:
+            warn(f"{self.path} has {stated[1]} pictures behind one page, of which only the first is read")
+            return
         if self.pages > 1:
             least = "at least " if self.pages == MOST_PAGES else ""
             warn(f"{self.path} has {least}{self.pages} pages, of which only the first is read; --pages edits all")
 
     @property
     def whole(self) -> Stored:
-        """All stored channels (H, W, S), decoded by libtiff."""
+        """All stored channels (H, W, S), decoded by libtiff; raises UnhandledImage if it does not know how."""
         with mmap(self.stream.fileno(), 0, access=ACCESS_READ) as data:
-            channels = np.asarray(imagecodecs.tiff_decode(data, self.page.index))
+            try:
+                channels = np.asarray(imagecodecs.tiff_decode(data, self.page.index))
+            except Exception as error:
+                if self.page.compression == tifffile.COMPRESSION.OJPEG:
+                    raise
+                raise UnhandledImage(
+                    f"{self.path} is compressed in a way, number {int(self.page.compression)}, that libtiff, which "
+                    "reads it, does not support; save it uncompressed"
+                ) from error
         return channels.reshape(*self.shape[:2], -1)
 
     def __enter__(self) -> "TiffRows":

@@ -287,10 +287,26 @@ def test_old_jpeg_is_read(tmp_path: Path, apart: bool) -> None:
     assert np.abs(levels_of(tmp_path / "in.tif").astype(int) - colour).max() < 4
 
 
+def test_unknown_compression_is_not_called_damage(tmp_path: Path) -> None:
+    fields = [(256, 3, [4]), (257, 3, [2]), (258, 3, [8]), (259, 3, [50099]), (262, 3, [1]), (277, 3, [1])]
+    (tmp_path / "in.tif").write_bytes(tiff_of([*fields, (278, 3, [2])], bytes(8)))
+    for read in (read_photograph, rows_of):
+        with pytest.raises(
+            ValueError, match=r"in\.tif is compressed in a way, number 50099, that libtiff, which reads"
+        ):
+            read(tmp_path / "in.tif")
+
+
+def test_a_stack_behind_one_page_is_told(tmp_path: Path) -> None:
+    tifffile.imwrite(tmp_path / "in.tif", SMALL, description="ImageJ=1.53t\nimages=9\nslices=9\n", **PLAIN)
+    with pytest.warns(UserWarning, match=r"in\.tif has 9 pictures behind one page, of which only the first is read"):
+        read_photograph(tmp_path / "in.tif")
+
+
 OME = b'<?xml version="1.0"?><OME xmlns="x"><Image><Pixels SizeZ="9" SizeX="120" SizeY="90"/></Image></OME>'
 STATED = [
-    (b"ImageJ=1.53t\nimages=9\nslices=9\nunit=micron\nmin=3.0\nmax=255.0\n", b"ImageJ=1.53t\nunit=micron\n", "ImageJ"),
-    (b"ImageJ=1.53t\nchannels=3\nimages=3\n", None, "ImageJ"),
+    (b"ImageJ=1.53t\nimages=1\nslices=1\nunit=micron\nmin=3.0\nmax=255.0\n", b"ImageJ=1.53t\nunit=micron\n", "ImageJ"),
+    (b"ImageJ=1.53t\nchannels=1\nimages=1\n", None, "ImageJ"),
     (OME, None, "OME"),
     (b'{"shape": [9, 90, 120, 3], "axes": "ZYXS"}', None, None),
     (b'{"shape": [90, 120, 3], "lens": "wide", "axes": "YXS"}', b'{"lens": "wide"}', None),
