@@ -147,18 +147,23 @@ def areas_of(image: Tensor) -> Tensor:
 def shading_of(source: Source[M], image: Tensor, areas: Tensor, development: Development) -> EnlargedChange:
     """The change of light and dark areas of a picture, from its image and areas as :func:`small` shows it.
 
-    A dark area of luminance b is multiplied by ``exp(shadows (1 - b)^3)``, and the distance of a light one from white
-    by ``exp(-highlights b^3)``. Both curves rise everywhere, alone and together. Where it gets lighter, chroma grows
-    with luminance.
+    Where it gets lighter, chroma grows with luminance.
     """
-    tones = areas.clamp(0, 1)
-    lifted = tones * torch.expm1(development.shadows * (1 - tones) ** 3)
-    lowered = (1 - tones) * torch.expm1(-development.highlights * tones**3)
     grey = reduce_channels(image, "luminance")
-    change, kept_chroma = balanced(image, limit(image, lifted - lowered))
+    change, kept_chroma = balanced(image, limit(image, shaded(areas.clamp(0, 1), development)))
     _, grown = balanced(image, change, Balance(colour=1 / MAX_SATURATION_GAIN))  # as much as luminance
     saturation = None if kept_chroma is None or grown is None else torch.where(change > 0, grown, kept_chroma)
     return EnlargedChange(Coarse.of(grey, change, saturation, "soft"), luminance, source.size)
+
+
+def shaded(tones: Tensor, development: Development) -> Tensor:
+    """The change of tones in [0, 1] by highlights and shadows.
+
+    A dark tone b is multiplied by ``exp(shadows (1 - b)^3)``, and the distance of a light one from white by
+    ``exp(-highlights b^3)``. Both curves rise everywhere, alone and together.
+    """
+    lifted = tones * torch.expm1(development.shadows * (1 - tones) ** 3)
+    return lifted - (1 - tones) * torch.expm1(-development.highlights * tones**3)
 
 
 @full_precision
