@@ -9,11 +9,14 @@ note.
     python -m benchmarks.files FOLDER --known benchmarks/refusals.json
 """
 
+import io
 import json
 import re
+import struct
 import sys
 import tempfile
 import warnings
+import zlib
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import suppress
@@ -24,7 +27,7 @@ from pathlib import Path
 import numpy as np
 import tifffile
 from numpy.typing import NDArray
-from PIL import ExifTags, Image, ImageOps
+from PIL import ExifTags, Image, ImageCms, ImageOps
 
 from benchmarks.harness import options
 from nlfilter_torch.photo.declared.presets import Recipe
@@ -32,7 +35,7 @@ from nlfilter_torch.photo.files import tiff
 from nlfilter_torch.photo.files.exif import upright
 from nlfilter_torch.photo.files.formats import SUFFIXES, first_bytes, read_channels
 from nlfilter_torch.photo.files.metadata import STORAGE_TAGS, Tag
-from nlfilter_torch.photo.files.png import STORAGE_CHUNKS, chunks
+from nlfilter_torch.photo.files.png import STORAGE_CHUNKS, chunks, write_chunk
 from nlfilter_torch.photo.files.tables import POINTERS, RESOLUTION, TiffTables
 from nlfilter_torch.photo.picture.photographs import read_photograph, write_photograph
 
@@ -257,11 +260,43 @@ def generate(folder: Path) -> None:
     whole = (folder / "turned.jpg").read_bytes()
     (folder / "cut.jpg").write_bytes(whole[: len(whole) // 2])
     (folder / "zeros.jpg").write_bytes(whole[:-2] + bytes(4000))
-    plain = (folder / "RGB.png").read_bytes()
-    (folder / "behind.png").write_bytes(plain + b"more")
+    _generate_pngs(folder, (folder / "RGB.png").read_bytes())
+    with tifffile.TiffWriter(folder / "reduced.tif") as file:
+        file.write(rgb[::2, ::2], photometric="rgb", subfiletype=1, subifds=1)
+        file.write(rgb, photometric="rgb")
+    with tifffile.TiffWriter(folder / "pyramid.tif") as file:
+        file.write(rgb, photometric="rgb", subifds=1)
+        file.write(rgb[::2, ::2], photometric="rgb", subfiletype=1)
+    if find_spec("pillow_heif"):
+        import pillow_heif
+
+        for depth, transfer in ((8, 13), (10, 16)):
+            heif = pillow_heif.from_pillow(Image.fromarray(rgb))
+            heif.save(folder / f"{depth}.heic", color_primaries=1, transfer_characteristics=transfer)
     rows = "0 0 0\n1 0 0\n0 1 0\n1 1 0\n0 0 1\n1 0 1\n0 1 1\n1 1 1\n"
     for number, head in enumerate(("", "DOMAIN_MAX 2 2 2\n", "LUT_1D_INPUT_RANGE 0 1\n", "// x\n", "TITLE a\x0cb\n")):
         (folder / f"table{number}.cube").write_text(f"{head}LUT_3D_SIZE 2\n{rows}\x1a")
+
+
+def _generate_pngs(folder: Path, plain: bytes) -> None:
+    """Files with descriptions of colours, wrong checksums, and bytes behind the end, from a plain one."""
+    profile = b"a\0\0" + zlib.compress(ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes())
+    sets: dict[str, list[tuple[bytes, bytes]]] = {
+        "profile": [(b"iCCP", profile), (b"gAMA", struct.pack(">I", 100_000))],
+        "numbers": [(b"cICP", bytes((12, 13, 0, 1))), (b"iCCP", profile)],
+        "hdr": [(b"cICP", bytes((9, 16, 0, 1))), (b"iCCP", profile)],
+        "text": [(b"tEXt", b"Title\0cat"), (b"tIME", bytes(7))],
+    }
+    for name, added in sets.items():
+        stream = io.BytesIO()
+        for chunk, content in added:
+            write_chunk(stream, chunk, content)
+        whole = plain[:33] + stream.getvalue() + plain[33:]  # behind the header
+        (folder / f"{name}.png").write_bytes(whole)
+        (folder / f"{name}-checksum.png").write_bytes(
+            whole[: 32 + len(stream.getvalue())] + b"?" + whole[33 + len(stream.getvalue()) :]
+        )
+    (folder / "behind.png").write_bytes(plain + b"more")
 
 
 def _tiffs(rgb: Pixels, alpha: Pixels, palette: Pixels) -> Iterator[tuple[str, dict[str, object]]]:
