@@ -25,7 +25,7 @@ Aperture = Literal["disc", "gaussian"]
 
 # A mask below BLURRED counts as background, above SHARP as subject. A blurred part of the subject is more disturbing
 # than a sharp part of the background, so uncertain pixels stay sharp.
-BLURRED, SHARP = 0.15, 0.4
+BLURRED, SHARP = 0.05, 0.25
 SUBJECT_WEIGHT = 1e-5  # weight of the subject in the blur of the background
 ROWS, FAST = 192, 64  # rows of a Fourier transform, about; its sizes are multiples of this, which makes it fast
 

@@ -4,7 +4,7 @@ The groups are for cross-validation: methods are compared by how well they predi
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -19,6 +19,7 @@ from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles, blocks_at
 Extent = Literal["near", "object", "everywhere"]
 INSIDE_MASK = 0.5  # mask from which on a pixel is inside an object, in which pixels are connected
 SOFT_BORDER = 8  # width in pixels of a soft border, which belongs to the nearest object
+VISIBLE = 0.05  # masks up to this are hardly visible, and from twice this on they are
 SMALL_PIECE = 0.03  # of the pixels of the object; smaller pieces within its border, such as hair, belong to it
 
 
@@ -32,7 +33,7 @@ def connected(masks: Tensor, scribbles: Tensor) -> Tensor:
         masks: of K regions, (B, K, H, W).
         scribbles: weights of those on the regions, (B, K, H, W), above 0 where painted.
     """
-    own, others = _parts(masks, scribbles, lambda own, _: SMALL_PIECE * own.sum())
+    own, others = _parts(masks, scribbles)
     for _ in range(SOFT_BORDER):
         wider = torch.where(others > 0, 0.0, _widened(own))
         others, own = torch.where(wider > 0, 0.0, _widened(others)), wider
@@ -40,16 +41,19 @@ def connected(masks: Tensor, scribbles: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def without_specks(masks: Tensor, scribbles: Tensor) -> Tensor:
-    """Which pixels do not belong to specks, (B, K, H, W) of bool: to what is smaller than the scribbles on its region.
+def without_haze(masks: Tensor, scribbles: Tensor, least: Tensor) -> Tensor:
+    """Shares (B, K, H, W) of masks that stay: 0 in haze, which is hardly visible, and in specks; 1 elsewhere.
 
-    Specks are not connected with a scribble, nor within a soft border of what is large enough. The arguments are those
-    of :func:`connected`.
+    Specks are smaller than ``least``, (B, K) in pixels, neither connected with a scribble nor within a soft border of
+    what is. Half of that border lies outside of what is selected by half; there, all stays. The other arguments are
+    those of :func:`connected`.
     """
-    own, large = _parts(masks, scribbles, lambda _, scribbled: scribbled.sum())
-    kept = F.max_pool2d(own.maximum(large), 2 * SOFT_BORDER + 1, 1, SOFT_BORDER) > 0
-    specks = ((masks >= INSIDE_MASK) & ~kept).to(masks)
-    return kept | (F.max_pool2d(specks, 2 * SOFT_BORDER + 1, 1, SOFT_BORDER) == 0)
+    selected = torch.maximum(*_parts(masks, scribbles, least))
+    border = F.max_pool2d(selected, 2 * SOFT_BORDER + 1, 1, SOFT_BORDER)
+    specks = F.max_pool2d((masks >= INSIDE_MASK).to(masks) * (1 - border), 2 * SOFT_BORDER + 1, 1, SOFT_BORDER)
+    visible = (masks / VISIBLE - 1).clamp(0.0, 1.0)
+    stays = F.max_pool2d(selected, SOFT_BORDER + 1, 1, SOFT_BORDER // 2)
+    return stays.maximum(visible * (1 - specks * (1 - border)))
 
 
 @torch.no_grad()
@@ -67,18 +71,18 @@ def _numbered(inside: Tensor) -> Tensor:
     return torch.from_numpy(label(inside.cpu().numpy(), connectivity=1)).to(inside.device)
 
 
-def _parts(masks: Tensor, scribbles: Tensor, least: Callable[[Tensor, Tensor], Tensor]) -> tuple[Tensor, Tensor]:
+def _parts(masks: Tensor, scribbles: Tensor, least: Tensor | None = None) -> tuple[Tensor, Tensor]:
     """The components of masks that hold a scribble, and other large ones, (B, K, H, W) of 0 and 1 each.
 
-    ``least`` gives the number of pixels of large ones, from those that hold a scribble and the scribbles, (H, W).
+    Large ones have at least so many pixels, (B, K), or :data:`SMALL_PIECE` of those that hold a scribble.
     """
+    inside = (masks >= INSIDE_MASK) | (scribbles > 0)
     parts = []
-    for mask, painted in zip(masks.flatten(0, 1), scribbles.flatten(0, 1), strict=True):
-        inside = (mask >= INSIDE_MASK) | (painted > 0)
-        numbers = _numbered(inside)
-        own = torch.isin(numbers, numbers[painted > 0].unique()) & inside
-        large = numbers.flatten().bincount() >= least(own, painted)
-        parts.append((own, inside & ~own & large[numbers]))
+    for number, planes in enumerate(zip(inside.flatten(0, 1), scribbles.flatten(0, 1) > 0, strict=True)):
+        numbers = _numbered(planes[0])
+        own = torch.isin(numbers, numbers[planes[1]].unique()) & planes[0]
+        enough = SMALL_PIECE * own.sum() if least is None else least.flatten()[number]
+        parts.append((own, planes[0] & ~own & (numbers.flatten().bincount() >= enough)[numbers]))
     own, large = (torch.stack(planes).view_as(masks).to(masks) for planes in zip(*parts, strict=True))
     return own, large
 

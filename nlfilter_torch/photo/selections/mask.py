@@ -36,7 +36,7 @@ from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles, parts_in_bl
 from nlfilter_torch.photo.picture.source import Fitted, Reduced, Source, at, kept
 from nlfilter_torch.photo.picture.viewing import viewed_size
 from nlfilter_torch.photo.selections.by_hand import ByHand, check_drawn
-from nlfilter_torch.photo.selections.connected import Extent, connected, without_specks
+from nlfilter_torch.photo.selections.connected import Extent, connected, without_haze
 from nlfilter_torch.photo.selections.matting import linear_mask, linear_models, solve_linear
 from nlfilter_torch.photo.selections.rough_mask import RoughMasks
 from nlfilter_torch.photo.selections.scribbled_colours import EPSILON, SOLVED_PIXELS, trimap_share
@@ -45,7 +45,6 @@ from nlfilter_torch.photo.selections.stray import without_strays
 VIEWED = VIEWING_SIZE.default_number  # megapixels; larger pictures are first reduced to this size
 FLOATS_PER_PIXEL = 80  # estimated working memory per pixel of the reduced picture, in addition to its operator
 ODDS, STEEPNESS = 1.5, 1.4  # of the curve from the solution along borders, too low halfway, to masks
-VISIBLE = 0.05  # masks up to this are 0, and change no more from twice this on
 MOST_WAITING = 2  # threads: operations on so few pixels are not worth dividing between two
 
 
@@ -73,8 +72,9 @@ def region_mask(
     scribbles separate the two, and the cut between them follows borders of the picture. An even area with a scribble,
     such as a sky, belongs to the region as a whole. Points along the borders of the picture also count as background
     unless they resemble the region or are part of such an area, so one scribble is enough. The borders of the mask are
-    then aligned with those of the picture. What would be selected by less than 0.05 is 0, up to 0.1 it is less than
-    computed. Specks that are smaller than the scribbles and not connected with one are left out.
+    then aligned with those of the picture. Away from all that is selected by half or more, masks are 0 where they would
+    be below 0.05, and less than computed up to 0.1. Specks that are smaller than the scribbles and not connected with
+    one are left out.
     Where a scribble that is at least three times as long as wide leaves its object, it does not count: at most 30 % of
     it, in one or two pieces of a very different colour, that no other scribble is meant for.
     :func:`diffusion_mask` is the paper's mask, which selects everything similar to one region.
@@ -392,11 +392,13 @@ def _computed_regions(
     if marked is not None:
         functions = functions * marked[:, :, None, None, None]
     regions = Regions(image, steps, functions, scribbles, boxes=boxes)
-    if everywhere:
-        return regions
     if limits is not None:  # without a scribble, all that is found in a box belongs to the object
         front = torch.where(front.amax((2, 3), keepdim=True) > 0, front, held(limits, small.size).to(front))
-    belongs = (connected if settings.extent == "object" else without_specks)(regions.reduced_masks(), front)
+    masks = regions.reduced_masks()
+    if settings.extent == "object":
+        belongs = connected(masks, front).to(masks)
+    else:
+        belongs = without_haze(masks, front, front.sum((2, 3)) * (not everywhere))
     return replace(regions, functions=functions * belongs.unsqueeze(2))
 
 
@@ -502,9 +504,7 @@ def _against(inside: list[Scribbles], number: int, background: list[Scribbles]) 
 
 
 def calibrated(mask: Tensor) -> Tensor:
-    """Mask of a solution along borders: a curve on which 0 and 1 stay as they are, and what is hardly visible is 0."""
+    """Mask of a solution along borders: a curve on which 0 and 1 stay as they are."""
     mask = mask.clamp(0.0, 1.0)
     inside, outside = ODDS * mask**STEEPNESS, (1 - mask) ** STEEPNESS
-    mask = inside / (inside + outside)
-    rise = (mask / VISIBLE - 1).clamp(0.0, 1.0)
-    return mask * rise.square() * (3 - 2 * rise)
+    return inside / (inside + outside)

@@ -18,12 +18,11 @@ from nlfilter_torch.photo.picture.resizing import block_means
 from nlfilter_torch.photo.selections.scribbled_colours import by_trimap
 
 COARSEST = 48  # minimum short side of the coarsest level, in pixels
-MOST_HALVINGS = 4  # maximum number of reduced levels
 
 
 def pyramid_levels(short: int) -> int:
     """Number of times a picture with that short side is halved."""
-    return max(0, min(MOST_HALVINGS, int(math.log2(max(short / COARSEST, 1)))))
+    return int(math.log2(max(short / COARSEST, 1)))
 
 
 def halved(planes: Tensor, levels: int) -> list[Tensor]:

@@ -32,11 +32,9 @@ STROKES = 0.3  # weight of strokes in these fits, relative to all that is cut of
 CERTAIN = 30.0  # log odds of strokes: above the sum of all others
 RARE_COLOURS = -24.0  # log of how many pixels neither side explains, which the Gaussian of all colours does
 MOST_BY_COLOUR = 6.0  # largest log odds by colour: neighbours and strokes overrule colours that a few pixels tell
-BY_REGRESSION, LEAST_REGRESSION = 1.0, 0.1  # weight of its log odds, and where they end
-BY_DISTANCE = 1.0  # log odds of pixels beside a stroke
+LEAST_REGRESSION = 0.1  # of it and of 1 minus it, where its log odds end
 BEYOND, FARTHEST = 0.5, 4.0  # log odds that are lost per radius of all strokes on an object, and for how many radii
 CONTOUR = 8.0  # log odds that a border costs per pixel of its length in an even area
-UNCONNECTED = 4.0  # log odds that pieces unconnected with a stroke lose in each round
 RARE, EPSILON = 1e-3, 1e-9  # relative weight of points that cost time and hardly count; least sum that is divided by
 FRAME = 0.3  # weight of pixels along the borders of a picture that are unlike the object, relative to strokes
 ACROSS, PER_CONTRAST = 4.0, 0.1  # distances along the picture: of an even one, and of a step of mean contrast
@@ -276,15 +274,15 @@ def _object_mask(planes: list[Tensor], extent: Extent, trimap: Tensor) -> Tensor
     squared = differences(lab).square().sum(1) * there
     typical = 2 * squared.sum() / there.sum().clamp(min=1.0) + EPSILON
     weights = CONTOUR * there * torch.exp(-squared / typical) / lab.new_tensor(LENGTHS).view(-1, 1, 1)
-    certain, unlike = likely.squeeze(0).clamp(LEAST_REGRESSION, 1 - LEAST_REGRESSION), (1 - likely.squeeze(0)).square()
+    likely, unlike = likely.squeeze(0), (1 - likely.squeeze(0)).square()
     beyond = torch.maximum(sides[1], (1 - free.squeeze(0)) * (strokes == 0))
-    odds = CERTAIN * (strokes - beyond) + BY_REGRESSION * certain.logit()
+    odds = CERTAIN * (strokes - beyond) + likely.logit(LEAST_REGRESSION)
     if without_box:
         frame = torch.ones_like(unlike)
         frame[1:-1, 1:-1] = 0.0
         beyond = torch.maximum(beyond, FRAME * frame * unlike * (sides[0] == 0))
     if extent != "everywhere":
-        odds = odds + BY_DISTANCE * nearness(lab, torch.stack([sides[0], beyond]))
+        odds = odds + nearness(lab, torch.stack([sides[0], beyond]))
         if without_box and extent == "object":
             odds = odds - BEYOND * radii_beyond(sides[0])
     points = Points.of(guide.flatten(1))
@@ -300,8 +298,7 @@ def _object_mask(planes: list[Tensor], extent: Extent, trimap: Tensor) -> Tensor
         solved, flow = cut(odds + by_colour, weights, flow, STEPS[number // ROUNDS])
         mask = torch.lerp(mask, solved, DAMPING if number else 1.0)
         if extent == "object" and bool((strokes > 0).any()):
-            apart = unconnected(mask, strokes)
-            odds, mask = odds - UNCONNECTED * apart, mask * ~apart
+            mask = mask * ~unconnected(mask, strokes)
         cut_off = [(2 * side.flatten() - 1).clamp(min=0.0) for side in (mask, 1 - mask)]
         fitted = [part + STROKES * side * (part.sum() / side.sum()) for part, side in zip(cut_off, known, strict=True)]
     return torch.lerp(mask, (odds + by_colour).sigmoid(), trimap)

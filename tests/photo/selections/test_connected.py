@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from nlfilter_torch.photo import defocus, enhance, recolor, region_mask
-from nlfilter_torch.photo.selections.connected import SOFT_BORDER, connected, without_specks
+from nlfilter_torch.photo.selections.connected import SOFT_BORDER, connected, without_haze
 from tests.problems import box, inverse, noise, oriented, paint
 from tests.strokes import SIZE as DOTTED
 from tests.strokes import dots, groups_of
@@ -47,18 +47,22 @@ def test_only_what_is_connected_belongs_to_the_object() -> None:
         assert torch.equal(inverse(turned.float(), number) > 0, belongs)
 
 
-def test_specks_are_what_is_smaller_than_the_scribbles_and_apart() -> None:
+def test_haze_and_specks_smaller_than_the_scribbles_go_away_from_what_is_selected() -> None:
     speck, large, hair = box(5, 50, 3, 3, size=SIZE), box(40, 40, 5, 6, size=SIZE), box(15, 10, 1, 2, size=SIZE)
-    haze = 0.2 * box(0, 20, 48, 20, size=SIZE)
-    masks = (LEFT + speck + large + hair + haze).clamp(max=1)
-    stays = without_specks(masks, STROKE)
-    assert stays[LEFT + large + hair > 0].all()
+    shade, haze = 0.2 * box(0, 20, 48, 10, size=SIZE), 0.04 * torch.ones_like(speck)
+    masks = torch.stack([LEFT + speck + large + hair, shade, haze]).amax(0).clamp(max=1)
+    stays = without_haze(masks, STROKE, STROKE.sum((2, 3)))
+    assert (stays[LEFT + large + hair > 0] == 1).all()
+    assert (stays[..., 0:9, 20:30] == 1).all()
     assert not stays[..., 1:12, 46:58].any()  # the speck with its soft border
-    assert stays[..., 24:, 20:40].all()
-    assert without_specks(masks, box(22, 8, 3, 3, size=SIZE))[speck > 0].all()  # as large as the scribble
+    assert not stays[..., 0:9, 34:40].any()  # haze
+    assert (stays[..., 14:34, 4:20] == 1).all()  # the border of the object
+    assert (without_haze(masks, STROKE, 0 * STROKE.sum((2, 3)))[speck > 0] == 1).all()  # no speck is too small
+    half = without_haze(0.075 * torch.ones_like(masks), STROKE, STROKE.sum((2, 3)))
+    assert half[..., 40, 60] == pytest.approx(0.5)
     for number in range(8):
-        turned = without_specks(oriented(masks, number), oriented(STROKE, number))
-        assert torch.equal(inverse(turned.float(), number) > 0, stays)
+        turned = without_haze(oriented(masks, number), oriented(STROKE, number), STROKE.sum((2, 3)))
+        assert torch.equal(inverse(turned, number), stays)
 
 
 def test_each_region_is_connected_by_itself() -> None:
