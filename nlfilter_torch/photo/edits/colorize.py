@@ -10,6 +10,9 @@ relative differences has the fewest large errors, so that the distance of the me
 regression are compared by predicting the colour of each stroke from other strokes: the smaller the errors of the
 regression are in comparison, and the more strokes there are, the more it counts, and the larger the distance may be.
 
+Where there are few strokes, of few colours, the mean is blended with what cuts of the picture between these colours
+give, as for masks of objects: they follow its borders, and know of texture and of surroundings.
+
 Shadows and highlights of an object have less chroma than its midtones. The regression therefore extends chroma relative
 to :func:`usual_chroma`, and propagation between neighbours relative to its square root; that by relative differences
 only where this reduces the chroma.
@@ -33,7 +36,7 @@ from nlfilter_torch.operator.options import FilterOptions
 from nlfilter_torch.operator.pixel_matrix import Columns
 from nlfilter_torch.operator.spectrum import Spectrum
 from nlfilter_torch.photo.declared.declaration import Edit
-from nlfilter_torch.photo.declared.parameters import COLORIZE
+from nlfilter_torch.photo.declared.parameters import COLORIZE, MASK
 from nlfilter_torch.photo.picture.boxes import (
     boxes_of,
     check_scribbles_in,
@@ -69,7 +72,7 @@ from nlfilter_torch.photo.picture.source import (
 from nlfilter_torch.photo.picture.viewing import Coarse, viewed_size
 from nlfilter_torch.photo.selections.connected import StrokeGroups
 from nlfilter_torch.photo.selections.local_values import ABSOLUTE, RELATIVE, Links, LocalValues
-from nlfilter_torch.photo.selections.mask import blocks_of
+from nlfilter_torch.photo.selections.mask import RegionMask, Regions, blocks_of, fit_regions
 from nlfilter_torch.photo.selections.rough_mask import TEXTURE_MARGIN, with_texture
 
 Method = Literal["regression", "kmeans"]
@@ -117,6 +120,9 @@ SAME_ERROR = 0.13  # squared error of a predicted stroke that hardly counts
 ERROR_EXPONENT, MOST_WEIGHT = 2.0, 3.0  # exponent of the ratio of errors, and limit of the resulting factor
 COLOUR_ROWS = 16  # rows of a photograph that are read to see whether it is in colour
 COLOURED, COLOURED_SHARE = 0.04, 0.01  # difference of channels in a coloured pixel, and share of such pixels
+# Colours up to which objects are cut out, since each takes as long as a mask, and number of strokes at which that
+# counts half. They were chosen as the constants above.
+MOST_CUT, CUT_HALF = 8, 8
 FEW_STROKES = 5  # number of compared strokes at which the factor is about half of that for many
 
 
@@ -311,6 +317,7 @@ class Estimates(Generic[M]):
         relative: propagation by relative differences: relative to the usual chroma, and unscaled.
         everywhere: the strength of the edit, (B, 1, 1, 1).
         regression_weight: factor of the regression.
+        cut: what cuts between the colours give, or None.
     """
 
     viewed: Source[M]
@@ -321,6 +328,7 @@ class Estimates(Generic[M]):
     relative: LocalValues
     everywhere: Tensor
     regression_weight: float | Tensor
+    cut: "Cut | None"
 
     @staticmethod
     def of(operators: Operators[M], scribbles: Scribbles, wanted: Tensor, strength: float | Tensor) -> "Estimates[M]":
@@ -343,7 +351,8 @@ class Estimates(Generic[M]):
             residual = groups.of_own(residuals[1:]) * usual
             regression_weight = compared(groups, scribbles.weights, residual, wanted, relative.left_out)
         everywhere = per_image(strength, wanted, 4)
-        return Estimates(viewed, saturation, far, near, absolute, relative, everywhere, regression_weight)
+        cut = Cut.of(operators, scribbles, wanted, groups.sums(scribbles.weights), everywhere)
+        return Estimates(viewed, saturation, far, near, absolute, relative, everywhere, regression_weight, cut)
 
     def __call__(self, pixels: Pixels) -> Tensor:
         """The chroma of pixels, (B, 2, h, w)."""
@@ -362,11 +371,65 @@ class Estimates(Generic[M]):
         factors = self.regression_weight * trust, influence**2, RELATIVE_WEIGHT
         change = weighted_mean((alike, connected, around), factors) - around
         limited = change * (1 + squared_sum(change) / (self.regression_weight * MOST_CHANGE**2)).rsqrt()
-        return self.saturation.unsqueeze(3) * (around + limited)
+        chroma = around + limited
+        if self.cut is not None:
+            chroma = self.cut.blended(chroma, influence, pixels)
+        return self.saturation.unsqueeze(3) * chroma
 
     def _interpolated(self, estimate: LocalValues, pixels: Pixels, own: Tensor) -> Tensor:
         place = (estimate.links, pixels.first, pixels.image.shape)
         return kept(self.viewed, place, [estimate.values], estimate, own, pixels.first)
+
+
+@dataclass(frozen=True, eq=False)
+class Cut:
+    """The chroma of pixels by cuts between the colours of strokes.
+
+    Attributes:
+        objects: masks of what each of K colours is meant for.
+        colours: chroma of these, (B, K, 2), 0 where an image has fewer.
+        valid: which of them each image has, (B, K, 1, 1).
+        share: of this estimate, (B, 1, 1, 1).
+    """
+
+    objects: Regions
+    colours: Tensor
+    valid: Tensor
+    share: Tensor
+
+    @staticmethod
+    def of(
+        operators: Operators[M], scribbles: Scribbles, chroma: Tensor, strokes: Tensor, strength: Tensor
+    ) -> "Cut | None":
+        """Cut the picture between scribbles of chroma (B, 2, n); None if there are one or many colours in all images.
+
+        Args:
+            operators: of the picture.
+            scribbles: on it.
+            chroma: of these.
+            strokes: weights of each stroke, (B, 1, S).
+            strength: of the edit, (B, 1, 1, 1).
+        """
+        regions, colours, valid = group_colours(with_green(chroma.unsqueeze(2)), scribbles.weights.unsqueeze(2))
+        counts = valid.sum(1)
+        few = ((counts > 1) & (counts <= MOST_CUT)).to(chroma)
+        if not bool(few.any()):
+            return None
+        inside = [scribbles.weighted(part) for part in regions.squeeze(2).split(1, dim=1)]
+        settings = RegionMask.of({**MASK.defaults, "extent": "everywhere", "generator": operators.options.generator})
+        objects = fit_regions(operators.viewed, inside, [], settings)
+        share = few * CUT_HALF / (CUT_HALF + (strokes > 0).sum(2).squeeze(1))
+        return Cut(objects, colours[:, :, ::2], valid[..., None, None], share.view(-1, 1, 1, 1) * strength)
+
+    def blended(self, chroma: Tensor, influence: Tensor, pixels: Pixels) -> Tensor:
+        """Chroma (B, 2, h, w) of pixels, blended with that of the objects that they belong to.
+
+        The more so the less ``influence`` (B, 1, h, w) strokes have without an edge between: these tell more.
+        """
+        masks = self.objects.masks(pixels) * self.valid
+        total = masks.sum(1, keepdim=True)
+        own = torch.einsum("bkhw,bkc->bchw", masks, self.colours) / total.clamp(min=NO_CHROMA)
+        return torch.lerp(chroma, own, self.share * (1 - influence) * total.clamp(max=1.0))
 
 
 @dataclass(frozen=True, eq=False)
