@@ -152,7 +152,9 @@ def colorize(
 
     Paper: Sec. V-B. ``"regression"`` extends the chroma of the strokes by :func:`propagate_strokes`, first over long
     distances, then the residual near the strokes. Two estimates by propagation between neighbouring pixels up to edges
-    are blended in. The regression counts more the better it predicts the colour of each stroke from other strokes.
+    are blended in. The regression counts more the better it predicts the colour of each stroke from other strokes. If
+    there are few strokes, of at most 8 colours, cuts between their areas, as of :func:`region_mask`, count, too, where
+    no stroke is connected without an edge.
     Shadows and highlights get less chroma than midtones of the same object. ``"kmeans"`` is the paper's method:
     :func:`segment_mask` divides the image into one segment per colour.
 
@@ -416,7 +418,13 @@ class Cut:
         if not bool(few.any()):
             return None
         inside = [scribbles.weighted(part) for part in regions.squeeze(2).split(1, dim=1)]
-        settings = RegionMask.of({**MASK.defaults, "extent": "everywhere", "generator": operators.options.generator})
+        options = operators.options
+        chosen = {
+            "num_landmarks": options.num_landmarks,
+            "landmarks": options.landmarks,
+            "generator": options.generator,
+        }
+        settings = RegionMask.of({**MASK.defaults, "extent": "everywhere", **chosen})
         objects = fit_regions(operators.viewed, inside, [], settings)
         share = few * CUT_HALF / (CUT_HALF + (strokes > 0).sum(2).squeeze(1))
         return Cut(objects, colours[:, :, ::2], valid[..., None, None], share.view(-1, 1, 1, 1) * strength)

@@ -135,7 +135,8 @@ def _colour(edit: Edit, marks: Sequence[Mark]) -> Tensor | None:
     colour = next(mark.colour for mark in marks if mark.role == "box")
     if colour is None and "added" not in roles:
         raise ValueError(
-            f"strokes of {edit.name} must be in a colour, or its box must say one, got neither; choose a colour"
+            f"strokes of {edit.name} must be in a colour, or its box must say one, got neither; choose a colour, such "
+            "as --box 40,60,20,20:green"
         )
     return None if colour is None else colour_of(colour)
 

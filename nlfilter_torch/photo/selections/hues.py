@@ -37,9 +37,7 @@ from nlfilter_torch.photo.selections.scribbled_colours import (
 Mask = NDArray[np.bool_]
 
 NUM_COLOURS = 128  # approximate number of scribbled pixels that all are compared with
-DARK_LUMINANCE = 0.02  # luminance below which hue and saturation are uncertain
-HALF_COUNTED = 0.1  # luminance of a scribbled pixel that counts half, for the same reason
-BLACK = 1e-4  # added to it, so that pixels of a black object count, too
+DARK_LUMINANCE = 0.02  # luminance below which hue and saturation are uncertain; a scribbled pixel of it counts half
 BANDWIDTH, PER_SATURATION = 0.06, 0.08  # of this comparison: for a grey object, and how it grows with the saturation
 AROUND_SIGMA, AROUND_GRID = 0.02, 60  # surroundings: standard deviation, share of the short side; rows or columns
 LEAST_SIGMA = 3.0  # the least of it, in pixels: wider than a soft border, whose pixels are mixtures
@@ -77,7 +75,7 @@ class HueSamples:
         """Choose from scribbled pixels of colours (B, 3, n), in order :func:`outwards`, and of weights (B, 1, n)."""
         sample, shares = every_nth(colours.clamp(0.0, 1.0), weights, NUM_COLOURS)  # as the reduced picture is
         luminance = split_luminance(sample.unsqueeze(2))[0].squeeze(2)
-        shares = shares * (luminance + BLACK) / (luminance + HALF_COUNTED)
+        shares = shares * (luminance + EPSILON) / (luminance + DARK_LUMINANCE)  # those of a black object count, too
         return HueSamples(relative_chroma(sample), shares / shares.sum(2, keepdim=True).clamp(min=EPSILON))
 
     def likeness(self, image: Tensor) -> Tensor:

@@ -7,10 +7,7 @@ slices across it. A run of slices is stray if its colours are far from all colou
 occur elsewhere in the stroke are not. It begins where colours begin to leave those of the rest, since slices at a
 border hold colours of both sides. The farther of both ends is judged first, then gaps, then what is left once more.
 
-Then colours of what is left are divided in two by their means, for gaps that a stroke crosses and things that it
-touches. The smaller part is stray if it is small, differs strongly from the larger, is cut off from it in colour, and
-lies in one or two pieces: parts of a pattern lie in many, and shading changes gradually. Dabs, boxes and rough masks,
-which are not drawn along a thing, stay what they are.
+Dabs, boxes and rough masks, which are not drawn along a thing, stay what they are.
 """
 
 from dataclasses import dataclass
@@ -206,10 +203,8 @@ def _spread(distances: Numbers) -> float:
 FEWEST = 12  # cells of a stroke that may have stray parts
 LARGEST_AREA = 0.04  # of the picture that a stroke covers; larger areas are rough masks, which count as they are
 ELONGATED = 5.0  # least squared border of a stroke, relative to four times its area: three times as long as wide
-COMPACT = 0.75  # share of the smaller part that lies in two pieces
 STRAY_LIGHTNESS = 0.5  # weight of differences in lightness, much of which is shading
 SHARED = 0.2  # of a stroke that has colours of another one, which are then meant
-DIVIDING_STEPS = 8  # of the division in two
 
 
 def without_strays(scribbles: Scribbles, size: tuple[int, int], *, of_one_colour: bool = False) -> Scribbles:
@@ -254,11 +249,10 @@ def _of_region(points: Numbers, at: Cells, shape: tuple[int, int], of_one_colour
         own = np.flatnonzero(strokes == stroke)
         kept = own
         if len(own) <= LARGEST_AREA * shape[0] * shape[1] and grid.elongation(own) >= ELONGATED:
-            for stray_part in (stray_runs, compact_part):
-                part = stray_part(means[kept], grid.rows[kept], grid.columns[kept])
-                if part.any() and 2 * (~part).sum() >= len(own):
-                    parts.append((kept[part], stroke))
-                    kept = kept[~part]
+            part = stray_runs(means[own], grid.rows[own], grid.columns[own])
+            if part.any():
+                parts.append((own[part], stroke))
+                kept = own[~part]
         middles.append(np.median(means[kept], axis=0))
     for stroke in range(1, len(middles) + 1) if of_one_colour else ():
         own = np.flatnonzero(strokes == stroke)
@@ -272,44 +266,6 @@ def _of_region(points: Numbers, at: Cells, shape: tuple[int, int], of_one_colour
         ignored[places] = (distances > GAP / 2).all()
     stray: NDArray[np.bool_] = ignored[back]
     return stray
-
-
-def compact_part(colours: Numbers, rows: Cells, columns: Cells) -> NDArray[np.bool_]:
-    """Which cells (m,) of a stroke are the smaller of two parts, if these differ strongly and it lies in few pieces."""
-    part = smaller_part(colours)
-    if part is None or not Grid(rows - rows.min(), columns - columns.min()).is_compact(np.flatnonzero(part)):
-        return np.zeros(len(colours), dtype=bool)
-    return part
-
-
-def smaller_part(colours: Numbers) -> NDArray[np.bool_] | None:
-    """Which cells of a stroke with colours (m, 3) are the smaller of two parts, if these differ strongly; else None."""
-    if len(colours) < FEWEST:
-        return None
-    middle = np.median(colours, axis=0)
-    part = _far(np.linalg.norm(colours - middle, axis=1))
-    for _ in range(DIVIDING_STEPS):
-        if not 0 < part.sum() < len(part):
-            return None
-        ends = np.stack([colours[~part].mean(0), colours[part].mean(0)])
-        before, part = part, np.linalg.norm(colours - ends[1], axis=1) < np.linalg.norm(colours - ends[0], axis=1)
-        if (before == part).all():
-            break
-    if part.sum() > len(part) / 2:
-        part = ~part
-    if not 0 < part.sum() <= LARGEST_STRAY * len(part):
-        return None
-    ends = np.stack([colours[~part].mean(0), colours[part].mean(0)])
-    spread = sum(
-        np.linalg.norm(colours[side] - end, axis=1).mean() for side, end in zip((~part, part), ends, strict=True)
-    )
-    distance = np.linalg.norm(ends[1] - ends[0])
-    return part if distance >= max(GAP, SPREADS * spread) else None
-
-
-def _far(distances: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """The cells beyond the middle between the nearest and the farthest."""
-    return distances > (distances.min() + distances.max()) / 2
 
 
 @dataclass(frozen=True)
@@ -337,13 +293,6 @@ class Grid:
         inner = plane[:-2, 1:-1] & plane[2:, 1:-1] & plane[1:-1, :-2] & plane[1:-1, 2:]
         border = int((plane[1:-1, 1:-1] & ~inner).sum())
         return border**2 / (4 * len(part))
-
-    def is_compact(self, part: Cells) -> bool:
-        """Whether cells with these numbers lie in one or two pieces, but for a few of them."""
-        chosen = np.zeros(len(self.rows), dtype=bool)
-        chosen[part] = True
-        sizes = np.sort(np.bincount(self.pieces(chosen)[part]))[::-1]
-        return bool(sizes[:2].sum() >= COMPACT * sizes.sum())
 
     def pieces(self, chosen: NDArray[np.bool_]) -> Cells:
         """Number of the connected piece of chosen cells at each cell, (m,), from 1 on; 0 for others."""

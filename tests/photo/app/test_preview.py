@@ -77,15 +77,16 @@ def test_pictures_are_held_until_a_step_before_them_changes(session: Session, mo
     assert events == ["filter", "edit"] * 2
 
 
-HERE, THERE = ((0.2, 0.2), (0.3, 0.2)), ((0.7, 0.6), (0.8, 0.7))
+HERE, THERE, BELOW = ((0.2, 0.2), (0.3, 0.2)), ((0.7, 0.6), (0.8, 0.7)), ((0.3, 0.8), (0.4, 0.85))
+BLUE_AND_RED = (Stroke(HERE, 0.04, "#2040e0"), Stroke(THERE, 0.04, "#c02010"))
 PAIRS = {
     "recolor": (
         Step("recolor", (Stroke(HERE, 0.04, "#2040e0"),)),
         Step("recolor", (Stroke(HERE, 0.04, "#20e040"), Stroke(THERE, 0.04, "out")), reach=0.5),
     ),
     "colorize": (
-        Step("colorize", (Stroke(HERE, 0.04, "#2040e0"),)),
-        Step("colorize", (Stroke(HERE, 0.04, "#2040e0"), Stroke(THERE, 0.04, "#c02010")), strength=0.3),
+        Step("colorize", BLUE_AND_RED),
+        Step("colorize", (*BLUE_AND_RED, Stroke(BELOW, 0.04, "#20a010")), strength=0.3),
     ),
     "defocus": (
         Step("defocus", (Stroke(HERE, 0.04, "in"),)),

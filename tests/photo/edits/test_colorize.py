@@ -278,3 +278,19 @@ def test_colours_do_not_depend_on_other_images_of_a_batch() -> None:
     for k in range(2):
         alone = colorize(grey[k : k + 1], image[k : k + 1], mask[k : k + 1], num_landmarks=30)
         torch.testing.assert_close(both[k : k + 1], alone, atol=1e-4, rtol=0)
+
+
+def test_what_no_stroke_is_connected_with_takes_the_colour_of_its_like(monkeypatch: pytest.MonkeyPatch) -> None:
+    generator = torch.Generator().manual_seed(3)
+    rough = 0.5 + 0.2 * torch.randn(1, 1, 48, 72, generator=generator)
+    grey = torch.where(torch.arange(72) // 24 == 1, torch.full_like(rough, 0.5), rough).clamp(0, 1)
+    left, middle = box(20, 6, size=(48, 72)), box(20, 34, size=(48, 72))
+    strokes = paint(0.8, 0.3, 0.3, left) + paint(0.3, 0.3, 0.8, middle)
+
+    def red_on_the_right() -> float:
+        coloured = colorize(grey, strokes, left + middle, num_landmarks=60)
+        return float((coloured[:, 0] > coloured[:, 2])[..., 52:].float().mean())
+
+    assert red_on_the_right() > 0.8
+    monkeypatch.setattr("nlfilter_torch.photo.edits.colorize.MOST_CUT", 0)
+    assert red_on_the_right() < 0.5
