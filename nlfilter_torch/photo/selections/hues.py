@@ -25,7 +25,7 @@ from nlfilter_torch.operator.features import blur
 from nlfilter_torch.photo.declared.parameters import MASK
 from nlfilter_torch.photo.picture.colour import dot, split_luminance
 from nlfilter_torch.photo.picture.resizing import block_means, enlarged
-from nlfilter_torch.photo.selections.connected import INSIDE_MASK, connected
+from nlfilter_torch.photo.selections.connected import INSIDE_MASK, SMALL_PIECE, connected
 from nlfilter_torch.photo.selections.scribbled_colours import (
     EPSILON,
     SIMILAR_SHARE,
@@ -37,7 +37,8 @@ from nlfilter_torch.photo.selections.scribbled_colours import (
 Mask = NDArray[np.bool_]
 
 NUM_COLOURS = 128  # approximate number of scribbled pixels that all are compared with
-DARK_LUMINANCE = 0.02  # luminance below which hue and saturation are uncertain; a scribbled pixel of it counts half
+DARK_LUMINANCE = 0.02  # luminance below which hue and saturation are uncertain
+HALF_COUNTED = 0.1  # luminance of a scribbled pixel that counts half, for the same reason
 BANDWIDTH, PER_SATURATION = 0.06, 0.08  # of this comparison: for a grey object, and how it grows with the saturation
 AROUND_SIGMA, AROUND_GRID = 0.02, 60  # surroundings: standard deviation, share of the short side; rows or columns
 LEAST_SIGMA = 3.0  # the least of it, in pixels: wider than a soft border, whose pixels are mixtures
@@ -51,7 +52,7 @@ SATURATED = (0.2, 0.4)  # glossy paint reflects the sky
 SAME_HUE = (0.75, 0.9)
 # Of areas in shade: pixels that thinner ones than twice that are no sides of an object, pixels beyond them that are
 # compared, and their mean likeness from which on an area goes on. Chosen on choosing composites and one photograph.
-THIN, BEYOND, OPEN = 2, 4, 0.3
+THIN, BEYOND, OPEN = 2, 4, 0.32
 # Widest gap, as a share of the short side, between equally large pieces of an object, and between any: a strap, an arm.
 GAP, WIDEST_GAP = 0.03, 0.08
 #: Bandwidth in which colours are compared with those of scribbles to keep: that of masks, as both say what is alike.
@@ -75,7 +76,7 @@ class HueSamples:
         """Choose from scribbled pixels of colours (B, 3, n), in order :func:`outwards`, and of weights (B, 1, n)."""
         sample, shares = every_nth(colours.clamp(0.0, 1.0), weights, NUM_COLOURS)  # as the reduced picture is
         luminance = split_luminance(sample.unsqueeze(2))[0].squeeze(2)
-        shares = shares * (luminance + EPSILON) / (luminance + DARK_LUMINANCE)  # those of a black object count, too
+        shares = shares * (luminance + EPSILON) / (luminance + HALF_COUNTED)  # those of a black object count, too
         return HueSamples(relative_chroma(sample), shares / shares.sum(2, keepdim=True).clamp(min=EPSILON))
 
     def likeness(self, image: Tensor) -> Tensor:
@@ -122,28 +123,27 @@ def shaded_parts(core: Tensor, alike: Tensor) -> Tensor:
     """
     if is_unreadable(core):
         return torch.zeros_like(core)
-    inside, same = core >= INSIDE_MASK, alike >= 1
-    added = connected(torch.maximum(core, same.to(core)), inside.to(core)) & same & ~inside
-    parts = [
-        _closed_off(*(plane.squeeze(0).cpu().numpy() for plane in planes))
-        for planes in zip(added, inside, alike, strict=True)
-    ]
+    planes = (plane.squeeze(1).cpu().numpy() for plane in (core >= INSIDE_MASK, alike))
+    parts = [_closed_off(*pair) for pair in zip(*planes, strict=True)]
     return torch.stack(parts).unsqueeze(1).to(core)
 
 
-def _closed_off(added: Mask, core: Mask, alike: NDArray[np.float64]) -> Tensor:
+def _closed_off(core: Mask, alike: NDArray[np.float64]) -> Tensor:
     """The wide areas of (h, w) beside what is selected beyond which pixels are not alike, and the gaps that they close.
 
     None is more than half as large as what is selected, which they could not be a side of.
     """
+    added = (alike >= 1) & ~core
     numbers = label(added)
+    beside = np.bincount(numbers.ravel(), binary_dilation(core).ravel()) > 0
     beyond = np.where(added | binary_dilation(core, iterations=BEYOND), 0, expand_labels(numbers, BEYOND)).ravel()
     areas, around = np.bincount(numbers.ravel()), np.bincount(beyond, minlength=numbers.max() + 1)
     going_on = np.bincount(beyond, alike.ravel(), len(around)) / around.clip(1)
     wide = np.bincount(numbers.ravel(), binary_erosion(added, iterations=THIN).ravel()) > 0
-    closed = wide & (going_on < OPEN) & (2 * areas <= core.sum())
-    reach = round(GAP * min(core.shape) / 2)
-    folds = binary_erosion(binary_dilation(core, iterations=reach), iterations=reach + reach // 2)
+    closed = beside & wide & (going_on < OPEN) & (2 * areas <= core.sum())
+    reach = max(1, round(GAP * min(core.shape) / 2))
+    folds = binary_dilation(np.pad(core, reach), iterations=reach)
+    folds = binary_erosion(folds, iterations=reach + reach // 2)[reach:-reach, reach:-reach]
     whole = binary_fill_holes(core | folds | (added & closed[numbers]))
     return torch.from_numpy(binary_dilation(whole & ~core))
 
@@ -153,8 +153,8 @@ def pieces_of(masks: Tensor, painted: Tensor) -> Tensor:
     """Which pixels (B, K, h, w) of masks belong to the object under strokes, ``painted`` (B, K, h, w), as bool.
 
     An arm or a strap before an object hides part of it. Pieces of a mask belong to it if they are connected with a
-    stroke, or if the gap between is narrow, which is judged by how much smaller the piece is than the rest. All do
-    if values cannot be read.
+    stroke, or if the gap between is narrow, which is judged by how much smaller the piece is than the rest; specks do
+    not. All do if values cannot be read.
     """
     if is_unreadable(masks):
         return torch.ones_like(masks, dtype=torch.bool)
@@ -172,6 +172,7 @@ def _beside(inside: Mask, own: Mask) -> Tensor:
         gaps = np.full(len(areas), np.inf)
         np.minimum.at(gaps, numbers.ravel(), distance_transform_edt(~own).ravel())
         near = gaps <= min(inside.shape) * np.minimum(GAP * np.sqrt(own.sum() / areas), WIDEST_GAP)
+        near &= areas >= SMALL_PIECE * own.sum()
         near[0] = False
         if (near[numbers] <= own).all():
             break
