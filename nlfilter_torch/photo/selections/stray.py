@@ -257,7 +257,9 @@ def _of_region(points: Numbers, at: Cells, shape: tuple[int, int], of_one_colour
     for stroke in range(1, len(middles) + 1) if of_one_colour else ():
         own = np.flatnonzero(strokes == stroke)
         others = np.array(middles[: stroke - 1] + middles[stroke:]).reshape(-1, 3)
-        apart = (np.linalg.norm(means[own, None] - others, axis=2) > GAP).all(1)
+        apart = (np.linalg.norm((means[own, None] - others)[..., 1:], axis=2) > GAP).all(
+            1
+        )  # in a* and b*, without shade
         if len(others) and apart.mean() <= 1 - SHARED:
             ignored[own[apart]] = True
     for places, stroke in parts:  # what another stroke is meant for is not stray
