@@ -32,7 +32,7 @@ python_use_unqualified_type_names = True
 # A reference from a docstring that leads nowhere is an error, but for other libraries and for what is not public.
 nitpicky = True
 nitpick_ignore_regex = [
-    ("py:.*", r"(collections|torch|numpy|matplotlib|deepinv)\..*"),
+    ("py:.*", r"(collections|torch|numpy|matplotlib|deepinv|sklearn)\..*"),
     ("py:mod", r"nlfilter_torch(\.\w+)+"),
     ("py:class", r"nlfilter_torch(\.[a-z_]+)+\.\w+"),
 ]

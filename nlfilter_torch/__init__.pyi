@@ -8,6 +8,7 @@ from .filtering.filters import polynomial_response as polynomial_response
 from .filtering.fit import fit_alpha as fit_alpha
 from .filtering.fitted import FittedFilter as FittedFilter
 from .filtering.fitted import fit_filter as fit_filter
+from .filtering.labels import propagate_labels as propagate_labels
 from .filtering.masks import diffusion_map as diffusion_map
 from .filtering.masks import diffusion_mask as diffusion_mask
 from .filtering.masks import segment_mask as segment_mask
@@ -40,6 +41,8 @@ from .operator.build import nonlocal_operator as nonlocal_operator
 from .operator.build import operator_from_features as operator_from_features
 from .operator.features import estimate_bandwidth as estimate_bandwidth
 from .operator.hidden import pad_images as pad_images
+from .operator.neighbours import bandwidth_of_points as bandwidth_of_points
+from .operator.neighbours import neighbour_distances as neighbour_distances
 from .operator.operator import Certificate as Certificate
 from .operator.operator import Diagnostics as Diagnostics
 from .operator.operator import NonlocalOperator as NonlocalOperator

@@ -8,7 +8,7 @@ import pytest
 import nlfilter_torch
 
 PACKAGE = "nlfilter_torch"
-ROOMS = ("version", "core", "operator", "filtering", "nn", "deepinv", "photo")
+ROOMS = ("version", "core", "operator", "filtering", "nn", "deepinv", "sklearn", "photo")
 PHOTO_ROOMS = (
     "declared",
     "files",
