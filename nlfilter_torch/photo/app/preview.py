@@ -14,6 +14,7 @@ from bisect import bisect_right
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from threading import Lock
 
 import torch
 import torch.nn.functional as F
@@ -223,6 +224,7 @@ class Preview:
         self.pixels, self._light = reduced, light
         self.edited: Tensor | None = None
         self._layers: Layers | None = None
+        self._layering = Lock()  # layers are computed apart from pictures that need none
         self._working = range_of(InMemory(photograph.float() if light is None else self.pixels))
         self._source = InMemory(self.pixels, {})  # with the filter of the masks
         self._compared_by: Key = ()  # the settings of that filter
@@ -236,22 +238,23 @@ class Preview:
         """The layers for the filter of a step; slow if its settings have changed."""
         order = len(detail["alpha"]) - 1
         key = (*filter_key(detail), detail["viewing_size"], order)
-        if self._layers is None or self._layers.key != key:
-            stride, shown = self._compared(detail)
-            guide = reduce_channels(shown, "luminance")
-            bandwidth = detail.arguments(self.size)["photometric_bandwidth"]
-            operator = operator_of_sample(
-                guide,
-                stride,
-                detail,
-                bandwidth=estimate_bandwidth(guide) if bandwidth == "auto" else bandwidth,
-                distance=self._distance(detail, guide),
-                channels="luminance",
-                patch_size=detail["patch_size"],
-            )
-            layers = detail_layers(operator, reduce_channels(self.pixels, "luminance"), order=order)
-            self._layers = Layers(key, layers, operator.spectrum().eigenvalues[0])
-        return self._layers
+        with self._layering:
+            if self._layers is None or self._layers.key != key:
+                stride, shown = self._compared(detail)
+                guide = reduce_channels(shown, "luminance")
+                bandwidth = detail.arguments(self.size)["photometric_bandwidth"]
+                operator = operator_of_sample(
+                    guide,
+                    stride,
+                    detail,
+                    bandwidth=estimate_bandwidth(guide) if bandwidth == "auto" else bandwidth,
+                    distance=self._distance(detail, guide),
+                    channels="luminance",
+                    patch_size=detail["patch_size"],
+                )
+                layers = detail_layers(operator, reduce_channels(self.pixels, "luminance"), order=order)
+                self._layers = Layers(key, layers, operator.spectrum().eigenvalues[0])
+            return self._layers
 
     def _compared(self, detail: Step) -> tuple[int, Tensor]:
         """The stride of the patches that the filter of a step compares, and their picture, near the viewing size."""

@@ -317,8 +317,7 @@ class Session:
 
     def eigenvalues(self, detail: Step) -> Tensor:
         """Eigenvalues (R,) of the filter of a step of detail, which its layers belong to."""
-        with self._drawing:
-            return self.preview.layers(detail).eigenvalues
+        return self.preview.layers(detail).eigenvalues
 
     def mask(self, edit: str) -> Tensor | None:
         """The mask (1, 1, h, w) of what the scribbles of the chosen step of an edit select, or None."""
