@@ -16,9 +16,10 @@ from nlfilter_torch.photo.edits.parts import Parts, Rectangle
 from nlfilter_torch.photo.files.formats import check_memory
 from nlfilter_torch.photo.picture.developing import limits_of, part_of_planes, reframed
 from nlfilter_torch.photo.picture.in_memory import InMemory
-from nlfilter_torch.photo.picture.light import develop_image, in_light, lit_photograph
+from nlfilter_torch.photo.picture.light import Light, develop_image, fit_light, in_light, lit_photograph
 from nlfilter_torch.photo.picture.painting import TensorPainter
 from nlfilter_torch.photo.picture.photographs import Photograph, cut_photograph
+from nlfilter_torch.photo.picture.pixels import Strip
 from nlfilter_torch.photo.picture.source import Cache
 
 DEVELOPING = -1  # the place before all steps, of a slider that moves
@@ -64,6 +65,18 @@ class Developed:
     def parts(self) -> Parts:
         """Parts of it at full size."""
         return Parts(self.photograph.pixels[0].permute(1, 2, 0).numpy(), self.name)
+
+    @cached_property
+    def _light(self) -> Light:
+        """The change of light, with the areas of the preview."""
+        return fit_light(InMemory(self.cut.pixels, self._areas), self.development, self._limits)
+
+    def lit(self, place: Rectangle) -> Tensor:
+        """A part in its light, without steps, (1, C, h, w) in [0, 1]; other parts are not computed."""
+        part, width = part_of_planes(self.cut.pixels, place.rows, place.columns), self.frame.width
+        if self.development.changes_light:
+            part = self._light(Strip(part, place.rows.start * width + place.columns.start, width))
+        return part.clamp(0, 1)
 
     def close(self) -> None:
         """Remove the temporary files of the parts, if there are any."""

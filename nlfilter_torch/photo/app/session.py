@@ -341,7 +341,10 @@ class Session:
             ValueError, OSError, MemoryError: if the photograph cannot be edited.
         """
         with self._fitting:
-            return self._fitted(self._develop(recipe.develop), recipe, report).edited(place)
+            developed = self._develop(recipe.develop)
+            if not self._on(developed, recipe).acting:
+                return developed.lit(place)
+            return self._fitted(developed, recipe, report).edited(place)
 
     def at_rest(self, recipe: Recipe, report: Report = in_silence) -> Tensor:
         """The photograph under an edit as :meth:`save` makes it, reduced to the size of the preview.

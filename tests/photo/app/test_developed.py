@@ -55,6 +55,17 @@ def test_the_preview_at_rest_is_the_file(tmp_path: Path) -> None:
     assert max(read_photograph(session.save("small.png", side=60)).size) == 60
 
 
+def test_a_part_without_steps_is_computed_alone(session: Session) -> None:
+    light = replace(ALL, shadows=0.7, contrast=0.3)
+    session.load(Recipe((), light))
+    session.render()
+    part = Rectangle(range(10, 40), range(20, 90))
+    assert difference(session.part(part, session.recipe), develop_image(cat(), light)[..., 10:40, 20:90]) < 0.01
+    assert "photograph" not in vars(session.developed)
+    saved = read_photograph(session.save("out.png")).pixels
+    assert difference(saved[..., 10:40, 20:90], session.part(part, session.recipe)) < 0.51
+
+
 def test_strokes_are_stored_in_coordinates_of_the_original(session: Session) -> None:
     session.load(Recipe((), Development(straighten=5.0, crop=(0.3, 0.2, 1.0, 1.0))))
     session.render()
