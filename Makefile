@@ -112,6 +112,7 @@ QUICK := \
 	'colorize --quick' \
 	'colorize --quick --lines' \
 	'compilation --quick --only export' \
+	'launches --quick' \
 	'layers points block refinement clusters --quick' \
 	'layers functions styles --quick' \
 	'prior --quick' \

@@ -10,17 +10,7 @@ from torch import Tensor
 
 from nlfilter_torch.core.blocks import stratified
 from nlfilter_torch.core.communicator import ALONE, Communicator
-from nlfilter_torch.core.kernels.clusters import (
-    TRIALS,
-    UNCOVERED,
-    PivotSampler,
-    affinities,
-    lloyd,
-    odds,
-    pick,
-    pivots,
-    squared_distances,
-)
+from nlfilter_torch.core.kernels.clusters import MULTIPLIED, TRIALS, lloyd, pick, pivots
 from nlfilter_torch.core.torch_internals import register
 from nlfilter_torch.operator.options import Assignment, FilterOptions, Sampling
 from nlfilter_torch.operator.orientation import (
@@ -43,8 +33,6 @@ STARTED_FROM = 32  # candidates per landmark from which the start is drawn; more
 # 5 % higher with 16384 candidates than with 32768; drawing the start from more of them does not lower it.
 MOST_CANDIDATES = 32768
 MOST_STARTED_FROM = 8192
-DRAWN_SINGLY = 256  # with more landmarks than this, the start is drawn in blocks, by matrix products
-BLOCK, PROPOSED = 64, 8  # landmarks in a block, and proposals per landmark
 ITERATIONS = 5
 # Scores that differ by at most this many units of rounding are tied. Constant and periodic pictures with coordinates
 # have many ties, which must not be decided by a kernel's order of summation.
@@ -296,56 +284,16 @@ def _pivots(points: Tensor, count: int, generator: torch.Generator) -> Tensor:
     power is greedier than the residual itself: at h_y = 40/255 the error of W y on the small astronaut of
     benchmarks.accuracy is 0.55 grey levels with it, 0.79 with the first power, and 0.71 if k-means starts from
     arbitrary candidates. Half of the proposals depend on the distance from the nearest pivot too, so that clusters
-    wider than the bandwidth are not missed, and of several proposals the one that covers most is taken: on six
-    photographs, at bandwidths of 5 to 40 grey levels, this lowers the error of W y by another 3 %.
+    wider than the bandwidth are not missed, and of several times as many proposals those that cover most are taken.
     """
     draws = pivot_draws(count, generator).to(points)
-    if count > DRAWN_SINGLY:
-        offsets = torch.rand(count, generator=generator, device=generator.device, dtype=torch.float64).to(points.device)
-        images = points.split(1) if points.device.type == "cpu" else [points]  # on CPUs one image at a time
-        return torch.cat([_pivots_by_blocks(image, draws, offsets) for image in images])
-    return pivots(points, draws, CAPTURED)
+    together = points.device.type != "cpu" or count <= MULTIPLIED  # on CPUs matrix products are of one image at a time
+    return torch.cat([pivots(part, draws, CAPTURED) for part in points.split(len(points) if together else 1)])
 
 
 def pivot_draws(count: int, generator: torch.Generator) -> Tensor:
     """Random numbers (count, TRIALS) in [0, 1) that decide the pivots, in float64."""
     return torch.rand(count, TRIALS, generator=generator, device=generator.device, dtype=torch.float64)
-
-
-def _pivots_by_blocks(points: Tensor, draws: Tensor, offsets: Tensor) -> Tensor:
-    """Choose pivots as in :func:`_pivots`, but a block at a time, so that nearly all of the work is matrix products.
-
-    Within a block, pivots are drawn from a systematic sample of candidates. A third of these are drawn by each of the
-    two :func:`odds` before the block, the others uniformly, since a few points may hold all of the residual. In the
-    draw, weights are divided by the probability of the candidate.
-    """
-    batch, _, size = points.shape
-    norms = points.square().sum(1, keepdim=True)  # (B, 1, S)
-    residual, nearest = torch.ones_like(norms), torch.full_like(norms, UNCOVERED)
-    columns = points.new_empty(batch, len(draws), size)
-    drawn: list[Tensor] = []
-    for block, offset in zip(draws.split(BLOCK), offsets, strict=False):
-        first = sum(pivot.shape[2] for pivot in drawn)
-        before = columns[:, :first]
-        shares = odds(residual, nearest, CAPTURED)
-        shares = (shares / shares.mean(2, keepdim=True)).sum(1, keepdim=True) + 1.0
-        summed = shares.cumsum(2, dtype=torch.float64)
-        ticks = (torch.arange(PROPOSED * len(block), device=points.device) + offset) / (PROPOSED * len(block))
-        proposed = torch.searchsorted(summed, summed[:, :, -1:] * ticks).clamp_(max=size - 1)  # (B, 1, P)
-        few, lengths, known = (pick(planes, proposed) for planes in (points, norms, before))
-        squares = squared_distances(few, lengths, few, lengths)
-        shared = torch.baddbmm(affinities(squares), known.mT, known, alpha=-1)  # (B, P, P)
-        sampler = PivotSampler(few, lengths, pick(shares, proposed), CAPTURED, shared, squares)
-        chosen, rows, scales = sampler.draw(pick(residual, proposed), pick(nearest, proposed), block)
-        drawn.append(proposed.gather(2, chosen))  # (B, 1, n)
-        few, lengths, known = (pick(planes, chosen) for planes in (few, lengths, known))
-        apart = squared_distances(points, norms, few, lengths)  # (B, n, S)
-        nearest = torch.minimum(nearest, apart.amin(1, keepdim=True))
-        rest = torch.baddbmm(affinities(apart), known.mT, before, alpha=-1)
-        lower = pick(rows, chosen).mT.tril(-1) + torch.diag_embed(scales)
-        columns[:, first : first + len(block)] = torch.linalg.solve_triangular(lower, rest, upper=False)
-        residual -= columns[:, first : first + len(block)].square().sum(1, keepdim=True)
-    return torch.cat(drawn, dim=2).squeeze(1)
 
 
 def means_of_clusters(subset: Tensor, start: Tensor, assignment: Tensor) -> Tensor:

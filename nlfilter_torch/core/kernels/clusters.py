@@ -1,6 +1,6 @@
 """Parts of k-means: initial centroids, from randomly pivoted Cholesky decomposition, and Lloyd's iteration."""
 
-from dataclasses import dataclass
+from collections.abc import Iterator
 
 import torch
 from torch import Tensor
@@ -8,79 +8,27 @@ from torch import Tensor
 from nlfilter_torch.core.kernels.library import contiguous, kernel, run
 from nlfilter_torch.core.torch_internals import register
 
-# As in interface.h. Of the proposals for a pivot, half are drawn in proportion to a power of the distance from the
+# As in interface.h. Of the proposals for pivots, half are drawn in proportion to a power of the distance from the
 # nearest pivot too, similar to k-means++ (Arthur and Vassilvitskii, 2007): where clusters are wider than the bandwidth,
-# residuals alone do not tell a cluster without a pivot from a point beside one. With the square, as there, the last of
-# 90 clusters was sometimes missed; with the fourth power it was not, in six trials. Outliers are proposed more often,
-# but rarely chosen.
-TRIALS = 6
+# residuals alone do not tell a cluster without a pivot from a point beside one.
+TRIALS = 6  # proposals for each pivot
+FIRST, LARGEST = 6, 48  # pivots of the first block, and of the largest; each block has twice as many as all before it
+ORDERED = 2  # times that proposals are ordered by what they add
 COVERED = 4.0  # squared distance from the nearest pivot at which a point counts as half covered
 UNCOVERED = 1e16  # squared distance before there is a pivot, and the largest that counts
 DISTINCT = 1e-6  # added to squared distances, so that there are probabilities where all points are equal
-NEARLY = 1e-5  # proposals whose coverage differs by less than this share are equally good
+NEARLY = 1e-5  # proposals that cover more by less than this share of the points are equally good
+MULTIPLIED = 256  # pivots from which matrix products are faster than the kernel in C
 CACHED_SCORES = 1 << 20  # scores of points and centres; on CPUs a batch is divided into parts with at most this many
 
 
-@dataclass(frozen=True)
-class PivotSampler:
-    """Matrix of affinities ``exp(-d^2)`` of points (B, D, S), from which pivots are drawn.
-
-    Attributes:
-        points: (B, D, S).
-        norms: their squared norms, (B, 1, S).
-        divisor: divisor of the probabilities in the draw, (B, 1, S): how likely it was that a point is among these.
-        captured: lower bound of residuals; a smaller residual counts as captured.
-        matrix: residual matrix (B, S, S) if other points than these are pivots already; None: the affinities.
-        squares: squared distances (B, S, S) of the points from each other, if they are known.
-    """
-
-    points: Tensor
-    norms: Tensor
-    divisor: Tensor
-    captured: float
-    matrix: Tensor | None = None
-    squares: Tensor | None = None
-
-    def draw(self, residual: Tensor, nearest: Tensor, draws: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Randomly pivoted Cholesky decomposition: pivots (B, 1, M), rows (B, M, S) and divisors of the rows (B, M).
-
-        Of each pivot's :data:`TRIALS` proposals, half are drawn by :func:`odds` with distances and half without. The
-        one that covers the points best becomes the pivot.
-
-        Args:
-            residual: diagonal of the matrix, (B, 1, S).
-            nearest: squared distances of the points from the nearest pivot, (B, 1, S).
-            draws: random numbers (M, TRIALS) in [0, 1).
-        """
-        rows = residual.new_zeros(residual.shape[0], len(draws), residual.shape[2])
-        chosen, scales = [], []
-        for step, numbers in enumerate(draws.unbind()):
-            pivot, apart = self._choose(residual, nearest, numbers)
-            before = rows[:, :step]
-            row = affinities(apart) if self.matrix is None else pick(self.matrix, pivot).mT
-            row = torch.baddbmm(row, pick(before, pivot).mT, before, alpha=-1)
-            scale = row.gather(2, pivot).clamp(min=self.captured).sqrt()
-            row /= scale
-            residual = residual - row.square()
-            nearest = torch.minimum(nearest, apart).scatter(2, pivot, 0.0)
-            rows[:, step] = row.squeeze(1)
-            chosen.append(pivot)
-            scales.append(scale)
-        return torch.cat(chosen, dim=2), rows, torch.cat(scales, dim=2).squeeze(1)
-
-    def _choose(self, residual: Tensor, nearest: Tensor, numbers: Tensor) -> tuple[Tensor, Tensor]:
-        """The next pivot (B, 1, 1) and the squared distances of all points from it, (B, 1, S)."""
-        # Summed in float64, as in C, so that rounding does not decide which of thousands of points is drawn.
-        summed = (odds(residual, nearest, self.captured) / self.divisor).cumsum(2, dtype=torch.float64)  # (B, 2, S)
-        ticks = numbers.view(2, -1) * summed[:, :, -1:]
-        proposed = torch.searchsorted(summed, ticks).clamp_(max=residual.shape[2] - 1).flatten(1).unsqueeze(1)
-        if self.squares is None:
-            others, lengths = pick(self.points, proposed), pick(self.norms, proposed)
-            apart = squared_distances(self.points, self.norms, others, lengths)  # (B, TRIALS, S)
-        else:
-            apart = pick(self.squares, proposed).mT
-        best = best_trial(apart, nearest, self.divisor)
-        return proposed.gather(2, best), pick(apart.mT, best).mT
+def pivot_blocks(count: int) -> Iterator[slice]:
+    """Blocks of the numbers of pivots; each is chosen at once, by what the earlier ones leave."""
+    first = 0
+    while first < count:
+        last = first + min(count - first, max(FIRST, 2 * first), LARGEST)
+        yield slice(first, last)
+        first = last
 
 
 def odds(residual: Tensor, nearest: Tensor, captured: float) -> Tensor:
@@ -89,28 +37,28 @@ def odds(residual: Tensor, nearest: Tensor, captured: float) -> Tensor:
     The fourth power of its residual (B, 1, S), times the fourth power of its distance from the nearest pivot, of which
     ``nearest`` (B, 1, S) is the square, and alone.
     """
-    power = chance(residual, captured)
+    power = residual.clamp(min=captured).pow(4)
     return torch.cat([power * (nearest + DISTINCT).square(), power], dim=1)
 
 
-def chance(residual: Tensor, captured: float) -> Tensor:
-    """The fourth power of residuals."""
-    return residual.clamp(min=captured).square().square()
+def most_covering(apart: Tensor, nearest: Tensor, count: int) -> Tensor:
+    """Numbers (B, 1, count) of the proposals that together cover most, given squared distances (B, P, S) from them.
 
-
-def best_trial(apart: Tensor, nearest: Tensor, divisor: Tensor) -> Tensor:
-    """Index (B, 1, 1) of the proposal that covers the points best, given squared distances (B, T, S) from proposals.
-
-    A point counts as half covered at the squared distance :data:`COVERED` from the nearest pivot. Of proposals that
-    are equally good to rounding, the first is taken.
+    A point counts as covered the more the closer the nearest pivot is, by half at the squared distance
+    :data:`COVERED`; ``nearest`` (B, 1, S) is that of the pivots so far. Proposals are ordered by what each adds, then
+    again by what each adds to the better ones. Proposals that are equally good to rounding keep their order.
     """
-    covered = (COVERED / (torch.minimum(apart, nearest) + COVERED) / divisor).sum(2, dtype=torch.float64)  # (B, T)
-    trials = covered.unbind(1)
-    best, most = torch.zeros_like(trials[0], dtype=torch.long), trials[0]
-    for number, trial in enumerate(trials[1:], 1):
-        better = trial > most * (1 + NEARLY)
-        best, most = torch.where(better, number, best), torch.where(better, trial, most)
-    return best.view(-1, 1, 1)
+    covered = COVERED / (torch.minimum(apart, nearest) + COVERED)
+    before = (COVERED / (nearest + COVERED)).sum(2, dtype=torch.float64)  # (B, 1)
+    unit = NEARLY * apart.shape[2]
+    # Summed in float64, as in C, so that rounding does not decide between proposals.
+    added = covered.sum(2, dtype=torch.float64) - before
+    order = (added / unit).round_().argsort(dim=1, descending=True, stable=True)
+    for _ in range(ORDERED):
+        reached = covered.gather(1, order.unsqueeze(2).expand_as(covered)).cummax(1).values
+        added = torch.diff(reached.sum(2, dtype=torch.float64), dim=1, prepend=before)
+        order = order.gather(1, (added / unit).round_().argsort(dim=1, descending=True, stable=True))
+    return order[:, :count].unsqueeze(1)
 
 
 def squared_distances(points: Tensor, norms: Tensor, others: Tensor, lengths: Tensor) -> Tensor:
@@ -131,7 +79,9 @@ def pick(planes: Tensor, at: Tensor) -> Tensor:
     return planes.gather(2, at.expand(-1, planes.shape[1], -1))
 
 
-def _compiled_pivots(points: Tensor, draws: Tensor, captured: float) -> Tensor:
+def _compiled_pivots(points: Tensor, draws: Tensor, captured: float) -> Tensor | None:
+    if len(draws) > MULTIPLIED:
+        return None
     points, draws = contiguous(points, draws)
     batch, size, count = points.shape
     chosen = torch.empty(batch, len(draws), dtype=torch.long)
@@ -146,13 +96,38 @@ def _fake_pivots(points: Tensor, draws: Tensor, captured: float) -> Tensor:
 
 @register("pivots(Tensor points, Tensor draws, float captured) -> Tensor", kernel(_compiled_pivots), _fake_pivots)
 def pivots(points: Tensor, draws: Tensor, captured: float) -> Tensor:
-    """Pivots (B, M) of a randomly pivoted Cholesky decomposition of the affinities of points (B, D, S).
+    """Pivots (B, M) of a randomly pivoted Cholesky decomposition of the affinities of points (B, D, S), in blocks.
 
-    Uses the random numbers ``draws``, (M, TRIALS) in [0, 1); see :class:`PivotSampler`.
+    For every block of :func:`pivot_blocks`, :data:`TRIALS` times as many points are proposed as there are to be pivots,
+    half of them by each of the two :func:`odds`, from strata of equal probability with the random numbers ``draws``,
+    (M, TRIALS) in [0, 1). Those that together cover most become pivots. A residual below ``captured`` counts as
+    captured. Epperly, Tropp and Webber, 2024, accept or reject the proposals of a block by chance instead.
     """
     norms = points.square().sum(1, keepdim=True)  # (B, 1, S)
-    ones = torch.ones_like(norms)
-    return PivotSampler(points, norms, ones, captured).draw(ones, UNCOVERED * ones, draws)[0].squeeze(1)
+    residual, nearest = torch.ones_like(norms), torch.full_like(norms, UNCOVERED)
+    columns = points.new_empty(len(points), len(draws), points.shape[2])
+    drawn: list[Tensor] = []
+    for block in pivot_blocks(len(draws)):
+        numbers, before = draws[block].reshape(2, -1).double(), columns[:, : block.start]
+        strata = torch.arange(numbers.shape[1], device=points.device)
+        # Summed in float64, as in C, so that rounding does not decide which of thousands of points is drawn.
+        summed = odds(residual, nearest, captured).cumsum(2, dtype=torch.float64)
+        ticks = (strata + numbers) / numbers.shape[1] * summed[:, :, -1:]
+        proposed = torch.searchsorted(summed, ticks).clamp_(max=points.shape[2] - 1).flatten(1).unsqueeze(1)
+        apart = squared_distances(points, norms, pick(points, proposed), pick(norms, proposed))  # (B, P, S)
+        best = most_covering(apart, nearest, block.stop - block.start)
+        chosen, apart = proposed.gather(2, best), apart.gather(1, best.mT.expand(-1, -1, apart.shape[2]))
+        drawn.append(chosen)
+        if block.stop == len(draws):
+            break
+        nearest = torch.minimum(nearest, apart.amin(1, keepdim=True)).scatter(2, chosen, 0.0)
+        rest = torch.baddbmm(affinities(apart), pick(before, chosen).mT, before, alpha=-1)
+        among = pick(rest, chosen).double()
+        among.diagonal(dim1=1, dim2=2).add_(captured)
+        lower = torch.linalg.cholesky_ex(among).L.to(rest)
+        columns[:, block] = torch.linalg.solve_triangular(lower, rest, upper=False)
+        residual = residual - columns[:, block].square().sum(1, keepdim=True)
+    return torch.cat(drawn, dim=2).squeeze(1)
 
 
 def _compiled_lloyd(points: Tensor, start: Tensor, iterations: int, margin: float) -> Tensor:

@@ -7,11 +7,14 @@
 #pragma once
 
 /* Of the choice of pivots; as in clusters.py. */
-#define TRIALS 6          /* points proposed for a pivot */
+#define TRIALS 6          /* proposals for each pivot */
+#define FIRST 6           /* pivots of the first block; each other block has twice as many as all before it */
+#define LARGEST 48        /* pivots of the largest block */
+#define ORDERED 2         /* times that proposals are ordered by what they add */
 #define COVERED 4.0f      /* squared distance from the nearest pivot at which a point counts as half covered */
 #define UNCOVERED 1e16f   /* squared distance before there is a pivot, and the largest that counts */
 #define DISTINCT 1e-6f    /* added to squared distances, so that there are probabilities where all points are equal */
-#define NEARLY 1e-5       /* proposals whose coverage differs by less than this share are equally good */
+#define NEARLY 1e-5       /* proposals that cover more by less than this share of the points are equally good */
 
 /* The best instruction set that this processor supports, as an index of SETS; 0 for none. */
 int nlfilter_level(void);
@@ -59,7 +62,7 @@ int nlfilter_grams(int level, int threads, long pixels, long images, long num_la
 int nlfilter_lloyd(int level, int threads, long images, long size, long count, long num_landmarks, long iterations,
                    float margin, const float *points, const float *start, int *nearest);
 
-/* Pivots (B, M) of randomly pivoted Cholesky decompositions, each the best of TRIALS proposals. */
+/* Pivots (B, M) of randomly pivoted Cholesky decompositions, in blocks of the best of TRIALS proposals for each. */
 int nlfilter_pivots(int level, int threads, long images, long size, long count, long num_landmarks, float captured,
                     const float *points, const float *draws, long *pivots);
 

@@ -45,8 +45,14 @@ int nlfilter_lloyd(int level, int threads, long images, long size, long count, l
     return run_pieces(&work, threads);
 }
 
-/* Rows of S floats of the scratch memory before the points; LINE sums of blocks fit in the last one. */
-static long pivot_rows(long num_landmarks) { return num_landmarks + TRIALS + 6; }
+/* Rows of S floats of the scratch memory before the points; the sums of blocks fit in one. */
+static long pivot_rows(long num_landmarks)
+{
+    long most = 0;
+    for (long first = 0; first < num_landmarks; first += pivot_block(first, num_landmarks))
+        most = pivot_block(first, num_landmarks) > most ? pivot_block(first, num_landmarks) : most;
+    return num_landmarks + TRIALS * most + 7;
+}
 
 static void run_pivots(struct work *work, long image, long piece, long first, long last, float *scratch)
 {

@@ -75,20 +75,35 @@ INLINE void NAME(pivot_odds)(const struct pivots *task, const float *residual, c
     }
 }
 
-/* Index of the point that a random number in [0, 1) draws. `blocks` (S / LINE) holds the sums of odds of LINE points. */
-INLINE long NAME(drawn)(const float *odds, const double *blocks, long used, long count, double draw)
+/* Sums of odds of LINE points each; returns their sum. */
+INLINE double NAME(sum_blocks)(const float *odds, long count, double *blocks)
 {
-    double total = 0.0, reached = 0.0;
-    for (long b = 0; b < count / LINE; b++)
+    double total = 0.0;
+    for (long b = 0; b < count / LINE; b++) {
+        double sums[8] = {0.0};
+        for (long i = b * LINE; i < (b + 1) * LINE; i += 8)
+            for (int k = 0; k < 8; k++)
+                sums[k] += odds[i + k];
+        blocks[b] = 0.0;
+        for (int k = 0; k < 8; k++)
+            blocks[b] += sums[k];
         total += blocks[b];
+    }
+    return total;
+}
+
+/* Index of the point where the sum of odds reaches `tick`. `blocks` (S / LINE) holds the sums of odds of LINE points. */
+INLINE long NAME(drawn)(const float *odds, const double *blocks, long used, long count, double tick)
+{
+    double reached = 0.0;
     long block = 0;
-    for (; block < count / LINE - 1 && reached + blocks[block] < draw * total; block++)
+    for (; block < count / LINE - 1 && reached + blocks[block] < tick; block++)
         reached += blocks[block];
     long point = block * LINE;
     const long last = (point + LINE < used ? point + LINE : used) - 1;
     for (; point < last; point++) {
         reached += odds[point];
-        if (reached >= draw * total)
+        if (reached >= tick)
             break;
     }
     return point;
@@ -115,43 +130,70 @@ INLINE void NAME(distances)(const struct pivots *task, const float *points, cons
     }
 }
 
-/* Index of the proposal that covers the points best, given its squared distances (TRIALS, S); the first of nearly
- * equal ones. */
-INLINE int NAME(best_trial)(const struct pivots *task, const float *distances, const float *nearest)
+/* Sum over the points of the larger of two rows. The first becomes that, if `kept`; the second, if `squares`, holds
+ * squared distances, and then how well they cover the points. */
+INLINE double NAME(larger)(long count, float *reached, float *row, const int kept, const int squares)
 {
-    int best = 0;
-    double most = 0.0;
-    for (int t = 0; t < TRIALS; t++) {
-        double covered = 0.0;
-        for (long start = 0; start < task->count; start += LINE) {
-            FLOATS sum = {0};
-            for (long i = start; i < start + LINE; i += LANES) {
-                const FLOATS here = *(const FLOATS *)(distances + t * task->count + i);
-                const FLOATS least = *(const FLOATS *)(nearest + i);
-                const INTS nearer = here < least;
-                sum += COVERED / ((FLOATS)(((INTS)here & nearer) | ((INTS)least & ~nearer)) + COVERED);
-            }
-            for (int lane = 0; lane < LANES; lane++)
-                covered += sum[lane];
+    double total = 0.0;
+    for (long start = 0; start < count; start += LINE) {
+        FLOATS sum = {0};
+        for (long i = start; i < start + LINE; i += LANES) {
+            FLOATS here = *(const FLOATS *)(row + i);
+            if (squares)
+                *(FLOATS *)(row + i) = here = COVERED / (here + COVERED);
+            const FLOATS before = *(const FLOATS *)(reached + i);
+            const INTS more = here > before;
+            const FLOATS most = (FLOATS)(((INTS)here & more) | ((INTS)before & ~more));
+            sum += most;
+            if (kept)
+                *(FLOATS *)(reached + i) = most;
         }
-        covered -= task->count - task->used; /* points beyond the last have a distance of 0 from the nearest pivot */
-        if (covered > most * (1 + NEARLY)) {
-            best = t;
-            most = covered;
-        }
+        for (int lane = 0; lane < LANES; lane++)
+            total += sum[lane];
     }
-    return best;
+    return total;
+}
+
+/* The proposals (P) for pivots in the order of what they add to the better ones, rounded, so that rounding of sums does
+ * not decide. Writes how well they cover the points to `rows` (P, S). */
+INLINE void NAME(propose)(const struct pivots *task, const float *points, const float *norms, const long *proposed,
+                          long total, const float *nearest, float *reached, float *rows, struct proposal *proposals)
+{
+    const long count = task->count;
+    const double unit = NEARLY * task->used;
+    for (long i = 0; i < count; i++)
+        reached[i] = COVERED / (nearest[i] + COVERED);
+    const double before = NAME(larger)(count, reached, reached, 0, 0);
+    for (long p = 0; p < total; p++) {
+        if (p % TRIALS == 0)
+            NAME(distances)(task, points, norms, proposed + p, rows + p * count);
+        const double sum = NAME(larger)(count, reached, rows + p * count, 0, 1);
+        proposals[p] = (struct proposal){proposed[p], rows + p * count, p, rint((sum - before) / unit)};
+    }
+    qsort(proposals, total, sizeof *proposals, compare_proposals);
+    for (int round = 0; round < ORDERED; round++) {
+        double last = before;
+        for (long i = 0; i < count; i++)
+            reached[i] = COVERED / (nearest[i] + COVERED);
+        for (long p = 0; p < total; p++) {
+            const double sum = NAME(larger)(count, reached, proposals[p].row, 1, 0);
+            proposals[p].place = p;
+            proposals[p].added = rint((sum - last) / unit);
+            last = sum;
+        }
+        qsort(proposals, total, sizeof *proposals, compare_proposals);
+    }
 }
 
 /* Pivots (M) of a randomly pivoted Cholesky decomposition of the affinities between points (D, S), with S a multiple of
- * LINE. Scratch holds norms, residuals, squared distances from the nearest pivot, two rows of odds, the sums of their
- * blocks, squared distances from the proposals, and the columns (M, S). */
+ * LINE. Scratch holds norms, residuals, squared distances from the nearest pivot, two rows of odds, a row of what is
+ * covered, the sums of blocks of odds, the columns (M, S), and rows for the proposals. */
 static TARGET void NAME(pivots)(const struct pivots *task, const float *points, long *pivots, float *scratch)
 {
     const long size = task->size, count = task->count;
     float *norms = scratch, *residual = norms + count, *nearest = residual + count, *odds = nearest + count;
-    float *distances = odds + 2 * count, *columns = distances + TRIALS * count;
-    double *blocks = (double *)(columns + task->num_landmarks * count); /* (2, S / LINE) */
+    float *reached = odds + 2 * count, *columns = reached + 2 * count, *rows = columns + task->num_landmarks * count;
+    double *blocks = (double *)(reached + count); /* (2, S / LINE) */
     memset(norms, 0, count * sizeof(float));
     for (long k = 0; k < size; k++)
         for (long i = 0; i < count; i++)
@@ -160,38 +202,44 @@ static TARGET void NAME(pivots)(const struct pivots *task, const float *points, 
         residual[i] = 1.0f;
         nearest[i] = i < task->used ? UNCOVERED : 0.0f;
     }
-    for (long m = 0; m < task->num_landmarks; m++) {
+    for (long first = 0, width; first < task->num_landmarks; first += width) {
+        width = pivot_block(first, task->num_landmarks);
+        struct proposal proposals[TRIALS * LARGEST];
+        long proposed[TRIALS * LARGEST], *chosen = pivots + first;
+        const long half = width * TRIALS / 2;
         NAME(pivot_odds)(task, residual, nearest, odds);
-        for (long b = 0; b < 2 * count / LINE; b++) {
-            double sums[8] = {0.0};
-            for (long i = b * LINE; i < (b + 1) * LINE; i += 8)
-                for (int k = 0; k < 8; k++)
-                    sums[k] += odds[i + k];
-            blocks[b] = 0.0;
-            for (int k = 0; k < 8; k++)
-                blocks[b] += sums[k];
+        for (int kind = 0; kind < 2; kind++) {
+            const double total = NAME(sum_blocks)(odds + kind * count, count, blocks);
+            for (long t = 0; t < half; t++) {
+                const double draw = task->draws[first * TRIALS + kind * half + t];
+                proposed[kind * half + t] =
+                    NAME(drawn)(odds + kind * count, blocks, task->used, count, (t + draw) / half * total);
+            }
         }
-        long proposed[TRIALS];
-        for (int t = 0; t < TRIALS; t++) {
-            const long row = t >= TRIALS / 2;
-            proposed[t] = NAME(drawn)(odds + row * count, blocks + row * (count / LINE), task->used, count,
-                                      task->draws[m * TRIALS + t]);
+        NAME(propose)(task, points, norms, proposed, 2 * half, nearest, reached, rows, proposals);
+        for (long p = 0; p < width; p++)
+            chosen[p] = proposals[p].point;
+        if (first + width == task->num_landmarks)
+            return;
+        for (long p = 0; p < width; p += TRIALS) { /* again, with rows at the end that are not used */
+            for (long t = 0; t < TRIALS; t++)
+                proposed[t] = chosen[p + t < width ? p + t : p];
+            NAME(distances)(task, points, norms, proposed, rows + p * count);
         }
-        NAME(distances)(task, points, norms, proposed, distances);
-        const int best = NAME(best_trial)(task, distances, nearest);
-        const long pivot = pivots[m] = proposed[best];
-        const float *apart = distances + best * count;
-        float *column = columns + m * count;
-        for (long i = 0; i < count; i += LANES)
-            *(FLOATS *)(column + i) = NAME(exp2)(
-                NAME(clamp)(-*(const FLOATS *)(apart + i), -60.0f, 0.0f) * 1.4426950408889634f);
-        NAME(accumulate)(columns + pivot, count, columns, m, count, -1.0f, column);
-        const float scale = 1.0f / sqrtf(column[pivot] > task->captured ? column[pivot] : task->captured);
-        for (long i = 0; i < count; i++) {
-            column[i] *= scale;
-            residual[i] -= column[i] * column[i];
-            nearest[i] = apart[i] < nearest[i] ? apart[i] : nearest[i];
+        for (long p = 0; p < width; p++) {
+            const float *apart = rows + p * count;
+            float *column = columns + (first + p) * count;
+            for (long i = 0; i < count; i += LANES)
+                *(FLOATS *)(column + i) = NAME(exp2)(
+                    NAME(clamp)(-*(const FLOATS *)(apart + i), -60.0f, 0.0f) * 1.4426950408889634f);
+            NAME(accumulate)(columns + chosen[p], count, columns, first + p, count, -1.0f, column);
+            const float scale = 1.0f / sqrtf(column[chosen[p]] + task->captured);
+            for (long i = 0; i < count; i++) {
+                column[i] *= scale;
+                residual[i] -= column[i] * column[i];
+                nearest[i] = apart[i] < nearest[i] ? apart[i] : nearest[i];
+            }
+            nearest[chosen[p]] = 0.0f;
         }
-        nearest[pivot] = 0.0f;
     }
 }

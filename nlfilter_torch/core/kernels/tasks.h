@@ -69,6 +69,27 @@ struct grams {
     long rows, step; /* padded rows and pixels of a tile of F that fits the cache */
 };
 
+/* A proposal for a pivot: how well it covers the points (S), its place in the order so far, and what it adds. */
+struct proposal {
+    long point;
+    float *row;
+    long place;
+    double added;
+};
+
+static inline int compare_proposals(const void *first, const void *second)
+{
+    const struct proposal *a = first, *b = second;
+    return a->added != b->added ? (a->added < b->added ? 1 : -1) : (a->place > b->place) - (a->place < b->place);
+}
+
+/* Number of pivots in the block that begins with number `first`. */
+static inline long pivot_block(long first, long count)
+{
+    const long wanted = 2 * first > FIRST ? 2 * first : FIRST, most = wanted < LARGEST ? wanted : LARGEST;
+    return count - first < most ? count - first : most;
+}
+
 struct pivots {
     const float *points, *draws; /* (B, D, S), (M, TRIALS) */
     long *pivots;                /* (B, M) */

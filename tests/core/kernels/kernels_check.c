@@ -204,19 +204,22 @@ static void check_landmarks(int level, int threads)
             residual[i] = 1;
             nearest_pivot[i] = UNCOVERED;
         }
-        for (int m = 0; m < M; m++) {
+        for (int m = 0, width, first = 0; m < M; m++) {
+            width = 2 * first > FIRST ? 2 * first : FIRST; /* pivots in the block that begins with the first */
+            width = M - first < width ? M - first : width;
             const long pivot = pivots[b][m];
+            const int half = width * TRIALS / 2;
             double apart = INFINITY, at = 0, reached = 0; /* of the proposal whose share is nearest to its draw */
-            for (int t = 0; t < TRIALS; t++) {
+            for (int t = 0; t < 2 * half; t++) {
                 double whole = 0, before = 0, own = 0;
                 for (int i = 0; i < S; i++) {
-                    own = pow(fmax(residual[i], 1e-6), 4);
-                    own *= t < TRIALS / 2 ? pow(nearest_pivot[i] + DISTINCT, 2) : 1;
+                    own = pow(fmax(residual[i], 1e-6), 4) * (t < half ? pow(nearest_pivot[i] + DISTINCT, 2) : 1);
                     whole += own;
                     before += i <= pivot ? own : 0;
                 }
-                own = pow(fmax(residual[pivot], 1e-6), 4) * (t < TRIALS / 2 ? pow(nearest_pivot[pivot] + DISTINCT, 2) : 1);
-                const double tick = draws[m][t], end = fmin(fmax(tick, (before - own) / whole), before / whole);
+                own = pow(fmax(residual[pivot], 1e-6), 4) * (t < half ? pow(nearest_pivot[pivot] + DISTINCT, 2) : 1);
+                const double tick = (t % half + draws[first + t / TRIALS][t % TRIALS]) / half;
+                const double end = fmin(fmax(tick, (before - own) / whole), before / whole);
                 if (fabs(end - tick) < apart) {
                     apart = fabs(end - tick);
                     at = tick;
@@ -224,19 +227,26 @@ static void check_landmarks(int level, int threads)
                 }
             }
             compare(reached, at); /* the draw is within the share of the pivot */
-            const double root = sqrt(fmax(residual[pivot], 1e-6));
-            for (int i = 0; i < S; i++) {
-                double distance = 0;
-                for (int k = 0; k < D; k++)
-                    distance += pow(samples[b][k][i] - samples[b][k][pivot], 2);
-                column[m][i] = exp(-distance);
-                nearest_pivot[i] = fmin(nearest_pivot[i], distance);
-                for (int j = 0; j < m; j++)
-                    column[m][i] -= column[j][i] * column[j][pivot];
-                column[m][i] /= root;
+            if (m + 1 < first + width)
+                continue;
+            for (int j = first; j < first + width; j++) {
+                const long at_pivot = pivots[b][j];
+                for (int i = 0; i < S; i++) {
+                    double distance = 0;
+                    for (int k = 0; k < D; k++)
+                        distance += pow(samples[b][k][i] - samples[b][k][at_pivot], 2);
+                    column[j][i] = exp(-distance);
+                    nearest_pivot[i] = fmin(nearest_pivot[i], distance);
+                    for (int k = 0; k < j; k++)
+                        column[j][i] -= column[k][i] * column[k][at_pivot];
+                }
+                const double root = sqrt(column[j][at_pivot] + 1e-6);
+                for (int i = 0; i < S; i++) {
+                    column[j][i] /= root;
+                    residual[i] -= column[j][i] * column[j][i];
+                }
             }
-            for (int i = 0; i < S; i++)
-                residual[i] -= column[m][i] * column[m][i];
+            first += width;
         }
     }
     judge("pivots", status, 1e-4);
