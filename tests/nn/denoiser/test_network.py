@@ -208,7 +208,7 @@ def test_the_edit_takes_profiles_with_a_strength_for_each_image() -> None:
 
 @pytest.mark.parametrize("channels", [2, 4])
 def test_other_channels_are_denoised_one_by_one(channels: int) -> None:
-    image = noisy(CAT[:, :1].repeat(2, channels, 1, 1), 0.1)
+    image = noisy(CAT[:, :1, 8:].repeat(2, channels, 1, 1), 0.1)
     with torch.no_grad():
         result = TRAINED_ONE(image, 0.1)
         torch.testing.assert_close(result[1:, 1:2], TRAINED_ONE(image[1:, 1:2], 0.1), rtol=0, atol=1e-4)
