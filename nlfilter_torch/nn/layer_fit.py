@@ -3,7 +3,7 @@
 import math
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 
 import torch
@@ -46,6 +46,10 @@ class LayerFit:
     spatial_bandwidth: float | None
     alpha: tuple[float, ...]
     starts: tuple[float, ...]
+
+
+class _Spent(Exception):
+    """All evaluations of a descent have been used."""
 
 
 class _Search:
@@ -93,13 +97,17 @@ class _Search:
         return error if math.isfinite(error) else math.inf
 
     def descend(self, most: int) -> None:
-        """L-BFGS with at most so many evaluations, and landmarks that are chosen anew before and then held."""
+        """L-BFGS with so many evaluations, and landmarks that are chosen anew before and then held; leaves its best."""
         self.scale = max(self.anew(), torch.finfo(torch.float64).tiny)
+        last, best = self.evaluations + most, (math.inf, self.state())
         optimizer = torch.optim.LBFGS(
             self.free, max_iter=most, max_eval=most, tolerance_change=SETTLED, line_search_fn="strong_wolfe"
         )
 
         def closure() -> float:
+            nonlocal best
+            if self.evaluations >= last:  # the optimiser asks only between line searches
+                raise _Spent
             with torch.no_grad():  # a line search may try bandwidths that overflow
                 for parameter, (low, high) in self.limits.items():
                     parameter.clamp_(low, high)
@@ -107,9 +115,14 @@ class _Search:
             value = self.error()
             scaled = value / self.scale
             scaled.backward()
-            return float(scaled.detach())
+            reached = float(scaled.detach())
+            if reached < best[0]:
+                best = reached, self.state()
+            return reached
 
-        optimizer.step(closure)
+        with suppress(_Spent):
+            optimizer.step(closure)
+        self.restore(best[1])
 
 
 @contextmanager

@@ -64,7 +64,7 @@ def test_a_guide_is_fitted_with_the_bandwidths() -> None:
         guide = nn.Conv2d(1, 3, 3, padding=1)
     before = guide.weight.detach().clone()
     fitted = layer(0.1)
-    found = fit_layer(fitted, IMAGE, EDITED, guide=guide, evaluations=60)
+    found = fit_layer(fitted, IMAGE, EDITED, guide=guide, evaluations=110)
     assert not torch.equal(guide.weight, before)
     assert distance(fitted(IMAGE, guide=guide(IMAGE))) == pytest.approx(found.error, rel=1e-4)
 
