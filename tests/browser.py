@@ -209,6 +209,7 @@ class Tab:
     def drag(self, slider: Locator, start: float, end: float, *, steps: int = 4, release: bool = True) -> None:
         """Drag a slider from one fraction of its length to another."""
         expect(slider).to_be_visible()
+        slider.scroll_into_view_if_needed()
         box = slider.bounding_box()
         assert box is not None
         y = box["y"] + box["height"] / 2
