@@ -128,6 +128,10 @@ def _size(scene: Scene) -> tuple[int, int]:
     return scene.size
 
 
+def _points(scene: Scene) -> Tensor:
+    return 5 * scene.noise(scene.batch, 3, math.prod(scene.size))
+
+
 def _background(scene: Scene) -> Tensor:
     return scene.background()
 
@@ -235,6 +239,24 @@ def _refine_module(logits: Tensor, guide: Tensor, **options: Any) -> Tensor:
     return nlf.Refine(**options)(logits, guide, confidence)
 
 
+def _restored(operator: nlf.NonlocalOperator, image: Tensor, strength: float) -> Tensor:
+    """Restore an image of which every other column is known."""
+
+    def known(x: Tensor) -> Tensor:
+        return x[..., ::2]
+
+    def put_back(y: Tensor) -> Tensor:
+        return torch.stack([y, torch.zeros_like(y)], dim=-1).flatten(-2)[..., : image.shape[-1]]
+
+    prior = nlf.NonlocalPrior(operator)
+    return nlf.restore(known(image), known, put_back, prior, strength=strength, steps=5).image
+
+
+def _fitted_layer(image: Tensor, target: Tensor) -> float:
+    layer = nlf.NonlocalFilter((1.0, 1.0), num_landmarks=9, learn=("alpha", "photometric_bandwidth"))
+    return nlf.fit_layer(layer, image, target, evaluations=60).error
+
+
 def _look(**options: Any) -> Tensor:
     image = options.pop("image")
     return photo.Look(**options)(image)
@@ -267,7 +289,7 @@ FUNCTIONS = {
     ),
     "operator_from_features": Function(
         nlf.operator_from_features,
-        {"features": lambda scene: 5 * scene.noise(scene.batch, 3, math.prod(scene.size)), "size": _size},
+        {"features": _points, "size": _size},
         {name: kind for name, kind in AFFINITY.items() if name not in ("patch_size", "spatial_bandwidth")}
         | BALANCED
         | {"weights": lambda scene: 0.5 + 9 * scene.noise(math.prod(scene.size))},
@@ -336,6 +358,27 @@ FUNCTIONS = {
             "alpha": lambda scene: 4 * scene.noise(scene.order + 1),
         },
         RESIDUAL | FILTER,
+    ),
+    "sure": Function(
+        lambda operator, **options: nlf.sure(operator, **options),
+        OPERATOR | {"image": _image(1, 3), "noise": _number(0.01, 0.3)},
+        ALPHA,
+    ),
+    "propagate_labels": Function(
+        nlf.propagate_labels,
+        OPERATOR | {"labels": lambda scene: torch.tensor([[0, 1, *[-1] * (math.prod(scene.size) - 2)]] * scene.batch)},
+        {"strength": _plain(0.1, 200)},
+    ),
+    "bandwidth_of_points": Function(nlf.bandwidth_of_points, {"points": _points}, {"k": _count(1, 10)}),
+    "neighbour_distances": Function(nlf.neighbour_distances, {"points": _points}, {"k": _count(1, 10)}),
+    "NonlocalPrior": Function(
+        lambda operator, form, **arguments: nlf.NonlocalPrior(operator, form).prox(**arguments),
+        OPERATOR | {"form": _one_of("red", "plug-and-play"), "x": _image(1, 3), "g": _number(0, 10)},
+        {},
+    ),
+    "restore": Function(_restored, OPERATOR | {"image": _image(1, 3), "strength": _plain(0.1, 3)}, {}),
+    "fit_layer": Function(
+        _fitted_layer, {"image": lambda scene: scene.noise(1, 1, 8, 8), "target": lambda s: s.noise(1, 1, 8, 8)}, {}
     ),
     "fit_filter": Function(
         lambda **arguments: nlf.fit_filter(**arguments).moments,

@@ -274,16 +274,20 @@ class _Grams(torch.autograd.Function):
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         factor, scaling, remainder = ctx.saved_tensors
         grad_factor, grad_scaling = torch.empty_like(factor), torch.empty_like(scaling)
-        grad_remainder = None if remainder is None else torch.empty_like(remainder)
+        weights = scaling if remainder is None else remainder  # which are not needed for a single sum
+        grad_weights = torch.zeros_like(weights)
         symmetric = (grad + grad.mT).to(factor)  # (B, J, M, M)
         for block, (rows, pulled, inner, product) in buffered_blocks(factor, 4):
             d = scaling[:, None, block]
             torch.mul(factor[:, :, block], d, out=rows)
             torch.bmm(symmetric[:, 0], rows, out=pulled)
-            if remainder is not None and grad_remainder is not None:
-                torch.bmm(symmetric[:, 1], rows, out=inner)
-                grad_remainder[:, block] = torch.mul(inner, rows, out=product).sum(1) / 2
-                pulled.addcmul_(inner, remainder[:, None, block])
+            power = None  # r^(j - 1)
+            for j in range(1, grad.shape[1]):
+                torch.bmm(symmetric[:, j], rows, out=inner)
+                slope = torch.mul(inner, rows, out=product).sum(1).mul_(j / 2)
+                grad_weights[:, block] += slope if power is None else slope * power
+                power = weights[:, block] if power is None else power * weights[:, block]
+                pulled.addcmul_(inner, power.unsqueeze(1))
             grad_scaling[:, block] = torch.mul(pulled, factor[:, :, block], out=product).sum(1)
             grad_factor[:, :, block] = pulled.mul_(d)
-        return grad_factor, grad_scaling, grad_remainder, None, None
+        return grad_factor, grad_scaling, None if remainder is None else grad_weights, None, None

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from nlfilter_torch.core.blocks import SWEPT
 from nlfilter_torch.core.kernels import definitions_only, tall_skinny
-from nlfilter_torch.core.kernels.tall_skinny import gather, moment, spread, sum_grams, weigh
+from nlfilter_torch.core.kernels.tall_skinny import compute_grams, gather, moment, spread, sum_grams, weigh
 from nlfilter_torch.operator.scaling import KernelMatrix
 from tests.native import LEVELS, by_torch, random
 from tests.pairwise import pairwise
@@ -145,3 +145,9 @@ def test_grams(level: int, pixels: int, marks: int, count: int) -> None:
         assert (result[:, j] - exact).abs().max() <= size
         assert (plain[:, j] - exact).abs().max() <= 10 * size
     assert torch.equal(result, result.mT)
+
+
+@pytest.mark.parametrize("count", [1, 2, 4])
+def test_gradients_of_grams(count: int) -> None:
+    factor, scaling, remainder = (doubles(*shape).requires_grad_() for shape in ((2, 4, 9), (2, 9), (2, 9)))
+    assert torch.autograd.gradcheck(lambda *parts: compute_grams(*parts, count), (factor, scaling, remainder))

@@ -61,6 +61,11 @@ def block_on(device: str) -> nlf.NonlocalBlock:
         return nlf.NonlocalBlock(3)
 
 
+def layer_on(device: str) -> nlf.NonlocalFilter:
+    with torch.device(device):
+        return nlf.NonlocalFilter((1.0, 1.0), num_landmarks=9)
+
+
 CASES: dict[str, Case] = {
     "nonlocal_operator": lambda x: x.operator() @ x.image(),
     "nonlocal_operator uniform": lambda x: x.operator(landmarks="uniform").scaling,
@@ -80,6 +85,7 @@ CASES: dict[str, Case] = {
     "filter_regions": lambda x: nlf.filter_regions(x.operator(), x.image(), x.mask(2), x.zeros(2, 4)),
     "polynomial_response": lambda x: nlf.polynomial_response(x.zeros(1, 4), x.zeros(4)),
     "fit_alpha": lambda x: nlf.fit_alpha(x.operator(), x.image(), x.image(), mask=x.mask(), rounding=0.0),
+    "NonlocalPrior": lambda x: nlf.NonlocalPrior(x.operator()).prox(x.image(), 0.5),
     "sure": lambda x: nlf.sure(x.operator(), x.image(), 0.1),
     "neighbour_distances": lambda x: nlf.neighbour_distances(x.zeros(1, 3, 50), k=4),
     "bandwidth_of_points": lambda x: nlf.bandwidth_of_points(x.zeros(1, 3, 50)),
@@ -129,13 +135,23 @@ READS: dict[str, Case] = {
     "defocus": lambda x: photo.defocus(x.image(), x.mask()),
     "region_mask": lambda x: photo.region_mask(x.image(), x.mask()),
     "enhance": lambda x: photo.enhance(x.image(), x.zeros(2, 4), x.mask(2), num_landmarks=LANDMARKS),
+    "propagate_labels": lambda x: nlf.propagate_labels(
+        x.operator(), torch.zeros(1, 624, dtype=torch.long, device=x.device)
+    ),
+    "restore": lambda x: (
+        nlf.restore(x.image(), torch.clone, torch.clone, nlf.NonlocalPrior(x.operator()), strength=1.0, steps=2).image
+    ),
+    "fit_layer": lambda x: nlf.fit_layer(layer_on(x.device), x.image(), x.image(), evaluations=60).error,
 }
 CLASSES = {
     "Certificate",
+    "Contraction",
     "Diagnostics",
     "FunctionProduct",
+    "LayerFit",
     "NoiseProfile",
     "NonlocalOperator",
+    "Restoration",
     "Spectrum",
 }  # results of functions
 
@@ -176,6 +192,7 @@ def test_backward_reads_no_value(case: str) -> None:
         result.sum().backward()
     else:
         assert case in (
+            "bandwidth_of_points",
             "estimate_bandwidth",
             "estimate_noise",
             "noise_profile",
