@@ -222,7 +222,7 @@ def test_images(function: str) -> None:
     name, call = TAKE_AN_IMAGE[function]
     rows = [({"x": value}, exactly(f"{name} {must}"), error) for value, error, must in BAD_IMAGES]
     if function not in ("nonlocal_operator", "estimate_bandwidth"):  # which take none; others get two against none
-        rows.append(({"x": EMPTY[:0]}, f"^{'image' if function == 'NonlocalFilter' else name} must h", ValueError))
+        rows.append(({"x": EMPTY[:0]}, f"^{name} must h", ValueError))
     if name != "guide":
         size = f"^{name} must have the height and width of the "
         rows += [
