@@ -240,8 +240,8 @@ def differences(case: Case, before: Path, after: Path, notes: list[str]) -> Iter
             ".avif",
         ):
             yield f"resolution {first.extras.dpi} {pair}"
-    tags = {tag.code: tag.stored("<") for tag in first.extras.tags}
-    kept = {tag.code: tag.stored("<") for tag in second.extras.tags}
+    tags = {tag.code: tag.in_order("<") for tag in first.extras.tags}
+    kept = {tag.code: tag.in_order("<") for tag in second.extras.tags}
     for code, tag in tags.items():
         if kept.get(code) != tag and not named(notes, str(code)) and not (code in (282, 283, 296) and first.extras.dpi):
             yield f"tag {code}"
