@@ -16,7 +16,7 @@ from nlfilter_torch.core.precision import per_image, working_dtype
 from nlfilter_torch.nn.prior import NonlocalPrior
 from nlfilter_torch.operator.build import nonlocal_operator
 
-STRENGTH = 1.0  # best of five at a noise of 0.1, on the astronaut of scikit-image
+PRIOR_STRENGTH = 1.0  # best of five at a noise of 0.1, on the astronaut of scikit-image
 
 
 class Prior(deepinv.optim.Prior):
@@ -59,7 +59,7 @@ class Denoiser(deepinv.models.Denoiser):
         options: other options of :func:`~nlfilter_torch.nonlocal_operator`.
     """
 
-    def __init__(self, strength: float = STRENGTH, guide: Tensor | None = None, **options: Any) -> None:
+    def __init__(self, strength: float = PRIOR_STRENGTH, guide: Tensor | None = None, **options: Any) -> None:
         super().__init__()
         check_values(strength, "strength", "positive")
         self.strength, self.options = strength, options

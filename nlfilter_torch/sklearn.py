@@ -14,7 +14,7 @@ from sklearn.utils.multiclass import check_classification_targets
 from sklearn.utils.validation import check_is_fitted, check_random_state, validate_data
 from torch import Tensor
 
-from nlfilter_torch.filtering.labels import STRENGTH, propagate_labels, shares
+from nlfilter_torch.filtering.labels import LABEL_STRENGTH, propagate_labels, shares
 from nlfilter_torch.operator.build import operator_from_points
 from nlfilter_torch.operator.neighbours import NEIGHBOURS, bandwidth_of_points
 from nlfilter_torch.operator.operator import NonlocalOperator
@@ -24,7 +24,7 @@ Array = NDArray[Any]
 
 # Of the estimated bandwidth, for labels: of 1, 0.75, 0.55, 0.4 the best in the mean of scikit-learn's tables of wines
 # and of breast cancer, with five labels a class.
-NARROW = 0.55
+BANDWIDTH_SHARE = 0.55
 
 
 class _Linked(BaseEstimator):  # type: ignore[misc]
@@ -134,7 +134,7 @@ class LabelPropagation(ClassifierMixin, _Linked):  # type: ignore[misc]
     def __init__(
         self,
         *,
-        strength: float = STRENGTH,
+        strength: float = LABEL_STRENGTH,
         bandwidth: float | None = None,
         n_neighbors: int = NEIGHBOURS,
         n_landmarks: int = FilterOptions.num_landmarks,
@@ -154,7 +154,7 @@ class LabelPropagation(ClassifierMixin, _Linked):  # type: ignore[misc]
         self.classes_, numbers = np.unique(given[known], return_inverse=True)
         labels = torch.full((1, len(given)), -1)
         labels[0, torch.from_numpy(known)] = torch.from_numpy(numbers)
-        found = propagate_labels(self._link(table, NARROW), labels, strength=self.strength)
+        found = propagate_labels(self._link(table, BANDWIDTH_SHARE), labels, strength=self.strength)
         self.label_distributions_ = found[0].mT.numpy()
         self.transduction_ = self.classes_[self.label_distributions_.argmax(1)]
         self._sums = self.operator_.matrix.sums(found)

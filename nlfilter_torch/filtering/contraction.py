@@ -33,11 +33,14 @@ Map = Callable[[Tensor], Tensor]
 
 FAILURE = 1e-6  # probability that a bound does not hold
 PRODUCTS = 100  # of each run of Lanczos, at most
-SETTLED = 0.05  # share of |A|^2, or of the distance of the factor from 1, within which bounds are sharp enough
+SHARP = 0.05  # share of |A|^2, or of the distance of the factor from 1, within which bounds are sharp enough
 EACH = 5  # products after which the bounds are computed; a divisor of PRODUCTS
 BISECTIONS = 60
-NEGLIGIBLE = {torch.float32: 1e-5, torch.float64: 1e-12}  # rounding of products, relative to the largest eigenvalue
-LINEAR = {torch.float32: 1e-3, torch.float64: 1e-8}  # rounding of A, relative
+NEGLIGIBLE_REST = {
+    torch.float32: 1e-5,
+    torch.float64: 1e-12,
+}  # rounding of products, relative to the largest eigenvalue
+LINEARITY = {torch.float32: 1e-3, torch.float64: 1e-8}  # rounding of A, relative
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +99,7 @@ class _Lanczos:
             vector = vector - (parts @ self.plain).squeeze(1)
         beside = self._append(vector)
         largest = self.diagonal.abs().amax(1).clamp(min=1e-300)
-        ended = (beside <= NEGLIGIBLE[vector.dtype] * largest) | (self.beside == 0).any(1)
+        ended = (beside <= NEGLIGIBLE_REST[vector.dtype] * largest) | (self.beside == 0).any(1)
         beside = torch.where(ended, 0.0, beside)
         alive = (~ended).to(vector).view(-1, 1, 1)
         self.plain = torch.cat([self.plain[:, :-1], self.plain[:, -1:] * alive], dim=1)
@@ -143,7 +146,7 @@ def _check_linear(forward: Map, transpose: Map, like: Tensor, mass: Tensor, gene
     images = [forward(first), forward(second), forward(first + 2 * second)]
     for image in images:
         check_tensor(image, "forward(x)", "return a tensor")
-    tolerance = LINEAR[like.dtype]
+    tolerance = LINEARITY[like.dtype]
     error = (images[2] - images[0] - 2 * images[1]).norm() / images[2].norm().clamp(min=1e-30)
     if float(error) > tolerance:
         warn(
@@ -193,8 +196,8 @@ def squared_norm(forward: Map, transpose: Map, start: Tensor, mass: Tensor, fail
         ritz, level = space.ritz_values(), space.level(failure)
         largest = ritz[:, -1]
         most = largest + (level / products).exp()  # p(x) is at least (x - largest)^k
-        bound = _beyond(ritz, level, None, most) + NEGLIGIBLE[start.dtype] * largest.abs()
-        if bool((bound - largest <= SETTLED * largest).all()):
+        bound = _beyond(ritz, level, None, most) + NEGLIGIBLE_REST[start.dtype] * largest.abs()
+        if bool((bound - largest <= SHARP * largest).all()):
             break
     return bound, products
 
@@ -256,7 +259,7 @@ def contraction(
         lowest = _beyond(-ritz.flip(1), level, torch.ones_like(norm), below)
         at_least = torch.maximum(ritz[:, -1], -ritz[:, 0])
         factor = torch.maximum(highest, lowest)
-        if bool((factor - at_least <= SETTLED * (1 - at_least)).all()):
+        if bool((factor - at_least <= SHARP * (1 - at_least)).all()):
             break
-    factor = (factor + NEGLIGIBLE[like.dtype]).clamp(max=1.0)
+    factor = (factor + NEGLIGIBLE_REST[like.dtype]).clamp(max=1.0)
     return Contraction(factor, at_least.clamp(0.0, 1.0), norm, step, failure, products + count)

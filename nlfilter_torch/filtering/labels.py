@@ -11,12 +11,12 @@ from nlfilter_torch.core.precision import full_precision
 from nlfilter_torch.filtering.prior import proximal_map
 from nlfilter_torch.operator.operator import NonlocalOperator
 
-UNKNOWN = -1  # label of points whose class is to be found
-STRENGTH = 100.0
+NO_LABEL = -1  # label of points whose class is to be found
+LABEL_STRENGTH = 100.0
 
 
 @full_precision
-def propagate_labels(operator: NonlocalOperator, labels: Tensor, *, strength: float = STRENGTH) -> Tensor:
+def propagate_labels(operator: NonlocalOperator, labels: Tensor, *, strength: float = LABEL_STRENGTH) -> Tensor:
     """Extend the labels of some points to all points that W links to them.
 
     The scores are ``(I + g (I - W))^-1 Y`` with the indicators Y of the labels, solved exactly, and divided by their
@@ -58,7 +58,7 @@ def propagate_labels(operator: NonlocalOperator, labels: Tensor, *, strength: fl
             f"labels must have shape (1, N) or ({len(operator)}, N), got {tuple(labels.shape)}; use labels[None]"
         )
     check_shape(labels, (len(labels), operator.factor.shape[2]), "labels", "give one for each point")
-    if int(labels.min()) < UNKNOWN or int(labels.max()) < 0:
+    if int(labels.min()) < NO_LABEL or int(labels.max()) < 0:
         raise ValueError(
             f"labels must be -1 or classes from 0 on, and some known, got {int(labels.min())} to {int(labels.max())}; "
             "number the classes from 0"

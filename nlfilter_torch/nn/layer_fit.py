@@ -16,14 +16,14 @@ from nlfilter_torch.nn.affinity import HeldAssignment
 from nlfilter_torch.nn.sliders import NonlocalFilter
 from nlfilter_torch.operator.features import estimate_bandwidth
 
-PHOTOMETRIC = tuple(2.0**power for power in range(-4, 4))  # starts, in units of the estimate of the guide
-SPATIAL = (1 / 64, 1 / 24, 1 / 10, 1 / 4, 1.0)  # starts, in units of the short side
+PHOTOMETRIC_STARTS = tuple(2.0**power for power in range(-4, 4))  # starts, in units of the estimate of the guide
+SPATIAL_STARTS = (1 / 64, 1 / 24, 1 / 10, 1 / 4, 1.0)  # starts, in units of the short side
 BANDWIDTHS = ("photometric_bandwidth", "spatial_bandwidth")
-BEYOND = 16.0  # factor by which bandwidths may leave the range of the starts
+BEYOND_STARTS = 16.0  # factor by which bandwidths may leave the range of the starts
 BEST = 3  # starts from which the bandwidths descend
-ROUNDS = 2  # descents from each, with an assignment of pixels to landmarks that is renewed before each
+DESCENTS = 2  # descents from each, with an assignment of pixels to landmarks that is renewed before each
 LEAST_EVALUATIONS = 60
-SETTLED = 1e-9
+SETTLED_DESCENT = 1e-9
 
 
 @dataclass(frozen=True)
@@ -101,7 +101,7 @@ class _Search:
         self.scale = max(self.anew(), torch.finfo(torch.float64).tiny)
         last, best = self.evaluations + most, (math.inf, self.state())
         optimizer = torch.optim.LBFGS(
-            self.free, max_iter=most, max_eval=most, tolerance_change=SETTLED, line_search_fn="strong_wolfe"
+            self.free, max_iter=most, max_eval=most, tolerance_change=SETTLED_DESCENT, line_search_fn="strong_wolfe"
         )
 
         def closure() -> float:
@@ -191,7 +191,7 @@ def fit_layer(
     for name, places in zip(BANDWIDTHS, zip(*starts, strict=True), strict=False):
         parameter, values = getattr(layer.affinity, f"log_{name}"), [place for place in places if place is not None]
         if parameter is not None and values:
-            search.limits[parameter] = math.log(min(values) / BEYOND), math.log(max(values) * BEYOND)
+            search.limits[parameter] = math.log(min(values) / BEYOND_STARTS), math.log(max(values) * BEYOND_STARTS)
     with _held(layer), torch.enable_grad(), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of bandwidths on the way
         found = [(search.anew(), search.state())]
@@ -207,8 +207,8 @@ def fit_layer(
         chosen = found[: BEST if search.free else 0]
         for number, (error, state) in enumerate(chosen):
             best = error, state
-            for turn in range(ROUNDS):
-                left = (evaluations - search.evaluations) // ((len(chosen) - number) * ROUNDS - turn) - 2
+            for turn in range(DESCENTS):
+                left = (evaluations - search.evaluations) // ((len(chosen) - number) * DESCENTS - turn) - 2
                 if left < 1:
                     break
                 search.restore(best[1])
@@ -242,7 +242,7 @@ def _starts(
     spatial: list[float | None] = [None]
     if isinstance(affinity.photometric_bandwidth, Tensor):
         estimate = float(estimate_bandwidth(image if guide is None else guide(image)).mean())
-        photometric = [factor * max(estimate, 1e-6) for factor in PHOTOMETRIC]
+        photometric = [factor * max(estimate, 1e-6) for factor in PHOTOMETRIC_STARTS]
     if isinstance(affinity.spatial_bandwidth, Tensor):
-        spatial = [max(share * min(image.shape[2:]), 0.5) for share in SPATIAL]
+        spatial = [max(share * min(image.shape[2:]), 0.5) for share in SPATIAL_STARTS]
     return [(h, s) for h in photometric for s in spatial if (h, s) != (None, None)]

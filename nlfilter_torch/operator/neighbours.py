@@ -8,8 +8,8 @@ from nlfilter_torch.core.precision import full_precision, working_dtype
 from nlfilter_torch.operator.traps import sampled_points
 
 NEIGHBOURS = 10
-LEAST = 1e-6  # bandwidth over the largest distance from the centre, for points of which most are equal
-ROWS = 256  # points whose affinities are added up
+LEAST_BANDWIDTH = 1e-6  # bandwidth over the largest distance from the centre, for points of which most are equal
+POINTS_AT_ONCE = 256  # points whose affinities are added up
 HALVINGS = 40
 
 
@@ -71,7 +71,9 @@ def bandwidth_of_points(points: Tensor, k: int = NEIGHBOURS) -> Tensor:
     """
     check_features(points, "points")
     check_count(k, "k")
-    sample = sampled_points(points.shape[2], ROWS)[:: 2 if points.shape[2] <= 2 * ROWS else 1].to(points.device)
+    sample = sampled_points(points.shape[2], POINTS_AT_ONCE)[:: 2 if points.shape[2] <= 2 * POINTS_AT_ONCE else 1].to(
+        points.device
+    )
     values = (points - points.mean(2, keepdim=True)).double()
     norms = values.square().sum(1)
     squared = norms[:, sample, None] + norms[:, None] - 2 * values[:, :, sample].mT @ values
@@ -80,7 +82,7 @@ def bandwidth_of_points(points: Tensor, k: int = NEIGHBOURS) -> Tensor:
     wanted = min(k, 0.5 * (points.shape[2] - 1))  # all others only at an infinite bandwidth
     largest = norms.amax(1).sqrt()
     largest = torch.where(largest > 0, largest, 1.0)
-    low, high = (LEAST * largest).log(), (1e3 * largest).log()
+    low, high = (LEAST_BANDWIDTH * largest).log(), (1e3 * largest).log()
     for _ in range(HALVINGS):
         middle = (low + high) / 2
         sums = torch.exp(-squared / (2 * middle).exp()[:, None, None]).sum(2).median(1).values

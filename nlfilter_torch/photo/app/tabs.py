@@ -12,7 +12,7 @@ from nlfilter_torch.photo.app import controls, drawing
 from nlfilter_torch.photo.app.controls import Choice, Control, Slider, SteadySlider, digits, show_pressed
 from nlfilter_torch.photo.app.curve import CurveEditor
 from nlfilter_torch.photo.app.tools import BRUSH_RADIUS, BRUSHES, FREE, PALETTE, PROPORTIONS, Brush, Proportions
-from nlfilter_torch.photo.declared.development import AUTO, DEVELOP, WHOLE_CROP
+from nlfilter_torch.photo.declared.development import AUTO_BALANCE, DEVELOP, WHOLE_CROP
 from nlfilter_torch.photo.declared.json_values import Value
 from nlfilter_torch.photo.declared.parameters import EDITS
 from nlfilter_torch.photo.declared.presets import LOOKS, PRESETS, PURPOSES, Recipe
@@ -197,7 +197,7 @@ class DevelopTab(EditTab):
         for button, is_on in (
             (self._crop, self._page.is_cropping),
             (self._pick, self._page.is_picking),
-            (self._auto, develop.temperature == AUTO),
+            (self._auto, develop.temperature == AUTO_BALANCE),
         ):
             show_pressed(button, is_on)
         self._curve.follow(develop.curve)
@@ -241,8 +241,8 @@ class DevelopTab(EditTab):
         self._curve.draw_tones(histogram)
 
     def _toggle_auto(self) -> None:
-        is_auto = self._page.recipe().develop.temperature == AUTO
-        self._page.develop({"temperature": None if is_auto else AUTO, "warmth": 0.0, "tint": 0.0}, True)
+        is_auto = self._page.recipe().develop.temperature == AUTO_BALANCE
+        self._page.develop({"temperature": None if is_auto else AUTO_BALANCE, "warmth": 0.0, "tint": 0.0}, True)
 
     def _develop(self, _: str, values: Mapping[str, Value], complete: bool) -> None:
         """Change some values."""

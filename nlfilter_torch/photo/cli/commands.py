@@ -13,7 +13,7 @@ from nlfilter_torch.photo.cli.edits import (
     check_usual,
     edit_photograph,
     other_recipe,
-    parsed,
+    parsed_value,
     preset_option,
     step_of,
     typed_options,
@@ -70,7 +70,7 @@ def develop(
 ) -> None:
     """Develop a photograph; the help is that of the declaration."""
     sides = None if aspect is None else options.parse_aspect(aspect)
-    development = Development(**{name: parsed(value, DEVELOP[name]) for name, value in values.items()})
+    development = Development(**{name: parsed_value(value, DEVELOP[name]) for name, value in values.items()})
 
     from nlfilter_torch.photo.cli.jobs import develop_file
 

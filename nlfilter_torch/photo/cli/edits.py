@@ -232,11 +232,11 @@ def step_of(edit: Edit, options_of_edit: Mapping[str, Value]) -> Step:
     for parameter in edit:
         if parameter.name not in options_of_edit:
             continue
-        values[parameter.name] = parsed(options_of_edit[parameter.name], parameter)
+        values[parameter.name] = parsed_value(options_of_edit[parameter.name], parameter)
     return Step(edit.name, (), **values)
 
 
-def parsed(value: Any, parameter: Parameter) -> Any:
+def parsed_value(value: Any, parameter: Parameter) -> Any:
     """The value of an option, of which text stands for lists and for numbers that may be words.
 
     Raises:

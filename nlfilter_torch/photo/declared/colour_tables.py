@@ -22,7 +22,7 @@ EXPORT = "export a 3-D table of colours from 0 to 1"
 MOST_HALD_LEVEL = math.isqrt(MAX_NODES)
 CURVES, COLOURS = "LUT_1D", "LUT_3D"  # the tables of a .cube file
 MOST_CURVE_NODES = 65536
-NUMBER = re.compile(r"\d{1,9}(?:\.\d*)?")  # of nodes; some programs write 33.0
+NODE_COUNT = re.compile(r"\d{1,9}(?:\.\d*)?")  # of nodes; some programs write 33.0
 CUBE_NODES, HALD_LEVEL = 33, 8  # of the tables that are written
 WHITE_16 = 65535
 
@@ -59,7 +59,7 @@ class Cube:
             self.ranges[table] = ([least] * 3, [most] * 3)
         elif keyword == f"{table}_SIZE" and table in self.sizes:
             most_nodes = MAX_NODES if table == COLOURS else MOST_CURVE_NODES
-            size = float(values[0]) if len(values) == 1 and NUMBER.fullmatch(values[0]) else 0.0
+            size = float(values[0]) if len(values) == 1 and NODE_COUNT.fullmatch(values[0]) else 0.0
             if size != int(size) or not 2 <= size <= most_nodes:
                 raise ValueError(
                     f"{place} must be a whole number from 2 to {most_nodes}, got {' '.join(values)}; "

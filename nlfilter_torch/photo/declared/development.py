@@ -21,7 +21,7 @@ SAME = 0.01  # pixels, by which the sides of a crop that was moved may differ
 TURNS = (0, 90, 180, 270)  # degrees
 EVEN_CURVE: tuple[float, ...] = (0.0, 0.25, 0.5, 0.75, 1.0)  # the curve that changes nothing
 NEUTRAL = 6500.0  # kelvin of the light for which a file is balanced
-AUTO = "auto"
+AUTO_BALANCE = "auto"
 
 
 def _amount(name: str, help: str) -> Parameter:
@@ -72,7 +72,7 @@ DEVELOP = Edit(
             2000,
             15000,
             optional=True,
-            words=(AUTO,),
+            words=(AUTO_BALANCE,),
             metavar="KELVIN",
             slider=Slider("Temperature", 2000, 12000, 50, none=NEUTRAL),
         ),

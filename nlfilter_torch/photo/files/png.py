@@ -54,7 +54,7 @@ ADAM7 = (
 # Chunks that describe the pixels of the file. Colours are checked, see _profile.
 STORAGE_CHUNKS = (b"IHDR", b"PLTE", b"tRNS", b"IDAT", b"IEND", b"gAMA", b"cHRM", b"sRGB")
 HDR_PROFILES = {b"ITUR_2100_PQ": 16, b"ITUR_2100_HLG": 18}  # by the names that they have in HDR files of PNG
-BEHIND = 1 << 20  # bytes behind the end that are looked at
+BEHIND_END = 1 << 20  # bytes behind the end that are looked at
 PIXEL_CHUNKS = (b"IHDR", b"PLTE", b"tRNS", b"IDAT", b"IEND")
 TEXTS = (b"tEXt", b"zTXt", b"iTXt")
 READ = (b"iCCP", b"eXIf", b"pHYs", b"acTL", b"fcTL", b"fdAT")
@@ -172,7 +172,7 @@ def open_png(path: Path, data: bytes | mmap) -> Png:
         raise UnhandledImage(f"{path} is an animation of {frames} frames; save one of them as a picture")
     damaged = [f"the chunk {chunk.name.decode('latin-1')}" for chunk in found if not chunk.sound]
     end = found[-1].stop + 4
-    behind = bytes(data[end : end + BEHIND]) if names[-1] == b"IEND" else b""
+    behind = bytes(data[end : end + BEHIND_END]) if names[-1] == b"IEND" else b""
     profile = _profile(path, by_name, damaged)
     orientation, metadata = _metadata(contents, damaged, ["the bytes behind the picture"] * bool(behind.strip(b"\0")))
     metadata = replace(metadata, icc=profile)

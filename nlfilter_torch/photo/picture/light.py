@@ -18,7 +18,7 @@ from nlfilter_torch.core.torch_internals import cached_constants
 from nlfilter_torch.core.workers import divided_among, threads_for
 from nlfilter_torch.operator.features import reduce_channels
 from nlfilter_torch.operator.options import FilterOptions
-from nlfilter_torch.photo.declared.development import AUTO, EVEN_CURVE, NEUTRAL, Development
+from nlfilter_torch.photo.declared.development import AUTO_BALANCE, EVEN_CURVE, NEUTRAL, Development
 from nlfilter_torch.photo.picture.colour import split_luminance
 from nlfilter_torch.photo.picture.developing import develop_planes, limits_of
 from nlfilter_torch.photo.picture.in_memory import InMemory
@@ -37,12 +37,12 @@ DARK = 1e-3  # light in which nobody sees colours
 LUMINANCE = (0.2126, 0.7152, 0.0722)  # weights of red, green and blue in linear light
 #: From XYZ to linear sRGB, by rows.
 TO_SRGB = ((3.2406, -1.5372, -0.4986), (-0.9689, 1.8758, 0.0415), (0.0557, -0.2040, 1.0570))
-AREAS = 0.3  # megapixels of the picture in which areas are found
+AREA_MEGAPIXELS = 0.3  # megapixels of the picture in which areas are found
 LEVELS, DISTANCE = 40 / 255, 1 / 8  # how different the tones of an area are, and its size as a share of the short side
 LANDMARKS = 150
 ORDER = 3  # power of W whose result the areas are
 NORM = 6  # exponent of the mean that finds the colour of the light: between the mean and the largest value
-CLIPPED = 0.98  # value from which on a channel may be clipped, and its colour wrong
+CLIPPED_FROM = 0.98  # value from which on a channel may be clipped, and its colour wrong
 SMALLEST = 1e-9
 
 
@@ -119,7 +119,7 @@ class Light:
 def fit_light(source: Source[M], development: Development, limits: tuple[Tensor, Tensor]) -> Light:
     """Fit a change of light to a picture in the frame in which it is shown; what is kept of it serves other values."""
     balance = shading = None
-    if development.temperature == AUTO and source.channels == 3:
+    if development.temperature == AUTO_BALANCE and source.channels == 3:
         balance = kept(source, "own light", [], balance_of_light, kept(source, "small", [], small, source))
     if development.shades:
         image = kept(source, "small", [], small, source)
@@ -129,7 +129,7 @@ def fit_light(source: Source[M], development: Development, limits: tuple[Tensor,
 
 def small(source: Source[M]) -> Tensor:
     """A picture in the size in which areas are found, (B, C, h, w)."""
-    size = viewed_size(source.size, AREAS)
+    size = viewed_size(source.size, AREA_MEGAPIXELS)
     return everywhere(source if size == source.size else source.resized(size), Fitted(whole_image))
 
 
@@ -313,7 +313,7 @@ def balance_of_light(image: Tensor) -> Tensor:
     Trezzi, 2004). Not differentiable.
     """
     values = image.detach().double()
-    counted = ((values.amax(1, keepdim=True) < CLIPPED) & (values.amin(1, keepdim=True) > 0)).double()
+    counted = ((values.amax(1, keepdim=True) < CLIPPED_FROM) & (values.amin(1, keepdim=True) > 0)).double()
     light = (_linear(values).clamp(min=0) ** NORM * counted).mean((2, 3)).clamp(min=SMALLEST**NORM) ** (1 / NORM)
     gains = []
     for red, green, blue in light.log2().tolist():

@@ -204,7 +204,7 @@ FEWEST = 12  # cells of a stroke that may have stray parts
 LARGEST_AREA = 0.04  # of the picture that a stroke covers; larger areas are rough masks, which count as they are
 ELONGATED = 5.0  # least squared border of a stroke, relative to four times its area: three times as long as wide
 STRAY_LIGHTNESS = 0.5  # weight of differences in lightness, much of which is shading
-SHARED = 0.2  # of a stroke that has colours of another one, which are then meant
+SHARED_COLOURS = 0.2  # of a stroke that has colours of another one, which are then meant
 
 
 def without_strays(scribbles: Scribbles, size: tuple[int, int], *, of_one_colour: bool = False) -> Scribbles:
@@ -260,7 +260,7 @@ def _of_region(points: Numbers, at: Cells, shape: tuple[int, int], of_one_colour
         apart = (np.linalg.norm((means[own, None] - others)[..., 1:], axis=2) > GAP).all(
             1
         )  # in a* and b*, without shade
-        if len(others) and apart.mean() <= 1 - SHARED:
+        if len(others) and apart.mean() <= 1 - SHARED_COLOURS:
             ignored[own[apart]] = True
     for places, stroke in parts:  # what another stroke is meant for is not stray
         others = np.array(middles[: stroke - 1] + middles[stroke:]).reshape(-1, 3)
