@@ -11,6 +11,7 @@ from PIL import Image
 
 from nlfilter_torch.__main__ import main
 from nlfilter_torch.operator.features import reduce_channels
+from nlfilter_torch.photo.app.developed import Developed
 from nlfilter_torch.photo.app.session import Session, reduced_size
 from nlfilter_torch.photo.declared.presets import find_recipe
 from nlfilter_torch.photo.edits.recipe import apply_recipe
@@ -108,7 +109,8 @@ NAMES = [
 
 def test_names_to_save_under(session: Session) -> None:
     for name, photograph, wanted in NAMES:
-        session.name, session.original = name, replace(session.original, photograph=photograph)
+        session.name = name
+        session.original = session.developed = Developed.of(photograph, name, 81)
         assert session.suggested_name() == wanted
         session.save(wanted)  # which supports this depth
 

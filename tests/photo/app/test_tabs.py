@@ -73,20 +73,21 @@ def test_what_the_brush_paints() -> None:
 
 def test_what_takes_part_is_chosen(shown: Controls) -> None:
     tab = EditTab("recolor", shown)
-    assert shown.pressed("All alike")
-    shown.click("All alike")
-    assert shown.changes == []
+    assert shown.pressed("Only this")
     shown.click("Only this")
-    assert shown.changes == [("recolor", {"extent": "object"}, True)]
+    assert shown.changes == []
+    shown.click("All alike")
+    assert shown.changes.pop() == ("recolor", {"extent": "near"}, True)
     (wider,) = shown.of(ui.checkbox)
-    wider.set_value(True)
-    assert shown.changes.pop() == ("recolor", {"extent": "everywhere"}, True)
-    for extent, button in (("everywhere", "All alike"), ("object", "Only this"), ("near", "All alike")):
+    for extent, button in (("near", "All alike"), ("everywhere", "All alike"), ("object", "Only this")):
         shown.show(tab, Recipe((Step("recolor", extent=extent),)))
         assert shown.pressed(button)
         assert (wider.value, wider.visible) == (extent == "everywhere", extent != "object")
         shown.click(button)
-    assert len(shown.changes) == 1
+    assert shown.changes == []
+    shown.show(tab, Recipe((Step("recolor", extent="near"),)))
+    wider.set_value(True)
+    assert shown.changes == [("recolor", {"extent": "everywhere"}, True)]
 
 
 def test_an_object_is_cut_out(shown: Controls) -> None:
