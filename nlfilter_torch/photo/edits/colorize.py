@@ -417,14 +417,15 @@ class Cut:
         few = ((counts > 1) & (counts <= MOST_CUT)).to(chroma)
         if not bool(few.any()):
             return None
-        inside = [scribbles.weighted(part) for part in regions.squeeze(2).split(1, dim=1)]
+        grey = replace(scribbles, image=reduce_channels(scribbles.image.unsqueeze(2), "luminance").squeeze(2))
+        inside = [grey.weighted(part) for part in regions.squeeze(2).split(1, dim=1)]
         options = operators.options
         chosen = {
             "num_landmarks": options.num_landmarks,
             "landmarks": options.landmarks,
             "generator": options.generator,
         }
-        settings = RegionMask.of({**MASK.defaults, "extent": "everywhere", **chosen})
+        settings = replace(RegionMask.of({**MASK.defaults, "extent": "everywhere", **chosen}), grey=True)
         objects = fit_regions(operators.viewed, inside, [], settings)
         share = few * CUT_HALF / (CUT_HALF + (strokes > 0).sum(2).squeeze(1))
         return Cut(objects, colours[:, :, ::2], valid[..., None, None], share.view(-1, 1, 1, 1) * strength)

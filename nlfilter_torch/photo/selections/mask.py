@@ -27,13 +27,13 @@ from nlfilter_torch.photo.declared.shared_parameters import VIEWING_SIZE
 from nlfilter_torch.photo.picture.boxes import boxes_of, check_scribbles_in, held, in_boxes, just_outside, scaled
 from nlfilter_torch.photo.picture.drawn import Drawn
 from nlfilter_torch.photo.picture.edit import PhotoEdit
-from nlfilter_torch.photo.picture.in_memory import edited, in_blocks
+from nlfilter_torch.photo.picture.in_memory import InMemory, edited, in_blocks
 from nlfilter_torch.photo.picture.measuring import shrunk
 from nlfilter_torch.photo.picture.pixels import Box, M, Pixels, corner
 from nlfilter_torch.photo.picture.regions import num_regions, read_regions
 from nlfilter_torch.photo.picture.resizing import enlarged
 from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles, parts_in_blocks
-from nlfilter_torch.photo.picture.source import Fitted, Reduced, Source, at, kept
+from nlfilter_torch.photo.picture.source import Fitted, Reduced, Source, at, kept, luminance
 from nlfilter_torch.photo.picture.viewing import viewed_size
 from nlfilter_torch.photo.selections.by_hand import ByHand, check_drawn
 from nlfilter_torch.photo.selections.connected import Extent, connected, without_haze
@@ -132,6 +132,7 @@ class RegionMask(PhotoEdit):
 
     Attributes:
         names: of the scribbles and of those on the background, in errors.
+        grey: whether only the luminance of the picture and of its pixels under scribbles counts.
     """
 
     declared: ClassVar[Edit] = MASK
@@ -141,6 +142,7 @@ class RegionMask(PhotoEdit):
     reach: float | Tensor
     extent: Extent = MASK.defaults["extent"]
     names: tuple[str, str] = ("scribbles", "background")
+    grey: bool = False
 
     def fit(self, source: Source[M], drawn: Drawn[M]) -> Fitted:
         """Fit the masks of scribbled regions."""
@@ -238,7 +240,8 @@ class Regions:
 
     def computed(self, pixels: Pixels) -> Tensor:
         """Masks (B, K, h, w) of the given pixels as they are computed, see :meth:`finished`."""
-        image, masks = pixels.image.clamp(0.0, 1.0) - 0.5, []
+        seen = luminance(pixels) if self.reduced.shape[1] == 1 else pixels.image
+        image, masks = seen.clamp(0.0, 1.0) - 0.5, []
         for functions, scribbles in zip(self.functions.unbind(1), self.scribbles, strict=True):
             mask = calibrated(linear_mask(image, self.rows(functions, pixels)))
             front, back = scribbles.planes(pixels).split(1, dim=1)
@@ -369,6 +372,8 @@ def _computed_regions(
     check_values(options.photometric_bandwidth, "photometric_bandwidth", "positive", source.batch)
     check_count(options.num_landmarks, "num_landmarks")
     small, steps = _reduced(source, FLOATS_PER_PIXEL + options.num_landmarks)
+    if settings.grey and small.channels > 1:
+        small = kept(small, "luminance", [], small.like, luminance(small), small.weights)
     everywhere = settings.extent == "everywhere"
     distance = math.inf if everywhere else options.spatial_bandwidth
     options = replace(
@@ -408,7 +413,7 @@ def _filled(scribbles: Scribbles, marked: Tensor) -> Scribbles:
     return scribbles.weighted(torch.where(marked.view(-1, 1, 1), scribbles.weights, everywhere))
 
 
-def _reduced(source: Source[M], floats: int) -> tuple[Reduced, tuple[float, float]]:
+def _reduced(source: Source[M], floats: int) -> tuple[InMemory, tuple[float, float]]:
     """The reduced picture that masks are computed in, and height and width of one of its pixels.
 
     It is reduced by way of the size of a preview, so that masks are the same in a preview and in the photograph.
