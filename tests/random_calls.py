@@ -242,18 +242,22 @@ def _refine_module(logits: Tensor, guide: Tensor, **options: Any) -> Tensor:
 def _restored(operator: nlf.NonlocalOperator, image: Tensor, strength: float) -> Tensor:
     """Restore an image of which every other column is known."""
 
+    width = operator.size[-1] if isinstance(operator, nlf.NonlocalOperator) else 0
+
     def known(x: Tensor) -> Tensor:
         return x[..., ::2]
 
     def put_back(y: Tensor) -> Tensor:
-        return torch.stack([y, torch.zeros_like(y)], dim=-1).flatten(-2)[..., : image.shape[-1]]
+        return y if y.ndim == 0 else torch.stack([y, torch.zeros_like(y)], dim=-1).flatten(-2)[..., :width]
 
+    dense = isinstance(image, Tensor) and image.ndim == 4 and image.layout == torch.strided
     prior = nlf.NonlocalPrior(operator)
-    return nlf.restore(known(image), known, put_back, prior, strength=strength, steps=5).image
+    return nlf.restore(known(image) if dense else image, known, put_back, prior, strength=strength, steps=5).image
 
 
 def _fitted_layer(image: Tensor, target: Tensor) -> float:
-    layer = nlf.NonlocalFilter((1.0, 1.0), num_landmarks=9, learn=("alpha", "photometric_bandwidth"))
+    learn = ("alpha", "photometric_bandwidth")
+    layer = nlf.NonlocalFilter((1.0, 1.0), num_landmarks=9, photometric_bandwidth=0.2, learn=learn)
     return nlf.fit_layer(layer, image, target, evaluations=60).error
 
 
@@ -578,7 +582,7 @@ def _wrong(rng: random.Random, name: str, value: Any) -> Any:
 
 
 def _with(tensor: Tensor, value: float) -> Tensor:
-    changed = tensor.clone()
+    changed = tensor.clone() if tensor.is_floating_point() else tensor.double()
     changed.view(-1)[-1] = value
     return changed
 
@@ -607,7 +611,7 @@ TENSORS: tuple[Callable[[Tensor], Any], ...] = (
     lambda t: t.to_sparse(),
     lambda t: t.numpy(),
     lambda t: t.tolist(),
-    lambda t: t.clone().requires_grad_(),
+    lambda t: t.clone().requires_grad_(t.is_floating_point()),
 )
 
 

@@ -47,10 +47,10 @@ def noise_map(noise: float | Tensor, image: Tensor, name: str = "noise") -> Tens
 
 
 def variance_of(noise: float | Tensor | NoiseModel, image: Tensor) -> Tensor:
-    """Variance (B, 1 or C, H, W) of the noise of an image, without a gradient."""
+    """Variance (B, 1 or C, H, W) of the noise of an image, without a gradient; of levels in float64."""
     if isinstance(noise, NoiseModel):
         return noise.variance(image.detach())
-    return noise_map(noise, image).detach().square()
+    return noise_map(noise, image).detach().double().square()
 
 
 def drawn(noise: float | Tensor | NoiseModel, image: Tensor, generator: torch.Generator) -> Tensor:

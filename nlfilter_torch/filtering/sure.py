@@ -103,6 +103,10 @@ def sure(
         order = sliders.shape[-1] - 1
         divergence = layer_divergences(function, y, noise, None, order, probes=probes, generator=generator)
         divergence = (sliders.to(divergence) * divergence).sum(1)
+    elif not callable(function):
+        raise TypeError(
+            f"function must be an operator or a function of an image, got {type(function).__name__}; pass one of these"
+        )
     elif alpha is not None:
         raise ValueError("alpha must be None unless function is an operator, got sliders; apply them in the function")
     elif step is None:
@@ -110,7 +114,8 @@ def sure(
     else:
         output, divergence = _by_differences(function, y, noise, step, probes, generator)
     error = (output - y).double().square().flatten(1).sum(1) - variance.double().flatten(1).sum(1) + 2 * divergence
-    return (error / values).to(image.dtype)
+    most = torch.finfo(image.dtype).max  # squares of large values have no number in float32
+    return (error / values).clamp(-most, most).to(image.dtype)
 
 
 def _generator(generator: torch.Generator | None) -> torch.Generator:
@@ -214,7 +219,9 @@ def _layer_traces(operator: NonlocalOperator, shares: Tensor, order: int) -> Ten
     exact = operator.communicator.pixels(matrix.factor.shape[2]) <= SUMMED_EXACTLY
     batch = max(len(matrix.factor), len(shares))
     factor, scaling, remainder = (part.expand(batch, *part.shape[1:]) for part in matrix.parts[:3])
-    shares = shares.expand(batch, -1)
+    # The traces are linear in shares, which may be too large for float32.
+    largest = operator.communicator.max(shares.amax(1, keepdim=True))
+    shares = (shares / torch.where(largest > 0, largest, 1.0)).expand(batch, -1)
     total = weighted(shares, operator.weights)
 
     def grams(weights: Tensor | None) -> Tensor:
@@ -231,4 +238,4 @@ def _layer_traces(operator: NonlocalOperator, shares: Tensor, order: int) -> Ten
         for m in range(power):
             inner = (small[m].mT * of_shares[:, power - 1 - m]).sum((1, 2))
             traces[power] = traces[power] + (power - m) * inner
-    return torch.stack([before - after for before, after in pairwise(traces)] + traces[-1:], dim=1)
+    return largest * torch.stack([before - after for before, after in pairwise(traces)] + traces[-1:], dim=1)

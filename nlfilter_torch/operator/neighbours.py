@@ -46,7 +46,7 @@ def neighbour_distances(points: Tensor, k: int = NEIGHBOURS) -> Tensor:
             squared[:, torch.arange(len(block)), block] = -torch.inf  # the point itself comes first
             parts.append(squared.topk(kept + 1, largest=False).indices[..., -1])
     nearest = torch.cat(parts, dim=1).unsqueeze(1).expand(-1, points.shape[1], -1)
-    squares = (values - values.gather(2, nearest)).square().sum(1)
+    squares = (values - values.gather(2, nearest)).double().square().sum(1)  # which would overflow in float32
     apart = squares > 0  # the root has no derivative at 0
     return torch.where(apart, torch.where(apart, squares, 1.0).sqrt(), 0.0).to(points.dtype)
 

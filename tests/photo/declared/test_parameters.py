@@ -65,7 +65,8 @@ def test_docstrings_describe_the_arguments_of_the_function_of_an_image() -> None
 def test_settings_of_an_edit_are_arguments_of_its_function(edit: type[PhotoEdit]) -> None:
     function = inspect.signature(getattr(photo, edit.declared.function or edit.declared.name)).parameters
     drawn = {"image", "grey", "strokes", *(scribble.argument for scribble in edit.declared.scribbles)}
-    settings = {field.name for field in fields(edit)} - {"options", "names", "working", "hot_pixels"}  # these: measured
+    measured = {"options", "names", "working", "hot_pixels"}
+    settings = {field.name for field in fields(edit)} - measured - {"grey"}  # which colorize sets for its own masks
     options = {field.name for field in fields(FilterOptions)} & set(function)
     assert settings | options == set(function) - drawn
     assert {parameter.keyword for parameter in edit.declared if parameter.is_option} <= settings | options
