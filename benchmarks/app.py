@@ -180,8 +180,7 @@ def in_the_browser(path: Path, repeats: int) -> None:
         with chromium() as browser:
             tab = Tab(browser.new_page(viewport={"width": 1400, "height": 1000}))
             tab.page.goto(editor.with_token())
-            tab.wait_for_picture()
-            tab.page.locator(".response circle").first.wait_for()
+            tab.open_details()
             slider = tab.slider("Texture")
             tab.drag(slider, 0.2, 0.25, release=False)
             tab.page.wait_for_timeout(3000)

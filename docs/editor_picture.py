@@ -53,7 +53,7 @@ class Screenshot:
             editor = Editor(Path(name), photograph.name)
             try:
                 tab = Tab.at(browser, editor.with_token(), *self.size, touch=self.touch)
-                tab.wait_until_ready()
+                tab.open_details()
                 self.work(tab)
                 tab.page.mouse.move(4, 70)  # away from what it explains
                 tab.page.wait_for_timeout(QUIET)

@@ -136,10 +136,16 @@ class Tab:
         )
 
     def wait_until_ready(self) -> None:
-        """Wait until a photograph and its sliders are shown and the page has its final layout."""
+        """Wait until a photograph is shown, the controls can be used, and the page has its final layout."""
         self.wait_for_picture()
-        expect(self.page.locator(".response circle")).not_to_have_count(0)
+        expect(self.page.locator(".panel[inert]")).to_have_count(0)
         self.place()
+
+    def open_details(self) -> None:
+        """Open the tab of details, whose brush draws on every photograph, once one is shown."""
+        self.wait_until_ready()
+        self.page.get_by_role("tab", name="Detail").click()
+        expect(self.page.locator(".response circle")).not_to_have_count(0)
 
     def place(self) -> FloatRect:
         """Position and size of the photograph on the page, once they are the same in several frames."""

@@ -9,7 +9,8 @@ from torch import Tensor
 from nlfilter_torch.photo.app import drawing
 from nlfilter_torch.photo.app.session import Session
 from nlfilter_torch.photo.app.tools import BRUSHES, Brush, CropTool
-from nlfilter_torch.photo.declared.parameters import DETAIL, EDITS
+from nlfilter_torch.photo.declared.development import DEVELOP
+from nlfilter_torch.photo.declared.parameters import EDITS
 from nlfilter_torch.photo.declared.strokes import Mark
 
 LEAST_SIDE = 3  # pixels of the preview, of a box; less is a click
@@ -43,7 +44,7 @@ class Canvas:
         self._frame = 0
         self._flashes = 0
         self._mask_shown: bytes | None = None  # the mask that was shown last
-        self._step = DETAIL.name  # the step whose strokes are shown
+        self._step = DEVELOP.name  # the tab that is open, whose strokes are shown
         self._line: list[tuple[float, float]] = []  # of the stroke that is being drawn
         with ui.element("div").classes("canvas") as self.place:
             self._build_welcome(choosing)
@@ -87,7 +88,7 @@ class Canvas:
             wipe.on("update:model-value", js_handler="(share) => closeup.wipe(share)")
             self._show_strokes = ui.checkbox("Strokes", value=True, on_change=self.draw_strokes).props("dense")
             self._show_mask = ui.checkbox("Mask", value=False, on_change=self._follow_view).props("dense")
-            self._show_mask.tooltip("Show what the strokes select")
+            self._show_mask.tooltip("Show what the strokes select").set_enabled(False)
             self._is_plain = ui.checkbox("B/W", value=False, on_change=self._follow_view).props("dense")
             self._is_plain.props('aria-label="B/W: black and white"').tooltip("Show the mask in black and white")
             self._is_plain.set_visibility(False)

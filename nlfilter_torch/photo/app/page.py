@@ -60,8 +60,8 @@ class Editor:
         self.is_cropping = False
         self.proportions = Proportions()
 
-    def build(self, image: Path | None, address: str = "") -> None:
-        """Lay the page out, and open the photograph of an address that the page had before, or an image."""
+    def build(self, image: Path | None, address: str = "", tab: str = "") -> None:
+        """Lay the page out, and open the photograph and the tab of an address that the page had before, or an image."""
         EDITORS[self._token] = self
         self._client = ui.context.client
         self._client.on_delete(self._leave)
@@ -76,7 +76,8 @@ class Editor:
             with ui.column().classes("panel") as self._side:
                 handle = ui.button(icon="drag_handle").props('flat dense aria-label="Show or hide the controls"')
                 handle.classes("handle").on("click", js_handler="() => page.fold()")
-                self._panel = Panel(self, self._switch)
+                self._panel = Panel(self, self._switch, tab)
+        self._canvas.switch(self._panel.tab)
         self._tasks.sign.move(self._canvas.place)
         if image is not None or address:
             self._wait("Opening\u2026")
@@ -473,6 +474,12 @@ class Editor:
             self._panel.follow()
         if tab == DETAIL.name and self.session is not None:
             self._tasks.start(self._respond())
+        self._remember()
+
+    def _remember(self) -> None:
+        """Let the address of the page be that of its photograph and tab, for a reload."""
+        if self.session is not None:
+            ui.navigate.history.replace(f"/?photo={quote(self.session.address)}&tab={self._panel.tab}")
 
     # Files
 
@@ -517,7 +524,7 @@ class Editor:
         self._wait("Opening\u2026" if session.recipe == Recipe() else "Applying the edit\u2026")
         self.follow()
         with self._client:
-            ui.navigate.history.replace(f"/?photo={quote(session.address)}")
+            self._remember()
             if session.pages > 1:
                 ui.notify(
                     f"{session.name} has several pages; the first is shown.", position="bottom-left", timeout=8000
@@ -594,9 +601,9 @@ class Pages:
     photographs: Library
     image: Path | None
 
-    def build(self, photo: str = "") -> None:
-        """Build a page, for the photograph of an address that a page had before, if there is one."""
-        Editor(self.photographs).build(self.image, photo)
+    def build(self, photo: str = "", tab: str = "") -> None:
+        """Build a page, for the photograph and tab of an address that a page had before, if there is one."""
+        Editor(self.photographs).build(self.image, photo, tab)
 
     def picture(self, token: str, kind: str, at: str = "") -> Response:
         """A picture of the page with a token, by its kind, of the original at a place; or status 404.

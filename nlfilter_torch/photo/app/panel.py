@@ -171,15 +171,16 @@ class StepList:
 class Panel:
     """Tabs of all edits, the list of steps and a histogram, built into the open element.
 
-    ``switch`` is called with the name of the edit whose tab was opened.
+    ``switch`` is called with the name of the edit whose tab was opened; ``opened`` is the one that is open at first, by
+    default that of the photograph.
     """
 
-    def __init__(self, page: EditedPage, switch: Callable[[str], None]) -> None:
+    def __init__(self, page: EditedPage, switch: Callable[[str], None], opened: str = "") -> None:
         self._recipe = page.recipe
         with ui.tabs(on_change=lambda event: switch(event.value)).classes("w-full") as bar:
             bar.props("dense no-caps align=justify")
             self._titles = {edit: ui.tab(edit, label=TITLES[edit]) for edit in TABS}
-        panels = ui.tab_panels(bar, value=DETAIL.name, animated=False, keep_alive=True)
+        panels = ui.tab_panels(bar, value=opened if opened in TABS else DEVELOP.name, animated=False, keep_alive=True)
         self._bar = bar
         self._tabs: dict[str, EditTab] = {}
         with panels.classes("w-full bg-transparent"):

@@ -33,7 +33,12 @@ COLLECTED = (700, 10, 10)
 
 
 def serve(
-    build: Callable[[str], None], picture: Callable[[str, str, str], Response], *, host: str, port: int, open_page: bool
+    build: Callable[[str, str], None],
+    picture: Callable[[str, str, str], Response],
+    *,
+    host: str,
+    port: int,
+    open_page: bool,
 ) -> None:
     """Run the editor until it is interrupted.
 

@@ -23,6 +23,7 @@ class Page:
         self.brush = Brush()
         self.strokes = 0
         self.canvas = Canvas(self.brush, "token", self.draw, self.lay, "() => 0")
+        self.canvas.switch("detail")
 
     def draw(self, step: str, add: Callable[[], None]) -> None:
         add()
@@ -42,8 +43,10 @@ class Page:
 
 
 @pytest.fixture
-def shown(client: Client) -> Page:
-    return Page()
+def shown(client: Client, scripts: list[str]) -> Page:
+    page = Page()
+    scripts.clear()
+    return page
 
 
 @pytest.fixture
@@ -80,7 +83,7 @@ def test_drawing_the_edit(opened: Page, session: Session) -> None:
 def test_nothing_is_drawn_before_a_photograph(shown: Page) -> None:
     shown.canvas.draw(None)
     shown.paint((10.0, 20.0), (30.0, 20.0))
-    assert shown.canvas.pictures == {}
+    assert not any(shown.canvas.pictures.values())
     assert shown.strokes == 0
 
 

@@ -257,6 +257,7 @@ def test_a_change_is_shown_while_the_pointer_moves_and_can_then_be_undone(opened
 
 def test_strokes_are_cleared(opened: Page) -> None:
     session = opened.session
+    opened.editor._switch("detail")
     for kind in ("pointerdown", "pointerup"):
         opened.editor._canvas._pointer(kind, 20, 20)
     opened.finish()

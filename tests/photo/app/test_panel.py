@@ -32,7 +32,7 @@ def test_every_edit_has_a_tab_with_its_sliders(shown: Controls, panel: Panel, op
     assert tabs[:2] == ["develop", "detail"]
     assert set(tabs[1:]) == set(EDITS)
     assert len(tabs) == len(EDITS) + 1
-    assert shown.of(ui.tabs)[0].value == "detail"
+    assert shown.of(ui.tabs)[0].value == "develop"
     labels = {p.slider.label for edit in EDITS.values() for p in edit if p.slider is not None and edit.name != "detail"}
     assert labels | {"Texture", "Shading"} <= shown.sliders().keys()
     assert len(shown.of(ui.toggle)) == len(BRUSHES)

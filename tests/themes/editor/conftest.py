@@ -54,5 +54,5 @@ def tab(browser: Browser, editor: Editor, folder: Path) -> Iterator[Tab]:
 def opened(tab: Tab, folder: Path) -> Tab:
     tab.open(folder / "cat.png")
     expect(tab.page.get_by_text("150×100 pixels")).to_be_visible()
-    tab.wait_until_ready()
+    tab.open_details()
     return tab

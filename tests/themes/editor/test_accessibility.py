@@ -41,12 +41,13 @@ def test_no_serious_defect(browser: Browser, editor: Editor, width: int, height:
     tab = Tab.at(browser, editor.with_token(), width, height, touch=width < 500)
     page = tab.page
     tab.wait_until_ready()
-    result = {"Detail": defects(page)}
-    page.get_by_role("tab", name="Photo").click()
+    result = {"Photo": defects(page)}
     page.get_by_role("button", name="Crop").click()
     tab.slider("Left edge").wait_for()
     result["crop"] = defects(page)
     page.keyboard.press("Escape")
+    tab.open_details()
+    result["Detail"] = defects(page)
     page.get_by_role("tab", name="Look").click()
     page.get_by_role("button", name="faded").click()
     expect(page.get_by_role("checkbox", name="Look: on")).to_be_attached()

@@ -25,7 +25,7 @@ def shots(tmp_path: Path) -> Path:
 def shown(tab: Tab) -> None:
     """Wait for the photograph."""
     expect(tab.page.get_by_text("150×100 pixels")).to_be_visible()
-    tab.wait_until_ready()
+    tab.open_details()
 
 
 def leaving_is_asked_for(page: Page) -> None:
@@ -41,7 +41,7 @@ def leaving_is_asked_for(page: Page) -> None:
     with page.expect_event("dialog"):
         page.evaluate("() => { location.href = 'about:blank'; }")
     assert dialogs == ["beforeunload"]
-    assert page.url.endswith("?photo=cat.png")
+    assert page.url.endswith("?photo=cat.png&tab=detail")
     page.remove_listener("dialog", stay)
 
 

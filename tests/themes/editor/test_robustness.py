@@ -80,7 +80,7 @@ def test_before_a_photograph_one_is_chosen_or_dropped(tab: Tab, folder: Path) ->
     assert not dropped(page, {"notes.txt": b"", "dropped.png": content, "b.png": b""})  # the page is not left for it
     expect(page.get_by_text("Only one file is opened at a time: dropped.png.")).to_be_visible()
     expect(page.locator(".title")).to_have_text("dropped.png")
-    tab.wait_until_ready()
+    tab.open_details()
     before = tab.source()
     assert not dropped(page, {"edit.json": Recipe((Step("detail", alpha=(3.0, 1.0, 1.0, 1.0)),)).to_json().encode()})
     tab.wait_for_picture(before)
@@ -94,6 +94,7 @@ def test_before_a_photograph_one_is_chosen_or_dropped(tab: Tab, folder: Path) ->
 
 
 def test_a_slider_before_a_photograph(tab: Tab, folder: Path) -> None:
+    tab.page.get_by_role("tab", name="Detail").click()
     tab.drag(tab.slider("Texture"), 0.2, 0.8)
     expect(tab.page.get_by_text("1.00 ×")).to_have_count(4)
     tab.open(folder / "cat.png")
@@ -154,6 +155,7 @@ def test_two_tabs_edit_two_photographs(opened: Tab, browser: Browser, editor: Ed
     other.wait_for_picture()
     before, others = opened.source(), other.source()
     opened.drag(opened.slider("Texture"), 0.2, 0.6, release=False)
+    other.open_details()
     other.drag(other.slider("Texture"), 0.2, 0.9)
     opened.page.mouse.up()
     opened.wait_for_picture(before)
@@ -274,7 +276,7 @@ def test_stopped_in_the_midst_of_saving(browser: Browser, tmp_path: Path) -> Non
     editor = Editor(tmp_path, "cat.png", before=stopping)
     try:
         tab = Tab.at(browser, editor.with_token())
-        tab.wait_until_ready()
+        tab.open_details()
         tab.paint((0.2, 0.9), (0.3, 0.9))
         expect(tab.page.get_by_text("In the region")).to_be_visible()
         tab.drag(tab.slider("Texture in the region"), 0.2, 0.8)

@@ -29,7 +29,7 @@ def test_layout_on_every_screen(
     tab = Tab.at(browser, editor.with_token(), width, height, touch=touch)
     page = tab.page
     tab.open(folder / "cat.png")
-    tab.wait_until_ready()
+    tab.open_details()
     assert page.evaluate("() => document.documentElement.scrollWidth") <= width
     photo, save = tab.place(), page.get_by_role("button", name="Save photo").bounding_box()
     panel = page.locator(".panel").bounding_box()
@@ -57,7 +57,7 @@ def test_an_edit_on_every_screen(
         button.tap() if touch else button.click()
 
     tab.open(folder / "cat.png")
-    tab.wait_until_ready()
+    tab.open_details()
     expect(page.get_by_role("button", name="Undo")).to_be_disabled()
     if touch:
         by_finger(tab, (0.2, 0.9), (0.25, 0.9), (0.3, 0.9))

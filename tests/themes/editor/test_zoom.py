@@ -94,7 +94,7 @@ class Zoomed(Tab):
 @pytest.mark.parametrize(("width", "height"), POINTED)
 def test_zoom_and_pan_by_mouse_keys_and_buttons(browser: Browser, editor: Editor, width: int, height: int) -> None:
     tab = Zoomed.at(browser, editor.with_token(), width, height)
-    tab.wait_until_ready()
+    tab.open_details()
     page, fit = tab.page, tab.scale()
     page.keyboard.press("1")
     expect(tab.level).to_have_text("100 %")
@@ -132,7 +132,7 @@ def test_zoom_and_pan_by_mouse_keys_and_buttons(browser: Browser, editor: Editor
 @pytest.mark.parametrize(("width", "height"), TOUCHED)
 def test_zoom_and_pan_by_fingers(browser: Browser, editor: Editor, width: int, height: int) -> None:
     tab = Zoomed.at(browser, editor.with_token(), width, height, touch=True)
-    tab.wait_until_ready()
+    tab.open_details()
     page, fit, fingers = tab.page, tab.scale(), Fingers(tab)
     x, y = tab.middle()
     under = tab.share(x, y)
@@ -172,7 +172,7 @@ def test_zoom_and_pan_by_fingers(browser: Browser, editor: Editor, width: int, h
 def test_scribbles_before_and_pieces_follow_the_zoom(browser: Browser, editor: Editor) -> None:
     """A scribble stays where it was drawn, its edit is shown as it is saved, and the wipe shows the original."""
     tab, folder = Zoomed.at(browser, editor.with_token(), 1280, 800), editor.log.parent
-    tab.wait_until_ready()
+    tab.open_details()
     page = tab.page
     tab.enlarge("400 %")
     x, y = tab.middle()
