@@ -31,8 +31,10 @@ from torch import Tensor
 
 from nlfilter_torch.core.blocks import stratified, weighted
 from nlfilter_torch.core.communicator import ALONE, Communicator
+from nlfilter_torch.core.kernels.clusters import MULTIPLIED
+from nlfilter_torch.core.kernels.library import by_rows, kernel, pointer, repeated, run_on_factor
 from nlfilter_torch.core.kernels.tall_skinny import moment, positive_root, spread, sum_grams, sweep, weigh
-from nlfilter_torch.core.torch_internals import is_hidden
+from nlfilter_torch.core.torch_internals import cached_constants, is_hidden, register
 from nlfilter_torch.core.warning import warn
 
 EXCESS = {torch.float32: 1e-5, torch.float64: 1e-10}  # amount by which d of a pixel may exceed 1 through rounding
@@ -276,19 +278,38 @@ def _draw(matrix: KernelMatrix, scaling: Tensor, count: int) -> tuple[KernelMatr
     return matrix.at(chosen, weight), chosen
 
 
+def _explored_count(landmarks: int, pixels: int) -> int:
+    """Number of points of the initial guess; 0 for all."""
+    count = min(max(pixels // SHARE, 16 * landmarks), EXPLORED)
+    return count if 2 * count < pixels else 0
+
+
+@cached_constants
+def _explored(pixels: int, count: int) -> Tensor:
+    """Numbers (n,) of the points of the initial guess, or, of weighted points, of the places in the sum of weights.
+
+    One random pixel from each interval: a fixed stride could coincide with the period of a texture.
+    """
+    return stratified(pixels, count, torch.Generator().manual_seed(0))
+
+
+def _sampled_count(landmarks: int, pixels: int, ranks: int = 1) -> int:
+    """Number of points on which Newton's method runs; all, if these are more than half of them."""
+    least, usual, most = (bound * landmarks // ranks for bound in SAMPLED_PER_LANDMARK)
+    return max(min(pixels // SHARE, max(most, pixels // LARGE)), min(usual, EXPLORED // ranks), least)
+
+
 def _guess(matrix: KernelMatrix) -> Tensor:
     """Initial guess of t (B, M, 1), from a few thousand pixels distributed evenly over the image."""
-    factor, sample, pixels = matrix.factor, matrix, matrix.factor.shape[2]
-    count = min(max(pixels // SHARE, 16 * factor.shape[1]), EXPLORED)
-    if 2 * count < pixels:
-        # One random pixel from each interval: a fixed stride could coincide with the period of a texture.
-        chosen = stratified(pixels, count, torch.Generator().manual_seed(0)).to(factor.device).expand(len(factor), -1)
-        counts = torch.ones_like(matrix.diagonal[:, :1]) * (pixels / count)
+    (batch, landmarks, pixels), sample = matrix.factor.shape, matrix
+    if count := _explored_count(landmarks, pixels):
+        chosen = _explored(pixels, count).to(matrix.factor.device).expand(batch, -1)
+        counts = torch.full_like(matrix.diagonal[:, :1], pixels / count)
         if matrix.weights is not None:  # in proportion to the weights, so that no point of weight 0 is drawn
             summed = matrix.weights.double().cumsum(1)
             ticks = (chosen.double() + 0.5) / pixels * summed[:, -1:]
             chosen = torch.searchsorted(summed, ticks.contiguous()).clamp_(max=pixels - 1)
-            counts = (summed[:, -1:] / count).to(factor)
+            counts = (summed[:, -1:] / count).to(matrix.factor)
         sample = matrix.at(chosen, counts.expand(-1, count))
     sums = sample.affinities(sample.moment(torch.ones_like(sample.diagonal))) + sample.diagonal
     total = sample.moment(sums.clamp_(min=1.0).rsqrt_())  # no row of K sums to less than its unit diagonal
@@ -303,12 +324,60 @@ def sampled_newton(matrix: KernelMatrix, tolerance: float) -> Balancing:
     Newton's method with the Jacobian of a sample, corrected by BFGS updates from the sweeps over all pixels. On an
     accelerator the number of sweeps is fixed, as reading a residual would stall its queue.
     """
-    if matrix.factor.dtype == torch.float64 and not is_hidden(matrix.factor):
+    hidden = is_hidden(matrix.factor)
+    if matrix.factor.dtype == torch.float64 and not hidden:
         return _refined(matrix, tolerance)
+    if matrix.communicator.size > 1:
+        return _by_sweeps(matrix, tolerance)
+    *found, sweeps = balance(matrix.factor, matrix.diagonal, matrix.weights, tolerance)
+    scaling, actual, residual, inverse = found
+    return Balancing(matrix, scaling, actual, residual, ACCELERATOR_SWEEPS if hidden else int(sweeps.max()), inverse)
+
+
+def _compiled_balance(
+    factor: Tensor, diagonal: Tensor, weights: Tensor | None, tolerance: float
+) -> tuple[Tensor, ...] | None:
+    batch, landmarks, pixels = factor.shape
+    if landmarks > MULTIPLIED:
+        return None
+    factor, found = by_rows(factor), _fake_balance(factor)
+    diagonal = repeated(diagonal, batch, pixels)
+    weights = None if weights is None else repeated(weights, batch, pixels)
+    count, sampled = _explored_count(landmarks, pixels), _sampled_count(landmarks, pixels)
+    explored = _explored(pixels, count) if count else None
+    arguments = diagonal.data_ptr(), pointer(weights), pointer(explored), count, sampled, tolerance
+    run_on_factor("balance", factor, *arguments, *(tensor.data_ptr() for tensor in found))
+    return found
+
+
+def _fake_balance(factor: Tensor, *others: object) -> tuple[Tensor, ...]:
+    batch, landmarks, _ = factor.shape
+    moment, inverse = (factor.new_empty(batch, landmarks, n, dtype=torch.float64) for n in (1, landmarks))
+    sweeps = factor.new_empty(batch, dtype=torch.long)
+    return factor.new_empty(batch, factor.shape[2]), moment, factor.new_empty(batch), inverse, sweeps
+
+
+@register(
+    "balance(Tensor factor, Tensor diagonal, Tensor? weights, float tolerance) "
+    "-> (Tensor, Tensor, Tensor, Tensor, Tensor)",
+    kernel(_compiled_balance),
+    _fake_balance,
+)
+def balance(factor: Tensor, diagonal: Tensor, weights: Tensor | None, tolerance: float) -> tuple[Tensor, ...]:
+    """Scaling (B, N), moment (B, M, 1), residual (B,), inverse (B, M, M) and number of sweeps (B,) of a balancing.
+
+    By :func:`sampled_newton`; images of a batch end together here, and by themselves in C.
+    """
+    found = _by_sweeps(KernelMatrix(factor, diagonal, weights), tolerance)
+    sweeps = torch.full_like(found.residual, found.steps, dtype=torch.long)
+    return found.scaling, found.moment, found.residual, found.inverse.contiguous(), sweeps
+
+
+def _by_sweeps(matrix: KernelMatrix, tolerance: float) -> Balancing:
+    """The definition of :func:`sampled_newton`, also over ranks."""
     watched, ranks = not is_hidden(matrix.factor), matrix.communicator.size
     landmarks, pixels = matrix.factor.shape[1:]
-    least, usual, most = (bound * landmarks // ranks for bound in SAMPLED_PER_LANDMARK)
-    count = max(min(pixels // SHARE, max(most, pixels // LARGE)), min(usual, EXPLORED // ranks), least)
+    count = _sampled_count(landmarks, pixels, ranks)
     total = _guess(matrix)
     scaling, actual = matrix.sweep(total)
     worst, slow, gain, inverse = 1.0, 0, 1.0, total.new_zeros(len(total), landmarks, landmarks)
@@ -443,25 +512,53 @@ def conjugate_gradients(matrix: KernelMatrix, weight: Tensor, right: Tensor, inv
     left, as it may be where balancing failed. On accelerators all steps are taken, since reading a residual would stall
     the queue.
     """
+    if matrix.communicator.size > 1:
+        solution, left = _by_directions(matrix, weight, right, inverse)
+    else:
+        solution, left = conjugate(matrix.factor, weight, right, inverse)
+    if not is_hidden(left) and not bool((left <= UNSOLVED**2).all()):
+        warn(
+            "balancing left a linear system unsolved, so that a gradient may be inexact; raise photometric_bandwidth "
+            "or num_landmarks"
+        )
+    return solution
+
+
+def _compiled_conjugate(factor: Tensor, weight: Tensor, right: Tensor, inverse: Tensor) -> tuple[Tensor, Tensor]:
+    factor, (batch, landmarks, pixels) = by_rows(factor), factor.shape
+    solution, left = right.new_empty(batch, landmarks, 1), right.new_empty(batch)
+    vectors = repeated(weight, batch, pixels), right.contiguous(), inverse.contiguous()
+    bounds = GRADIENT_STEPS[factor.dtype], SOLVED[factor.dtype]
+    pointers = [tensor.data_ptr() for tensor in (*vectors, solution, left)]
+    run_on_factor("conjugate", factor, *pointers[:3], *bounds, *pointers[3:])
+    return solution, left
+
+
+@register(
+    "conjugate(Tensor factor, Tensor weight, Tensor right, Tensor inverse) -> (Tensor, Tensor)",
+    kernel(_compiled_conjugate, sums=2),
+    lambda factor, weight, right, inverse: (torch.empty_like(right), right.new_empty(right.shape[0])),
+)
+def conjugate(factor: Tensor, weight: Tensor, right: Tensor, inverse: Tensor) -> tuple[Tensor, Tensor]:
+    """The solution of :func:`conjugate_gradients`, and what is left (B,) of the squared residual, relative."""
+    return _by_directions(KernelMatrix(factor, weight), weight, right, inverse)
+
+
+def _by_directions(matrix: KernelMatrix, weight: Tensor, right: Tensor, inverse: Tensor) -> tuple[Tensor, Tensor]:
+    """The definition of :func:`conjugate`, also over ranks."""
     factor, communicator = matrix.factor, matrix.communicator
     tiny = torch.finfo(torch.float64).tiny  # avoids 0 / 0: if the right side is zero, so is the solution
     solution, residual = torch.zeros_like(right), right
     preconditioned = inverse @ residual
     direction, size = preconditioned, (residual * preconditioned).sum(1, keepdim=True)
-    goal = SOLVED[factor.dtype] ** 2 * size
+    first = size
     for _ in range(GRADIENT_STEPS[factor.dtype]):
         image = direction + communicator.sum(weigh(factor, weight, direction.to(factor).squeeze(2)).unsqueeze(2))
         step = size / (direction * image).sum(1, keepdim=True).clamp(min=tiny)
         solution, residual = solution + step * direction, residual - step * image
         preconditioned = inverse @ residual
         before, size = size, (residual * preconditioned).sum(1, keepdim=True)
-        if not is_hidden(factor) and bool((size <= goal).all()):
+        if not is_hidden(factor) and bool((size <= SOLVED[factor.dtype] ** 2 * first).all()):
             break
         direction = preconditioned + size / before.clamp(min=tiny) * direction
-    else:
-        if not is_hidden(size) and not bool((size <= goal * (UNSOLVED / SOLVED[factor.dtype]) ** 2).all()):
-            warn(
-                "balancing left a linear system unsolved, so that a gradient may be inexact; raise "
-                "photometric_bandwidth or num_landmarks"
-            )
-    return solution
+    return solution, (size / first.clamp(min=tiny)).flatten()

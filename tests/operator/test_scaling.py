@@ -7,16 +7,21 @@ import pytest
 import torch
 from torch import Tensor
 
+from nlfilter_torch.operator.nystrom import inverse_cholesky, nystrom_factor
 from nlfilter_torch.operator.scaling import (
     LARGEST_ROOT,
     Balancing,
     KernelMatrix,
+    balance,
+    conjugate,
     conjugate_gradients,
     damped,
     newton,
     scaling_from_moment,
 )
 from nlfilter_torch.operator.sinkhorn import solve
+from tests.native import LEVELS, by_torch
+from tests.pairwise import pairwise
 from tests.problems import noise
 
 
@@ -115,3 +120,65 @@ def test_blocks_are_balanced_like_the_whole() -> None:
     bias = matrix.sweep(expected)[1] - sampled.sweep(expected)[1]
     total, _, _ = newton(sampled.whole, 2 * expected, steps=20, bias=bias)
     torch.testing.assert_close(total, expected)
+
+
+def kernels(pixels: int, marks: int, batch: int = 1) -> tuple[Tensor, Tensor]:
+    """Factors and diagonals of points in a plane, in float32."""
+    points = 6 * noise(batch, 2, pixels, seed=1).float()
+    landmarks = points[:, :, :: max(1, pixels // marks)][:, :, :marks]
+    return nystrom_factor(points, landmarks, inverse_cholesky(landmarks), "diagonal")
+
+
+@pytest.mark.parametrize(
+    ("level", "pixels", "marks", "weighted"),
+    pairwise(LEVELS, [1, 60, 900, 20_000], [1, 7, 40], [False, True], possible=lambda _, n, m, __: m <= n),
+    indirect=["level"],
+)
+def test_kernels_in_c_balance_like_the_definition(level: int, pixels: int, marks: int, weighted: bool) -> None:
+    factor, diagonal = kernels(pixels, marks, batch=2)
+    weights = 3 * noise(2, pixels, seed=4).float() * (torch.arange(pixels) % 5 != 1) if weighted else None
+    found, expected = balance(factor, diagonal, weights, 1e-6), by_torch(balance, factor, diagonal, weights, 1e-6)
+    for own, other in zip(found[:2], expected[:2], strict=True):
+        torch.testing.assert_close(own, other, rtol=1e-5, atol=1e-6)
+    scaling, moment, residual, inverse, sweeps = found
+    masses = scaling if weights is None else scaling * weights
+    torch.testing.assert_close(moment, factor.double() @ masses.double().unsqueeze(2), rtol=1e-5, atol=1e-5)
+    sums = scaling * ((factor.mT @ moment.float()).squeeze(2) + diagonal * scaling)
+    assert (sums - 1).abs().max() < 1e-5
+    assert residual.max() < 1e-5
+    assert sweeps.max() <= expected[4].max()
+    solution = inverse @ moment  # the inverse is that of a sample
+    share = masses * scaling / (1 + scaling.square() * diagonal)
+    exact = torch.linalg.solve(
+        torch.eye(factor.shape[1]).double() + (factor * share.unsqueeze(1)).double() @ factor.double().mT, moment
+    )
+    assert (solution - exact).norm() <= (1e-4 if pixels < 900 else 0.3) * exact.norm()
+
+
+@pytest.mark.parametrize(
+    ("level", "pixels", "marks", "count"), pairwise(LEVELS, [1, 60, 20_000], [1, 7, 40], [1, 2]), indirect=["level"]
+)
+def test_kernels_in_c_solve_like_the_definition(
+    level: int, pixels: int, marks: int, count: int, threads: Callable[[int], None]
+) -> None:
+    threads(count)
+    factor, _ = kernels(max(pixels, marks), marks, batch=2)
+    weight, right = noise(2, factor.shape[2], seed=4).float() / 20, noise(2, marks, 1, seed=5) - 0.5
+    inverse = torch.eye(marks).double().expand(2, -1, -1)
+    for own, other in zip(
+        conjugate(factor, weight, right, inverse), by_torch(conjugate, factor, weight, right, inverse), strict=True
+    ):
+        torch.testing.assert_close(own, other, rtol=1e-5, atol=1e-6)
+    zero, left = conjugate(factor, weight, torch.zeros_like(right), inverse)
+    assert not zero.any()
+    assert not left.any()
+
+
+def test_images_are_balanced_in_a_batch_as_alone(threads: Callable[[int], None]) -> None:
+    """Also on two threads, where each has an image."""
+    factor, diagonal = kernels(3000, 20, batch=3)
+    expected = [balance(*parts, None, 1e-6) for parts in zip(factor.split(1), diagonal.split(1), strict=True)]
+    for count in (1, 2):
+        threads(count)
+        for whole, parts in zip(balance(factor, diagonal, None, 1e-6), zip(*expected, strict=True), strict=True):
+            torch.testing.assert_close(whole, torch.cat(parts), rtol=1e-6, atol=1e-6)

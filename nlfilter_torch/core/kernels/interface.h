@@ -16,6 +16,14 @@
 #define DISTINCT 1e-6f    /* added to squared distances, so that there are probabilities where all points are equal */
 #define NEARLY 1e-5       /* proposals that cover more by less than this share of the points are equally good */
 
+/* Of balancing; as in operator/scaling.py. */
+#define LARGEST_ROOT 2.0f /* bound of d while t is approximate */
+#define GUESSES 3         /* fixed-point steps of the initial guess */
+#define SAMPLE_STEPS 3    /* Newton steps on a sample */
+#define UNIFORM 0.05      /* fraction of the sample drawn uniformly */
+#define MAX_SWEEPS 12
+#define RESAMPLED 0.2f    /* a new sample is drawn after a sweep that reduces the error by less */
+
 /* The best instruction set that this processor supports, as an index of SETS; 0 for none. */
 int nlfilter_level(void);
 
@@ -48,15 +56,31 @@ int nlfilter_gather(int level, int threads, long pixels, long images, long num_l
                     long planes_stride, double *out);
 
 /* A vector over all pixels and its moment: with `diagonal` the scaling that belongs to `row`, half an estimate of the
- * moment; with `scaling` its product with the row times the factor. */
+ * moment; with `scaling` its product with the row times the factor. The moment is that of the vector times the
+ * `weights` (B, N), unless these are NULL. */
 int nlfilter_sweep(int level, int threads, long pixels, long images, long num_landmarks, const float *factor,
                    long factor_step, long factor_stride, const float *row, const float *scaling, const float *diagonal,
-                   float most, float *out, double *moment);
+                   const float *weights, float most, float *out, double *moment);
 
 /* Gram matrices (B, R, M, M) of the scaled factor, weighted by powers of the remainder. */
 int nlfilter_grams(int level, int threads, long pixels, long images, long num_landmarks, const float *factor,
                    long factor_step, long factor_stride, long count, const float *scaling, const float *remainder,
                    double *out);
+
+/* The scaling (B, N) that balances kernels with a unit diagonal, its moment (B, M), the largest deviation of a row sum
+ * (B), an approximate inverse of the Jacobian (B, M, M), and the number of sweeps (B). The first guess is that of the
+ * points with the numbers `explored`, or of all if it is NULL; Newton's method runs on `sampled_count` points, or on all
+ * if these are more than half of them. */
+int nlfilter_balance(int level, int threads, long pixels, long images, long num_landmarks, const float *factor,
+                     long factor_step, long factor_stride, const float *diagonal, const float *weights,
+                     const long *explored, long explored_count, long sampled_count, float tolerance, float *scaling,
+                     double *moment, float *residual, double *inverse, long *steps);
+
+/* Solutions (B, M) of (I + U diag(weight) U^T) s = right for the factor U, preconditioned by `inverse`, and what is
+ * `left` (B) of the squared residual, relative. */
+int nlfilter_conjugate(int level, int threads, long pixels, long images, long num_landmarks, const float *factor,
+                       long factor_step, long factor_stride, const float *weight, const double *right,
+                       const double *inverse, long most_steps, double solved, double *solution, double *left);
 
 /* Lloyd's iteration of k-means: the nearest centre (B, S) of each point. */
 int nlfilter_lloyd(int level, int threads, long images, long size, long count, long num_landmarks, long iterations,

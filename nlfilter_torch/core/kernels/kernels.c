@@ -43,9 +43,9 @@
 
 const struct set SETS[] = {
     {0},
-    {3, columns_avx2, backward_avx2, spread_avx2, gather_avx2, sweep_avx2, grams_avx2, assign_avx2, pivots_avx2,
+    {3, columns_avx2, backward_avx2, spread_avx2, gather_avx2, sweep_avx2, grams_avx2, positive_avx2, assign_avx2, pivots_avx2,
      convolution_avx2, lattice_avx2, eliminate_avx2, substitute_avx2},
-    {6, columns_avx512, backward_avx512, spread_avx512, gather_avx512, sweep_avx512, grams_avx512, assign_avx512,
+    {6, columns_avx512, backward_avx512, spread_avx512, gather_avx512, sweep_avx512, grams_avx512, positive_avx512, assign_avx512,
      pivots_avx512, convolution_avx512, lattice_avx512, eliminate_avx512, substitute_avx512},
 };
 
@@ -69,7 +69,7 @@ int nlfilter_level(void)
 
 const struct set SETS[] = {
     {0},
-    {6, columns_neon, backward_neon, spread_neon, gather_neon, sweep_neon, grams_neon, assign_neon, pivots_neon,
+    {6, columns_neon, backward_neon, spread_neon, gather_neon, sweep_neon, grams_neon, positive_neon, assign_neon, pivots_neon,
      convolution_neon, lattice_neon, eliminate_neon, substitute_neon},
 };
 

@@ -135,6 +135,7 @@ INLINE const float *NAME(fetch)(const float *source, long width, float fill, flo
 
 #include "columns.h"
 #include "backward.h"
+#include "balancing.h"
 #include "convolution.h"
 #include "grams.h"
 #include "landmarks.h"

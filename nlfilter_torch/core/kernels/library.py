@@ -19,7 +19,8 @@ from torch import Tensor
 ONE_THREAD = 1 << 15  # elements of a factor below which starting a second thread takes longer than it saves
 Result = TypeVar("Result")
 
-_POINTER, _LONG, _INT, _FLOAT = ctypes.c_void_p, ctypes.c_long, ctypes.c_int, ctypes.c_float
+_POINTER, _LONG, _INT = ctypes.c_void_p, ctypes.c_long, ctypes.c_int
+_FLOAT, _DOUBLE = ctypes.c_float, ctypes.c_double
 _library: ctypes.CDLL | None = None
 level = 0  # index of instruction_sets.NAMES, set once: 0 without a library
 
@@ -54,10 +55,22 @@ _definitions = _Definitions()
 def use(library: ctypes.CDLL, best: int) -> None:
     """Run the kernels of a compiled library, with instruction sets up to ``best``.
 
-    ``interface.h`` declares the types of the arguments; a test compares them with these.
+    Raises:
+        ImportError: if it was compiled from an earlier version of the kernels.
     """
     global _library, level
+    try:
+        _declare(library)
+    except AttributeError as error:
+        raise ImportError(
+            f"kernels.so must be compiled from this version of nlfilter_torch, got one without {error.name}; install "
+            "the package again, which compiles it"
+        ) from error
     _library, level = library, best
+
+
+def _declare(library: ctypes.CDLL) -> None:
+    """Declare the types of the arguments of a library, which ``interface.h`` declares too; a test compares them."""
     shared: list[Any] = [_INT, _INT, _LONG]  # instruction set, threads, pixels
     share_threads(library, _openmp())
     planes: list[Any] = [_POINTER, _LONG, _LONG]  # (B, R, N) and their strides
@@ -67,7 +80,9 @@ def use(library: ctypes.CDLL, best: int) -> None:
     factor: list[Any] = [_LONG, _LONG, *planes]  # images, landmarks, (B, M, N)
     library.nlfilter_spread.argtypes = [*shared, *factor, _LONG, *[_POINTER] * 3]
     library.nlfilter_gather.argtypes = [*shared, *factor, _LONG, *planes, _POINTER]
-    library.nlfilter_sweep.argtypes = [*shared, *factor, *[_POINTER] * 3, _FLOAT, _POINTER, _POINTER]
+    library.nlfilter_sweep.argtypes = [*shared, *factor, *[_POINTER] * 4, _FLOAT, _POINTER, _POINTER]
+    library.nlfilter_balance.argtypes = [*shared, *factor, *[_POINTER] * 3, _LONG, _LONG, _FLOAT, *[_POINTER] * 5]
+    library.nlfilter_conjugate.argtypes = [*shared, *factor, *[_POINTER] * 3, _LONG, _DOUBLE, _POINTER, _POINTER]
     library.nlfilter_lloyd.argtypes = [*shared, *[_LONG] * 4, _FLOAT, *[_POINTER] * 3]
     library.nlfilter_pivots.argtypes = [*shared, *[_LONG] * 3, _FLOAT, *[_POINTER] * 3]
     library.nlfilter_grams.argtypes = [*shared, *factor, _LONG, *[_POINTER] * 3]
@@ -96,17 +111,22 @@ def definitions_only() -> AbstractContextManager[None]:
     return _definitions
 
 
-def kernel(compiled: Callable[..., Result], dtype: torch.dtype = torch.float32) -> Callable[..., Result | None]:
+def kernel(
+    compiled: Callable[..., Result], dtype: torch.dtype = torch.float32, sums: int = 0
+) -> Callable[..., Result | None]:
     """Let a kernel in C return None where there is none or it is not to be used; see :func:`definitions_only`.
 
     Args:
         compiled: calls the kernel, for non-empty tensors on CPUs.
-        dtype: of all tensors that the kernel takes.
+        dtype: of the tensors that the kernel takes.
+        sums: number of its last arguments that are sums over pixels, in float64.
     """
 
     @wraps(compiled)
     def wrapper(*arguments: Any) -> Result | None:
-        return compiled(*arguments) if level and not _definitions.used and _suit(arguments, dtype) else None
+        planes = len(arguments) - sums
+        suited = _suit(arguments[:planes], dtype) and _suit(arguments[planes:], torch.float64)
+        return compiled(*arguments) if level and not _definitions.used and suited else None
 
     return wrapper
 

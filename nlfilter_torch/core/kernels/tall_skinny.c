@@ -12,6 +12,7 @@ static struct tall_skinny part(const struct work *work, long image)
     task.out = task.out ? task.out + image * task.count * task.pixels : NULL;
     task.scaling = task.scaling ? task.scaling + image * task.pixels : NULL;
     task.diagonal = task.diagonal ? task.diagonal + image * task.pixels : NULL;
+    task.weights = task.weights ? task.weights + image * task.pixels : NULL;
     return task;
 }
 
@@ -55,20 +56,21 @@ int nlfilter_gather(int level, int threads, long pixels, long images, long num_l
 static void run_sweep(struct work *work, long image, long piece, long first, long last, float *scratch)
 {
     const struct tall_skinny task = part(work, image);
-    (void)scratch;
-    SETS[work->level].sweep(&task, first, last, work->totals + piece * task.num_landmarks);
+    SETS[work->level].sweep(&task, first, last, scratch, work->totals + piece * task.num_landmarks);
 }
 
 /* With `diagonal`: out = the scaling d and moment = factor d, where row is half of the estimated moment.
  * Without: moment = factor diag(scaling) factor^T row, with out as working memory. */
 int nlfilter_sweep(int level, int threads, long pixels, long images, long num_landmarks,
                    const float *factor, long factor_step, long factor_stride, const float *row,
-                   const float *scaling, const float *diagonal, float most, float *out, double *moment)
+                   const float *scaling, const float *diagonal, const float *weights, float most, float *out,
+                   double *moment)
 {
     struct tall_skinny task = {
         .factor = factor, .factor_stride = factor_stride, .factor_step = factor_step, .num_landmarks = num_landmarks,
-        .count = 1, .rows = row, .scaling = scaling, .diagonal = diagonal, .most = most, .images = out,
-        .images_step = pixels, .out = out, .pixels = pixels};
-    struct work work = {.run = run_sweep, .task = &task, .level = level, .images = images, .pixels = pixels};
+        .count = 1, .rows = row, .scaling = scaling, .diagonal = diagonal, .weights = weights, .most = most,
+        .images = out, .images_step = pixels, .out = out, .pixels = pixels};
+    struct work work = {.run = run_sweep, .task = &task, .level = level, .images = images, .pixels = pixels,
+                        .floats = weights ? sweep_step(num_landmarks) : 0};
     return add_up(&work, threads, num_landmarks, moment);
 }

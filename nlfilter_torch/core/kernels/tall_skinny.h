@@ -77,10 +77,11 @@ static TARGET void NAME(gather)(const struct tall_skinny *task, long first, long
 }
 
 /* For pixels first to last: out = the root d of d (u . 2 rows + c d) = 1, or without c the product of `spread`;
- * totals += factor out. Processes few pixels at a time, so that their columns stay cached for the second product. */
-static TARGET void NAME(sweep)(const struct tall_skinny *task, long first, long last, double *totals)
+ * totals += factor diag(weights) out. Processes few pixels at a time, so that their columns stay cached for the second
+ * product. */
+static TARGET void NAME(sweep)(const struct tall_skinny *task, long first, long last, float *weighted, double *totals)
 {
-    const long most = NEAR / task->num_landmarks / 64 * 64, step = most < 256 ? 256 : most;
+    const long step = sweep_step(task->num_landmarks);
     for (long start = first; start < last; start += step) {
         const long end = last - start < step ? last : start + step;
         NAME(spread)(task, start, end);
@@ -91,6 +92,11 @@ static TARGET void NAME(sweep)(const struct tall_skinny *task, long first, long 
             const float d = over / (under < LEAST ? LEAST : under);
             task->out[i] = d > task->most ? task->most : d;
         }
-        NAME(gather)(task, start, end, totals);
+        struct tall_skinny second = *task;
+        for (long i = start; task->weights && i < end; i++)
+            weighted[i - start] = task->out[i] * task->weights[i];
+        if (task->weights)
+            second.images = weighted - start;
+        NAME(gather)(&second, start, end, totals);
     }
 }

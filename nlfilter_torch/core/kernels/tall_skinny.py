@@ -135,24 +135,27 @@ def _empty(factor: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _run(
-    factor: Tensor, row: Tensor, scaling: Tensor | None, diagonal: Tensor | None, most: float
+    factor: Tensor,
+    row: Tensor,
+    scaling: Tensor | None,
+    diagonal: Tensor | None,
+    most: float,
+    weights: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     out, total = _empty(factor)
     factor = by_rows(factor)
     batch, landmarks, pixels = factor.shape
     row = repeated(row, batch, landmarks)
-    scaling, diagonal = (t if t is None else repeated(t, batch, pixels) for t in (scaling, diagonal))
-    run_on_factor(
-        "sweep", factor, row.data_ptr(), pointer(scaling), pointer(diagonal), most, out.data_ptr(), total.data_ptr()
-    )
+    vectors = [t if t is None else repeated(t, batch, pixels) for t in (scaling, diagonal, weights)]
+    pointers = map(pointer, vectors)
+    run_on_factor("sweep", factor, row.data_ptr(), *pointers, most, out.data_ptr(), total.data_ptr())
     return out, total
 
 
 def _compiled_sweep(
     factor: Tensor, diagonal: Tensor, half: Tensor, most: float, weights: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
-    scaling, total = _run(factor, half, None, diagonal, most)
-    return scaling, total if weights is None else moment(factor, (weights * scaling).unsqueeze(1)).squeeze(2)
+    return _run(factor, half, None, diagonal, most, weights)
 
 
 @register(

@@ -58,10 +58,18 @@ struct tall_skinny {
     long images_stride;
     const float *scaling;  /* d, (N), or NULL */
     const float *diagonal; /* c, (N), or NULL */
+    const float *weights;  /* (N), or NULL */
     float most;            /* upper limit of d */
     long factor_step, images_step; /* from one image of a batch to the next; other arrays are contiguous */
     long pixels;                   /* N */
 };
+
+/* Pixels of a sweep whose columns stay cached for the second product. */
+static inline long sweep_step(long num_landmarks)
+{
+    const long most = NEAR / num_landmarks / 64 * 64;
+    return most < 256 ? 256 : most;
+}
 
 struct grams {
     const float *factor, *scaling, *remainder; /* (M, N), (N), (N) */
@@ -127,8 +135,9 @@ struct set {
     void (*backward)(const struct backward *, long first, long last, float *scratch, double *totals);
     void (*spread)(const struct tall_skinny *, long first, long last);
     void (*gather)(const struct tall_skinny *, long first, long last, double *totals);
-    void (*sweep)(const struct tall_skinny *, long first, long last, double *totals);
+    void (*sweep)(const struct tall_skinny *, long first, long last, float *scratch, double *totals);
     void (*grams)(const struct grams *, long first, long last, float *scratch, double *totals);
+    void (*positive)(double *matrix, long count, double *right, double *inverse);
     void (*assign)(const struct lloyd *, const float *points, const float *centres, float *tile, int *nearest,
                    float *sums);
     void (*pivots)(const struct pivots *, const float *points, long *pivots, float *scratch);

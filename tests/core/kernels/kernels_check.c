@@ -144,7 +144,7 @@ static void check_products(int level, int threads)
     judge("gather", status, 2e-6);
     for (int balanced = 0; balanced < 2; balanced++) {
         status = nlfilter_sweep(level, threads, N, B, M, factor[0][0], M * N, N, row[0], balanced ? NULL : scaling[0],
-                                balanced ? diagonal[0] : NULL, 3.0f, out[0], totals[0]);
+                                balanced ? diagonal[0] : NULL, NULL, 3.0f, out[0], totals[0]);
         for (int b = 0; b < B; b++) {
             double moment[M] = {0};
             for (int i = 0; i < N; i++) {
@@ -171,6 +171,60 @@ static void check_products(int level, int threads)
             compare(sums[b][k], sum);
         }
     judge("grams", status, 2e-6);
+}
+
+/* A scaling balances the kernel whose unit diagonal is completed; the solution of a system meets its equations. */
+static void check_balancing(int level, int threads, int counts)
+{
+    static float kernel[B][M][N], rest[B][N], weights[B][N], residual[B];
+    static double moment[B][M], inverse_[B][M][M], left_over[B];
+    static long explored[N / 4], steps[B];
+    fill(weights[0], sizeof weights, 0, 2);
+    for (int i = 0; i < N / 4; i++)
+        explored[i] = 4 * i;
+    for (int b = 0; b < B; b++)
+        for (int i = 0; i < N; i++) {
+            double length = 0;
+            for (int m = 0; m < M; m++)
+                length += pow(factor[b][m][i], 2);
+            for (int m = 0; m < M; m++)
+                kernel[b][m][i] = fabs(factor[b][m][i]) / sqrt(length + 1);
+            rest[b][i] = 1 / (length + 1);
+        }
+    int status = nlfilter_balance(level, threads, N, B, M, kernel[0][0], M * N, N, rest[0], counts ? weights[0] : NULL,
+                                  counts ? explored : NULL, counts ? N / 4 : 0, counts ? N / 3 : N, 1e-6f, out[0],
+                                  moment[0], residual, inverse_[0][0], steps);
+    for (int b = 0; b < B; b++) {
+        double sums_[M] = {0};
+        for (int i = 0; i < N; i++)
+            for (int m = 0; m < M; m++)
+                sums_[m] += kernel[b][m][i] * out[b][i] * (counts ? weights[b][i] : 1);
+        for (int i = 0; i < N; i++) {
+            double sum = rest[b][i] * out[b][i];
+            for (int m = 0; m < M; m++)
+                sum += kernel[b][m][i] * sums_[m];
+            compare(sum * out[b][i], 1);
+        }
+        for (int m = 0; m < M; m++)
+            compare(moment[b][m] / sums_[m], 1);
+    }
+    judge("balance", status, 1e-5);
+    status = nlfilter_conjugate(level, threads, N, B, M, kernel[0][0], M * N, N, rest[0], moment[0], inverse_[0][0], 50,
+                                1e-7, totals[0], left_over);
+    for (int b = 0; b < B; b++) {
+        const double *solution = (double *)totals + b * M;
+        double sums_[M] = {0};
+        for (int i = 0; i < N; i++) {
+            double product = 0;
+            for (int m = 0; m < M; m++)
+                product += kernel[b][m][i] * solution[m];
+            for (int m = 0; m < M; m++)
+                sums_[m] += kernel[b][m][i] * product * rest[b][i];
+        }
+        for (int m = 0; m < M; m++)
+            compare(solution[m] + sums_[m], moment[b][m]);
+    }
+    judge("conjugate", status, 1e-5);
 }
 
 static void check_landmarks(int level, int threads)
@@ -388,7 +442,9 @@ int main(void)
                 check_backward(level, threads, limited, R);
             }
             check_products(level, threads);
-            check_landmarks(level, threads);
+            check_balancing(level, threads, 0);
+        check_balancing(level, threads, 1);
+        check_landmarks(level, threads);
             for (int apart = 1; apart <= 5; apart++)
                 check_convolution(level, threads, apart, apart % 2);
             check_lattice(level, threads);

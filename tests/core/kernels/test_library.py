@@ -5,17 +5,18 @@ import re
 from contextlib import nullcontext
 from pathlib import Path
 from threading import Event, Thread
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 import torch
 from torch import Tensor
 
 from nlfilter_torch import nonlocal_operator
-from nlfilter_torch.core.kernels import columns, convolution, definitions_only, lattice, library, stencil  # noqa: F401, register
+from nlfilter_torch.core.kernels import clusters, columns, convolution, definitions_only, lattice, library, stencil  # noqa: F401, register
 from nlfilter_torch.core.kernels.clusters import TRIALS, lloyd, pivots  # noqa: F401, registers both
 from nlfilter_torch.core.kernels.tall_skinny import moment, spread, sum_grams
-from nlfilter_torch.operator import build  # noqa: F401, registers two
+from nlfilter_torch.operator import build, scaling  # noqa: F401, registers two
 from nlfilter_torch.operator.nystrom import inverse_cholesky, nystrom_factor
 from nlfilter_torch.operator.scaling import KernelMatrix
 from tests import reference
@@ -44,6 +45,13 @@ def arguments(dtype: torch.dtype) -> dict[str, tuple[Any, ...]]:
         "moment": (factor, images),
         "sweep": (factor, weights, vector, 2.0, weights),
         "weigh": (factor, weights, vector),
+        "balance": (factor, (1 - norms).clamp(min=0.0), weights, 1e-5),
+        "conjugate": (
+            factor,
+            weights,
+            vector.double().unsqueeze(2),
+            inverse_cholesky(landmarks).double() @ inverse_cholesky(landmarks).double().mT,
+        ),
         "grams": (factor, weights, weights, 2),
         "pivots": (features, torch.linspace(0.1, 0.9, TRIALS * LANDMARKS, dtype=dtype).view(-1, TRIALS), 1e-4),
         "lloyd": (features, landmarks, 3, 1e-6),
@@ -211,7 +219,7 @@ def test_negated_views_are_resolved() -> None:
 
 def parameters_of(prototype: str) -> list[object]:
     """Types of ctypes for the parameters in a prototype of C."""
-    types = {"int": ctypes.c_int, "long": ctypes.c_long, "float": ctypes.c_float}
+    types = {"int": ctypes.c_int, "long": ctypes.c_long, "float": ctypes.c_float, "double": ctypes.c_double}
     parts = [part.strip().removeprefix("const ") for part in prototype.split(",")]
     return [ctypes.c_void_p if "*" in part else types[part.split()[0]] for part in parts]
 
@@ -221,10 +229,26 @@ def test_ctypes_converts_to_the_types_that_the_header_declares() -> None:
     header = Path(library.__file__).with_name("interface.h").read_text(encoding="utf-8")
     prototypes = dict(re.findall(r"^int (nlfilter_\w+)\(([^)]*)\);", header, flags=re.MULTILINE))
     assert prototypes.pop("nlfilter_level") == "void"
-    assert len(prototypes) == 11
+    assert len(prototypes) == 13
     for name, prototype in prototypes.items():
         assert getattr(library._library, name).argtypes == parameters_of(" ".join(prototype.split())), name
         assert getattr(library._library, name).restype is ctypes.c_int
+
+
+def test_constants_in_c_are_those_of_the_definitions() -> None:
+    header = Path(library.__file__).with_name("interface.h").read_text(encoding="utf-8")
+    found = re.findall(r"^#define (\w+) ([-.e\d]+)f?", header, flags=re.MULTILINE)
+    assert len(found) == 14
+    for name, value in found:
+        assert float(value) == getattr(clusters if hasattr(clusters, name) else scaling, name), name
+
+
+@needs_kernels
+def test_a_library_of_an_earlier_version_says_what_to_do() -> None:
+    before = library._library
+    with pytest.raises(ImportError, match="one without nlfilter_share_threads; install the package again"):
+        library.use(cast(ctypes.CDLL, SimpleNamespace()), 1)
+    assert library._library is before
 
 
 @needs_kernels
