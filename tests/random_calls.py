@@ -430,6 +430,14 @@ FUNCTIONS = {
         | {"power": _number(0, 2), "edges": _plain(0, 1), "edge_width": _short_side(0.5)}
         | {"tones": _count(2, 9)},
     ),
+    "adjust_light": Function(
+        photo.adjust_light,
+        {"image": _image(1, 3), "region": lambda scene: scene.mask(1)},
+        LOCAL
+        | BY_HAND
+        | {name: _number(-1, 1) for name in ("exposure", "contrast", "shadows", "whites", "warmth", "vibrance")}
+        | {"temperature": _plain(2000, 15000), "photometric_bandwidth": _plain(0.03, 0.5)},
+    ),
     "defocus": Function(
         photo.defocus,
         {"image": _image(1, 3), "focus_region": lambda scene: scene.mask(1)},

@@ -33,6 +33,8 @@ DOMAINS: dict[str, tuple[str, Callable[[Any], Any], str]] = {
     "share": ("in [0, 1]", lambda v: (v >= 0) & (v <= 1), "clamp it"),
     "up to 10": ("in [0, 10]", lambda v: (v >= 0) & (v <= 10), "clamp it"),
     "below 1": ("in [0, 1)", lambda v: (v >= 0) & (v < 1), "clamp it"),
+    "signed share": ("in [-1, 1]", lambda v: (v >= -1) & (v <= 1), "clamp it"),
+    "stops": ("in [-5, 5]", lambda v: (v >= -5) & (v <= 5), "clamp it"),
     "finite": ("finite", lambda v: v == v, "pass a finite number"),
 }
 

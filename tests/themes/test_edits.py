@@ -8,6 +8,7 @@ import torch
 from nlfilter_torch.operator.build import nonlocal_operator
 from nlfilter_torch.photo import (
     abstract,
+    adjust_light,
     adjust_tone,
     colorize,
     defocus,
@@ -30,6 +31,7 @@ EDITS: dict[str, tuple[torch.Tensor, Edit]] = {
         GREY,
         lambda x: colorize(x, paint(0, 0, 0.5, SPOT).to(x), SPOT.to(x), method="kmeans", num_landmarks=30),
     ),
+    "adjust_light": (RGB, lambda x: adjust_light(x, SPOT.to(x), exposure=0.5, contrast=0.3, num_landmarks=30)),
     "defocus": (RGB, lambda x: defocus(x, SPOT.to(x), radius=2.0, num_landmarks=30)),
     "abstract": (RGB, lambda x: abstract(x, tones=6, edges=0.5, num_landmarks=30)),
     "denoise": (RGB, lambda x: denoise(x, noise_level=0.1, num_landmarks=30)),

@@ -30,6 +30,8 @@ develop in.png turned.png --rotate 90 --crop 0,40,30,30
 develop in.png warm.png --temperature 5500
 develop in.png balanced.png --temperature auto
 develop in.png strong.png --saturation 0.2
+light in.png darker.png --exposure -1 --linear 0,0,0,50%
+recolor in.png blue.png --radial 30%,30%,20%,20%,100%:blue
 mask in.png mask.png --region 20,20
 mask in.png mask.png --region 50%,50% --cutout alone.png
 """
@@ -56,6 +58,11 @@ ANSWERED = {
     "detail in.png out.png --sharpness 2": "nlfilter-torch sharpen IN OUT",
     "denoise in.png out.png --strength 50%": "--strength must be a number",
     "denoise in.png out.png --noise-level auto": "--noise-level must be a number",
+    "develop in.png out.png --exposure 1 --linear 0,0,0,9": "nlfilter-torch light changes a part of a photograph",
+    "light in.png out.png --exposure 1": "give --linear X,Y,X,Y, --radial X,Y,W,H, --region X,Y,W,H",
+    "light in.png out.png --exposure 1 --gradient 0,0,9,9": "here it is --linear or --radial",
+    "light in.png out.png --linear 5,5,5,5": "--linear must be X,Y,X,Y, two different points",
+    "vignette in.png out.png": "here it is nlfilter-torch light",
     "detail in.png out.png --landmarks many": "--landmarks must be an integer",
     "tone in.png out.png --contrast 20%": "(contrast of the smooth shading: 1 leaves it unchanged",
     "develop in.png out.png --exposure 1EV": "(brightness in stops: 1 doubles the light",

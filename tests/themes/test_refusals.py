@@ -43,6 +43,7 @@ from nlfilter_torch import (
 )
 from nlfilter_torch.photo import (
     abstract,
+    adjust_light,
     adjust_tone,
     apply_look,
     colorize,
@@ -845,6 +846,17 @@ EDITS: dict[str, list[Refusal]] = {
         ({"strength": None}, "^strength must be a number or a tensor, got NoneType", TypeError),
         ({"photometric_bandwidth": "auto"}, "^photometric_bandwidth must be a number or a", TypeError),
         ({"num_landmarks": "a"}, "^num_landmarks must be an int, got str", TypeError),
+    ),
+    "adjust_light": refusals(
+        adjust_light,
+        {"image": RGB, "region": SPOT, "exposure": 1.0},
+        ({"region": 0 * SPOT}, "^region must hold a painted pixel"),
+        ({"background": torch.ones(1, 1, 9, 9)}, "^background must have the height and width of the image"),
+        ({"exposure": 6.0}, r"^exposure must be in \[-5, 5\], got 6"),
+        ({"saturation": NAN}, r"^saturation must be in \[-1, 1\]"),
+        ({"temperature": 100.0}, "^temperature must be a number from 2000 to 15000"),
+        ({"curve": (0.0, 2.0)}, "^curve must be a list"),
+        ({"image": RGB[:, :2]}, "^image must have 1 or 3 channels, got 2"),
     ),
     "defocus": refusals(
         defocus,

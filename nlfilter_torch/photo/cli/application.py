@@ -88,6 +88,11 @@ OTHER_NAMES: Mapping[str, tuple[str, ...] | str] = {
     "--ev": ("--exposure",),
     "--ratio": ("--aspect",),
     "--proportions": ("--aspect",),
+    "--gradient": ("--linear", "--radial"),
+    **dict.fromkeys(
+        ("--linear", "--radial", "--region", "--box", "--add"),
+        "nlfilter-torch light changes a part of a photograph, such as light IN OUT --exposure -1 --linear 0,0,0,50%",
+    ),
     "--resize": "photographs keep their size",
     "--width": "photographs keep their size",
     "--height": "photographs keep their size",
@@ -109,6 +114,9 @@ OTHER_COMMANDS: Mapping[str, str] = {
     "exposure": "develop IN OUT --exposure STOPS",
     "brightness": "develop IN OUT --exposure STOPS",
     "white-balance": "develop IN OUT --temperature KELVIN --tint T",
+    **dict.fromkeys(
+        ("gradient", "vignette", "local", "dodge", "burn"), "light IN OUT --exposure STOPS --radial X,Y,W,H"
+    ),
     "contrast": "tone IN OUT --contrast FACTOR",
     "enhance": "detail IN OUT --preset crisp",
     "clarity": "detail IN OUT --preset crisp",

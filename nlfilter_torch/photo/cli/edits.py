@@ -97,12 +97,11 @@ def scribble_options(edit: Edit) -> dict[str, object]:
             "strokes": options.StrokesFile,
             "region": options.rectangles("--region", *options.REGIONS[kind]),
         }
-    for scribble in edit.with_options:
-        name = scribble.option.removeprefix("--")
-        metavar = options.REGIONS[scribble.kind][0]
-        if scribble.role == "box":  # which need not say a colour
+    for option in edit.with_options:
+        metavar = option.metavar + options.REGIONS[option.scribble.kind][0].removeprefix("X,Y,W,H")
+        if option.scribble.role == "box":  # which need not say a colour
             metavar = metavar.replace(":COLOUR", "[:COLOUR]")
-        annotations[name] = options.rectangles(scribble.option, metavar, scribble.option_help)
+        annotations[option.name.removeprefix("--")] = options.rectangles(option.name, metavar, option.help)
     if kinds:
         annotations["mask"] = options.MaskFile
     if "colours" in kinds:
@@ -273,7 +272,7 @@ def edit_photograph(
     colour = values.pop("colour", None) if "colour" in scribble_options(edit) else None
     source_colour = values.pop("source_colour", None)
     show, map = values.pop("show", None), values.pop("map", None)
-    others = {scribble.option: values.pop(scribble.option.removeprefix("--"), None) for scribble in edit.with_options}
+    others = {option.name: values.pop(option.name.removeprefix("--"), None) for option in edit.with_options}
     step = step_of(edit, values)
     look = None if preset is None else preset_step(find_recipe(preset), edit)
     if look is not None:
@@ -330,7 +329,7 @@ def _check_usual(option: str, value: Value, usual: tuple[float, float]) -> None:
 def useless_options(step: Step, typed: Collection[str], *, marked: bool) -> list[str]:
     """Notes if a step changes nothing, or options that the user typed have no effect."""
     edit, notes = step.declared, list[str]()
-    if not (edit.requires_strokes or marked or step.changes()):
+    if not (step.values_act if edit.requires_strokes else marked or step.changes()):
         notes.append(f"{edit.name} changes nothing with these options: the photograph is written without an edit")
     condition = edit.filter_condition
     if condition is not None and step[condition.name] != condition.value:

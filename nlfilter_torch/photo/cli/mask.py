@@ -54,7 +54,7 @@ def mask(
     from nlfilter_torch.photo.cli.scribbles import ScribbleOptions
 
     strokes, region, mask, show = (values.pop(name) for name in ("strokes", "region", "mask", "show"))
-    rectangles = {scribble.option: values.pop(scribble.option.removeprefix("--")) for scribble in MASK.with_options}
+    rectangles = {option.name: values.pop(option.name.removeprefix("--")) for option in MASK.with_options}
     scribbles = ScribbleOptions(region, strokes, mask, rectangles)
     if not scribbles.marks_objects(MASK):
         raise ValueError(MASK.scribbles[0].advice)

@@ -12,10 +12,20 @@ from skimage.color import rgb2hsv
 from torch import Tensor
 
 from nlfilter_torch.photo.cli.options import parse_lengths, parse_sliders, split_region
-from nlfilter_torch.photo.declared.declaration import Edit, Scribble
+from nlfilter_torch.photo.declared.declaration import Edit, MarkOption
 from nlfilter_torch.photo.declared.presets import Recipe
 from nlfilter_torch.photo.declared.rows import RowSource
-from nlfilter_torch.photo.declared.strokes import WORDS, Mark, Region, ScribbleRole, Shape, is_rectangle, noted
+from nlfilter_torch.photo.declared.strokes import (
+    SOFTNESS,
+    WORDS,
+    Mark,
+    Region,
+    ScribbleRole,
+    Shape,
+    is_rectangle,
+    mark_of,
+    noted,
+)
 from nlfilter_torch.photo.files.formats import check_depth
 from nlfilter_torch.photo.files.rows import StoredPicture
 from nlfilter_torch.photo.picture.drawn import Drawn, Painter, Size, drawn_by
@@ -55,7 +65,8 @@ class ScribbleOptions:
 
     def of(self, edit: Edit, *roles: ScribbleRole) -> list[str]:
         """The regions of an edit's scribbles that have one of these roles and options of their own."""
-        return [text for scribble in edit.with_role(*roles) for text in self.rectangles.get(scribble.option) or []]
+        own = [option.name for scribble in edit.with_role(*roles) for option in scribble.options]
+        return [text for name in own for text in self.rectangles.get(name) or []]
 
     def marks_objects(self, edit: Edit) -> bool:
         """Whether an object is marked, or its mask painted."""
@@ -91,10 +102,9 @@ class ScribbleOptions:
             name = f"--from {self.source}"
             marks.append(reader.of_picture(Path(name), "mask", name))
             pictures[name] = _colour_range(photograph, self.source, name)
-        for scribble in edit.scribbles:
-            is_object = scribble.role == "object"
-            texts = self.region if is_object else self.rectangles.get(scribble.option)
-            marks += [reader.of_text(text, scribble) for text in texts or []]
+        for option in (option for scribble in edit.scribbles for option in scribble.options):
+            texts = self.region if option.scribble.role == "object" else self.rectangles.get(option.name)
+            marks += [reader.of_text(text, option) for text in texts or []]
         if edit.requires_strokes and not edit.marks_object(marks):
             raise ValueError(next(scribble.advice for scribble in edit.with_role("object")))
         return MarkedPhotograph(edit, size, tuple(marks), pictures, alpha)
@@ -103,11 +113,11 @@ class ScribbleOptions:
         """Raise ValueError if an option limits a region that no other option marks."""
         if edit.regional is None or self.marks_objects(edit):
             return
-        for scribble in edit.with_options:
-            if self.rectangles.get(scribble.option):
+        for option in edit.with_options:
+            if self.rectangles.get(option.name):
                 added = "".join(f", {other.option}" for other in edit.with_role("box", "added"))
                 raise ValueError(
-                    f"{scribble.option} must come with --region{added} or --mask, got none of them; mark the region to "
+                    f"{option.name} must come with --region{added} or --mask, got none of them; mark the region to "
                     "edit, such as by --region 190,60,60,60"
                 )
 
@@ -165,10 +175,10 @@ class _Reader:
     colour: str | None
     alpha: tuple[float, ...]
 
-    def of_text(self, text: str, scribble: Scribble) -> Mark:
-        """The region of a text, for scribbles of an edit."""
-        option = scribble.option or "--region"
-        region, note = parse_region(text, option, self.size, WORDS[scribble.role])
+    def of_text(self, text: str, marking: MarkOption) -> Mark:
+        """The region of a text, which an option of the edit takes."""
+        option, scribble = marking.name, marking.scribble
+        region, note = parse_region(text, option, self.size, WORDS[scribble.role], marking.shape)
         if scribble.role == "box" and (not is_rectangle(region) or split_region(text)[1].count(",") != 3):
             raise ValueError(f"{option} must be a rectangle X,Y,W,H around the object, got {text!r}; give four numbers")
         if scribble.kind == "mask":
@@ -235,8 +245,10 @@ class _Reader:
         return _colour(self.colour or "", "--colour", self.colour or "")
 
 
-def parse_region(text: str, option: str, size: Size, paint: str) -> tuple[Region, str | None]:
-    """Parse a region of a photograph (H, W), and the note after its colon.
+def parse_region(
+    text: str, option: str, size: Size, paint: str, gradient: Shape | None = None
+) -> tuple[Region, str | None]:
+    """Parse a region of a photograph (H, W), or a gradient, and the note after its colon.
 
     It is ``X,Y,W,H``, or ``X,Y`` for a small square around a point; ``ellipse:X,Y,W,H`` is the ellipse in a rectangle,
     and six numbers or more are the corners of a polygon. Numbers are in pixels, or with a percent sign relative to the
@@ -250,6 +262,8 @@ def parse_region(text: str, option: str, size: Size, paint: str) -> tuple[Region
     """
     shape, numbers, note = split_region(text)
     lengths = size[1], size[0]
+    if gradient is not None:
+        return _gradient(numbers, option, size, paint, gradient), note
     try:
         values = parse_lengths(numbers.split(","), lengths)
         if len(values) % 2 or (shape == "ellipse" and len(values) != 4):
@@ -278,6 +292,27 @@ def parse_region(text: str, option: str, size: Size, paint: str) -> tuple[Region
         )
     box = [number / lengths[i % 2] for i, number in enumerate((x, y, width, height))]
     return Region.upright(box, shape, paint), note
+
+
+def _gradient(text: str, option: str, size: Size, paint: str, shape: Shape) -> Region:
+    """Parse a gradient on a photograph (H, W), which may begin or end outside it."""
+    *parts, last = text.split(",")
+    softness, wanted = SOFTNESS, "X,Y,X,Y, two different points, such as 0,0,0,40%"
+    try:
+        if shape == "radial":
+            wanted = "X,Y,W,H,SOFTNESS, a rectangle and a share of its radius up to 100%, such as 30%,20%,40%,50%,50%"
+            if len(parts) == 4:
+                softness, (*parts, last) = float(last.removesuffix("%")) / 100, parts
+        lengths = parse_lengths([*parts, last], (size[1], size[0]))
+        x, y, *others = (length / size[1 - i % 2] for i, length in enumerate(lengths))
+        entries = {"paint": paint, shape: [x, y, *others]} | ({"softness": softness} if shape == "radial" else {})
+        if shape == "linear":
+            entries[shape] = [[x, y], others]
+        region = mark_of(entries, option)
+    except ValueError:
+        raise ValueError(f"{option} must be {wanted}, in pixels or percent, got {text!r}; correct it") from None
+    assert isinstance(region, Region)  # for mypy
+    return region
 
 
 def _check_points(values: Sequence[float], option: str, size: Size, text: str) -> None:

@@ -8,10 +8,20 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from types import EllipsisType
-from typing import TYPE_CHECKING, Any, Literal, TypeGuard, cast
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeGuard, cast
 
 from nlfilter_torch.photo.declared.json_values import Value, is_within
-from nlfilter_torch.photo.declared.strokes import WORDS, Mark, ScribbleRole, is_layer, is_rectangle, mark_of, meaning_of
+from nlfilter_torch.photo.declared.strokes import (
+    WORDS,
+    Mark,
+    ScribbleRole,
+    Shape,
+    is_gradient,
+    is_layer,
+    is_rectangle,
+    mark_of,
+    meaning_of,
+)
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -30,8 +40,23 @@ MAX_NODES = 65  # along each axis of a lattice of colours
 Arguments = dict[str, Any]
 Kind = Literal["number", "count", "odd", "choice", "sliders", "lattice"]
 Unit = Literal["", "levels", "lab", "px", "%", "gain"]
-Domain = Literal["positive", "not negative", "share", "up to 10", "below 1", "finite", "count", "choice"]
+Domain = Literal[
+    "positive", "not negative", "share", "up to 10", "below 1", "signed share", "stops", "finite", "count", "choice"
+]
 
+#: For each gradient: the placeholder of its option, and its help.
+GRADIENTS: dict[Shape, tuple[str, str]] = {
+    "linear": (
+        "X,Y,X,Y",
+        "A gradient to add to the mask: a point up to which all is selected, and one from which on nothing is, in "
+        "pixels or in %. May be repeated.",
+    ),
+    "radial": (
+        "X,Y,W,H[,SOFTNESS]",
+        "An ellipse to add to the mask, in a rectangle in pixels or in %; it fades along a part of its radius, 50% "
+        "unless another is given. May be repeated.",
+    ),
+}
 #: Section in the help of a command for settings of the filter, which few users need.
 FILTER_PANEL = "Filter"
 #: For each unit: its name in errors, and the placeholder of a value in the help of a command.
@@ -279,6 +304,17 @@ def nodes_of(count: int) -> int | None:
 
 
 ScribbleKind = Literal["colours", "mask", "sliders"]
+PAINTED: tuple[ScribbleRole, ...] = ("added", "removed")  # roles of what is painted on masks by hand
+
+
+class MarkOption(NamedTuple):
+    """An option of a command that marks a part of the photograph; ``shape`` is that of its marks if it has only one."""
+
+    name: str
+    scribble: "Scribble"
+    metavar: str = "X,Y,W,H"
+    help: str = ""
+    shape: Shape | None = None
 
 
 @dataclass(frozen=True)
@@ -302,6 +338,7 @@ class Scribble:
             not offer these scribbles.
         option_help: description of that option.
         advice: for objects that are needed, the error of the command if there are none.
+        gradients: the shapes of gradients for which the command has options, too.
     """
 
     argument: str
@@ -312,6 +349,7 @@ class Scribble:
     option: str = ""
     option_help: str = ""
     advice: str = ""
+    gradients: tuple[Shape, ...] = ()
 
     @property
     def word(self) -> str:
@@ -323,6 +361,12 @@ class Scribble:
         if self.kind != "colours":
             return WORDS[self.role]
         return "colour" if self.role == "object" else f"{WORDS[self.role]} colour"
+
+    @property
+    def options(self) -> tuple[MarkOption, ...]:
+        """The options of the command for these scribbles."""
+        own = MarkOption(self.option or "--region", self, help=self.option_help)
+        return (own, *(MarkOption(f"--{shape}", self, *GRADIENTS[shape], shape) for shape in self.gradients))
 
 
 @dataclass(frozen=True)
@@ -403,9 +447,9 @@ class Edit:
         return any(scribble.needed for scribble in self.scribbles)
 
     @property
-    def with_options(self) -> tuple[Scribble, ...]:
-        """The scribbles for which the command has options of their own."""
-        return tuple(scribble for scribble in self.scribbles if scribble.option)
+    def with_options(self) -> tuple[MarkOption, ...]:
+        """The options of the command for scribbles, but for the one on objects."""
+        return tuple(option for scribble in self.scribbles if scribble.option for option in scribble.options)
 
     def with_role(self, *roles: ScribbleRole) -> tuple[Scribble, ...]:
         """The scribbles that have one of these roles."""
@@ -436,6 +480,8 @@ class Edit:
             raise ValueError(
                 f"paint of {place} must be box for rectangles only, got a different shape, {kind}; correct it"
             )
+        if is_gradient(mark) and meaning is not None and meaning.role not in PAINTED:
+            raise ValueError(f"paint of {place} must be add or remove for gradients, got {mark.paint}; correct it")
         if "mask" in kinds or ("colours" in kinds and (coloured or is_box)):
             return
         if "sliders" in kinds and (sliders is None or self["alpha"].is_valid(sliders)):

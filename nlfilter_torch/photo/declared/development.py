@@ -8,10 +8,14 @@ import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 from nlfilter_torch.photo.declared.declaration import Edit, Parameter, Slider
 from nlfilter_torch.photo.declared.json_values import is_within, shown
 from nlfilter_torch.photo.declared.strokes import Mark, Point
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 Crop = tuple[float, float, float, float]
 WHOLE_CROP: Crop = (0.0, 0.0, 1.0, 1.0)
@@ -26,9 +30,69 @@ AUTO_BALANCE = "auto"
 
 def _amount(name: str, help: str) -> Parameter:
     """A number from -1 to 1 that changes nothing at 0."""
-    return Parameter(name, "number", 0.0, help, -1, 1, idle=0.0, slider=Slider(name.capitalize(), -1, 1, 0.01))
+    slider = Slider(name.capitalize(), -1, 1, 0.01)
+    return Parameter(name, "number", 0.0, help, -1, 1, domain="signed share", idle=0.0, slider=slider, per_image=True)
 
 
+#: How light, white balance, tones and colours change, of all of a photograph or of a part of it.
+LIGHT_PARAMETERS = (
+    Parameter(
+        "exposure",
+        "number",
+        0.0,
+        "Brightness in stops: 1 doubles the light, -1 halves it, 0 leaves it.",
+        -5,
+        5,
+        domain="stops",
+        idle=0.0,
+        per_image=True,
+        metavar="STOPS",
+        slider=Slider("Exposure", -3, 3, 0.05),
+    ),
+    _amount("contrast", "Difference of light and dark, by a curve about middle grey: 1 is strong, -1 is flat."),
+    _amount(
+        "highlights",
+        "Brightness of light areas, from -1 to 1: below 0 skies get darker. Detail and edges stay as they are.",
+    ),
+    _amount(
+        "shadows",
+        "Brightness of dark areas, from -1 to 1: above 0 they get lighter. Detail and edges stay as they are.",
+    ),
+    _amount("whites", "Brightness of the lightest tones, up to white: above 0 more become white."),
+    _amount("blacks", "Brightness of the darkest tones, down to black: below 0 more become black."),
+    Parameter(
+        "temperature",
+        "number",
+        None,
+        "White balance in kelvin, the colour temperature of the light that the photograph was taken in: below 6500 "
+        "it becomes bluer, above it more amber. auto estimates the light. Default: as it is.",
+        2000,
+        15000,
+        optional=True,
+        idle=None,
+        words=(AUTO_BALANCE,),
+        metavar="KELVIN",
+        slider=Slider("Temperature", 2000, 12000, 50, none=NEUTRAL),
+    ),
+    _amount(
+        "warmth",
+        "White balance from blue, -1, to amber, 1, added to temperature: values above 0 make a cold photograph "
+        "warmer. Grey photographs stay grey.",
+    ),
+    _amount("tint", "White balance from green, -1, to magenta, 1: a greenish photograph becomes neutral above 0."),
+    _amount("vibrance", "Strength of pale colours, from -1 to 1; strong colours change little."),
+    _amount("saturation", "Strength of all colours: -1 is grey, 1 is twice as strong. Brightness stays."),
+    Parameter(
+        "curve",
+        "sliders",
+        EVEN_CURVE,
+        "Tone curve: the brightness that evenly spaced tones from black to white become, each from 0 to 1, such as "
+        "0,0.2,0.5,0.8,1.",
+        0,
+        1,
+        idle=EVEN_CURVE,
+    ),
+)
 #: Declared as an edit is, though it is no step: it comes first, and once.
 DEVELOP = Edit(
     "develop",
@@ -39,61 +103,11 @@ DEVELOP = Edit(
     By lamplight: `nlfilter-torch develop in.jpg out.jpg --temperature 4000`, or `--temperature auto`
 
     Cut a tenth off at the left and at the bottom: `nlfilter-torch develop in.jpg out.jpg --crop 10%,0%,90%,90%`
+
+    A part of a photograph: `nlfilter-torch light --help`
     """,
     (
-        Parameter(
-            "exposure",
-            "number",
-            0.0,
-            "Brightness in stops: 1 doubles the light, -1 halves it, 0 leaves it.",
-            -5,
-            5,
-            idle=0.0,
-            metavar="STOPS",
-            slider=Slider("Exposure", -3, 3, 0.05),
-        ),
-        _amount("contrast", "Difference of light and dark, by a curve about middle grey: 1 is strong, -1 is flat."),
-        _amount(
-            "highlights",
-            "Brightness of light areas, from -1 to 1: below 0 skies get darker. Detail and edges stay as they are.",
-        ),
-        _amount(
-            "shadows",
-            "Brightness of dark areas, from -1 to 1: above 0 they get lighter. Detail and edges stay as they are.",
-        ),
-        _amount("whites", "Brightness of the lightest tones, up to white: above 0 more become white."),
-        _amount("blacks", "Brightness of the darkest tones, down to black: below 0 more become black."),
-        Parameter(
-            "temperature",
-            "number",
-            None,
-            "White balance in kelvin, the colour temperature of the light that the photograph was taken in: below 6500 "
-            "it becomes bluer, above it more amber. auto estimates the light. Default: as it is.",
-            2000,
-            15000,
-            optional=True,
-            words=(AUTO_BALANCE,),
-            metavar="KELVIN",
-            slider=Slider("Temperature", 2000, 12000, 50, none=NEUTRAL),
-        ),
-        _amount(
-            "warmth",
-            "White balance from blue, -1, to amber, 1, added to temperature: values above 0 make a cold photograph "
-            "warmer. Grey photographs stay grey.",
-        ),
-        _amount("tint", "White balance from green, -1, to magenta, 1: a greenish photograph becomes neutral above 0."),
-        _amount("vibrance", "Strength of pale colours, from -1 to 1; strong colours change little."),
-        _amount("saturation", "Strength of all colours: -1 is grey, 1 is twice as strong. Brightness stays."),
-        Parameter(
-            "curve",
-            "sliders",
-            EVEN_CURVE,
-            "Tone curve: the brightness that evenly spaced tones from black to white become, each from 0 to 1, such as "
-            "0,0.2,0.5,0.8,1.",
-            0,
-            1,
-            idle=EVEN_CURVE,
-        ),
+        *LIGHT_PARAMETERS,
         Parameter(
             "rotate",
             "count",
@@ -152,21 +166,17 @@ def check_value(name: str, value: object, place: str = "") -> None:
         raise ValueError(f"{called} must be {DEVELOP[name].wanted}, got {shown(value)}; correct it")
 
 
-@dataclass(frozen=True)
-class Development:
-    """Light, white balance, colours, turning and crop of a photograph; by default nothing changes.
+@dataclass(frozen=True, kw_only=True)
+class LightValues:
+    """Light, white balance, tones and colours: numbers, or tensors that broadcast with a picture (B, C, H, W).
 
     Highlights and shadows come first, on the light that the photograph has; then exposure and white balance, the tones
-    from blacks to curve, and the colours.
+    from blacks to curve, and the colours. A tensor counts as a value that changes something.
 
     Attributes:
         exposure: stops, -5 to 5; 1 doubles the light.
         warmth: white balance, -1 (blue) to 1 (amber).
         tint: -1 (green) to 1 (magenta).
-        straighten: degrees, -45 to 45, by which the picture is rotated clockwise about its middle.
-        crop: left, top, right and bottom edge as shares of the turned picture, which keeps its size. A crop with empty
-            corners is shrunk about its middle until it has none.
-        rotate: 0, 90, 180 or 270 degrees, clockwise, before it is straightened.
         temperature: kelvin of the light that the photograph was taken in, 2000 to 15000; None is 6500, which changes
             nothing, and ``"auto"`` estimates the light from the picture.
         contrast: -1 to 1, of all tones about middle grey.
@@ -177,6 +187,61 @@ class Development:
         curve: what 2 to 100 evenly spaced tones from 0 to 1 become, from 0 to 1.
         vibrance: -1 to 1, of pale colours.
         saturation: -1 (grey) to 1 (twice), of all colours.
+    """
+
+    exposure: "float | Tensor" = DEVELOP.defaults["exposure"]
+    warmth: "float | Tensor" = DEVELOP.defaults["warmth"]
+    tint: "float | Tensor" = DEVELOP.defaults["tint"]
+    temperature: float | str | None = None
+    contrast: "float | Tensor" = DEVELOP.defaults["contrast"]
+    highlights: "float | Tensor" = DEVELOP.defaults["highlights"]
+    shadows: "float | Tensor" = DEVELOP.defaults["shadows"]
+    whites: "float | Tensor" = DEVELOP.defaults["whites"]
+    blacks: "float | Tensor" = DEVELOP.defaults["blacks"]
+    curve: tuple[float, ...] = EVEN_CURVE
+    vibrance: "float | Tensor" = DEVELOP.defaults["vibrance"]
+    saturation: "float | Tensor" = DEVELOP.defaults["saturation"]
+
+    def _any(self, *names: str) -> bool:
+        """Whether one of these values is not 0."""
+        values = [getattr(self, name) for name in names]
+        return any(not isinstance(value, int | float) or value != 0 for value in values)
+
+    @property
+    def exposes(self) -> bool:
+        """Whether the light of all colours changes alike."""
+        return self._any("exposure")
+
+    @property
+    def balances(self) -> bool:
+        """Whether the white balance changes."""
+        return self._any("warmth", "tint") or self.temperature not in (None, NEUTRAL)
+
+    @property
+    def colours(self) -> bool:
+        """Whether the strength of colours changes."""
+        return self._any("vibrance", "saturation")
+
+    @property
+    def bends(self) -> bool:
+        """Whether tones change by a curve, the same for all pixels."""
+        return self._any("contrast", "whites", "blacks") or self.curve != EVEN_CURVE
+
+    @property
+    def shades(self) -> bool:
+        """Whether light or dark areas change."""
+        return self._any("highlights", "shadows")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Development(LightValues):
+    """Light, turning and crop of a photograph, with numbers for all values; by default nothing changes.
+
+    Attributes:
+        straighten: degrees, -45 to 45, by which the picture is rotated clockwise about its middle.
+        crop: left, top, right and bottom edge as shares of the turned picture, which keeps its size. A crop with empty
+            corners is shrunk about its middle until it has none.
+        rotate: 0, 90, 180 or 270 degrees, clockwise, before it is straightened.
 
     Raises:
         ValueError: if a value is out of range.
@@ -186,21 +251,9 @@ class Development:
         ((80, 120), (150, 100))
     """
 
-    exposure: float = DEVELOP["exposure"].default_number
-    warmth: float = DEVELOP["warmth"].default_number
-    tint: float = DEVELOP["tint"].default_number
     straighten: float = DEVELOP["straighten"].default_number
     crop: Crop = WHOLE_CROP
     rotate: int = 0
-    temperature: float | str | None = None
-    contrast: float = DEVELOP["contrast"].default_number
-    highlights: float = DEVELOP["highlights"].default_number
-    shadows: float = DEVELOP["shadows"].default_number
-    whites: float = DEVELOP["whites"].default_number
-    blacks: float = DEVELOP["blacks"].default_number
-    curve: tuple[float, ...] = EVEN_CURVE
-    vibrance: float = DEVELOP["vibrance"].default_number
-    saturation: float = DEVELOP["saturation"].default_number
 
     def __post_init__(self) -> None:
         """Check all values, and make them numbers of the declared type."""
@@ -215,26 +268,6 @@ class Development:
     def is_idle(self) -> bool:
         """Whether nothing changes."""
         return self == AS_IT_IS
-
-    @property
-    def balances(self) -> bool:
-        """Whether the white balance changes."""
-        return bool(self.warmth or self.tint) or self.temperature not in (None, NEUTRAL)
-
-    @property
-    def colours(self) -> bool:
-        """Whether the strength of colours changes."""
-        return bool(self.vibrance or self.saturation)
-
-    @property
-    def bends(self) -> bool:
-        """Whether tones change by a curve, the same for all pixels."""
-        return bool(self.contrast or self.whites or self.blacks) or self.curve != EVEN_CURVE
-
-    @property
-    def shades(self) -> bool:
-        """Whether light or dark areas change."""
-        return bool(self.highlights or self.shadows)
 
     @property
     def changes_light(self) -> bool:

@@ -15,6 +15,7 @@ from nlfilter_torch.photo.declared.declaration import (
     Scribble,
     Slider,
 )
+from nlfilter_torch.photo.declared.development import LIGHT_PARAMETERS
 from nlfilter_torch.photo.declared.shared_parameters import (
     COLOUR_TOLERANCE,
     EXTENT,
@@ -47,6 +48,7 @@ ADD = Scribble(
     role="added",
     option="--add",
     option_help="A rectangle to add to the mask, as with a brush, whatever is found. May be repeated.",
+    gradients=("linear", "radial"),
 )
 REMOVE = Scribble(
     "removed",
@@ -205,6 +207,42 @@ TONE = Edit(
     ),
     function="adjust_tone",
     hint="Contrast of large shapes, and of the largest details on them.",
+)
+
+LIGHT = Edit(
+    "light",
+    """Change light, white balance, tones and colours of a part of a photograph; `nlfilter-torch develop` changes all.
+
+    The part is an object, of which some is marked, or a gradient.
+
+    Darken the sky: `nlfilter-torch light in.jpg out.jpg --exposure -1 --linear 0,0,0,50%`
+
+    Warmer light on a face: `nlfilter-torch light in.jpg out.jpg --warmth 0.3 --shadows 0.4 --radial 40%,20%,20%,30%`
+
+    An object alone: `nlfilter-torch light in.jpg out.jpg --exposure 0.7 --box 150,30,200,300`
+    """,
+    (
+        *LIGHT_PARAMETERS,
+        REGION_REACH,
+        replace(EXTENT, default="object"),
+        COLOUR_TOLERANCE,
+        *filter_parameters(share=0.3, patch_size=1)[1:],
+    ),
+    function="adjust_light",
+    hint="Paint on some of an object, or drag a gradient; only that part changes.",
+    scribbles=(
+        Scribble(
+            "region",
+            "Change this",
+            needed=True,
+            advice="give --linear X,Y,X,Y, --radial X,Y,W,H, --region X,Y,W,H, --box X,Y,W,H or --mask FILE to mark "
+            "what changes, such as --linear 0,0,0,50%; nlfilter-torch develop changes all of the photograph",
+        ),
+        Scribble("background", "Not this", role="background", option="--background", option_help=BACKGROUND_HELP),
+        BOX,
+        ADD,
+        REMOVE,
+    ),
 )
 
 DENOISE = Edit(
@@ -508,5 +546,5 @@ ABSTRACT = Edit(
 
 #: All edits, in the order in which the editor applies them.
 EDITS: dict[str, Edit] = {
-    edit.name: edit for edit in (DENOISE, DETAIL, TONE, SHARPEN, COLORIZE, RECOLOR, DEFOCUS, ABSTRACT, LOOK)
+    edit.name: edit for edit in (DENOISE, LIGHT, DETAIL, TONE, SHARPEN, COLORIZE, RECOLOR, DEFOCUS, ABSTRACT, LOOK)
 }

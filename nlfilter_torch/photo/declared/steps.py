@@ -127,12 +127,17 @@ class Step:
     def would_change(self) -> bool:
         """Whether the step has any effect when it is switched on."""
         if self.declared.requires_strokes:
-            return self.marks_object()
+            return self.marks_object() and self.values_act
         if self.declared.parts and not any(self[name] for name in self.declared.parts):
             return False
-        acting = [p for p in self.declared if p.idle is not ...]
         regions = sliders_of(self.strokes, self.sliders_inside) if self.has_region() else ()
-        return any(not p.is_idle(self[p.name]) for p in acting) or any(set(sliders) != {1} for sliders in regions)
+        return self.values_act or any(set(sliders) != {1} for sliders in regions)
+
+    @property
+    def values_act(self) -> bool:
+        """Whether values differ from those that change nothing, or the edit has no such values."""
+        acting = [p for p in self.declared if p.idle is not ...]
+        return not acting or any(not p.is_idle(self[p.name]) for p in acting)
 
     def bytes_per_pixel(self, *, masked: bool = False) -> int:
         """Memory in bytes needed per pixel of an image; ``masked`` if a region is given by other means than strokes."""

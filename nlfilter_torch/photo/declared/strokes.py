@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import pairwise
-from typing import Literal, NamedTuple, TypeGuard, cast, get_args
+from typing import Any, Literal, NamedTuple, TypeGuard, cast, get_args
 
 from nlfilter_torch.photo.declared.json_values import is_within, shown
 
@@ -30,9 +30,11 @@ MIN_RADIUS = 0.75  # minimum radius in pixels, at which a dot always covers a pi
 TO_CENTRE = 0.71  # pixels from any point of a picture to the nearest centre of a pixel, at most: half of a diagonal
 ELLIPSE_SIDES = 64  # of the polygon that stands for an ellipse where only its extent matters
 Point = tuple[float, float]
-#: What a region is: all of a parallelogram, the ellipse in it, a polygon, or the white parts of a picture in a file
-#: (``"mask"``), or the opaque ones, with their colours (``"layer"``).
-Shape = Literal["rectangle", "ellipse", "polygon", "mask", "layer"]
+#: What a region is: all of a parallelogram, the ellipse in it, a polygon, the white parts of a picture in a file
+#: (``"mask"``), or the opaque ones, with their colours (``"layer"``); or a gradient, whose weights fall smoothly from 1
+#: to 0: from one line to a parallel one (``"linear"``), or in an ellipse from halfway to its border (``"radial"``).
+Shape = Literal["rectangle", "ellipse", "polygon", "mask", "layer", "linear", "radial"]
+SOFTNESS = 0.5  # share of the radius of a radial gradient along which it falls from 1 to 0
 
 
 class Meaning(NamedTuple):
@@ -144,17 +146,20 @@ class Region(Marking):
     """A part of a picture with sharp borders, or the part that a picture in a file marks.
 
     Attributes:
-        points: corners of a polygon; for other shapes those at the upper left, the upper right and the lower left of
-            the parallelogram that they fill.
+        points: corners of a polygon; for a linear gradient, the points on its axis where it is 1 and where it is 0; for
+            other shapes those at the upper left, the upper right and the lower left of the parallelogram that they
+            fill.
         shape: what it is.
         paint: its meaning: in, out, add, remove or box; after in, add and box, a colour or sliders may follow.
         file: path of the picture in a file.
+        softness: of a radial gradient: share of its radius along which it falls to 0; 1 falls from the middle.
     """
 
     points: tuple[Point, ...]
     shape: Shape
     paint: str
     file: str = ""
+    softness: float = SOFTNESS
 
     @staticmethod
     def upright(box: Sequence[float], shape: Shape, paint: str, file: str = "") -> "Region":
@@ -174,12 +179,12 @@ class Region(Marking):
     @property
     def outline(self) -> tuple[Point, ...]:
         """Corners of a polygon that has about its extent."""
-        if self.shape == "polygon":
+        if self.shape in ("polygon", "linear"):
             return self.points
         origin, right, lower = self.points
         across, down = ((corner[0] - origin[0], corner[1] - origin[1]) for corner in (right, lower))
         places = [(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)]
-        if self.shape == "ellipse":
+        if self.shape in ("ellipse", "radial"):
             angles = [2 * math.pi * k / ELLIPSE_SIDES for k in range(ELLIPSE_SIDES)]
             places = [((1 + math.cos(angle)) / 2, (1 + math.sin(angle)) / 2) for angle in angles]
         return tuple(
@@ -190,12 +195,14 @@ class Region(Marking):
         """Return the region as a JSON object."""
         if self.file:
             return {"paint": self.paint, self.shape: self.file}
-        (left, top), (right, upper), (first, bottom) = self.points[:3]
-        if self.shape != "polygon" and (upper, first) == (top, left):
-            # Of decimal numbers, the difference is rounded; the shortest number that gives the same edge is meant.
-            sides = [_length(start, end) for start, end in ((left, right), (top, bottom))]
-            return {"paint": self.paint, self.shape: [left, top, *sides]}
-        return {"paint": self.paint, self.shape: [list(point) for point in self.points]}
+        places: list[object] = [list(point) for point in self.points]
+        if self.shape not in ("polygon", "linear"):
+            (left, top), (right, upper), (first, bottom) = self.points
+            if (upper, first) == (top, left):
+                # Of decimal numbers, the difference is rounded; the shortest number that gives the same edge is meant.
+                places = [left, top, *(_length(start, end) for start, end in ((left, right), (top, bottom)))]
+        softness = {"softness": self.softness} if self.shape == "radial" and self.softness != SOFTNESS else {}
+        return {"paint": self.paint, self.shape: places, **softness}
 
     def mapped(self, place: Callable[[float, float], Point], scale: float) -> "Region":
         """The region where each of its points is at another place; lengths follow."""
@@ -204,15 +211,19 @@ class Region(Marking):
     def reaches(self, size: tuple[int, int]) -> bool:
         """Whether its outline meets or holds the centres of pixels of a picture (H, W)."""
         height, width = size
+        if self.shape == "linear":
+            (x0, y0), (x1, y1) = ((x * width, y * height) for x, y in self.points)
+            corners = [(x, y) for x in (0.5, width - 0.5) for y in (0.5, height - 0.5)]
+            return any((x - x1) * (x0 - x1) + (y - y1) * (y0 - y1) > 0 for x, y in corners)
         corners = [(x * width - 0.5, y * height - 0.5) for x, y in self.outline]
         sides = list(pairwise([*corners, corners[0]]))
         return any(_crosses(*side, (width - 1, height - 1)) for side in sides) or _holds(sides, (0.0, 0.0))
 
     def text(self, size: tuple[int, int]) -> str:
-        """``X,Y,W,H`` in pixels of a picture (H, W), or the corners of a polygon."""
+        """``X,Y,W,H`` in pixels of a picture (H, W), or the corners of a polygon or the ends of a linear gradient."""
         lengths = size[1], size[0]
         corners = [tuple(round(share * length) for share, length in zip(p, lengths, strict=True)) for p in self.points]
-        if self.shape == "polygon":
+        if self.shape in ("polygon", "linear"):
             return ",".join(f"{x},{y}" for x, y in corners)
         (left, top), (right, _), (_, bottom) = corners
         return f"{'ellipse:' if self.shape == 'ellipse' else ''}{left},{top},{right - left},{bottom - top}"
@@ -280,12 +291,20 @@ def mark_of(value: object, place: str) -> Mark:
     """
     entries = value if isinstance(value, dict) else {}
     shapes = [shape for shape in get_args(Shape) if shape in entries]
-    if set(entries) != {"points", "radius", "paint"} and (len(shapes) != 1 or set(entries) != {"paint", shapes[0]}):
+    further = {"softness"} if shapes == ["radial"] else set[str]()
+    if set(entries) != {"points", "radius", "paint"} and (
+        len(shapes) != 1 or set(entries) - further != {"paint", shapes[0]}
+    ):
         raise ValueError(
             f"strokes of {place} must have the entries points, radius and paint, or paint and one of "
             f"{', '.join(get_args(Shape))}, got {shown(value)}; correct it"
         )
     return _region_of(entries, shapes[0], place) if shapes else _stroke_of(entries, place)
+
+
+def is_gradient(mark: Mark) -> bool:
+    """Whether a mark is a gradient, which is painted on a mask, but marks no object."""
+    return isinstance(mark, Region) and mark.shape in ("linear", "radial")
 
 
 def is_layer(mark: Mark) -> bool:
@@ -306,25 +325,32 @@ def _stroke_of(entries: dict[str, object], place: str) -> Stroke:
     return Stroke(tuple((float(x), float(y)) for x, y in points), float(radius), cast(str, entries["paint"]))
 
 
-def _region_of(entries: dict[str, object], shape: Shape, place: str) -> Region:
+def _region_of(entries: dict[str, Any], shape: Shape, place: str) -> Region:
     """Create a region from its entries, whose paint may have no meaning yet."""
     value, paint = entries[shape], cast(str, entries["paint"])
     if shape in ("mask", "layer"):
         if not isinstance(value, str) or not value:
             raise ValueError(f"{shape} of a stroke in {place} must be the path of a file, got {shown(value)}; name one")
         return Region.of_file(value, shape, paint)
-    if shape != "polygon" and isinstance(value, list) and len(value) == 4 and all(is_within(v, -2, 2) for v in value):
+    softness = entries.get("softness", SOFTNESS)
+    if not (is_within(softness, 0, 1) and softness > 0):
+        raise ValueError(f"softness of a stroke in {place} must be in (0, 1], got {shown(softness)}; correct it")
+    upright = shape not in ("polygon", "linear") and isinstance(value, list) and len(value) == 4
+    if upright and all(is_within(v, -2, 2) for v in value):
         box = [float(number) for number in value]
         if min(box[2:]) > 0:
-            return Region.upright(box, shape, paint)
-    least, most = (3, math.inf) if shape == "polygon" else (3, 3)
-    if not (isinstance(value, list) and least <= len(value) <= most and all(map(_is_point, value))):
-        wanted = "three or more corners" if shape == "polygon" else "left and upper edge, width and height"
+            return replace(Region.upright(box, shape, paint), softness=float(softness))
+    least, most, wanted = {
+        "polygon": (3, math.inf, "three or more corners"),
+        "linear": (2, 2, "two different points, where it is 1 and where it is 0"),
+    }.get(shape, (3, 3, "left and upper edge, width and height"))
+    valid = isinstance(value, list) and least <= len(value) <= most and all(map(_is_point, value))
+    if not valid or (shape == "linear" and value[0] == value[1]):
         raise ValueError(
             f"{shape} of a stroke in {place} must be {wanted}, in shares of width and height from -2 to 2, got "
             f"{shown(value)}; correct it"
         )
-    return Region(tuple((float(x), float(y)) for x, y in value), shape, paint)
+    return Region(tuple((float(x), float(y)) for x, y in value), shape, paint, softness=float(softness))
 
 
 def _holds(sides: Sequence[tuple[Point, Point]], point: Point) -> bool:

@@ -22,6 +22,7 @@ from nlfilter_torch.photo.picture.viewing import viewed_size
 #: The name of each edit, which is that of its module, and of its class. A new edit takes a line here.
 CLASSES = {
     "denoise": "Denoise",
+    "light": "LightEdit",
     "detail": "Detail",
     "tone": "Tone",
     "sharpen": "Sharpen",

@@ -18,7 +18,7 @@ from nlfilter_torch.core.torch_internals import cached_constants
 from nlfilter_torch.core.workers import divided_among, threads_for
 from nlfilter_torch.operator.features import reduce_channels
 from nlfilter_torch.operator.options import FilterOptions
-from nlfilter_torch.photo.declared.development import AUTO_BALANCE, EVEN_CURVE, NEUTRAL, Development
+from nlfilter_torch.photo.declared.development import AUTO_BALANCE, EVEN_CURVE, NEUTRAL, Development, LightValues
 from nlfilter_torch.photo.picture.colour import split_luminance
 from nlfilter_torch.photo.picture.developing import develop_planes, limits_of
 from nlfilter_torch.photo.picture.in_memory import InMemory
@@ -86,45 +86,44 @@ class Light:
     """A change of the light of a picture, fitted to it.
 
     Attributes:
-        development: the values.
+        values: of light.
         limits: of the picture before, (B, 1, 1, 1) each, see :func:`limits_of`; beyond [0, 1] they are not kept.
         balance: factors (B, 3, 1, 1) of red, green and blue that make its own light white, or None.
         shading: the change of light and dark areas, or None.
     """
 
-    development: Development
+    values: LightValues
     limits: tuple[Tensor, Tensor]
     balance: Tensor | None = None
     shading: EnlargedChange | None = None
 
     def __call__(self, pixels: Pixels) -> Tensor:
         """Pixels of the picture in this light."""
-        development, image = self.development, pixels.image
+        values, image = self.values, pixels.image
         if self.shading is not None:
             image = self.shading.edited(pixels)
         coloured = image.shape[1] == 3
-        gains = image.new_tensor(gains_of(development, coloured=coloured)[: image.shape[1]]).view(1, -1, 1, 1)
-        if self.balance is not None:
-            gains = gains * self.balance.to(gains)
-        if bool((gains != 1).any()):
-            image = _times(image, gains)
-        if development.bends:
-            image = bent(image, development)
-        if development.colours and coloured:
-            image = strengthened(image, development.saturation, development.vibrance)
+        if values.exposes or (coloured and (values.balances or self.balance is not None)):
+            gains = [torch.as_tensor(gain).to(image) for gain in gains_of(values, coloured=coloured)[: image.shape[1]]]
+            factors = torch.cat([gain.reshape(-1, 1, 1, 1) for gain in gains], dim=1)
+            image = _times(image, factors if self.balance is None else factors * self.balance.to(factors))
+        if values.bends:
+            image = bent(image, values)
+        if values.colours and coloured:
+            image = strengthened(image, values.saturation, values.vibrance)
         is_wide = (self.limits[0] < 0) | (self.limits[1] > 1)
         return torch.where(is_wide, image, image.clamp(0, 1))
 
 
-def fit_light(source: Source[M], development: Development, limits: tuple[Tensor, Tensor]) -> Light:
+def fit_light(source: Source[M], values: LightValues, limits: tuple[Tensor, Tensor]) -> Light:
     """Fit a change of light to a picture in the frame in which it is shown; what is kept of it serves other values."""
     balance = shading = None
-    if development.temperature == AUTO_BALANCE and source.channels == 3:
+    if values.temperature == AUTO_BALANCE and source.channels == 3:
         balance = kept(source, "own light", [], balance_of_light, kept(source, "small", [], small, source))
-    if development.shades:
+    if values.shades:
         image = kept(source, "small", [], small, source)
-        shading = shading_of(source, image, kept(source, "areas", [], areas_of, image), development)
-    return Light(development, limits, balance, shading)
+        shading = shading_of(source, image, kept(source, "areas", [], areas_of, image), values)
+    return Light(values, limits, balance, shading)
 
 
 def small(source: Source[M]) -> Tensor:
@@ -144,26 +143,26 @@ def areas_of(image: Tensor) -> Tensor:
     return grey.operator(Guide(options)).layers(whole_image, ORDER)(grey)[:, -1]
 
 
-def shading_of(source: Source[M], image: Tensor, areas: Tensor, development: Development) -> EnlargedChange:
+def shading_of(source: Source[M], image: Tensor, areas: Tensor, values: LightValues) -> EnlargedChange:
     """The change of light and dark areas of a picture, from its image and areas as :func:`small` shows it.
 
     Where it gets lighter, chroma grows with luminance.
     """
     grey = reduce_channels(image, "luminance")
-    change, kept_chroma = balanced(image, limit(image, shaded(areas.clamp(0, 1), development)))
+    change, kept_chroma = balanced(image, limit(image, shaded(areas.clamp(0, 1), values)))
     _, grown = balanced(image, change, Balance(colour=1 / MAX_SATURATION_GAIN))  # as much as luminance
     saturation = None if kept_chroma is None or grown is None else torch.where(change > 0, grown, kept_chroma)
     return EnlargedChange(Coarse.of(grey, change, saturation, "soft"), luminance, source.size)
 
 
-def shaded(tones: Tensor, development: Development) -> Tensor:
+def shaded(tones: Tensor, values: LightValues) -> Tensor:
     """The change of tones in [0, 1] by highlights and shadows.
 
     A dark tone b is multiplied by ``exp(shadows (1 - b)^3)``, and the distance of a light one from white by
     ``exp(-highlights b^3)``. Both curves rise everywhere, alone and together.
     """
-    lifted = tones * torch.expm1(development.shadows * (1 - tones) ** 3)
-    return lifted - (1 - tones) * torch.expm1(-development.highlights * tones**3)
+    lifted = tones * torch.expm1(values.shadows * (1 - tones) ** 3)
+    return lifted - (1 - tones) * torch.expm1(-values.highlights * tones**3)
 
 
 @full_precision
@@ -225,7 +224,7 @@ def _linear(values: Tensor) -> Tensor:
     return torch.where(values > LINEAR, ((values.clamp(min=LINEAR) + OFFSET) / (1 + OFFSET)) ** GAMMA, values / SLOPE)
 
 
-def bent(image: Tensor, development: Development) -> Tensor:
+def bent(image: Tensor, values: LightValues) -> Tensor:
     """Change the tones of an image (B, C, H, W), each channel alike; beyond [0, 1] by what is added at the ends.
 
     >>> grey = torch.tensor([0.0, 0.25, 0.5, 0.75, 1.0]).view(1, 1, 1, 5)
@@ -233,10 +232,10 @@ def bent(image: Tensor, development: Development) -> Tensor:
     [0.0, 0.15625, 0.5, 0.84375, 1.0]
     """
     inside = image.clamp(0, 1)
-    tones = inside + 0.12 * (development.whites * inside**3 + development.blacks * (1 - inside) ** 3)
-    tones = tones + 2 * development.contrast * (inside - 0.5) * inside * (1 - inside)
-    if development.curve != EVEN_CURVE:
-        tones = on_curve(tones.clamp(0, 1), development.curve)
+    tones = inside + 0.12 * (values.whites * inside**3 + values.blacks * (1 - inside) ** 3)
+    tones = tones + 2 * values.contrast * (inside - 0.5) * inside * (1 - inside)
+    if values.curve != EVEN_CURVE:
+        tones = on_curve(tones.clamp(0, 1), values.curve)
     return image + (tones - inside)
 
 
@@ -260,7 +259,7 @@ def _pieces(curve: tuple[float, ...]) -> tuple[Tensor, Tensor]:
     return knots, torch.from_numpy(PchipInterpolator(knots.numpy(), curve).c)
 
 
-def strengthened(image: Tensor, saturation: float, vibrance: float) -> Tensor:
+def strengthened(image: Tensor, saturation: float | Tensor, vibrance: float | Tensor) -> Tensor:
     """Multiply the chroma of an RGB image (B, 3, H, W), without change of luminance and hue.
 
     It grows only as far as the channels stay within [0, 1].
@@ -272,7 +271,7 @@ def strengthened(image: Tensor, saturation: float, vibrance: float) -> Tensor:
     return grey + chroma * torch.minimum(factor, room.amin(1, keepdim=True).clamp(min=1))
 
 
-def gains_of(development: Development, *, coloured: bool = True) -> list[float]:
+def gains_of(values: LightValues, *, coloured: bool = True) -> list[float | Tensor]:
     """What red, green and blue are multiplied by in linear light; white balance keeps the luminance of grey.
 
     What ``temperature="auto"`` adds depends on the picture, and is left out.
@@ -280,13 +279,13 @@ def gains_of(development: Development, *, coloured: bool = True) -> list[float]:
     >>> gains_of(Development(exposure=1.0)), gains_of(Development(tint=1.0), coloured=False)
     ([2.0, 2.0, 2.0], [1.0, 1.0, 1.0])
     """
-    warmer, redder = (development.warmth, development.tint) if coloured else (0.0, 0.0)
+    warmer, redder = (values.warmth, values.tint) if coloured else (0.0, 0.0)
     gains = [2.0 ** (BLUE_TO_AMBER * warmer), 2.0 ** (-GREEN_TO_MAGENTA * redder), 2.0 ** (-BLUE_TO_AMBER * warmer)]
-    if coloured and isinstance(development.temperature, float):
-        ratios = zip(light_of(NEUTRAL), light_of(development.temperature), strict=True)
+    if coloured and isinstance(values.temperature, int | float):
+        ratios = zip(light_of(NEUTRAL), light_of(values.temperature), strict=True)
         gains = [gain * white / light for gain, (white, light) in zip(gains, ratios, strict=True)]
     brightness = sum(weight * gain for weight, gain in zip(LUMINANCE, gains, strict=True))
-    light = 2.0**development.exposure
+    light = 2.0**values.exposure
     return [light * gain / brightness if coloured else light for gain in gains]
 
 

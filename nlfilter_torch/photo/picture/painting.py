@@ -110,7 +110,7 @@ def _covered(mark: Mark, size: Size, rows: slice, *, soft: bool, opened: Open) -
         covered, own = _read(mark, size, rows, opened(mark.file))
         colours = own if colours is None else colours
     else:
-        part, covered = _region_part(mark, size, rows)
+        part, covered = _linear(mark, size, rows) if mark.shape == "linear" else _region_part(mark, size, rows)
     if covered.numel():
         yield part, covered, colours
 
@@ -158,7 +158,7 @@ def _span(a: float, b: float, radius: float, first: int, last: int) -> tuple[int
 
 
 def _region_part(region: Region, size: Size, rows: slice) -> tuple[Part, Tensor]:
-    """The part of some rows that holds all of a region, and which of its pixels have their centre in it.
+    """The part of some rows that holds all of a region, and the weights of its pixels: 1 for those with centres in it.
 
     A region between the centres of pixels covers the pixel that holds its middle, so that it does not vanish in a
     preview.
@@ -179,8 +179,23 @@ def _region_part(region: Region, size: Size, rows: slice) -> tuple[Part, Tensor]
     return (slice(first - rows.start, last - rows.start), slice(left, right)), inside.float()
 
 
+def _linear(region: Region, size: Size, rows: slice) -> tuple[Part, Tensor]:
+    """All of some rows, and their weights in a linear gradient: 1 before its axis begins, and 0 after its end."""
+    (x0, y0), (x1, y1) = ((x * size[1], y * size[0]) for x, y in region.points)
+    y, x = _centres(size, rows, slice(0, size[1]))
+    dx, dy = x1 - x0, y1 - y0
+    along = ((x * size[1] - x0) * dx + (y * size[0] - y0) * dy) / max(dx * dx + dy * dy, 1e-12)
+    return (slice(0, rows.stop - rows.start), slice(0, size[1])), _falling(along).float()
+
+
+def _falling(along: Tensor) -> Tensor:
+    """Weights that fall from 1 at 0 to 0 at 1, without a kink at either end."""
+    left = 1 - along.clamp(0, 1)
+    return left.square() * (3 - 2 * left)
+
+
 def _inside(region: Region, size: Size, down: slice, across: slice) -> Tensor:
-    """Which pixels of a part of a picture have their centre in a region, (h, w)."""
+    """Which pixels of a part of a picture have their centre in a region, (h, w); for a gradient, their weights."""
     if region.shape == "polygon":
         y, x = _centres(size, down, across)
         inside = torch.zeros(y.shape[0], x.shape[1], dtype=torch.bool)
@@ -189,8 +204,9 @@ def _inside(region: Region, size: Size, down: slice, across: slice) -> Tensor:
                 inside ^= ((y0 > y) != (y1 > y)) & (x < x0 + (y - y0) * (x1 - x0) / (y1 - y0))
         return inside
     u, v = _in_parallelogram(region, size, down, across)
-    if region.shape == "ellipse":
-        return (2 * u - 1).square() + (2 * v - 1).square() <= 1
+    if region.shape in ("ellipse", "radial"):
+        squared = (2 * u - 1).square() + (2 * v - 1).square()
+        return squared <= 1 if region.shape == "ellipse" else _falling(1 + (squared.sqrt() - 1) / region.softness)
     return (u >= 0) & (u < 1) & (v >= 0) & (v < 1)
 
 

@@ -12,7 +12,10 @@ from tests.photo.app.page_controls import Controls
 def test_sliders_show_and_change_the_development(client: Client) -> None:
     shown = Controls(client)
     tab = DevelopTab("develop", shown)
-    shown.show(tab, Recipe((), Development(0.5, -0.2, 0.1, 3.0, temperature=5000.0, shadows=0.4)))
+    shown.show(
+        tab,
+        Recipe((), Development(exposure=0.5, warmth=-0.2, tint=0.1, straighten=3.0, temperature=5000.0, shadows=0.4)),
+    )
     changed = {"Exposure": 0.5, "Warmth": -0.2, "Tint": 0.1, "Straighten": 3.0, "Temperature": 5000, "Shadows": 0.4}
     assert {label: value for label, value in shown.sliders().items() if value and "Curve" not in label} == changed
     assert {"0.50 stops", "5000 K", "3.0\u00b0"} <= set(shown.texts())

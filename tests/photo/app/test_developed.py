@@ -22,7 +22,7 @@ from tests.browser import difference
 from tests.pairwise import each_value
 from tests.problems import cat
 
-ALL = Development(0.4, 0.2, 0.1, 4.0, (0.1, 0.0, 1.0, 0.9))
+ALL = Development(exposure=0.4, warmth=0.2, tint=0.1, straighten=4.0, crop=(0.1, 0.0, 1.0, 0.9))
 BLUE = Stroke(((0.37, 0.35), (0.45, 0.37)), 0.04, "#2040e0")
 
 

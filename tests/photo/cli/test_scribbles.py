@@ -464,3 +464,16 @@ def test_files_of_strokes_that_do_not_suit_are_refused(
     Image.new("L", (WIDTH, HEIGHT), 255).save(tmp_path / "mask.png")
     assert "--mask must come with --colour" in refusal(capsys, "recolor", photo, out, "--mask", tmp_path / "mask.png")
     assert not out.exists()
+
+
+def test_gradients_in_pixels_and_percent() -> None:
+    linear = parse_region("-9,0,50%,120:red", "--linear", SIZE, "add", "linear")
+    assert linear == (Region(((-0.1, 0.0), (0.5, 2.0)), "linear", "add"), "red")
+    radial, _ = parse_region("9,6,50%,50%,30%", "--radial", SIZE, "add", "radial")
+    assert radial.entries() == {"paint": "add", "radial": [0.1, 0.1, 0.5, 0.5], "softness": 0.3}
+    drawn = marked(EDITS["defocus"], ScribbleOptions(rectangles={"--radial": ["0,0,90,60"], "--linear": ["0,0,0,6"]}))
+    assert [mark.entries()["paint"] for mark in drawn.marks] == ["add", "add"]
+    for option, shape in (("--linear", "linear"), ("--radial", "radial")):
+        for text in ("1,2,3", "0,0,0,0", "0,0,1,x", "0,0,1,300%", ""):
+            with pytest.raises(ValueError, match=f"{option} must be X,Y,.*, in pixels or percent, got '{text}'"):
+                parse_region(text, option, SIZE, "add", shape)

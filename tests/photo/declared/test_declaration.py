@@ -137,7 +137,7 @@ def test_an_edit_knows_its_parameters_by_name_and_by_argument() -> None:
 def test_an_edit_tells_its_scribbles() -> None:
     assert EDIT.words == ("colour", "out")
     assert EDIT.requires_strokes
-    assert [scribble.argument for scribble in EDIT.with_options] == ["keep"]
+    assert [option.scribble.argument for option in EDIT.with_options] == ["keep"]
     assert [scribble.argument for scribble in EDIT.with_role("background", "added")] == ["keep"]
     assert EDIT.regional is None
     regions = Scribble("regions", "Edit this", "sliders")

@@ -135,7 +135,9 @@ def test_steps_whose_strokes_are_cropped_away_change_nothing() -> None:
 
 
 def test_there_and_back_through_a_file() -> None:
-    recipe = Recipe((Step("tone"),), Development(0.5, 0.1, -0.2, 1.5, (0.1, 0.0, 1.0, 0.9)))
+    recipe = Recipe(
+        (Step("tone"),), Development(exposure=0.5, warmth=0.1, tint=-0.2, straighten=1.5, crop=(0.1, 0.0, 1.0, 0.9))
+    )
     assert Recipe.from_json(recipe.to_json(), "edit.json") == recipe
     only = Recipe((), Development(exposure=1.0))
     assert json.loads(only.to_json()) == {"version": 1, "develop": {"exposure": 1.0}, "steps": []}

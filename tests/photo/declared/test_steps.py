@@ -17,8 +17,8 @@ def test_idle_steps_change_nothing(pixels: torch.Tensor) -> None:
     for edit in EDITS:
         assert not Step.idle(edit).changes()
         assert apply_recipe(Recipe((Step.idle(edit),)), pixels) is pixels
-        changed: dict[str, Any] = {"matrix": (0.5,) * 9} if edit == "look" else {}  # the default look changes nothing
-        assert Step(edit, (BLUE, IN), **changed).changes()
+        changed: dict[str, dict[str, Any]] = {"look": {"matrix": (0.5,) * 9}, "light": {"exposure": 1.0}}
+        assert Step(edit, (BLUE, IN), **changed.get(edit, {})).changes()  # the default look and light change nothing
 
 
 def test_more_memory_is_asked_for_by_hungrier_steps() -> None:

@@ -240,3 +240,36 @@ def test_a_box_moves_with_a_crop_and_a_turned_picture() -> None:
     assert all(left - 1e-6 <= x <= right + 1e-6 and top - 1e-6 <= y <= bottom + 1e-6 for x, y in inside)
     gone = Development(crop=(0.0, 0.0, 0.2, 0.4)).frame((40, 80))
     assert on_frame(Step("defocus", (box,)), gone).strokes == ()
+
+
+GRADIENTS = [
+    {"paint": "add", "linear": [[0.5, -0.1], [0.4, 1.2]]},
+    {"paint": "remove", "radial": [0.1, 0.2, 0.3, 0.4]},
+    {"paint": "add", "radial": [[0.1, 0.2], [0.4, 0.3], [0.0, 0.5]], "softness": 1.0},
+]
+
+
+@pytest.mark.parametrize("entries", GRADIENTS)
+def test_gradients_in_files(entries: dict[str, object]) -> None:
+    assert DEFOCUS.mark_of(entries, "edit.json").entries() == entries
+
+
+@pytest.mark.parametrize(
+    ("entries", "sentence"),
+    [
+        ({"paint": "add", "linear": [[0.5, 0.5], [0.5, 0.5]]}, "linear of a stroke in edit.json must be two different"),
+        ({"paint": "add", "linear": [0.5, 0.5, 0.6, 0.7]}, "linear of a stroke in edit.json must be two different"),
+        ({"paint": "add", "radial": [0, 0, 1, 1], "softness": 0}, r"softness of .* must be in \(0, 1\], got 0"),
+        ({"paint": "add", "ellipse": [0, 0, 1, 1], "softness": 1}, "must have the entries points, radius and paint"),
+        ({"paint": "in", "linear": [[0, 0], [0, 1]]}, "must be add or remove for gradients, got in; correct it"),
+    ],
+)
+def test_bad_gradients(entries: dict[str, object], sentence: str) -> None:
+    with pytest.raises(ValueError, match=sentence):
+        DEFOCUS.mark_of(entries, "edit.json")
+
+
+def test_a_linear_gradient_reaches_what_lies_before_its_end() -> None:
+    upper = Region(((0.5, 0.2), (0.5, 0.4)), "linear", "add")
+    assert upper.reaches((10, 10))
+    assert not replace(upper, points=((0.5, -0.2), (0.5, 0.04))).reaches((10, 10))

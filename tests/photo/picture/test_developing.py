@@ -88,7 +88,7 @@ def test_only_grey_and_rgb_are_developed(channels: int) -> None:
 
 def test_gradients() -> None:
     image = torch.rand(1, 3, 5, 6, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    for development in (Development(-0.5, 0.3, 0.1), Development(straighten=5.0, rotate=270)):
+    for development in (Development(exposure=-0.5, warmth=0.3, tint=0.1), Development(straighten=5.0, rotate=270)):
         assert gradcheck(lambda values, d=development: develop_image(values, d), (0.1 + 0.5 * image).requires_grad_())
 
 

@@ -50,11 +50,13 @@ def test_values_above_white_are_not_lost() -> None:
     assert torch.allclose(develop_image(darker, Development(exposure=3.0)), wide, atol=1e-5)
     assert develop_image(wide[..., :3], Development(exposure=3.0)).max() == 1
     both = torch.cat([wide, wide.clamp(0, 1)])  # one picture of a batch does not change the other
-    assert torch.equal(develop_image(both, Development(exposure=1.0))[1], develop_image(both[1:], Development(1.0))[0])
+    assert torch.equal(
+        develop_image(both, Development(exposure=1.0))[1], develop_image(both[1:], Development(exposure=1.0))[0]
+    )
 
 
 LIGHTING = Development(
-    0.2, contrast=0.3, highlights=-0.8, shadows=0.7, whites=-0.2, blacks=0.3, vibrance=0.4, saturation=-0.1
+    exposure=0.2, contrast=0.3, highlights=-0.8, shadows=0.7, whites=-0.2, blacks=0.3, vibrance=0.4, saturation=-0.1
 )
 
 

@@ -182,3 +182,33 @@ def test_a_painter_sees_that_a_picture_of_marks_has_changed(tmp_path: Path) -> N
     assert planes[1] is planes[0]
     assert bool(planes[0].all())
     assert not bool(planes[2].any())
+
+
+def test_gradients_fall_smoothly_from_1_to_0() -> None:
+    """Along their axis alone, whatever the proportions of the picture, and the same for any rows of it."""
+    linear = Region(((0.25, 0.5), (0.75, 0.5)), "linear", "add")
+    weights = rasterised([((linear, True),)], (10, 40))[0, 0]
+    assert (weights == weights[:1]).all()
+    assert (weights[0, :10] == 1).all()
+    assert (weights[0, 30:] == 0).all()
+    assert (weights[0].diff() <= 0).all()
+    assert weights[0, 19] + weights[0, 20] == pytest.approx(1)
+    slanted = Region(((0.0, 0.0), (1.0, 1.0)), "linear", "add")  # alike across it, in pixels
+    weights = rasterised([((slanted, True),)], (20, 40))[0, 0]
+    assert weights[0, 10] == pytest.approx(float(weights[4, 8]), abs=1e-6)
+    for gradient in (linear, slanted, Region.upright((0.1, 0.2, 0.6, 0.7), "radial", "add")):
+        whole = rasterised([((gradient, True),)], (20, 40))
+        assert torch.equal(rasterised([((gradient, True),)], (20, 40), slice(5, 9)), whole[:, :, 5:9])
+
+
+def test_a_radial_gradient_is_full_within_and_none_beyond_its_ellipse() -> None:
+    radial = Region.upright((0.0, 0.0, 1.0, 1.0), "radial", "add")
+    weights = rasterised([((radial, True),)], (41, 81))[0, 0]
+    assert (weights[20, 21:60] == 1).all()
+    assert weights[20, 10] == pytest.approx(0.5, abs=0.05)
+    assert weights[0, 0] == weights[40, 80] == 0
+    wide = rasterised([((replace(radial, softness=1.0), True),)], (41, 81))[0, 0]
+    assert wide[20, 20] == pytest.approx(0.5, abs=0.02)
+    assert (wide <= weights).all()
+    both = rasterised([((radial, True), (Region(((0.5, 0.0), (0.5, 1.0)), "linear", "remove"), False))], (41, 81))
+    assert both[0, 0, 20, 40] == pytest.approx(0.5, abs=0.02)

@@ -21,7 +21,11 @@ def hidden() -> HiddenPixels:
 
 def test_pixels_are_those_of_the_image() -> None:
     photograph = Photograph(colour("chelsea", *SIZE))
-    for development in (Development(), Development(0.4, 0.2, straighten=3.0), Development(crop=(0.1, 0.2, 0.9, 1.0))):
+    for development in (
+        Development(),
+        Development(exposure=0.4, warmth=0.2, straighten=3.0),
+        Development(crop=(0.1, 0.2, 0.9, 1.0)),
+    ):
         edited = develop_photograph(photograph, development)
         assert torch.equal(edited.pixels, develop_image(photograph.pixels, development))
         assert edited.alpha is edited.hidden is edited.weights is None
