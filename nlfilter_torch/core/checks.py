@@ -6,6 +6,7 @@ Only public functions validate; internal functions trust their arguments.
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
+from itertools import cycle
 from numbers import Integral, Real
 from typing import Any, TypeGuard
 
@@ -102,7 +103,7 @@ def check_finite(tensor: Tensor, name: str) -> None:
         return
     values = tensor.detach()
     # The sum takes a tenth of the time of checking each value, but overflows for large finite values.
-    if bool(values.sum().isfinite()):
+    if math.isfinite(float(values.sum())):
         return
     if bad := int((~torch.isfinite(values)).sum()):
         raise ValueError(f"{name} must be finite, got {bad} NaN or infinite value(s); replace them first")
@@ -281,25 +282,23 @@ def check_reach(value: float, name: str, size: tuple[int, int]) -> None:
         raise ValueError(f"{name} must be at most {limit}, got {described(value)}; lower it")
 
 
-def check_scale(bandwidth: float | Tensor, name: str, largest: Tensor, what: str) -> None:
-    """Raise if squares of features overflow; features have magnitudes up to ``largest`` (B,) over the bandwidth.
+def check_scale(bandwidth: float | Tensor, name: str, largest: Sequence[float], dtype: torch.dtype, what: str) -> None:
+    """Raise if squares of features overflow in ``dtype``.
 
-    Skipped if :func:`~nlfilter_torch.core.torch_internals.is_hidden`.
+    Features have magnitudes up to ``largest``, of each image, over the bandwidth. Skipped if the bandwidth is hidden,
+    see :func:`~nlfilter_torch.core.torch_internals.is_hidden`.
     """
-    bandwidths = bandwidth.detach() if isinstance(bandwidth, Tensor) else torch.tensor(bandwidth, dtype=torch.float64)
-    if is_hidden(largest) or is_hidden(bandwidths):
+    if isinstance(bandwidth, Tensor) and is_hidden(bandwidth):
         return
-    limits = torch.finfo(largest.dtype)
-    # Squared differences of features are summed; the margin allows for gradients.
-    smallest = (largest.double() / (limits.max**0.5 / 64)).clamp(min=4 * limits.tiny)
-    bandwidths = bandwidths.double().reshape(-1).expand_as(smallest)
-    if bool((bandwidths < smallest).any()):
-        worst = int((bandwidths / smallest).argmin())
-        least = 1.06 * float(smallest[worst])  # the message shows two digits, rounded up
-        raise ValueError(
-            f"{name} must be at least {least:.2g} for {what} up to {float(largest[worst]):.2g}, "
-            f"got {float(bandwidths[worst]):.2g}; raise it"
-        )
+    values = bandwidth.detach().reshape(-1).tolist() if isinstance(bandwidth, Tensor) else [bandwidth]
+    limits = torch.finfo(dtype)
+    for value, most in zip(cycle(values), largest, strict=False):
+        # Squared differences of features are summed; the margin allows for gradients.
+        least = max(most / (limits.max**0.5 / 64), 4 * limits.tiny)
+        if value < least:  # the message shows two digits, rounded up
+            raise ValueError(
+                f"{name} must be at least {1.06 * least:.2g} for {what} up to {most:.2g}, got {value:.2g}; raise it"
+            )
 
 
 def check_count(value: object, name: str, *, least: int = 1, most: int | None = None) -> None:

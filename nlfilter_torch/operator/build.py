@@ -79,13 +79,6 @@ def _is_small(bandwidth: float | Tensor | str) -> bool:
     return isinstance(bandwidth, str) or bandwidth < 1
 
 
-def _largest(guide: Tensor) -> Tensor:
-    """The largest magnitude of each image, (B,)."""
-    if is_hidden(guide) or guide.shape[0] == 0:
-        return guide.abs().flatten(1).amax(1)
-    return torch.stack([torch.stack(image.aminmax()).abs().amax() for image in guide])  # faster on CPUs
-
-
 def nonlocal_operator(
     guide: Tensor,
     *,
@@ -268,13 +261,15 @@ def _from_guide(
     guide, halo = communicator.with_halo(guide, max(window.shape[0] // 2, 1))
     counts = None if weights is None or filled else weights > 0
     bandwidth = _bandwidth(guide, halo, options, communicator, weights, counts)
-    largest = _largest(guide.detach())
-    check_scale(bandwidth, "photometric_bandwidth", largest, "values of the guide")
     spatial = options.spatial_bandwidth
+    if not is_hidden(guide):
+        ends = [image.aminmax() for image in guide.detach()]  # faster on CPUs than those of all images
+        largest = [max(-float(least), float(most)) for least, most in ends]
+        check_scale(bandwidth, "photometric_bandwidth", largest, guide.dtype, "values of the guide")
+        farthest = [float(max(communicator.whole(size)))] * len(guide)
+        for axis_bandwidth in () if spatial is None else bandwidths_of(spatial):
+            check_scale(axis_bandwidth, "spatial_bandwidth", farthest, guide.dtype, "coordinates")
     if spatial is not None:
-        farthest = torch.full_like(largest, max(communicator.whole(size)))
-        for axis_bandwidth in bandwidths_of(spatial):
-            check_scale(axis_bandwidth, "spatial_bandwidth", farthest, "coordinates")
         spatial = tuple(_copy(communicator.copy_to_group(value)) for value in bandwidths_of(spatial))
     recipe = GuideFeatures(window, _copy(bandwidth), spatial, options.guide_channels)
     features = recipe(guide, origin=(communicator.first_row - halo[0], 0), halo=halo, counts=counts)
@@ -469,7 +464,7 @@ def _assemble(
     balancing = sinkhorn_balance(matrix, tolerance=tolerance, completed=completed, bound=bound)
     matrix, scaling, residual, before = balancing.matrix, balancing.scaling, balancing.residual, balancing.before
     factor, diagonal = matrix.factor, matrix.diagonal
-    worst = float(residual.max()) if watched else 0.0
+    worst = balancing.worst if watched else 0.0
     remainder = scaling * (scaling * diagonal)  # in this order: without completion d^2 may overflow
     gram = PixelMatrix(factor, scaling, remainder, weights, communicator).gram_below
     allowed = slack(factor.dtype, worst)
@@ -479,7 +474,7 @@ def _assemble(
         before = tuple(torch.linalg.solve(limit.detach(), total) for total in before)  # preserves u . total
         matrix = replace(matrix, factor=factor)
         residual = _residual(matrix, scaling)
-        warn_of_residual(residual, tolerance, factor.dtype, completed=completed)
+        warn_of_residual(float(residual.max()), tolerance, factor.dtype, completed=completed)
     if hidden is not None:
         columns, own = whole_kernel
         columns = columns if kernel.limiter is None else kernel.limiter @ columns

@@ -7,6 +7,7 @@ point's own value, so that W extends what is known to them.
 
 import math
 from dataclasses import replace
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -17,6 +18,7 @@ from nlfilter_torch.operator.landmarks import (
     assign_landmarks,
     canonical_candidates,
     clustered,
+    drawn,
     drawn_candidates,
     orientations,
 )
@@ -90,10 +92,12 @@ def _in_canonical_order(
     numbers = source_pixels(orientation.numbers, box, torch.arange(len(places), device=kept.device))[0]
     order = (amounts[numbers] > 0).nonzero().squeeze(1)
     counted = _uneven(amounts[numbers[order]].unsqueeze(0))
-    drawn = drawn_candidates((1, len(order)), count, "kmeans", generator, counted).to(order.device)
-    candidates, _, chosen = canonical_candidates(inside, box, order[drawn], orientation, layout)
+    pixels = drawn_candidates((1, len(order)), count, "kmeans", generator, counted).to(order.device)
+    draws = None if len(pixels) == count else drawn(len(pixels), count, generator)
+    source = partial(source_pixels, orientation.numbers, box, order[pixels])
+    candidates, _, chosen = canonical_candidates(inside, source, orientation, layout)
     assignment = Assignment(places[candidates], None, None, math.prod(size))
-    return clustered(pick(image, assignment.candidates.unsqueeze(1)), chosen, assignment, count, generator)
+    return clustered(pick(image, assignment.candidates.unsqueeze(1)), chosen, assignment, count, draws)
 
 
 def _uneven(weights: Tensor) -> Tensor | None:

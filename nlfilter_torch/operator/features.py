@@ -384,7 +384,7 @@ def _magnitude(padded: Tensor) -> Tensor:
         slopes.append(lines.narrow(axis, 2, length) - lines.narrow(axis, 0, length))
     squares = (slope.square() for slope in slopes)
     magnitude = reduce(torch.add, squares).sqrt()
-    if is_hidden(magnitude) or not bool(magnitude.sum().isfinite()):
+    if is_hidden(magnitude) or not math.isfinite(float(magnitude.sum())):
         # hypot cannot overflow, but on CPUs its last digit depends on the position in memory, and therefore on tiling.
         magnitude = reduce(torch.hypot, slopes)
     return magnitude

@@ -1,9 +1,10 @@
 """Landmarks: the few points whose affinities to all pixels determine the kernel. Paper: Sec. II-C, set A."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import cast
+from functools import partial
+from typing import NamedTuple, cast
 
 import torch
 from torch import Tensor
@@ -11,10 +12,11 @@ from torch import Tensor
 from nlfilter_torch.core.blocks import stratified
 from nlfilter_torch.core.communicator import ALONE, Communicator
 from nlfilter_torch.core.kernels.clusters import MULTIPLIED, TRIALS, lloyd, pick, pivots
-from nlfilter_torch.core.torch_internals import register
+from nlfilter_torch.core.torch_internals import cached_constants, register
 from nlfilter_torch.operator.options import Assignment, FilterOptions, Sampling
 from nlfilter_torch.operator.orientation import (
     MOST_CHANNELS,
+    ORIENTATIONS,
     Layout,
     Orientation,
     canonical_points,
@@ -70,20 +72,68 @@ def assign_landmarks(
         gives the same results as single calls.
     """
     count, sampling = options.num_landmarks, cast(Sampling, options.landmarks)
-    generator = torch.Generator().manual_seed(0) if options.generator is None else options.generator
-    points = math.prod(size)
-    if count == features.shape[-1] and communicator.size == 1:
+    points, alone = math.prod(size), communicator.size == 1
+    if count == features.shape[-1] and alone:
         return features.clone(), Assignment(torch.arange(points, device=features.device)[None], None, None, points)
-    pixels = drawn_candidates(size, count, sampling, generator, weights)
-    pixels = communicator.broadcast(pixels.to(features.device))
+    fixed = options.generator is None and weights is None and alone
+    if fixed:
+        pixels, draws = _fixed_draws(size, count, sampling)
+    else:
+        generator = torch.Generator().manual_seed(0) if options.generator is None else options.generator
+        pixels = drawn_candidates(size, count, sampling, generator, weights)
+        draws = None if len(pixels) == count else drawn(len(pixels), count, generator)
     if layout is not None and sampling == "kmeans" and weights is None:
         orientation = orientations(features, size, layout, communicator)
-        candidates, subset, chosen = canonical_candidates(features, size, pixels, orientation, layout, communicator)
+        source = partial(_fixed_source, orientation.numbers, size, count)
+        if not fixed:
+            pixels = communicator.broadcast(pixels.to(features.device))
+            source = partial(source_pixels, orientation.numbers, size, pixels)
+        candidates, subset, chosen = canonical_candidates(features, source, orientation, layout, communicator)
     else:
-        candidates = pixels[None]
+        pixels = communicator.broadcast(pixels.to(features.device))
+        candidates = pixels[None].clone()
         subset = communicator.columns(features, pixels)
         chosen = subset.detach()
-    return clustered(subset, chosen, Assignment(candidates, None, None, points), count, generator, communicator)
+    return clustered(subset, chosen, Assignment(candidates, None, None, points), count, draws, communicator)
+
+
+class Draws(NamedTuple):
+    """What the initial centroids are chosen by.
+
+    Attributes:
+        few: numbers (n,) of the candidates that may be chosen.
+        numbers: random numbers (M, TRIALS) in [0, 1) that decide the pivots, in float64.
+    """
+
+    few: Tensor
+    numbers: Tensor
+
+
+def drawn(candidates: int, count: int, generator: torch.Generator) -> Draws:
+    """Draw which of up to half of the candidates are chosen as initial centroids."""
+    few = torch.randperm(candidates, generator=generator, device=generator.device)
+    few = few[: _bounded(STARTED_FROM * count, MOST_STARTED_FROM, count)]
+    return Draws(few, torch.rand(count, TRIALS, generator=generator, device=generator.device, dtype=torch.float64))
+
+
+@cached_constants
+def _fixed_draws(size: tuple[int, ...], count: int, sampling: Sampling) -> tuple[Tensor, Draws | None]:
+    """What a new generator draws: candidates, and what follows if there are more than ``count``."""
+    generator = torch.Generator().manual_seed(0)
+    pixels = candidate_pixels(size, count, sampling, generator)
+    return pixels, None if len(pixels) == count else drawn(len(pixels), count, generator)
+
+
+def _fixed_source(orientation: Tensor, size: tuple[int, ...], count: int, *, flipped: bool = True) -> Tensor:
+    """:func:`source_pixels` of the candidates that a new generator draws for k-means."""
+    return _fixed_sources(size, count, orientation.device, flipped)[orientation]
+
+
+@cached_constants
+def _fixed_sources(size: tuple[int, ...], count: int, device: torch.device, flipped: bool) -> Tensor:
+    """The same for every orientation, (8, S)."""
+    pixels = candidate_pixels(size, count, "kmeans", torch.Generator().manual_seed(0)).to(device)
+    return source_pixels(torch.arange(ORIENTATIONS, device=device), size, pixels, flipped=flipped)
 
 
 def clustered(
@@ -91,33 +141,31 @@ def clustered(
     canonical: Tensor,
     candidates: Assignment,
     count: int,
-    generator: torch.Generator,
+    draws: Draws | None,
     communicator: Communicator = ALONE,
 ) -> tuple[Tensor, Assignment]:
     """The result of :func:`assign_landmarks` from candidates with features (B, D, S), and those by which they cluster.
 
-    Landmarks are the candidates themselves, if there are as many.
+    Landmarks are the candidates themselves without ``draws``.
     """
-    if subset.shape[2] == count:
+    if draws is None:
         return subset, candidates
-    start, assignment = clusters(canonical, count, generator, communicator)
+    start, assignment = clusters(canonical, count, draws, communicator)
     return means_of_clusters(subset, start, assignment), replace(candidates, clusters=assignment, start=start)
 
 
 def canonical_candidates(
     features: Tensor,
-    size: Sequence[int],
-    pixels: Tensor,
+    source: Callable[..., Tensor],
     orientation: Orientation,
     layout: Layout,
     communicator: Communicator = ALONE,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Candidates with the numbers ``pixels`` (S,) in the canonical orientation of each image.
+    """Candidates that have certain numbers in the canonical orientation of each image.
 
     Args:
         features: (B, D, N), of the rows here.
-        size: (H, W) of the whole image.
-        pixels: (S,).
+        source: :func:`source_pixels` of these numbers, with the option ``flipped`` open.
         orientation: of the images.
         layout: of the features.
         communicator: ranks that the rows of the image are distributed over.
@@ -125,11 +173,10 @@ def canonical_candidates(
     Returns:
         Their indices (B, S) in the images, their features (B, D, S), and those for the canonical orientation.
     """
-    candidates = source_pixels(orientation.numbers, size, pixels)
-    subset, coordinates = communicator.columns(features, candidates.unsqueeze(1)), None
+    candidates, coordinates = source(), None
+    subset = communicator.columns(features, candidates.unsqueeze(1))
     if layout.coordinates:
-        places = source_pixels(orientation.numbers, size, pixels, flipped=False)
-        coordinates = communicator.columns(features[:, -2:].detach(), places.unsqueeze(1))
+        coordinates = communicator.columns(features[:, -2:].detach(), source(flipped=False).unsqueeze(1))
     return candidates, subset, canonical_points(subset, orientation, layout, coordinates)
 
 
@@ -217,29 +264,22 @@ def condense(subset: Tensor, count: int, generator: torch.Generator, points: Ten
     """
     if subset.shape[2] == count:
         return subset
-    return means_of_clusters(subset, *clusters(subset.detach() if points is None else points, count, generator))
+    draws = drawn(subset.shape[2], count, generator)
+    return means_of_clusters(subset, *clusters(subset.detach() if points is None else points, count, draws))
 
 
-def clusters(
-    points: Tensor, count: int, generator: torch.Generator, communicator: Communicator = ALONE
-) -> tuple[Tensor, Tensor]:
+def clusters(points: Tensor, count: int, draws: Draws, communicator: Communicator = ALONE) -> tuple[Tensor, Tensor]:
     """Cluster points (B, D, S) by k-means: indices (B, 1, M) of the initial centroids, and assignment (B, S)."""
     points = points - points.mean(dim=2, keepdim=True)  # small offsets keep ||x||^2 + ||z||^2 - 2xz accurate
     # Single precision suffices here, and the kernels in C take nothing else.
     points = points.clamp(-LARGEST_FEATURE, LARGEST_FEATURE).float()
-    few = draw_few(points.shape[2], count, generator).to(points.device)
-    chosen = _pivots(pick(points, few.expand(len(points), 1, -1)), count, generator)
+    few = draws.few.to(points.device)
+    chosen = _pivots(pick(points, few.expand(len(points), 1, -1)), draws.numbers)
     start = communicator.broadcast(few[chosen]).unsqueeze(1)  # (B, 1, M)
     assignment = communicator.broadcast(
         lloyd(points, pick(points, start), ITERATIONS, TIE * torch.finfo(points.dtype).eps)
     )
     return start, assignment
-
-
-def draw_few(candidates: int, count: int, generator: torch.Generator) -> Tensor:
-    """Draw the indices of up to half of the candidates, from which the initial centroids are chosen."""
-    few = torch.randperm(candidates, generator=generator, device=generator.device)
-    return few[: _bounded(STARTED_FROM * count, MOST_STARTED_FROM, count)]
 
 
 def candidate_count(pixels: int, count: int, sampling: str) -> int:
@@ -275,8 +315,10 @@ def _grid(size: tuple[int, ...], count: int) -> Tensor:
     return torch.cat(lines)
 
 
-def _pivots(points: Tensor, count: int, generator: torch.Generator) -> Tensor:
-    """Choose initial centroids (B, count) among points (B, D, S): pivots of a randomly pivoted Cholesky decomposition.
+def _pivots(points: Tensor, draws: Tensor) -> Tensor:
+    """Choose initial centroids (B, M) among points (B, D, S), by random numbers (M, TRIALS).
+
+    They are pivots of a randomly pivoted Cholesky decomposition.
 
     Pivots are proposed in proportion to the fourth power of the residual: the part of the kernel's unit diagonal that
     the earlier pivots do not capture (Chen, Epperly, Tropp and Webber, 2022). Rare patches that are unlike all others
@@ -286,14 +328,9 @@ def _pivots(points: Tensor, count: int, generator: torch.Generator) -> Tensor:
     arbitrary candidates. Half of the proposals depend on the distance from the nearest pivot too, so that clusters
     wider than the bandwidth are not missed, and of several times as many proposals those that cover most are taken.
     """
-    draws = pivot_draws(count, generator).to(points)
-    together = points.device.type != "cpu" or count <= MULTIPLIED  # on CPUs matrix products are of one image at a time
+    together = points.device.type != "cpu" or len(draws) <= MULTIPLIED  # on CPUs products are of one image at a time
+    draws = draws.to(points)
     return torch.cat([pivots(part, draws, CAPTURED) for part in points.split(len(points) if together else 1)])
-
-
-def pivot_draws(count: int, generator: torch.Generator) -> Tensor:
-    """Random numbers (count, TRIALS) in [0, 1) that decide the pivots, in float64."""
-    return torch.rand(count, TRIALS, generator=generator, device=generator.device, dtype=torch.float64)
 
 
 def means_of_clusters(subset: Tensor, start: Tensor, assignment: Tensor) -> Tensor:

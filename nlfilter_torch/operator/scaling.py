@@ -24,6 +24,7 @@ a uniform sample misses, converge last. On photographs of a megapixel each sweep
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Protocol, TypeVar, TypeVarTuple
 
 import torch
@@ -257,6 +258,11 @@ class Balancing:
     steps: int
     inverse: Tensor
     before: tuple[Tensor, ...] = ()
+
+    @cached_property
+    def worst(self) -> float:
+        """The largest residual of a batch; reads values."""
+        return float(self.residual.max())
 
 
 def _draw(matrix: KernelMatrix, scaling: Tensor, count: int) -> tuple[KernelMatrix, Tensor | None]:

@@ -102,11 +102,12 @@ def balanced_in_rounds(matrix: KernelMatrix, tolerance: float, completed: bool) 
     watched, removed, before = not is_hidden(matrix.factor), None, list[Tensor]()
     while True:
         found = solve(matrix, tolerance, completed)
-        warn_of_residual(found.residual, tolerance, matrix.factor.dtype, completed=completed)
+        if watched:
+            warn_of_residual(found.worst, tolerance, matrix.factor.dtype, completed=completed)
         if not (completed and watched) or len(before) == MOST_ROUNDS:
             break
-        alone = isolated(found.scaling, matrix.diagonal, float(found.residual.max()), matrix.weights)
-        if not bool(matrix.communicator.max(alone.any().to(matrix.factor))):
+        alone = isolated(found.scaling, matrix.diagonal, found.worst, matrix.weights)
+        if not bool(matrix.communicator.max(alone.any().byte())):
             break
         before.append(found.moment)
         removed = alone if removed is None else removed | alone
@@ -115,13 +116,13 @@ def balanced_in_rounds(matrix: KernelMatrix, tolerance: float, completed: bool) 
     return replace(found, before=tuple(before)), removed
 
 
-def warn_of_residual(residual: Tensor, tolerance: float | None, dtype: torch.dtype, *, completed: bool) -> None:
-    """Warn, on CPUs, if row sums deviate from 1 by more than the tolerance and more than rounding."""
-    if not is_hidden(residual) and not bool((residual <= max(tolerance or 0.0, ALARM[dtype])).all()):
+def warn_of_residual(residual: float, tolerance: float | None, dtype: torch.dtype, *, completed: bool) -> None:
+    """Warn if row sums deviate from 1 by up to ``residual``, more than the tolerance and more than rounding."""
+    if not residual <= max(tolerance or 0.0, ALARM[dtype]):
         remedy = "raise photometric_bandwidth or num_landmarks" + (
             ", or use completion='diagonal'" if not completed else ""
         )
-        warn(f"balancing left row sums that differ from 1 by up to {residual.max().item():.1e}; {remedy}")
+        warn(f"balancing left row sums that differ from 1 by up to {residual:.1e}; {remedy}")
 
 
 def attainable(factor: Tensor, tolerance: float, communicator: Communicator) -> float:
@@ -185,7 +186,7 @@ def solve(matrix: KernelMatrix, tolerance: float, completed: bool) -> Balancing:
     quick = completed and not torch.compiler.is_compiling()
     solution = sampled_newton(matrix, tolerance) if quick else _chebyshev(matrix, tolerance)
     goal = attainable(matrix.factor, tolerance, matrix.communicator)
-    if not is_hidden(matrix.factor) and not bool((solution.residual <= goal).all()):
+    if not is_hidden(matrix.factor) and not solution.worst <= goal:
         solution = damped(matrix, solution, goal)
     return solution
 
@@ -262,7 +263,7 @@ def sinkhorn(
     if not is_hidden(factor) and (bound or factor.shape[1] * factor.shape[2] <= ALWAYS):
         remainder = result.scaling * (result.scaling * result.matrix.diagonal)
         balanced = PixelMatrix(result.matrix.factor, result.scaling, remainder)
-        if exceeds(balanced.gram_below, result.moment, slack(factor.dtype, float(result.residual.max()))):
+        if exceeds(balanced.gram_below, result.moment, slack(factor.dtype, result.worst)):
             warn("eigenvalues exceed 1, which compiled programs do not correct; use landmarks='kmeans'")
     moments = [*result.before, *[result.moment] * (MOST_ROUNDS + 1 - len(result.before))]
     removed = torch.zeros_like(diagonal, dtype=torch.bool) if removed is None else removed

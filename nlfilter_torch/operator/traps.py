@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.core.blocks import weighted
-from nlfilter_torch.core.torch_internals import is_hidden
+from nlfilter_torch.core.torch_internals import cached_constants, is_hidden
 from nlfilter_torch.core.warning import warn
 
 GREY_LEVELS = (4.0, 64.0)  # usual bandwidths in grey levels; where values end at 1, larger ones ask for the mean
@@ -94,13 +94,13 @@ GOLDEN = 0.6180339887498949  # whose multiples, without their whole parts, sprea
 HALF = 0.5  # share of its weight by which the row of a badly covered point is off
 
 
+@cached_constants
 def sampled_points(points: int, count: int = SAMPLED) -> Tensor:
     """Numbers (S,) of the points whose features are kept, spread over all ``points``; always the same, on the CPU."""
-    with torch.device("cpu"):
-        if points <= 2 * count:
-            return torch.arange(points)
-        starts = torch.arange(count + 1) * points // count
-        return starts[:-1] + (torch.arange(count).double() * GOLDEN % 1 * starts.diff()).long()
+    if points <= 2 * count:
+        return torch.arange(points)
+    starts = torch.arange(count + 1) * points // count
+    return starts[:-1] + (torch.arange(count).double() * GOLDEN % 1 * starts.diff()).long()
 
 
 def share_above(values: Tensor, limit: float, weights: Tensor | None) -> Tensor:

@@ -135,6 +135,10 @@ def test_candidates_stop_growing_with_the_landmarks(count: int, expected: int) -
     assert len(candidate_pixels((1000, 1000), count, "kmeans", seeded())) == expected
 
 
+def pivot_draws(count: int) -> torch.Tensor:
+    return torch.rand(count, clusters.TRIALS, generator=seeded(), dtype=torch.float64)
+
+
 def test_starts_drawn_in_blocks_are_about_as_good_as_those_drawn_singly(monkeypatch: pytest.MonkeyPatch) -> None:
     x = 0.5 * cloud(2, 3000).float()
     x[0, :, :300] *= 0.01  # many similar points
@@ -144,7 +148,7 @@ def test_starts_drawn_in_blocks_are_about_as_good_as_those_drawn_singly(monkeypa
         marks = condense(x, 300, seeded(seed))
         return nystrom_factor(x, marks, inverse_cholesky(marks), "diagonal")[1].mean(1)
 
-    pivots, in_blocks = _pivots(x, 300, seeded()), sum(map(residual, range(3)))
+    pivots, in_blocks = _pivots(x, pivot_draws(300)), sum(map(residual, range(3)))
     assert all(len(row.unique()) > 285 for row in pivots)  # few are chosen twice
     assert {7, 1007, 2007} <= set(pivots[0].tolist())
     monkeypatch.setattr(clusters, "LARGEST", 1)
@@ -164,14 +168,14 @@ def test_no_cluster_is_missed(marks: int, spread: float) -> None:
 
 def test_starts_of_many_landmarks_do_not_depend_on_the_batch() -> None:
     x = cloud(2, 1000)
-    alone = torch.cat([_pivots(image, 300, seeded()) for image in x.split(1)])
-    assert torch.equal(_pivots(x, 300, seeded()), alone)
+    alone = torch.cat([_pivots(image, pivot_draws(300)) for image in x.split(1)])
+    assert torch.equal(_pivots(x, pivot_draws(300)), alone)
 
 
 def test_a_few_points_that_hold_all_of_the_residual_do_not_fill_a_block() -> None:
     x = torch.zeros(1, 1, 1000, dtype=torch.float64)
     x[0, 0, :5] = 50.0 * torch.arange(1, 6)
-    pivots = _pivots(x, 300, seeded())[0]
+    pivots = _pivots(x, pivot_draws(300))[0]
     assert set(range(5)) <= set(pivots.tolist())
     assert len(pivots.unique()) > 200
 

@@ -1,5 +1,7 @@
 """The canonical orientation: shared by an image and its mirror images, so that landmarks turn with the image."""
 
+from functools import partial
+
 import pytest
 import torch
 from hypothesis import example, given
@@ -92,7 +94,8 @@ def test_candidates_of_all_orientations_are_equal_to_the_last_bit(
         assert recipe.layout is not None
         features = recipe(turned)
         orientation = orientations(features, size, recipe.layout)
-        points.append(canonical_candidates(features, size, pixels, orientation, recipe.layout)[2])
+        source = partial(source_pixels, orientation.numbers, size, pixels)
+        points.append(canonical_candidates(features, source, orientation, recipe.layout)[2])
     assert all(torch.equal(points[0], other) for other in points[1:])
 
 

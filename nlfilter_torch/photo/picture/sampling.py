@@ -338,7 +338,7 @@ class Look:
         with single_threaded(self.workers):
             block = Block(*kernel.factor(features), weights, image=image)
             balancing = solve(block, PILOT_TOLERANCE, completed)
-        warn_of_residual(balancing.residual, PILOT_TOLERANCE, self.picture.dtype, completed=completed)
+        warn_of_residual(balancing.worst, PILOT_TOLERANCE, self.picture.dtype, completed=completed)
         return Pilot(kernel, block, balancing.moment, rest.initial_seed())
 
     def _read(self, wanted: Tensor) -> tuple[Tensor, Tensor, float, Tensor]:

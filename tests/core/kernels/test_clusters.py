@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from nlfilter_torch import nonlocal_operator
-from nlfilter_torch.core.kernels.clusters import lloyd
+from nlfilter_torch.core.kernels.clusters import TRIALS, lloyd
 from nlfilter_torch.operator import landmarks
 from tests.native import LEVELS, by_torch, random
 from tests.pairwise import pairwise
@@ -18,8 +18,8 @@ from tests.pairwise import pairwise
 def test_landmarks(level: int, batch: int, size: int, points_and_marks: tuple[int, int]) -> None:
     points, marks = points_and_marks
     cloud = random(batch, size, points)
-    pivots = landmarks._pivots(cloud, marks, torch.Generator().manual_seed(1))
-    expected = by_torch(landmarks._pivots, cloud, marks, torch.Generator().manual_seed(1))
+    draws = torch.rand(marks, TRIALS, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    pivots, expected = landmarks._pivots(cloud, draws), by_torch(landmarks._pivots, cloud, draws)
     assert torch.equal(pivots[:, :6], expected[:, :6])  # on a line, the others are chosen by rounding
     assert torch.equal(pivots, expected) or size == 1
     start = cloud.gather(2, pivots.unsqueeze(1).expand(-1, size, -1))
