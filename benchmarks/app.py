@@ -1,8 +1,7 @@
-"""How long the editor takes from a movement of the pointer to the picture: ``python -m benchmarks.app [--browser]``.
+"""How long the editor takes from a movement of the pointer to the picture: ``python -m benchmarks.app``.
 
 Prints medians and quartiles of ``--repeats``, in milliseconds, on a square preview. Then, for a photograph of
-``--megapixels``, the same; with ``--browser`` from the pointer's move to the picture in a headless Chromium as well,
-over the server and its pictures as JPEG; from a pan at 100 % to the PNG files of what is newly seen, and of a view that
+``--megapixels``, the same; from a pan at 100 % to the PNG files of what is newly seen, and of a view that
 is all new; the time to open it and to save three edits of it as a JPEG, beside that of ``nlfilter-torch apply`` with
 the same edit, and the memory at the peak, above that before the photograph was opened.
 """
@@ -171,40 +170,11 @@ def files(path: Path, quick: bool) -> None:
         report("the same on the command line", [1e3 * wall])
 
 
-def in_the_browser(path: Path, repeats: int) -> None:
-    """From the pointer's move to the picture in the page."""
-    from tests.browser import Editor, Tab, chromium
-
-    editor = Editor(path.parent, path.name, threads=torch.get_num_threads())
-    try:
-        with chromium() as browser:
-            tab = Tab(browser.new_page(viewport={"width": 1400, "height": 1000}))
-            tab.page.goto(editor.with_token())
-            tab.open_details()
-            slider = tab.slider("Texture")
-            tab.drag(slider, 0.2, 0.25, release=False)
-            tab.page.wait_for_timeout(3000)
-            box = slider.bounding_box()
-            assert box is not None
-            times = []
-            for i in range(repeats):
-                before, x = tab.source(), box["x"] + (0.3 + 0.03 * i) * box["width"]
-                start = time.perf_counter()
-                tab.page.mouse.move(x, box["y"] + box["height"] / 2)
-                tab.wait_for_picture(before)
-                times.append(1e3 * (time.perf_counter() - start))
-                tab.page.wait_for_timeout(300)
-            report("pointer to picture in the browser", times)
-    finally:
-        editor.stop()
-
-
 def main() -> None:
     """Measure and print."""
     parser = options("app", __doc__, "saves one edit only as the first one of a process")
     parser.add_argument("--side", type=int, default=1000, help="pixels of a square preview")
     parser.add_argument("--megapixels", type=float, default=24, help="of the photograph that is seen at 100 %%")
-    parser.add_argument("--browser", action="store_true", help="with headless Chromium too")
     parser.add_argument("--repeats", type=int, default=20, help="of each movement")
     arguments = parser.parse_args()
     print(f"{arguments.side}x{arguments.side} pixels, {torch.get_num_threads()} threads, {platform.machine()}")
@@ -221,8 +191,6 @@ def main() -> None:
         in_the_library(compressed, arguments.repeats)
         files(compressed, arguments.quick)
         at_full_size(large, arguments.repeats)
-        if arguments.browser:
-            in_the_browser(compressed, arguments.repeats)
 
 
 if __name__ == "__main__":

@@ -276,6 +276,20 @@ def by_finger(tab: Tab, *points: tuple[float, float]) -> None:
     fingers.to("End")
 
 
+def dropped(page: Page, files: dict[str, bytes]) -> bool:
+    """Drop files on the page, or text if there are none; whether the browser does with them what it would do."""
+    return bool(
+        page.evaluate(
+            """files => { const data = new DataTransfer(); data.setData("text/plain", "text");
+            for (const [name, bytes] of files) data.items.add(new File([new Uint8Array(bytes)], name,
+              { type: name.endsWith(".png") ? "image/png" : "" }));
+            const how = { dataTransfer: data, bubbles: true, cancelable: true };
+            return document.querySelector(".panel").dispatchEvent(new DragEvent("drop", how)); }""",
+            [(name, list(content)) for name, content in files.items()],
+        )
+    )
+
+
 def pixels_of(answer: APIResponse) -> torch.Tensor:
     """The picture (1, 3, H, W) in [0, 1] that the editor has answered with."""
     return torch.from_numpy(np.array(Image.open(io.BytesIO(answer.body())))).permute(2, 0, 1)[None] / 255

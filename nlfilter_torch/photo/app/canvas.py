@@ -163,12 +163,26 @@ class Canvas:
         self.draw_mask()
 
     def draw(self, moving: int | None) -> None:
-        """Compute the picture and its mask, quickly while a slider of a step moves; may run in a thread."""
+        """Compute the picture and its mask, quickly while a slider of a step moves; may run in a thread.
+
+        A complete picture is not shown if the edit has changed meanwhile.
+        """
         session = self._session
         if session is None:
             return
-        self.take(session.render(moving))
-        self.lay_over(moving=moving is not None)
+        recipe, picture = session.recipe, session.render(moving)
+        if session is self._session and (moving is not None or session.recipe.effect == recipe.effect):
+            self.take(picture)
+            self.lay_over(moving=moving is not None)
+
+    def sketch(self, moving: int | None) -> bool:
+        """Compute the picture at once, approximately, and return whether that was possible; may run in a thread."""
+        session = self._session
+        picture = None if session is None else session.draft(moving)
+        if picture is None or session is not self._session:
+            return False
+        self.take(picture)
+        return True
 
     def lay_over(self, *, moving: bool = False) -> None:
         """Compute the mask, if it may be shown, and what does not count of the strokes; may run in a thread."""

@@ -62,6 +62,7 @@ class Closeup:
         self._number = 0
         self._pieces: dict[str, tuple[Rectangle, bytes]] = {}  # in the order in which they were made
         self._covered = torch.zeros(0, 0, dtype=torch.bool)  # cells
+        self._near: tuple[str, bytes] | None = None  # what is shown approximately, by its name
 
     def open(self, session: Session) -> None:
         """Show a photograph that was opened."""
@@ -78,6 +79,7 @@ class Closeup:
     def look(self, view: Sequence[float] | None) -> None:
         """Show a part, (left, top, right, bottom) in pixels of the photograph, or None for the whole photograph."""
         self._view = None if view is None else self._part(view)
+        self.show_nearly()
         self._wake()
 
     def hold(self) -> None:
@@ -98,6 +100,8 @@ class Closeup:
 
     def file(self, name: str) -> bytes | None:
         """A piece as a PNG file."""
+        if self._near is not None and name == self._near[0]:
+            return self._near[1]
         return self._pieces[name][1] if name in self._pieces else None
 
     def original(self, place: str) -> bytes | None:
@@ -120,8 +124,8 @@ class Closeup:
     def _forget(self) -> None:
         """Forget all pieces, which show another edit."""
         self._covered.zero_()
-        if self._pieces:
-            self._pieces = {}
+        if self._pieces or self._near is not None:
+            self._pieces, self._near = {}, None
             self._tell("closeup.clear()")
 
     def _wake(self) -> None:
@@ -136,9 +140,7 @@ class Closeup:
             while (piece := self._next()) is not None:
                 session, part = piece
                 recipe = session.recipe
-                if recipe.effect != self._recipe.effect:
-                    self._forget()
-                self._recipe = recipe
+                self._begin(recipe)
                 try:
                     report = Interruptible(self._is_outdated, session, recipe)
                     content = await self._tasks.run("Full size", _piece, session, part, recipe, report, progress=report)
@@ -146,20 +148,49 @@ class Closeup:
                     continue
                 if not self._is_outdated(session, recipe):
                     self._add(part, content)
+            if self._near is not None:  # covered
+                self._tell(f"closeup.drop('{self._near[0]}')")
+                self._near = None
         finally:
             self._working = False
             self._tasks.say(self)
 
+    def show_nearly(self) -> None:
+        """Show at once what the visible part will nearly be, below the pieces, if there is none of the edit yet."""
+        session, view = self.session, self._view
+        if session is None or view is None or self._held or bool(self._covered.any()):
+            return
+        if session.recipe.acting and session.has_drawn(session.recipe):
+            self._tasks.start(self._lay_below(session, view, session.recipe))
+
+    async def _lay_below(self, session: Session, view: Rectangle, recipe: Recipe) -> None:
+        content = await self._tasks.run("Full size", _nearly, session, view, recipe)
+        is_late = view != self._view or self._is_outdated(session, recipe) or bool(self._covered.any())
+        if content is not None and not is_late:
+            self._begin(recipe)
+            self._number += 1
+            self._near = f"near-{self._number}", content
+            self._place(self._near[0], view)
+
     def _is_outdated(self, session: Session, recipe: Recipe) -> bool:
         return self._held or self.session is not session or session.recipe.effect != recipe.effect
+
+    def _begin(self, recipe: Recipe) -> None:
+        """Show pieces of an edit from now on."""
+        if recipe.effect != self._recipe.effect:
+            self._forget()
+        self._recipe = recipe
+
+    def _place(self, name: str, part: Rectangle) -> None:
+        rows, columns = part.rows, part.columns
+        self._tell(f"closeup.add('{name}', {columns.start}, {rows.start}, {columns.stop}, {rows.stop})")
 
     def _add(self, part: Rectangle, content: bytes) -> None:
         self._number += 1
         name = f"piece-{self._number}"
         self._pieces[name] = (part, content)
         self._cells(part).fill_(True)
-        rows, columns = part.rows, part.columns
-        self._tell(f"closeup.add('{name}', {columns.start}, {rows.start}, {columns.stop}, {rows.stop})")
+        self._place(name, part)
         total = sum(len(p.rows) * len(p.columns) for p, _ in self._pieces.values())
         for old, (other, _) in list(self._pieces.items()):
             if total <= KEPT_PIECES:
@@ -194,6 +225,12 @@ class Closeup:
 def _piece(session: Session, part: Rectangle, recipe: Recipe, report: Report) -> bytes:
     """A part of the photograph under an edit, as a PNG file."""
     return drawing.lossless(session.part(part, recipe, report))
+
+
+def _nearly(session: Session, part: Rectangle, recipe: Recipe) -> bytes | None:
+    """The same at once, approximately; None if that is not possible."""
+    picture = session.nearly(part, recipe)
+    return None if picture is None else drawing.lossless(picture)
 
 
 def first_block(missing: Tensor, most: int) -> tuple[range, range] | None:

@@ -48,11 +48,13 @@ def app(image: Image = None, out: Out = None, host: Host = "127.0.0.1", port: Po
         raise ValueError(f"--out {folder} does not exist; create the folder first")
     try:
         from nlfilter_torch.photo.app.library import Library
+
+        photographs = Library.opening(folder, image)  # while the rest is imported
         from nlfilter_torch.photo.app.page import Pages
         from nlfilter_torch.photo.app.server import serve
     except ModuleNotFoundError as error:
         raise ValueError(
             f"the editor needs {error.name}, which is not installed; install it with: pip install 'nlfilter-torch[app]'"
         ) from error
-    pages = Pages(Library(folder, None if image is None else image.parent), image)
+    pages = Pages(photographs, image)
     serve(pages.build, pages.picture, host=host, port=port, open_page=open)

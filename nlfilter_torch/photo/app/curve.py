@@ -75,7 +75,8 @@ class CurveEditor:
 
     def _draw(self) -> None:
         tones = torch.linspace(0, 1, STEPS + 1)
-        pairs = zip(tones.tolist(), on_curve(tones, self._curve).tolist(), strict=True)
+        bent = tones if self._curve == EVEN_CURVE else on_curve(tones, self._curve)  # which takes an import
+        pairs = zip(tones.tolist(), bent.tolist(), strict=True)
         line = " ".join(f"{100 * x:.1f},{100 - 100 * y:.1f}" for x, y in pairs)
         self._line.set_content(
             '<svg viewBox="0 0 100 100" preserveAspectRatio="none" role="img" aria-label="tone curve">'

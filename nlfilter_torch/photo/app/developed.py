@@ -23,6 +23,7 @@ from nlfilter_torch.photo.picture.pixels import Strip
 from nlfilter_torch.photo.picture.source import Cache
 
 DEVELOPING = -1  # the place before all steps, of a slider that moves
+DRAFT_PIXELS = 400_000  # of a draft, at most: a quarter of what a preview may have, and of its time
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,6 +66,14 @@ class Developed:
     def parts(self) -> Parts:
         """Parts of it at full size."""
         return Parts(self.photograph.pixels[0].permute(1, 2, 0).numpy(), self.name)
+
+    @cached_property
+    def draft(self) -> Preview | None:
+        """A smaller preview, which follows a person's hand; None if the preview is small enough itself."""
+        pixels = self.preview.pixels
+        if pixels.shape[-2] * pixels.shape[-1] < 2 * DRAFT_PIXELS:
+            return None
+        return Preview(pixels.clamp(0, 1), DRAFT_PIXELS, reduction=self.preview.stride)
 
     @cached_property
     def _light(self) -> Light:

@@ -206,9 +206,13 @@ class Question:
         with ui.dialog().props(f'aria-label="{title}"') as self._dialog, ui.card().classes("dialog"):
             ui.label(title).classes("text-h6")
             ui.label(text)
+            self._build_options()
             with ui.row().classes("w-full justify-end"):
                 ui.button("Cancel", on_click=lambda: self._dialog.submit(False)).props("flat no-caps autofocus")
                 ui.button(ok, on_click=lambda: self._dialog.submit(True)).props("unelevated no-caps color=primary")
+
+    def _build_options(self) -> None:
+        """Build what is asked beside that."""
 
     async def answer(self) -> bool:
         """Whether to do it; the dialog is gone then."""
@@ -231,6 +235,8 @@ class Upload:
         accept: kinds of files, as the ``accept`` attribute of HTML has them.
         largest: largest size in bytes.
         show_error: takes a sentence for the user.
+        several: whether several files may be chosen at once, each of which is passed to the action.
+        begin: is called when files have been chosen, or None.
     """
 
     def __init__(
@@ -239,9 +245,15 @@ class Upload:
         accept: str,
         largest: int,
         show_error: Callable[[str], None],
+        *,
+        several: bool = False,
+        begin: Callable[[], object] | None = None,
     ) -> None:
         self._largest, self._show_error, self._accept = largest, show_error, accept
-        self._upload = ui.upload(auto_upload=True, on_upload=action, max_file_size=largest)
+        self._upload = ui.upload(multiple=several, auto_upload=True, on_upload=action, max_file_size=largest)
+        self._upload.on("finish", lambda: self._upload.run_method("reset"), args=[])
+        if begin is not None:
+            self._upload.on("added", begin, args=[])
         self._upload.on(
             "rejected",
             lambda event: self._refuse(*event.args),
@@ -267,7 +279,7 @@ class Upload:
         elif reason == "dialog":
             self._show_error(f"{name} is not opened while a dialog is; close it, and drop the file again")
         elif reason == "several":  # not an error, which would leave once this file is open
-            ui.notify(f"Only one file is opened at a time: {name}.", position="bottom-left", timeout=6000)
+            ui.notify(f"Only one edit is loaded at a time: {name}.", position="bottom-left", timeout=6000)
         else:
             self._show_error(f"{name} must be a {_kinds(self._accept)} file; choose another")
 

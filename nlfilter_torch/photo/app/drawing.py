@@ -46,6 +46,12 @@ def _grey_or_rgb(image: Tensor) -> Image.Image:
     return Image.fromarray(np.ascontiguousarray(planes.numpy()))
 
 
+def planes(image: Image.Image) -> Tensor:
+    """An image of Pillow, grey or RGB with 8 bits, as (1, 1 or 3, H, W) in [0, 1]."""
+    values = torch.from_numpy(np.array(image))
+    return (values[None] if values.ndim == 2 else values.permute(2, 0, 1))[None] / 255
+
+
 def picture(image: Tensor) -> bytes:
     """An image (1, 1 or 3, H, W) in [0, 1] as a JPEG."""
     return _encode(_grey_or_rgb(image), "JPEG", quality=JPEG_QUALITY, subsampling=0)

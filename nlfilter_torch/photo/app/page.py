@@ -20,10 +20,12 @@ from nlfilter_torch.photo.app.canvas import Canvas
 from nlfilter_torch.photo.app.closeup import AtRest, Closeup
 from nlfilter_torch.photo.app.developed import DEVELOPING, Developed
 from nlfilter_torch.photo.app.dialogs import EXPECTED, Arguments, NameDialog, Question, SaveDialog, Tasks, Upload
+from nlfilter_torch.photo.app.filmstrip import Filmstrip
 from nlfilter_torch.photo.app.library import Library
 from nlfilter_torch.photo.app.panel import Panel
 from nlfilter_torch.photo.app.server import SCRIPTS, STATIC
 from nlfilter_torch.photo.app.session import Session
+from nlfilter_torch.photo.app.shots import Shot
 from nlfilter_torch.photo.app.tabs import thumbnails
 from nlfilter_torch.photo.app.tools import FREE, Brush, Proportions
 from nlfilter_torch.photo.declared.json_values import Value
@@ -38,6 +40,7 @@ REPLACING = (
     "Colorize is for grey photographs: the colours of this one would all be replaced by those that you paint. "
     "Recolor changes the colour of an object, and keeps the rest."
 )
+TURNING = {"n": 1, "p": -1}  # keys that show the next photograph, and the previous one
 INSIDE, OUTSIDE = "#4ade80", "#60a5fa"  # colours of the sliders' response in the region, and elsewhere
 EDITORS: dict[str, "Editor"] = {}  # open pages by the token in the addresses of their pictures
 
@@ -54,14 +57,20 @@ class Editor:
         self._pictured: Developed | None = None  # what thumbnails of looks show
         self._picturing = 0  # how often they were drawn, so that browsers do not show others
         self._wanted: list[int | None] = []  # at most one picture to draw next: the place of a step that moves, or None
-        self._drawing = False
+        self._drawing = self._completing = self._incomplete = False
         self._responding = self._response_wanted = False  # whether the response of the sliders is computed, and again
+        self._shows_next = False  # whether the next file that the browser sends is shown
         self._framed: object = None  # what canvas and closeup show
         self.is_cropping = False
         self.proportions = Proportions()
 
-    def build(self, image: Path | None, address: str = "", tab: str = "") -> None:
-        """Lay the page out, and open the photograph and the tab of an address that the page had before, or an image."""
+    def build(self, image: Path | None, address: str = "", tab: str = "", roll: str = "") -> None:
+        """Lay the page out, and open the photograph and tab of an address that the page had before, or an image.
+
+        ``roll`` names the photographs of its strip.
+        """
+        self._roll = roll if roll in self._photographs.rolls else self._token
+        self._shots = self._photographs.rolls.setdefault(self._roll, {})
         EDITORS[self._token] = self
         self._client = ui.context.client
         self._client.on_delete(self._leave)
@@ -73,6 +82,15 @@ class Editor:
         with ui.element("div").classes("editor"):
             with ui.element("div").classes("viewer"):
                 self._canvas = Canvas(self.brush, self._token, self._draw, self._lay, self._upload.choosing)
+                self._filmstrip = Filmstrip(
+                    self._photographs,
+                    self._shots,
+                    self._tasks,
+                    lambda: self.session,
+                    self._turn_to,
+                    self._follow_all,
+                    self._token,
+                )
             with ui.column().classes("panel") as self._side:
                 handle = ui.button(icon="drag_handle").props('flat dense aria-label="Show or hide the controls"')
                 handle.classes("handle").on("click", js_handler="() => page.fold()")
@@ -81,7 +99,7 @@ class Editor:
         self._tasks.sign.move(self._canvas.place)
         if image is not None or address:
             self._wait("Opening\u2026")
-        ui.keyboard(on_key=self._key)
+        ui.keyboard(on_key=self._key, ignore=["input", "select", "textarea"])
         ui.on("closeup", lambda event: self._look(event.args))
         ui.on("stroke_dropped", self._canvas.drop_stroke)
         ui.on("save_photo", self._ask_photo_name)
@@ -115,7 +133,7 @@ class Editor:
         """The file of a picture that the page shows, by its kind; of the original at a place."""
         if kind == "original":
             return self._closeup.original(place)
-        return self._canvas.pictures.get(kind) or self._closeup.file(kind)
+        return self._canvas.pictures.get(kind) or self._closeup.file(kind) or self._filmstrip.picture(kind)
 
     def thumbnail(self, look: str) -> str:
         """The address of a picture of the photograph under a look, or "" if there is none."""
@@ -139,7 +157,14 @@ class Editor:
             ui.space()
             self._tasks = Tasks()
             show_error = self._tasks.show_error
-            self._upload = Upload(self._take_photograph, PHOTOGRAPH_KINDS, LARGEST_UPLOAD, show_error)
+            self._upload = Upload(
+                self._take_photograph,
+                PHOTOGRAPH_KINDS,
+                LARGEST_UPLOAD,
+                show_error,
+                several=True,
+                begin=self._await_photographs,
+            )
             presets = Upload(self._take_preset, PRESET_KINDS, LARGEST_PRESET, show_error)
             kinds = f"A PNG, JPEG, TIFF, WebP, AVIF or HEIC file of at most {LARGEST_UPLOAD / 1e9:g} GB"
             _button("Open", "folder_open", kinds, js=self._upload.choosing)
@@ -313,6 +338,14 @@ class Editor:
         for editor in list(EDITORS.values()):
             if editor.session is self.session:
                 editor.follow()
+        self._follow_photographs()
+
+    def _follow_all(self) -> None:
+        """Show the edits of all photographs, in all tabs."""
+        self._tasks.clear_error()
+        for editor in list(EDITORS.values()):
+            editor.follow()
+        self._follow_photographs()
 
     def follow(self) -> None:
         """Show the edit."""
@@ -348,6 +381,10 @@ class Editor:
         if self.session is not None and self.session.redo():
             self._changed()
 
+    def _turn_to(self, shot: Shot) -> None:
+        """Show another photograph of the strip."""
+        self._tasks.start(self._open(self._photographs.session, shot))
+
     def _reset(self) -> None:
         if self.session is not None:
             self.proportions = Proportions()
@@ -355,8 +392,16 @@ class Editor:
             self._changed()
 
     def _key(self, event: events.KeyEventArguments) -> None:
-        if event.action.keydown and event.modifiers.ctrl and str(event.key).lower() == "z":
-            self._redo() if event.modifiers.shift else self._undo()
+        if not event.action.keydown:
+            return
+        key, shift = str(event.key).lower(), event.modifiers.shift
+        actions = {"z": self._redo if shift else self._undo}
+        if shift:
+            actions |= {"c": self._filmstrip.copy, "v": self._filmstrip.paste}
+        if event.modifiers.ctrl and key in actions:
+            actions[key]()
+        elif key in TURNING and not (shift or event.modifiers.alt or event.modifiers.meta or event.modifiers.ctrl):
+            self._filmstrip.turn(TURNING[key])
 
     # Pictures
 
@@ -370,6 +415,7 @@ class Editor:
             self._tasks.start(self._keep_drawing())
 
     async def _keep_drawing(self) -> None:
+        """Draw what is wanted: large photographs at once as a sketch, which is completed beside further sketches."""
         self._drawing = True
         try:
             while self._wanted:
@@ -378,23 +424,50 @@ class Editor:
                     await self._show_crop()
                     if moving == DEVELOPING:
                         continue
-                await self._tasks.run("Working", self._canvas.draw, moving)
+                if await self._tasks.run("Working", self._canvas.sketch, moving):
+                    self._show()
+                    self._wait()
+                    self._canvas.draw_mask(moving=True)
+                    self._closeup.show_nearly()
+                elif moving is not None:
+                    await self._draw_completely(moving)
                 if moving is None:
-                    self._frame()
-                self._show()
-                self._wait()
-                if moving is None and self.session is not None and self._pictured is not self.session.developed:
-                    self._pictured = self.session.developed
-                    self._tasks.start(self._draw_looks(self.session.developed))
-                if self._panel.tab == DETAIL.name:
-                    self._tasks.start(self._respond())
-                self._canvas.draw_mask(moving=moving is not None)
-                self._canvas.draw_strokes()
+                    self._incomplete = True
+                    if not self._completing:
+                        self._tasks.start(self._complete())
         finally:
             self._drawing = False
+            if not self._incomplete and not self._completing:
+                self._wait()
+
+    async def _complete(self) -> None:
+        """Draw the preview itself, until it is that of the current edit."""
+        self._completing = True
+        try:
+            while self._incomplete:
+                self._incomplete = False
+                await self._draw_completely(None)
+        finally:
+            self._completing = False
             self._wait()
         if self.session is not None:
             self._at_rest.drawn(self.session)
+
+    async def _draw_completely(self, moving: int | None) -> None:
+        await self._tasks.run("Working", self._canvas.draw, moving)
+        if moving is None:
+            self._frame()
+        self._show()
+        self._wait()
+        self._closeup.show_nearly()
+        if moving is None and self.session is not None and self._pictured is not self.session.developed:
+            self._pictured = self.session.developed
+            self._tasks.start(self._draw_looks(self.session.developed))
+            self._prepare()
+        if self._panel.tab == DETAIL.name:
+            self._tasks.start(self._respond())
+        self._canvas.draw_mask(moving=moving is not None)
+        self._canvas.draw_strokes()
 
     async def _draw_looks(self, developed: Developed) -> None:
         """Draw thumbnails of the photograph, as it is developed, under each look."""
@@ -435,7 +508,7 @@ class Editor:
 
     def _is_preview(self, session: object) -> bool:
         """Whether the page shows the preview of a session, and nothing is being drawn or moved."""
-        is_drawing = self._drawing or bool(self._wanted)
+        is_drawing = self._drawing or self._completing or bool(self._wanted)
         return self.session is session and not (self._client.is_deleted or is_drawing or self._closeup.is_busy)
 
     def _frame(self) -> None:
@@ -475,11 +548,18 @@ class Editor:
         if tab == DETAIL.name and self.session is not None:
             self._tasks.start(self._respond())
         self._remember()
+        self._prepare()
+
+    def _prepare(self) -> None:
+        """Let the first move of a slider of the open tab be fast."""
+        if self.session is not None:
+            self._tasks.start(self._tasks.run("Preparing", self.session.prepare, self._panel.tab))
 
     def _remember(self) -> None:
-        """Let the address of the page be that of its photograph and tab, for a reload."""
+        """Let the address of the page be that of its photographs and tab, for a reload."""
         if self.session is not None:
-            ui.navigate.history.replace(f"/?photo={quote(self.session.address)}&tab={self._panel.tab}")
+            roll = f"roll={self._roll}&" if len(self._shots) > 1 else ""
+            ui.navigate.history.replace(f"/?{roll}photo={quote(self.session.address)}&tab={self._panel.tab}")
 
     # Files
 
@@ -494,14 +574,31 @@ class Editor:
             self._tasks.start(self._open(self._photographs.open, image))
 
     async def _take_photograph(self, event: events.UploadEventArguments) -> None:
-        event.sender.run_method("reset")
-        self._tasks.start(self._open_upload(event.file))
+        is_first, self._shows_next = self._shows_next or self.session is None, False
+        self._tasks.start(self._open_upload(event.file, is_first))
 
-    async def _open_upload(self, file: FileUpload) -> None:
+    def _await_photographs(self) -> None:
+        """Show the first of the photographs that the browser is about to send."""
+        self._shows_next = True
+
+    async def _open_upload(self, file: FileUpload, is_first: bool) -> None:
+        """Take a photograph into the strip, and show it if it is the first of those that were chosen together."""
         with tempfile.TemporaryDirectory(prefix="nlfilter-torch-") as folder:
             copy = Path(folder) / "photograph"
             await file.save(copy)
-            await self._open(self._photographs.open_upload, copy, file.name)
+            shot = await self._tasks.run("Opening", self._photographs.shot_of_upload, copy, file.name)
+        if is_first:
+            await self._open(self._photographs.session, shot)
+        else:
+            self._shots.setdefault(shot.address, shot)
+            self._follow_photographs()
+            with self._client:
+                self._remember()
+
+    def _follow_photographs(self) -> None:
+        """Show the photographs that are open, in all tabs."""
+        for editor in list(EDITORS.values()):
+            editor._filmstrip.follow()
 
     async def _open(self, find: Callable[[*Arguments], Session], *place: *Arguments) -> None:
         self._wait("Opening\u2026")
@@ -512,6 +609,7 @@ class Editor:
             raise
         if self._client.is_deleted:
             return
+        self._shots[session.address] = self._photographs.shot_of(session)
         self._title.set_text(session.name)
         self._tasks.clear_error()
         self._closeup.open(session)
@@ -523,6 +621,7 @@ class Editor:
             self._canvas.open(session)
         self._wait("Opening\u2026" if session.recipe == Recipe() else "Applying the edit\u2026")
         self.follow()
+        self._follow_photographs()
         with self._client:
             self._remember()
             if session.pages > 1:
@@ -534,7 +633,6 @@ class Editor:
 
     async def _take_preset(self, event: events.UploadEventArguments) -> None:
         content = await event.file.read()
-        event.sender.run_method("reset")
         session = self._opened("to edit")
         if session is None:
             return
@@ -601,9 +699,9 @@ class Pages:
     photographs: Library
     image: Path | None
 
-    def build(self, photo: str = "", tab: str = "") -> None:
-        """Build a page, for the photograph and tab of an address that a page had before, if there is one."""
-        Editor(self.photographs).build(self.image, photo, tab)
+    def build(self, photo: str = "", tab: str = "", roll: str = "") -> None:
+        """Build a page, for the photographs and tab of an address that a page had before, if there is one."""
+        Editor(self.photographs).build(self.image, photo, tab, roll)
 
     def picture(self, token: str, kind: str, at: str = "") -> Response:
         """A picture of the page with a token, by its kind, of the original at a place; or status 404.

@@ -201,6 +201,7 @@ class Preview:
         pixels: the largest number of pixels in the preview, approximately.
         reduced: the photograph in the size of the preview, in another light; None is computed.
         light: this change of light, or None.
+        reduction: sampling step of the photograph itself, if it is another preview.
 
     Attributes:
         size: (height, width) of the preview.
@@ -214,10 +215,11 @@ class Preview:
         pixels: int = PIXELS,
         reduced: Tensor | None = None,
         light: Callable[[Tensor], Tensor] | None = None,
+        reduction: float = 1.0,
     ) -> None:
         whole = (photograph.shape[-2], photograph.shape[-1])
         self.size = viewed_size(whole, pixels / MEGAPIXEL)
-        self.stride = math.sqrt(whole[0] * whole[1] / (self.size[0] * self.size[1]))
+        self.stride = reduction * math.sqrt(whole[0] * whole[1] / (self.size[0] * self.size[1]))
         self.photograph = photograph
         if reduced is None:
             reduced = resize(photograph.float(), self.size) if self.size != whole else photograph.float()
@@ -349,6 +351,21 @@ class Preview:
         if moving is None:
             self.edited = result
         return result
+
+    def prepare(self, recipe: Recipe, step: Step) -> None:
+        """Compute the filter of a step that may be changed or added next, after the steps before it in a recipe."""
+        if step.declared.requires_strokes:
+            return
+        with_step = recipe.with_current(step)
+        earlier = Recipe(with_step.steps[: with_step.place_of(step.edit)])
+        if not earlier.acting and self._is_of_layers(step):
+            self.layers(step)
+            return
+        pictures, edited = self._pictures, self.edited
+        image = self.render(earlier)
+        self._pictures, self.edited = pictures, edited
+        key = tuple(step for step in earlier.steps if step.changes())
+        self._filter_of(step.mixed(opacity=1.0), image, key, keep=True)(step)
 
     def _computed(self, step: Step, image: Tensor, before: tuple[Step, ...], *, keep: bool) -> StepPicture:
         """Apply a step to the picture after the steps before it; ``keep`` says whether to cache its filter."""

@@ -33,7 +33,7 @@ COLLECTED = (700, 10, 10)
 
 
 def serve(
-    build: Callable[[str, str], None],
+    build: Callable[[str, str, str], None],
     picture: Callable[[str, str, str], Response],
     *,
     host: str,

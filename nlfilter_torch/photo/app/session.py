@@ -3,17 +3,18 @@
 import math
 import threading
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from nlfilter_torch.photo.app.developed import DEVELOPING, Developed
 from nlfilter_torch.photo.app.preview import PIXELS, Preview, selected
 from nlfilter_torch.photo.app.sidecar import Sidecar
-from nlfilter_torch.photo.declared.development import Crop, Development
+from nlfilter_torch.photo.declared.development import DEVELOP, Crop, Development
 from nlfilter_torch.photo.declared.json_values import Value
 from nlfilter_torch.photo.declared.parameters import EDITS
 from nlfilter_torch.photo.declared.presets import Recipe, on_frame
@@ -47,6 +48,18 @@ COLOURED, RARE = 0.03, 0.002  # difference of channels of a colour, and the shar
 OPEN_BYTES = 40  # per pixel, for a photograph before and after the edit and the files of both; edits work in tiles
 
 
+@dataclass
+class History:
+    """Edits before the current one, and those that were undone; the last are the nearest."""
+
+    past: list[Recipe] = field(default_factory=list)
+    future: list[Recipe] = field(default_factory=list)
+
+    def add(self, before: Recipe) -> None:
+        """Take the edit before a change."""
+        self.past, self.future = [*self.past[-UNDOS + 1 :], before], []
+
+
 class Session:
     """The editing of a photograph, shared by all pages that show it.
 
@@ -66,6 +79,7 @@ class Session:
         pages: number of pages of the file.
         address: the address by which a page finds the session again.
         saved: the edit as of the last file that was written.
+        history: the edits to undo and redo.
     """
 
     def __init__(self, folder: Path, path: Path, name: str | None = None, pixels: int = PIXELS) -> None:
@@ -81,11 +95,12 @@ class Session:
         self._sidecar: Sidecar | None = None
         self._outdated: list[Developed] = []  # of other developments
         self._drawing = threading.Lock()  # previews cache what they compute, so they draw one picture at a time
+        self._drafting = threading.Lock()
+        self._rendered: tuple[object, Tensor] | None = None  # the edit and the picture that were drawn last
         self._fitting = threading.Lock()  # the same holds for parts at full size
         self._at_rest: tuple[object, Tensor] | None = None  # the last result, for other tabs
         self._pixels = pixels
-        self._past: list[Recipe] = []
-        self._future: list[Recipe] = []
+        self.history = History()
 
     def keep_in(self, sidecar: Sidecar) -> None:
         """Load the edit that is kept in a file, and keep the edit there from now on."""
@@ -112,12 +127,12 @@ class Session:
     @property
     def can_undo(self) -> bool:
         """Whether there is a change to undo."""
-        return bool(self._past)
+        return bool(self.history.past)
 
     @property
     def can_redo(self) -> bool:
         """Whether there is a change that was undone."""
-        return bool(self._future)
+        return bool(self.history.future)
 
     @property
     def preview(self) -> Preview:
@@ -220,8 +235,7 @@ class Session:
         """Complete a change, so that it can be undone."""
         before, self._shown = self._shown, self.recipe  # also if only another step was chosen
         if self.recipe != before:
-            self._past = [*self._past[-UNDOS + 1 :], before]
-            self._future = []
+            self.history.add(before)
             self._keep()
 
     def _keep(self) -> None:
@@ -235,11 +249,11 @@ class Session:
 
     def undo(self) -> bool:
         """Undo the last change; False if there is none."""
-        return self._go(self._past, self._future)
+        return self._go(self.history.past, self.history.future)
 
     def redo(self) -> bool:
         """Redo the last change that was undone; False if there is none."""
-        return self._go(self._future, self._past)
+        return self._go(self.history.future, self.history.past)
 
     def _go(self, there: list[Recipe], back: list[Recipe]) -> bool:
         if not there:
@@ -309,7 +323,65 @@ class Session:
                     self._outdated.append(self.developed)
                     self.developed = developed
             steps = self._on(developed, recipe, developed.preview.size)
-            return developed.preview.render(steps, moving, start)
+            return self._took(recipe, developed.preview.render(steps, moving, start))
+
+    def _took(self, recipe: Recipe, picture: Tensor) -> Tensor:
+        self._rendered = recipe.effect, picture
+        return picture
+
+    def draft(self, moving: int | None = None) -> Tensor | None:
+        """:meth:`render` at once, approximately: the preview with the change that the steps make to a smaller one.
+
+        None if that is no faster, as objects are found in a small picture anyway, or not possible since the photograph
+        is not developed yet. It does not wait for :meth:`render`.
+        """
+        recipe, developed = self.recipe, self.developed
+        if moving == DEVELOPING or developed.development != recipe.develop or not recipe.acting:
+            return None
+        if any(step.declared.requires_strokes for step in recipe.acting):
+            return None
+        with self._drafting:
+            draft = developed.draft
+            if draft is None:
+                return None
+            change = draft.render(self._on(developed, recipe, draft.size), moving) - draft.pixels
+        preview = developed.preview
+        change = F.interpolate(change, preview.size, mode="bilinear")
+        return self._took(recipe, (preview.pixels + change).clamp(0, 1))
+
+    def prepare(self, edit: str) -> None:
+        """Compute what the first move of a slider of an edit, or of the development, needs, before it is moved."""
+        recipe, developed = self.recipe, self.developed
+        if edit == DEVELOP.name:
+            developed.approximate(replace(developed.development, highlights=1.0), self.original.preview)
+            return
+        with self._drafting:
+            draft = developed.draft
+            if draft is not None and developed.development == recipe.develop:
+                draft.prepare(self._on(developed, recipe, draft.size), recipe.current(edit))
+
+    def has_drawn(self, recipe: Recipe) -> bool:
+        """Whether the picture that was drawn last is that of an edit."""
+        is_current = self._rendered is not None and self._rendered[0] == recipe.effect
+        return is_current and self.developed.development == recipe.develop
+
+    def nearly(self, place: Rectangle, recipe: Recipe) -> Tensor | None:
+        """:meth:`part` at once, approximately: its pixels with the change that was drawn last.
+
+        None if that is the change of another edit. It may be computed while :meth:`part` is.
+        """
+        developed, rendered = self.developed, self._rendered
+        if rendered is None or not self.has_drawn(recipe):
+            return None
+        (rows, columns), (height, width) = (place.rows, place.columns), self.size
+        change = rendered[1] - developed.preview.pixels.clamp(0, 1)
+        right, down = (a.start + a.stop for a in (columns, rows))
+        where = change.new_tensor(
+            [[len(columns) / width, 0, right / width - 1], [0, len(rows) / height, down / height - 1]]
+        )
+        grid = F.affine_grid(where[None], [1, 1, *place.size], align_corners=False)
+        seen = F.grid_sample(change, grid, mode="bilinear", padding_mode="border", align_corners=False)
+        return (developed.lit(place) + seen).clamp(0, 1)
 
     def _on(self, developed: Developed, recipe: Recipe, seen: tuple[int, int] | None = None) -> Recipe:
         """The steps of a recipe for the developed photograph, or for that reduced to a size."""
@@ -317,7 +389,8 @@ class Session:
 
     def eigenvalues(self, detail: Step) -> Tensor:
         """Eigenvalues (R,) of the filter of a step of detail, which its layers belong to."""
-        return self.preview.layers(detail).eigenvalues
+        preview = self.developed.draft or self.preview
+        return preview.layers(detail).eigenvalues
 
     def mask(self, edit: str) -> Tensor | None:
         """The mask (1, 1, h, w) of what the scribbles of the chosen step of an edit select, or None."""

@@ -12,7 +12,7 @@ import torch
 from PIL import Image
 
 from nlfilter_torch.core.progress import Progress
-from nlfilter_torch.photo.app import closeup
+from nlfilter_torch.photo.app import closeup, drawing
 from nlfilter_torch.photo.app.closeup import CELL, Closeup
 from nlfilter_torch.photo.app.session import Session
 from nlfilter_torch.photo.declared.presets import Recipe
@@ -73,7 +73,9 @@ class Page:
     def say(self, who: object, doing: str = "") -> None:
         self.said.append(doing)
 
-    async def run(self, doing: str, work: Callable[..., Any], *arguments: object, progress: Progress) -> Any:
+    async def run(
+        self, doing: str, work: Callable[..., Any], *arguments: object, progress: Progress | None = None
+    ) -> Any:
         self.before_work()
         return work(*arguments)
 
@@ -177,3 +179,25 @@ def test_the_original_at_full_size(page: Page) -> None:
     assert torch.equal(pixels(page.closeup.original("400,250,999,999")), cat(1)[..., 250:, 400:])
     for place in ("", "1,2,3", "1,2,x,4", "90,10,30,50", "-9,-9,0,0", "1,2,3,4,5"):
         assert page.closeup.original(place) is None
+
+
+def test_what_was_drawn_is_shown_below_the_pieces(page: Page, large: Session) -> None:
+    """At once the part is nearly what it will be, as the preview has the same pixels here."""
+    recipe = Recipe((Step("detail", alpha=(3.0, 1.0)),))
+    large.load(recipe)
+    drawn = large.render()
+    seen = drawn[..., 40:104, 20:84]
+    near = large.nearly(Rectangle(range(40, 104), range(20, 84)), recipe)
+    assert near is not None
+    assert (near - seen).abs().max() < 1e-4
+    page.closeup._view = Rectangle(range(40, 104), range(20, 84))
+    page.closeup.show_nearly()
+    page.finish()
+    assert page.told == ["closeup.add('near-1', 20, 40, 84, 104)"]
+    assert page.closeup.file("near-1") == drawing.lossless(near)
+    assert page.look(20, 40, 84, 104) == ["closeup.add('piece-2', 0, 0, 128, 128)", "closeup.drop('near-1')"]
+    assert page.closeup.file("near-1") is None
+    large.load(Recipe())
+    assert large.nearly(Rectangle(range(4), range(4)), recipe) is not None
+    large.render()
+    assert large.nearly(Rectangle(range(4), range(4)), recipe) is None

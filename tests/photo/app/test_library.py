@@ -172,3 +172,26 @@ def test_the_photograph_is_not_replaced_by_its_edited_version(shots: Path) -> No
         session.save("cat.png")
     assert difference(read_photograph(shots / "cat.png").pixels, cat()) < 1
     session.save("other.png")
+
+
+def test_an_image_is_opened_ahead(shots: Path) -> None:
+    library = Library.opening(shots, shots / "cat.png")
+    session = library.open(shots / "cat.png")  # waits for it
+    assert library.reopen("cat.png") is session
+    broken = shots / "notes.png"
+    broken.write_text("dear diary")
+    with pytest.raises(ValueError, match=r"notes\.png is not a PNG"):
+        Library.opening(shots, broken).open(broken)
+
+
+def test_what_the_browser_sent_is_opened_again(shots: Path, tmp_path: Path) -> None:
+    """Files of the folder are recognised, and others are kept while the editor runs."""
+    library, other = Library(shots), tmp_path / "sent"
+    shutil.copy(shots / "cat.png", other)
+    assert library.shot_of_upload(other, "cat.png").original == shots / "cat.png"
+    shot = library.shot_of_upload(other, "elsewhere.png")
+    other.unlink()
+    assert library.session(shot).name == "elsewhere.png"
+    assert library.shot_of(library.session(shot)) == shot
+    library._latest = None
+    assert library.reopen(shot.address).name == "elsewhere.png"

@@ -257,3 +257,22 @@ def test_grey_photographs_have_no_colours(session: Session, tmp_path: Path) -> N
     assert session.has_colours
     write_photograph(Photograph(cat().mean(1, keepdim=True).expand(-1, 3, -1, -1)), tmp_path / "grey.png")
     assert not Session(tmp_path, tmp_path / "grey.png").has_colours
+
+
+@pytest.mark.parametrize("recipe", [Recipe((Step("tone", contrast=1.4),)), Recipe((Step("detail", alpha=(1.0, 3.0)),))])
+def test_a_draft_is_near_the_preview(session: Session, recipe: Recipe, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is the preview itself with the change of a smaller picture, and nothing where that is no faster."""
+    assert session.draft() is None  # a small photograph
+    monkeypatch.setattr("nlfilter_torch.photo.app.developed.DRAFT_PIXELS", 5000)
+    session = Session(session.folder, session.path)
+    assert session.draft() is None  # without a step
+    session.prepare(recipe.steps[0].edit)
+    session.load(recipe)
+    draft = session.draft(0)
+    assert draft is not None
+    before, complete = session.preview.pixels, session.render()
+    assert draft.shape == complete.shape
+    assert not draft.equal(complete)
+    assert (draft - complete).square().mean() < 0.25 * (complete - before).square().mean()
+    session.recipe = session.developing({"exposure": 1.0})
+    assert session.draft() is None  # it has to be developed first

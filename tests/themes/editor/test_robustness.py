@@ -12,13 +12,13 @@ from pathlib import Path
 import pytest
 import skimage.data
 import torch
-from playwright.sync_api import Browser, Page, expect
+from playwright.sync_api import Browser, expect
 
 from nlfilter_torch.photo.declared.presets import Recipe, find_recipe
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.edits.recipe import apply_recipe
 from nlfilter_torch.photo.picture.photographs import Photograph, read_photograph, write_photograph
-from tests.browser import TIMEOUT, Editor, Tab, difference, running
+from tests.browser import TIMEOUT, Editor, Tab, difference, dropped, running
 from tests.problems import cat
 
 WATCHED = """window.seen = { welcome: false, signs: new Set() };
@@ -56,20 +56,6 @@ def test_errors_leave_when_something_succeeds(opened: Tab, folder: Path) -> None
     expect(error).not_to_be_visible(timeout=5000)  # before it would disappear by itself
 
 
-def dropped(page: Page, files: dict[str, bytes]) -> bool:
-    """Drop files on the page, or text if there are none; whether the browser does with them what it would do."""
-    return bool(
-        page.evaluate(
-            """files => { const data = new DataTransfer(); data.setData("text/plain", "text");
-            for (const [name, bytes] of files) data.items.add(new File([new Uint8Array(bytes)], name,
-              { type: name.endsWith(".png") ? "image/png" : "" }));
-            const how = { dataTransfer: data, bubbles: true, cancelable: true };
-            return document.querySelector(".panel").dispatchEvent(new DragEvent("drop", how)); }""",
-            [(name, list(content)) for name, content in files.items()],
-        )
-    )
-
-
 def test_before_a_photograph_one_is_chosen_or_dropped(tab: Tab, folder: Path) -> None:
     page = tab.page
     page.get_by_role("button", name="Save photo").click()
@@ -77,12 +63,13 @@ def test_before_a_photograph_one_is_chosen_or_dropped(tab: Tab, folder: Path) ->
     with page.expect_file_chooser():
         page.get_by_role("button", name="Open a photograph to begin").click()
     content = (folder / "cat.png").read_bytes()
-    assert not dropped(page, {"notes.txt": b"", "dropped.png": content, "b.png": b""})  # the page is not left for it
-    expect(page.get_by_text("Only one file is opened at a time: dropped.png.")).to_be_visible()
+    assert not dropped(page, {"notes.txt": b"", "dropped.png": content})  # the page is not left for it
     expect(page.locator(".title")).to_have_text("dropped.png")
     tab.open_details()
     before = tab.source()
-    assert not dropped(page, {"edit.json": Recipe((Step("detail", alpha=(3.0, 1.0, 1.0, 1.0)),)).to_json().encode()})
+    recipe = Recipe((Step("detail", alpha=(3.0, 1.0, 1.0, 1.0)),)).to_json().encode()
+    assert not dropped(page, {"edit.json": recipe, "b.json": recipe})
+    expect(page.get_by_text("Only one edit is loaded at a time: edit.json.")).to_be_visible()
     tab.wait_for_picture(before)
     assert not dropped(page, {"notes.txt": b"dear diary"})
     expect(page.get_by_text("notes.txt must be a PNG, JPEG, TIFF, WebP, AVIF or HEIC file")).to_be_visible()

@@ -49,11 +49,18 @@ class Closeup {
     this.fit();
   }
 
-  /** Add a piece by its name, at a place in pixels of the photograph. */
+  /** Add a piece by its name, at a place in pixels of the photograph; one that is only near lies below all others. */
   add(name, ...part) {
     const parent = document.querySelector(".pieces");
     const image = this.#picture(`${this.#address}/${name}`, part);
-    image.addEventListener("load", () => parent.append(image));
+    image.addEventListener("load", () => {
+      if (!name.startsWith("near")) {
+        parent.append(image);
+        return;
+      }
+      parent.querySelector('[data-name*="/near-"]')?.remove();
+      parent.prepend(image);
+    });
   }
 
   /** Remove a piece. */

@@ -17,7 +17,7 @@ class Page {
 
   #photographs = null;
 
-  /** Take a file that is dropped on the page, which the browser would leave the page for: photographs by an upload. */
+  /** Take files that are dropped on the page, which the browser would leave the page for: photographs by an upload. */
   takeDropped(photographs) {
     if (!this.#photographs) {
       const hasFiles = (event) => event.dataTransfer?.types.includes("Files");
@@ -33,10 +33,10 @@ class Page {
     this.#photographs = photographs;
   }
 
-  /** Send the first photograph of some files, or the first edit, and tell the upload what is not opened. */
+  /** Send the photographs of some files, or else the first edit, and tell the upload what is not opened. */
   #take(files) {
-    const photograph = files.find(isPhotograph);
-    const file = photograph ?? files.find(({ name }) => EDITS.test(name)) ?? files[0];
+    const photographs = files.filter(isPhotograph);
+    const file = photographs[0] ?? files.find(({ name }) => EDITS.test(name)) ?? files[0];
     if (!file) {
       return;
     }
@@ -44,11 +44,11 @@ class Page {
     const edits = EDITS.test(file.name) && uploads.find(({ $props }) => $props.accept.includes(".json"));
     const upload = edits || this.#photographs;
     const isBusy = document.querySelector(".q-dialog");
-    if (isBusy || files.length > 1) {
+    if (isBusy || (files.length > 1 && photographs.length === 0)) {
       upload.$emit("rejected", [{ failedPropValidation: isBusy ? "dialog" : "several", file }]);
     }
     if (!isBusy) {
-      upload.addFiles([file]);
+      upload.addFiles(photographs.length ? photographs : [file]);
     }
   }
 
