@@ -5,11 +5,12 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor
 
-# Pixels in a block, per core. A block of affinities is M x CACHED floats, 0.8 MB for M = 100, and stays in the cache of
-# its core until it is multiplied by the inverse Cholesky factor. Rows of 2048 floats would map to the same few cache
-# sets and evict each other; 2032 floats are an odd number of cache lines. A sweep writes only vectors, so its blocks
+# Pixels in a block, per core. A block of affinities is M x CACHED floats, 1.6 MB for M = 100, and stays in a cache near
+# its core until it is multiplied by the inverse Cholesky factor; at half the length twice as many calls take as long.
+# Rows of 4096 floats would map to the same few cache sets and evict each other; 4080 floats are an odd number of cache
+# lines. A sweep writes only vectors, so its blocks
 # may be longer (SWEPT), which saves calls; torch divides vectors of 32768 numbers or more among cores: two such blocks.
-CACHED = 2032
+CACHED = 4080
 SWEPT = 16400
 # Accelerators need long blocks; this length limits intermediate results to about 1 GB for M = 100.
 ACCELERATED = 1 << 21

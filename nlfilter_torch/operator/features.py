@@ -34,6 +34,7 @@ from nlfilter_torch.operator.orientation import Layout
 
 LUMINANCE = (0.299, 0.587, 0.114)  # shares of red, green and blue
 FAINT_WEIGHT = 1e-12  # in place of patch weights of 0
+FOLDED = 1 << 14  # pixels up to which the gradient of patches is computed in one call
 
 
 @cached_constants
@@ -80,8 +81,8 @@ def unit_window(patch_size: int, patch_weights: Tensor | None, axes: int = 2) ->
 def reduce_channels(guide: Tensor, guide_channels: GuideChannels) -> Tensor:
     """Reduce three channels to luminance (B, 1, ...) unless ``guide_channels`` is ``"all"``; keep other guides."""
     if guide_channels == "luminance" and guide.shape[1] == 3:
-        red, green, blue = (guide[:, channel : channel + 1] for channel in range(3))
-        return (LUMINANCE[0] * red).add(green, alpha=LUMINANCE[1]).add(blue, alpha=LUMINANCE[2])
+        red, green, blue = guide.unbind(1)
+        return (LUMINANCE[0] * red).add(green, alpha=LUMINANCE[1]).add(blue, alpha=LUMINANCE[2]).unsqueeze(1)
     return guide
 
 
@@ -235,7 +236,10 @@ class _ScaledPatches(torch.autograd.Function):
         grad_padded = torch.zeros_like(padded) if of_padded else None
         grad_scale = torch.zeros_like(scale) if of_scale else None
         planes = grad.unflatten(2, size).unflatten(1, (padded.shape[1], *scale.shape[1:]))  # (B, C, p, p, H, W)
-        # A row of the patch at a time: a number of planes that stays in the cache, and few calls for small images.
+        if of_padded and not of_scale and axes == 2 and grad[0, 0].numel() <= FOLDED:
+            weighted = planes * for_planes(scale.unsqueeze(1), axes)
+            return F.fold(weighted.flatten(4).flatten(1, 3), padded.shape[2:], scale.shape[1:]), None
+        # A row of the patch at a time: a number of planes that stays in the cache.
         for place in product(*map(range, scale.shape[1:-1])):
             rows = [slice(start, start + length) for start, length in zip(place, size, strict=False)]
             window: tuple[EllipsisType | slice, ...] = (..., *rows, slice(None))

@@ -22,6 +22,7 @@ a uniform sample misses, converge last. On photographs of a megapixel each sweep
 - kernels of the paper's method, whose scalings are large: :mod:`~nlfilter_torch.operator.sinkhorn`.
 """
 
+import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property
@@ -33,7 +34,7 @@ from torch import Tensor
 from nlfilter_torch.core.blocks import stratified, weighted
 from nlfilter_torch.core.communicator import ALONE, Communicator
 from nlfilter_torch.core.kernels.clusters import MULTIPLIED
-from nlfilter_torch.core.kernels.library import by_rows, kernel, pointer, repeated, run_on_factor
+from nlfilter_torch.core.kernels.library import ONE_THREAD_COLUMNS, by_rows, kernel, pointer, repeated, run_on_factor
 from nlfilter_torch.core.kernels.tall_skinny import moment, positive_root, spread, sum_grams, sweep, weigh
 from nlfilter_torch.core.torch_internals import cached_constants, is_hidden, register
 from nlfilter_torch.core.warning import warn
@@ -160,7 +161,7 @@ def newton(
     most: float = LARGEST_ROOT,
     bias: Tensor | float = 0.0,
     tolerance: float = 0.0,
-) -> tuple[Tensor, Tensor, Tensor]:
+) -> tuple[Tensor, Tensor, float]:
     """Newton's method for the moment t (B, M, 1) that equals the sum over the blocks at d(t) plus a ``bias``.
 
     With a bias, the blocks may be a sample: the sum over all points at some t, minus that over the sample. The error is
@@ -177,18 +178,20 @@ def newton(
             reads no values.
 
     Returns:
-        t, the Cholesky factor (B, M, M) of J in the last step, and the relative length of that step.
+        t, the inverse (B, M, M) of the Cholesky factor of J in the last step, and with a tolerance the relative length
+        of that step.
     """
-    identity = torch.eye(total.shape[1], dtype=total.dtype, device=total.device)
+    identity, change = torch.eye(total.shape[1], dtype=total.dtype, device=total.device), math.inf
     for _ in range(steps):
         sums, slope = summed(blocks(KernelMatrix.moment_and_slope, total, most))
         lower = torch.linalg.cholesky_ex(identity + slope).L  # J is positive definite
-        step = torch.cholesky_solve(sums + bias - total, lower)
+        # Unlike cholesky_solve and cholesky_inverse, this reads no values.
+        root = torch.linalg.solve_triangular(lower, identity.expand_as(lower), upper=False)
+        step = root.mT @ (root @ (sums + bias - total))
         total = total + step
-        change = step.norm() / total.norm()
-        if tolerance and float(change) <= tolerance:
+        if tolerance and (change := float(step.norm() / total.norm())) <= tolerance:
             break
-    return total, lower, change
+    return total, root, change
 
 
 def isolated(scaling: Tensor, diagonal: Tensor, residual: float, weights: Tensor | None = None) -> Tensor:
@@ -277,7 +280,8 @@ def _draw(matrix: KernelMatrix, scaling: Tensor, count: int) -> tuple[KernelMatr
     leverage = weighted(slope * (1 - diagonal) / (1 + slope * diagonal), weights)  # |u|^2 is 1 - c
     leverage = leverage + leverage.mean(1, keepdim=True) * UNIFORM + torch.finfo(leverage.dtype).tiny
     summed = leverage.double().cumsum(1)
-    ticks = (torch.arange(count, dtype=torch.float64, device=factor.device) + 0.5) / count
+    ends = 0.5 / count, 1 - 0.5 / count
+    ticks = torch.linspace(*ends, count, dtype=torch.float64, device=factor.device)
     chosen = torch.searchsorted(summed, summed[:, -1:] * ticks).clamp_(max=factor.shape[2] - 1)  # (B, n)
     weight = (summed[:, -1:] / count).to(factor) / leverage.gather(1, chosen)
     weight = weight if weights is None else weight * weights.gather(1, chosen)
@@ -352,7 +356,7 @@ def _compiled_balance(
     count, sampled = _explored_count(landmarks, pixels), _sampled_count(landmarks, pixels)
     explored = _explored(pixels, count) if count else None
     arguments = diagonal.data_ptr(), pointer(weights), pointer(explored), count, sampled, tolerance
-    run_on_factor("balance", factor, *arguments, *(tensor.data_ptr() for tensor in found))
+    run_on_factor("balance", factor, *arguments, *(tensor.data_ptr() for tensor in found), least=ONE_THREAD_COLUMNS)
     return found
 
 
@@ -376,7 +380,7 @@ def balance(factor: Tensor, diagonal: Tensor, weights: Tensor | None, tolerance:
     """
     found = _by_sweeps(KernelMatrix(factor, diagonal, weights), tolerance)
     sweeps = torch.full_like(found.residual, found.steps, dtype=torch.long)
-    return found.scaling, found.moment, found.residual, found.inverse.contiguous(), sweeps
+    return found.scaling, found.moment, found.residual, found.inverse, sweeps
 
 
 def _by_sweeps(matrix: KernelMatrix, tolerance: float) -> Balancing:
@@ -396,8 +400,8 @@ def _by_sweeps(matrix: KernelMatrix, tolerance: float) -> Balancing:
             # known, is subtracted; a sample of all points has none. Ranks differ in whether they sample.
             part = scaling if places is None else scaling.gather(1, places)
             bias = 0.0 if places is None and ranks == 1 else actual - sample.moment(part)
-            total, lower, _ = newton(sample.whole, actual, steps=SAMPLE_STEPS, bias=bias)
-            inverse = torch.cholesky_inverse(lower)
+            total, root, _ = newton(sample.whole, actual, steps=SAMPLE_STEPS, bias=bias)
+            inverse = root.mT @ root
         else:
             total = total - inverse @ error
         scaling, actual = matrix.sweep(total)

@@ -5,7 +5,8 @@
 
 #include "tasks.h"
 
-#define FEW 262144 /* elements of a factor below which waking another thread takes longer than it saves */
+#define FEW 1048576      /* elements of a factor below which waking another thread takes longer than it saves, */
+#define FEW_GRAMS 262144 /* and of a Gram matrix; as in library.py */
 
 /* Points of an image: all of them, or a sample. */
 struct points {
@@ -33,9 +34,9 @@ struct memory {
     long *places;
 };
 
-static int suited(const struct balancing *task, const struct points *points)
+static int suited(const struct balancing *task, const struct points *points, long few)
 {
-    return task->num_landmarks * points->count < FEW ? 1 : task->threads;
+    return task->num_landmarks * points->count < few ? 1 : task->threads;
 }
 
 static void halve(const double *total, float *half, long count)
@@ -50,7 +51,7 @@ static int sweep(const struct balancing *task, const struct points *points, cons
 {
     halve(total, half, task->num_landmarks);
     const int status =
-        nlfilter_sweep(task->level, suited(task, points), points->count, 1, task->num_landmarks, points->factor, 0,
+        nlfilter_sweep(task->level, suited(task, points, FEW), points->count, 1, task->num_landmarks, points->factor, 0,
                        points->stride, half, NULL, points->diagonal, points->weights, task->most, scaling, actual);
     for (long m = 0; m < task->num_landmarks; m++)
         actual[m] *= points->every;
@@ -62,7 +63,7 @@ static int moment(const struct balancing *task, const struct points *points, flo
 {
     for (long i = 0; points->weights && i < points->count; i++)
         values[i] *= points->weights[i];
-    const int status = nlfilter_gather(task->level, suited(task, points), points->count, 1, task->num_landmarks,
+    const int status = nlfilter_gather(task->level, suited(task, points, FEW), points->count, 1, task->num_landmarks,
                                        points->factor, 0, points->stride, 1, values, 0, 0, actual);
     for (long m = 0; m < task->num_landmarks; m++)
         actual[m] *= points->every;
@@ -72,8 +73,8 @@ static int moment(const struct balancing *task, const struct points *points, flo
 static int spread(const struct balancing *task, const struct points *points, long count, const float *rows,
                   const float *scaling, float *out)
 {
-    return nlfilter_spread(task->level, suited(task, points), points->count, 1, task->num_landmarks, points->factor, 0,
-                           points->stride, count, rows, scaling, out);
+    return nlfilter_spread(task->level, suited(task, points, FEW), points->count, 1, task->num_landmarks,
+                           points->factor, 0, points->stride, count, rows, scaling, out);
 }
 
 /* Columns of the points of a sample. */
@@ -102,7 +103,7 @@ static int sample_of(const struct balancing *task, const struct points *whole, c
     *sample = (struct points){memory->drawn, memory->drawn_diagonal, weights, count, count, every};
     for (long i = 0; i < count; i++)
         memory->drawn_diagonal[i] = whole->diagonal[places[i]];
-    return divide(&work, suited(task, sample), CHUNK);
+    return divide(&work, suited(task, sample, FEW), CHUNK);
 }
 
 /* Numbers of the points at which the sum of `shares` (n) reaches (tick + 1/2) / ticks of the `total`, in order. */
@@ -201,8 +202,8 @@ static int newton(const struct balancing *task, const struct points *sample, con
             const float d = scaling[i], w = sample->weights ? sample->weights[i] : 1.0f;
             root[i] = d * sqrtf(w / (1.0f + d * (d * sample->diagonal[i])));
         }
-        failed |= nlfilter_grams(task->level, suited(task, sample), sample->count, 1, landmarks, sample->factor, 0,
-                                 sample->stride, 1, root, root, slope);
+        failed |= nlfilter_grams(task->level, suited(task, sample, FEW_GRAMS), sample->count, 1, landmarks,
+                                 sample->factor, 0, sample->stride, 1, root, root, slope);
         for (long m = 0; m < landmarks; m++) {
             slope[m * landmarks + m] += 1.0;
             right[m] += bias[m] - memory->total[m];
@@ -397,9 +398,9 @@ static int solve_image(const struct system *task, long image, double *memory, fl
     for (long step = 0; step < task->most_steps && (!step || !(size <= goal)) && !failed; step++) {
         for (long m = 0; m < landmarks; m++)
             row[m] = (float)direction[m];
-        failed = nlfilter_sweep(task->level, task->threads, pixels, 1, landmarks, task->factor + image * task->factor_step,
-                                0, task->factor_stride, row, task->weight + image * pixels, NULL, NULL, 0.0f, out,
-                                product);
+        failed = nlfilter_sweep(task->level, task->threads, pixels, 1, landmarks,
+                                task->factor + image * task->factor_step, 0, task->factor_stride, row,
+                                task->weight + image * pixels, NULL, NULL, 0.0f, out, product);
         for (long m = 0; m < landmarks; m++)
             product[m] += direction[m];
         const double bend = inner(direction, product, landmarks), before = size > DBL_MIN ? size : DBL_MIN;

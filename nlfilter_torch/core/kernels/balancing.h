@@ -1,6 +1,6 @@
 /* Linear systems of balancing. */
 
-/* Solve matrix x = right in place, for a positive definite matrix (n, n), which becomes its upper Cholesky factor R with
+/* Solve matrix x = right in place, for a positive definite matrix (n, n), which becomes its upper Cholesky factor R:
  * R^T R = matrix. With `inverse`, also compute the inverse there; the matrix then holds nothing of use. */
 static TARGET void NAME(positive)(double *matrix, long count, double *right, double *inverse)
 {

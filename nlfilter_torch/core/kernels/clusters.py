@@ -48,9 +48,9 @@ def most_covering(apart: Tensor, nearest: Tensor, count: int) -> Tensor:
     :data:`COVERED`; ``nearest`` (B, 1, S) is that of the pivots so far. Proposals are ordered by what each adds, then
     again by what each adds to the better ones. Proposals that are equally good to rounding keep their order.
     """
-    covered = COVERED / (torch.minimum(apart, nearest) + COVERED)
-    before = (COVERED / (nearest + COVERED)).sum(2, dtype=torch.float64)  # (B, 1)
-    unit = NEARLY * apart.shape[2]
+    covered = (torch.minimum(apart, nearest) + COVERED).reciprocal_()  # in units of 1 / COVERED, a power of two
+    before = (nearest + COVERED).reciprocal_().sum(2, dtype=torch.float64)  # (B, 1)
+    unit = NEARLY * apart.shape[2] / COVERED
     # Summed in float64, as in C, so that rounding does not decide between proposals.
     added = covered.sum(2, dtype=torch.float64) - before
     order = (added / unit).round_().argsort(dim=1, descending=True, stable=True)

@@ -8,7 +8,16 @@ import torch
 from torch import Tensor
 
 from nlfilter_torch.core.blocks import buffered_blocks, strip_count, strips
-from nlfilter_torch.core.kernels.library import by_rows, contiguous, kernel, place, pointer, run, threads
+from nlfilter_torch.core.kernels.library import (
+    ONE_THREAD_COLUMNS,
+    by_rows,
+    contiguous,
+    kernel,
+    place,
+    pointer,
+    run,
+    threads,
+)
 from nlfilter_torch.core.torch_internals import is_hidden, register
 
 # Compared with a completed diagonal exp(-40) is negligible. Smaller affinities would become denormal floats, which are
@@ -107,8 +116,9 @@ def _compiled_columns(
     centre, rows, inverse_cholesky = contiguous(affinity.centre, affinity.rows, inverse_cholesky)
     batch, size, pixels = features.shape
     run(
-        "columns", threads(factor), pixels, batch, size, factor.shape[1], *place(features), centre.data_ptr(),
-        rows.data_ptr(), inverse_cholesky.data_ptr(), affinity.floor, limited, *place(factor), norms.data_ptr(),
+        "columns", threads(factor, ONE_THREAD_COLUMNS), pixels, batch, size, factor.shape[1], *place(features),
+        centre.data_ptr(), rows.data_ptr(), inverse_cholesky.data_ptr(), affinity.floor, limited, *place(factor),
+        norms.data_ptr(),
     )  # fmt: skip
     return factor, norms
 
@@ -169,7 +179,8 @@ def _compiled_backward(
     (batch, size, pixels), count = features.shape, factor.shape[1]
     sums = torch.empty(batch, count * (count + size + 1), dtype=torch.float64)
     run(
-        "backward", threads(factor), pixels, batch, size, count, *place(features), centre.data_ptr(), rows.data_ptr(),
+        "backward", threads(factor, ONE_THREAD_COLUMNS), pixels, batch, size, count, *place(features),
+        centre.data_ptr(), rows.data_ptr(),
         inverse_cholesky.data_ptr(), affinity.floor, limited, *place(factor), scale.data_ptr(), right.shape[1],
         pointer(left), *place(right), diagonal.data_ptr(), points.data_ptr(), grad_features.data_ptr(),
         sums.data_ptr(),

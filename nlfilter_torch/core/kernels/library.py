@@ -16,7 +16,11 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
-ONE_THREAD = 1 << 15  # elements of a factor below which starting a second thread takes longer than it saves
+# Elements of a factor below which a second thread does not pay: work of about 0.1 to 0.3 ms on one. Where all cores are
+# busy, waking a thread takes up to 15 ms.
+ONE_THREAD = 1 << 15
+ONE_THREAD_COLUMNS = 1 << 18  # of the columns of a factor, their gradients and Gram matrices
+ONE_THREAD_PRODUCTS = 1 << 20  # of products with a few rows
 Result = TypeVar("Result")
 
 _POINTER, _LONG, _INT = ctypes.c_void_p, ctypes.c_long, ctypes.c_int
@@ -170,9 +174,9 @@ def pointer(tensor: Tensor | None) -> int | None:
     return None if tensor is None else tensor.data_ptr()
 
 
-def threads(factor: Tensor) -> int:
-    """Number of threads: as many as torch uses, but 1 for small factors."""
-    return 1 if factor.numel() < ONE_THREAD else torch.get_num_threads()
+def threads(factor: Tensor, least: int = ONE_THREAD) -> int:
+    """Number of threads: as many as torch uses, but 1 for factors of fewer than ``least`` elements."""
+    return 1 if factor.numel() < least else torch.get_num_threads()
 
 
 def run(name: str, threads: int, count: int, *arguments: int | float | None) -> None:
@@ -181,7 +185,7 @@ def run(name: str, threads: int, count: int, *arguments: int | float | None) -> 
         raise MemoryError("not enough memory for buffers of a few rows; use a smaller image")
 
 
-def run_on_factor(name: str, factor: Tensor, *arguments: int | float | None) -> None:
-    """Run a kernel on all pixels of a factor (B, M, N) with contiguous rows."""
+def run_on_factor(name: str, factor: Tensor, *arguments: int | float | None, least: int = ONE_THREAD_PRODUCTS) -> None:
+    """Run a kernel on all pixels of a factor (B, M, N) with contiguous rows; see :func:`threads`."""
     batch, landmarks, pixels = factor.shape
-    run(name, threads(factor), pixels, batch, landmarks, *place(factor), *arguments)
+    run(name, threads(factor, least), pixels, batch, landmarks, *place(factor), *arguments)

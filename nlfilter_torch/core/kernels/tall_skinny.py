@@ -5,13 +5,22 @@ it: MKL multiplies a matrix by one vector on a single core, and by a few with a 
 strips the same products run on all cores. A sweep of balancing forms two products in one read of the factor.
 """
 
+from functools import reduce
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from nlfilter_torch.core.blocks import SWEPT, block_length, buffered_blocks, pixel_blocks, strip_count, strips
-from nlfilter_torch.core.kernels.library import by_rows, kernel, place, pointer, repeated, run_on_factor
+from nlfilter_torch.core.kernels.library import (
+    ONE_THREAD_COLUMNS,
+    by_rows,
+    kernel,
+    place,
+    pointer,
+    repeated,
+    run_on_factor,
+)
 from nlfilter_torch.core.precision import once_differentiable
 from nlfilter_torch.core.torch_internals import for_each_gradient, register
 
@@ -95,15 +104,15 @@ def moment(factor: Tensor, images: Tensor) -> Tensor:
 
     A float32 sum over a million pixels would lose the difference between row sums of 1 and 1.001.
     """
-    batch, landmarks, pixels = factor.shape
-    total = factor.new_zeros(batch, landmarks, images.shape[1], dtype=torch.float64)
+    batch, _, pixels = factor.shape
     # Splitting, unlike slicing, keeps the backward pass linear in the number of blocks.
     # A number of blocks that depends on the size would be compiled anew for each number.
     compiled = torch.compiler.is_compiling()
     step = -(-pixels // COMPILED_BLOCKS) if compiled else block_length(batch, factor.device, SWEPT)
-    for rows, part in zip(factor.split(step, dim=2), images.split(step, dim=2), strict=True):
-        total = total + gather(part, rows).mT
-    return total
+    parts = zip(factor.split(step, dim=2), images.split(step, dim=2), strict=True)
+    sums = (gather(part, rows).mT for rows, part in parts)
+    doubled = (t.to(torch.float64, memory_format=torch.contiguous_format).contiguous() for t in sums)
+    return reduce(torch.add, doubled)
 
 
 def _is_parted(thin: Tensor, factor: Tensor) -> bool:
@@ -171,15 +180,14 @@ def sweep(
     It takes ``half`` of t, (B, M), the upper limit ``most`` of d, and the number of pixels that each point represents,
     (B, N); None means one each. The moment is ``factor @ (weights * d)``.
     """
-    scaling, total = _empty(factor)
-    row = half.unsqueeze(2).mT
+    scaling, row, totals = factor.new_empty(diagonal.shape), half.unsqueeze(2).mT, list[Tensor]()
     for block in pixel_blocks(factor.shape[2], factor.shape[0], factor.device, length=SWEPT):
         columns = factor[:, :, block]
         root = positive_root(spread(row, columns).squeeze(1), diagonal[:, block])
         part = torch.clamp(root, max=most, out=scaling[:, block])
         part = part if weights is None else part * weights[:, block]
-        total += gather(part.unsqueeze(1), columns).squeeze(1)
-    return scaling, total
+        totals.append(gather(part.unsqueeze(1), columns).squeeze(1).double())
+    return scaling, reduce(torch.add, totals)
 
 
 def _compiled_weigh(factor: Tensor, weights: Tensor, vector: Tensor) -> Tensor:
@@ -193,12 +201,11 @@ def _compiled_weigh(factor: Tensor, weights: Tensor, vector: Tensor) -> Tensor:
 )
 def weigh(factor: Tensor, weights: Tensor, vector: Tensor) -> Tensor:
     """``factor diag(weights) factor^T vector``, (B, M) in float64, for a factor (B, M, N), (B, N) and (B, M)."""
-    _, total = _empty(factor)
-    row = vector.unsqueeze(2).mT
+    row, totals = vector.unsqueeze(2).mT, list[Tensor]()
     for block in pixel_blocks(factor.shape[2], factor.shape[0], factor.device, length=SWEPT):
         columns = factor[:, :, block]
-        total += gather(weights[:, None, block] * spread(row, columns), columns).squeeze(1)
-    return total
+        totals.append(gather(weights[:, None, block] * spread(row, columns), columns).squeeze(1).double())
+    return reduce(torch.add, totals)
 
 
 NEGLIGIBLE = 1e-15  # entries of F in float32 that count as zero: their products would be denormal, which is slow
@@ -213,7 +220,8 @@ def _compiled_grams(factor: Tensor, scaling: Tensor, remainder: Tensor | None, c
     out = _fake_grams(factor, scaling, remainder, count)
     factor, scaling = by_rows(factor), scaling.contiguous()
     remainder = scaling if remainder is None else remainder.contiguous()
-    run_on_factor("grams", factor, count, scaling.data_ptr(), remainder.data_ptr(), out.data_ptr())
+    pointers = scaling.data_ptr(), remainder.data_ptr(), out.data_ptr()
+    run_on_factor("grams", factor, count, *pointers, least=ONE_THREAD_COLUMNS)
     return out
 
 

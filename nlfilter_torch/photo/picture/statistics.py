@@ -61,7 +61,7 @@ def balance_by_passes(
     total, _, change = newton(blocks, total, steps=MAX_PASSES, most=most, bias=bias, tolerance=CONVERGED[dtype])
     if change > UNSETTLED:
         warn(
-            f"balancing still changed by {float(change):.1e} after {MAX_PASSES} passes; "
+            f"balancing still changed by {change:.1e} after {MAX_PASSES} passes; "
             "raise photometric_bandwidth or num_landmarks, or use completion='diagonal'"
         )
     return total
