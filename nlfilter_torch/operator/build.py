@@ -531,23 +531,26 @@ def _covering(
             "operator of a reduced image"
         )
     state = None if options.generator is None else options.generator.get_state()
+    exact: list[Tensor] = []  # rows of the exact filter of the sample, once the first trial has computed them
 
     def trial(count: int) -> tuple[float, tuple[Tensor, Assignment | None]]:
         if options.generator is not None and state is not None:
             options.generator.set_state(state)  # the last trial gives what its number gives when asked for at once
         wanted = replace(options, num_landmarks=count, covering=False)
         result = _landmarks(features, size, wanted, communicator, weights, layout, points)
-        return _badly_covered(features.detach(), wanted, weights, result[0].detach()), result
+        return _badly_covered(features.detach(), wanted, weights, result[0].detach(), exact), result
 
     return cover(trial, points)
 
 
 @torch.no_grad()
-def _badly_covered(features: Tensor, options: FilterOptions, weights: Tensor | None, landmarks: Tensor) -> float:
+def _badly_covered(
+    features: Tensor, options: FilterOptions, weights: Tensor | None, landmarks: Tensor, exact: list[Tensor]
+) -> float:
     """Share of the points of the worst image that landmarks (B, D, M) cover badly, without an operator of all points.
 
     The filter of some points, each of which stands for as many others, gives the balancing; see
-    :meth:`NonlocalOperator.badly_covered` for the rest.
+    :meth:`NonlocalOperator.badly_covered` for the rest. ``exact`` keeps what is the same for all landmarks.
     """
     points = features.shape[2]
     places, sample = (sampled_points(points, count).to(features.device) for count in (TRIED, SAMPLED))
@@ -557,7 +560,7 @@ def _badly_covered(features: Tensor, options: FilterOptions, weights: Tensor | N
     kept = features[:, :, sample]
     columns, weight, every = few.at(kept), counted[:, sample], points / len(sample)
     rows = SampledRows(kept, columns.factor, columns.scaling, columns.remainder, weight, every)
-    return float(rows.badly_covered().max())
+    return float(rows.badly_covered(exact).max())
 
 
 def _least(weights: Tensor | None, communicator: Communicator) -> Tensor | None:

@@ -26,13 +26,15 @@ def cover(trial: Callable[[int], tuple[float, T]], points: int) -> T:
 
     Returns:
         What the last trial returned beside the share. The numbers follow the power law through the last two shares, so
-        that few trials are needed, and grow at most twofold, so that few landmarks are superfluous.
+        that few trials are needed, and grow at most twofold, or as even the fastest fall demands, so that few landmarks are
+        superfluous.
     """
     limit, power = min(MOST, points), 1.0
     count = min(FIRST, limit)
     share, result = trial(count)
     while share > AIMED and count < limit:
-        growth = min(max((share / AIMED) ** (1 / power), LEAST_GROWTH), MOST_GROWTH)
+        ratio = share / AIMED
+        growth = min(max(ratio ** (1 / power), LEAST_GROWTH), max(ratio ** (1 / FASTEST), MOST_GROWTH))
         before, fewer = share, count
         count = min(limit, 8 * round(growth * count / 8))
         share, result = trial(count)

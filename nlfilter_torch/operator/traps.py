@@ -89,7 +89,7 @@ SAMPLED = 1024  # points whose rows are compared; all, if there are at most twic
 FEW = 256  # points of a first look, in about 2 ms on one core
 LARGEST_SHARE = 0.15  # of badly covered points, above which there is a warning
 LEAST_POINTS = 1024  # below which there is none, since as many landmarks as points can be afforded
-SWEEPS = 20  # of balancing the exact filter of the sample
+SWEEPS = 13  # of balancing the exact filter of the sample, each of which leaves a third of the deviations
 GOLDEN = 0.6180339887498949  # whose multiples, without their whole parts, spread evenly over the interval from 0 to 1
 HALF = 0.5  # share of its weight by which the row of a badly covered point is off
 
@@ -141,34 +141,42 @@ class SampledRows:
             every=self.every * step,
         )
 
-    def badly_covered(self) -> Tensor:
+    def badly_covered(self, exact: list[Tensor] | None = None) -> Tensor:
         """Share (B,) of the points, by weight, whose rows are off by more than half."""
-        return share_above(self.errors(), HALF, self.weights)
+        return share_above(self.errors(exact), HALF, self.weights)
 
-    def errors(self) -> Tensor:
+    def errors(self, exact: list[Tensor] | None = None) -> Tensor:
         """Share (B, S) of the weight of each row that lies at other points than in the exact filter of the sample.
 
         Half of the sum of the differences of a row, 1 at most if no weight is negative. Of a point that stands for
-        others of the image, only its own value counts as its own.
+        others of the image, only its own value counts as its own. The exact filters of the images are added to the list
+        ``exact``, or taken from it if it is not empty.
         """
-        return torch.stack([self._errors_of(image) for image in range(len(self.scaling))])
+        images = range(len(self.scaling))
+        exact = [] if exact is None else exact
+        if not exact:
+            exact += [self._exact(image) for image in images]
+        return torch.stack([self._errors_of(image, exact[image]) for image in images])
 
-    def _errors_of(self, image: int) -> Tensor:
-        """Errors (S,) of the rows of one image, in float64."""
-        features, factor = self.features[image].double(), self.factor[image].double()
-        scaling, own = self.scaling[image].double(), self.weights[image].double()
+    def _exact(self, image: int) -> Tensor:
+        """Rows (S, S) of the exact filter of the sample of one image, in float64."""
+        features, own = self.features[image].double(), self.weights[image].double()
         features = features - features.mean(1, keepdim=True)
         norms = features.square().sum(0)
         squared = norms.unsqueeze(1) + norms - 2 * features.mT @ features
         exact = torch.exp(-squared.clamp(min=0.0)) * (own * self.every)
         exact.diagonal().copy_(own)
+        least = torch.finfo(exact.dtype).tiny  # row sums of points that do not count
+        balanced = exact.sum(1).clamp(min=least).rsqrt()
+        for _ in range(SWEEPS):
+            balanced = balanced * (balanced * (exact @ balanced)).clamp(min=least).pow(-2 / 3)
+        return balanced.unsqueeze(1) * exact * balanced
+
+    def _errors_of(self, image: int, exact: Tensor) -> Tensor:
+        """Errors (S,) of the rows of one image, in float64."""
+        factor, scaling, own = (part[image].double() for part in (self.factor, self.scaling, self.weights))
         rows = scaling.unsqueeze(1) * (factor.mT @ factor) * scaling
         itself = rows.diagonal() * own + self.remainder[image]
         rows = rows * (own * self.every)
         rows.diagonal().copy_(itself)
-        least = torch.finfo(exact.dtype).tiny  # row sums of points that do not count
-        balanced = exact.sum(1).clamp(min=least).rsqrt()
-        for _ in range(SWEEPS):
-            balanced = (balanced / (exact @ balanced).clamp(min=least)).sqrt()
-        exact = balanced.unsqueeze(1) * exact * balanced
         return ((rows - exact).abs().sum(1) / 2).nan_to_num(nan=torch.inf)
