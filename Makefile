@@ -100,6 +100,7 @@ QUICK := \
 	'denoising --quick --patterns --methods noisy ours' \
 	'real_noise --quick' \
 	'self_calibration --quick' \
+	'error_bars --quick' \
 	'coverage --quick' \
 	'looks --quick' \
 	'detail --quick' \

@@ -21,6 +21,7 @@ from .filtering.spectral import spectral_filter as spectral_filter
 from .filtering.sure import sure as sure
 from .nn.affinity import NonlocalAffinity as NonlocalAffinity
 from .nn.block import NonlocalBlock as NonlocalBlock
+from .nn.denoiser.error import standard_error as standard_error
 from .nn.denoiser.estimate import noise_profile as noise_profile
 from .nn.denoiser.network import NonlocalDenoiser as NonlocalDenoiser
 from .nn.denoiser.noise import estimate_noise as estimate_noise

@@ -96,7 +96,7 @@ class Pairs:
         if pair.kind == "camera":
             yield Pair(_rounded(pair.clean), _rounded(pair.clean), "clean")
 
-    def _crop(self, random: Draws, side: int) -> Tensor | None:
+    def crop(self, random: Draws, side: int) -> Tensor | None:
         """A random square of a random picture, reduced at random, if the picture is large enough."""
         picture = list(self.pictures.values())[random.below(len(self.pictures))]
         most = min(picture.size) / side
@@ -111,7 +111,7 @@ class Pairs:
         """A photograph by a random camera, with noise or without, unless it needs a larger picture."""
         camera = Camera.drawn(random.generator, held_out=self.held_out)
         camera = camera if noise else camera.without_noise()
-        crop = self._crop(random, camera.side_before(side)) if camera.side_before(side) <= LARGEST_SIDE else None
+        crop = self.crop(random, camera.side_before(side)) if camera.side_before(side) <= LARGEST_SIDE else None
         if crop is None:
             return None
         clean, noisy = camera.photograph(crop, side, random.generator)
@@ -119,7 +119,7 @@ class Pairs:
 
     def _white(self, random: Draws, side: int) -> Pair | None:
         """White noise, the same everywhere or growing with the light, in 8 bits or not limited."""
-        clean = self._crop(random, side)
+        clean = self.crop(random, side)
         if clean is None:
             return None
         level = random.factor(0.7, 60) / 255
@@ -130,7 +130,7 @@ class Pairs:
 
     def _smoothed(self, random: Draws, side: int) -> Pair | None:
         """White noise that was smoothed, colour more than luminance, and often compressed."""
-        clean = self._crop(random, side)
+        clean = self.crop(random, side)
         if clean is None:
             return None
         luminance, colour = random.normal(*clean[:1].shape), random.normal(*clean.shape)
@@ -145,7 +145,7 @@ class Pairs:
         if random.number() < 0.4:
             return self.camera(random, side, noise=False)
         enlarged = random.number(1.2, 3) if random.number() < 0.2 else 1.0
-        crop = self._crop(random, int(side / enlarged))
+        crop = self.crop(random, int(side / enlarged))
         if crop is None:
             return None
         crop = F.interpolate(crop[None], (side, side), mode="bicubic")[0] if enlarged > 1 else crop

@@ -63,6 +63,18 @@ def drawn(noise: float | Tensor | NoiseModel, image: Tensor, generator: torch.Ge
     return noise_map(noise, image).detach() * random_signs(tuple(image.shape), image, generator)
 
 
+def sampled(noise: float | Tensor | NoiseModel, image: Tensor, generator: torch.Generator) -> Tensor:
+    """Normal noise (B, C, H, W) for an image, where :func:`drawn` may be random signs."""
+    if isinstance(noise, NoiseModel):
+        return noise.draw(image.detach(), generator)
+    return noise_map(noise, image).detach() * random_normal(tuple(image.shape), image, generator)
+
+
+def random_normal(shape: tuple[int, ...], like: Tensor, generator: torch.Generator) -> Tensor:
+    """Standard normal numbers, equal for a generator whatever the device of ``like``."""
+    return torch.randn(shape, generator=generator, device=generator.device).to(like.device, like.dtype)
+
+
 def random_signs(shape: tuple[int, ...], like: Tensor, generator: torch.Generator) -> Tensor:
     """Random numbers of 1 and -1, equal for a generator whatever the device of ``like``."""
     bits = torch.randint(2, shape, generator=generator, device=generator.device)

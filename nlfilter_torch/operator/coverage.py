@@ -26,8 +26,8 @@ def cover(trial: Callable[[int], tuple[float, T]], points: int) -> T:
 
     Returns:
         What the last trial returned beside the share. The numbers follow the power law through the last two shares, so
-        that few trials are needed, and grow at most twofold, or as even the fastest fall demands, so that few landmarks are
-        superfluous.
+        that few trials are needed, and grow at most twofold, or as much as even the fastest fall demands, so that few
+        landmarks are superfluous.
     """
     limit, power = min(MOST, points), 1.0
     count = min(FIRST, limit)

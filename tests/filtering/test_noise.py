@@ -3,7 +3,7 @@
 import torch
 
 from nlfilter_torch import NoiseProfile, profile_of_difference
-from nlfilter_torch.filtering.noise import drawn, is_noise_map, noise_map, variance_of
+from nlfilter_torch.filtering.noise import drawn, is_noise_map, noise_map, sampled, variance_of
 from tests.problems import noise, seeded
 
 
@@ -19,6 +19,15 @@ def test_maps_of_levels() -> None:
     torch.testing.assert_close(field.abs(), levels.expand_as(image))
     volume = noise(1, 1, 3, 4, 5)
     assert noise_map(volume, volume).shape == volume.shape
+
+
+def test_samples_are_normal_where_fields_are_signs() -> None:
+    image = noise(1, 1, 128, 128)
+    field = sampled(0.1, image, seeded())
+    torch.testing.assert_close(field.std(), torch.tensor(0.1, dtype=field.dtype), rtol=0.02, atol=0)
+    torch.testing.assert_close((field.abs() < 0.1).double().mean(), torch.tensor(0.6827).double(), rtol=0, atol=0.01)
+    profile = NoiseProfile.white(torch.tensor([0.1]), channels=1)
+    assert torch.equal(sampled(profile, image, seeded(1)), drawn(profile, image, seeded(1)))
 
 
 def test_fields_of_a_profile_have_its_levels_at_every_scale() -> None:

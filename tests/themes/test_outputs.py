@@ -55,6 +55,7 @@ REPLACED = [
     ("fit in.png after.png look.json --mask mask.png --preview mask.png", "--preview must be another file than"),
     ("fit in.png after.png look.json --preview seen.gif", "seen.gif must end in .png, .jpg"),
     ("denoise in.png out.png --map map.gif", "map.gif must end in .png, .jpg"),
+    ("denoise in.png out.png --error-map errors.png", "errors.png cannot hold this picture: PNG has no"),
     ("recolor in.png out.png --region 6,6,4,4:rgb(300,0,0)", "--region must end in a colour"),
 ]
 

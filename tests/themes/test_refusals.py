@@ -40,6 +40,7 @@ from nlfilter_torch import (
     refine,
     segment_mask,
     spectral_filter,
+    standard_error,
 )
 from nlfilter_torch.photo import (
     abstract,
@@ -961,6 +962,15 @@ EDITS: dict[str, list[Refusal]] = {
     ),
     "estimate_noise": refusals(
         estimate_noise, {"image": VOLUME}, ({}, r"^image must have shape \(B, C, H, W\), got .*; index or flatten")
+    ),
+    "standard_error": refusals(
+        standard_error,
+        {"function": torch.neg, "image": GUIDE, "noise": 0.1},
+        ({"function": 3}, "^function must be a function of an image, got int; pass a denoiser", TypeError),
+        ({"function": torch.sum}, "^the result of function must have shape"),
+        ({"noise": -0.1}, "^noise must"),
+        ({"noise": torch.ones(2, 1, 4, 9)}, "^noise must have the height and width of the image"),
+        ({"image": GUIDE * NAN}, "^image must be finite"),
     ),
     "noise_profile": refusals(
         noise_profile, {"image": VOLUME}, ({}, r"^image must have shape \(B, C, H, W\), got .*; index or flatten")

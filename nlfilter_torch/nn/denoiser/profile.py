@@ -13,7 +13,7 @@ from torch import Tensor
 
 from nlfilter_torch.core.checks import check_image, check_same_size
 from nlfilter_torch.core.precision import full_precision, per_image, squarable, working_dtype
-from nlfilter_torch.filtering.noise import random_signs
+from nlfilter_torch.filtering.noise import random_normal
 
 KNOTS = 6  # brightnesses at which levels are known: 0, 0.2, ... 1
 STIFFNESS = 4  # number of blocks that outweigh the assumption that variances at neighbouring knots are the same
@@ -109,25 +109,22 @@ class NoiseProfile:
     def draw(self, image: Tensor, generator: torch.Generator) -> Tensor:
         """A random field (B, C, H, W) with the levels of the noise of an image (B, C, H, W) at every scale.
 
-        It is a sum of random signs on grids of blocks of 1, 2, ... 16 pixels at random places, whose variances are
-        fitted to the squared levels at each brightness.
+        It is a sum of means of white noise over blocks of 1, 2, ... 16 pixels around each, whose variances are fitted
+        to the squared levels at each brightness.
         """
-        channels, size = image.shape[1], image.shape[2:]
+        channels, (height, width) = image.shape[1], image.shape[2:]
         deviations = replace(self, levels=self._parts().to(image)).at(image).unflatten(1, (-1, 2))  # (B, S, 2, H, W)
         total = torch.zeros_like(image)
         for scale, part in zip(self.SCALES, deviations.unbind(1), strict=True):
-            grid = [length // scale + 2 for length in size]
-            signs = random_signs((len(image), channels, *grid), image, generator)
-            field = signs.repeat_interleave(scale, 2).repeat_interleave(scale, 3)
-            top, left = torch.randint(scale, (2,), generator=generator, device=generator.device).tolist()
-            field = field[:, :, top : top + size[0], left : left + size[1]]
+            size = height + scale - 1, width + scale - 1
+            field = scale * F.avg_pool2d(random_normal((len(image), channels, *size), image, generator), scale, 1)
             total = total + (part[:, (0, 1, 1)] if channels == 3 else part[:, :1]) * field
         return join_colours(total, 3) if channels == 3 else total
 
     def _parts(self) -> Tensor:
-        """Deviations (B, S, 2, K) of signs on grids of blocks of each scale, which together have the levels."""
+        """Deviations (B, S, 2, K) of means over blocks of each scale, which together have the levels."""
         scales = np.array(self.SCALES)
-        # Two pixels at a distance d are in the same block of side t with probability 1 - d / t along each axis.
+        # Blocks of side t around two pixels at a distance d share 1 - d / t of their pixels along each axis.
         distances = [np.abs(np.subtract.outer(np.arange(s), np.arange(s))) for s in scales]
         together = np.array([[np.clip(1 - d / t, 0, None).mean() for t in scales] for d in distances])
         gains = (scales[:, None] * together) ** 2  # squared level at scale s for a unit of variance on blocks of side t

@@ -51,6 +51,7 @@ from nlfilter_torch.photo.picture.tiles import Passes, Processes, Statistics, Ti
 from nlfilter_torch.photo.picture.viewing import viewed_size
 
 MAP_DEPTH: Depth = "uint16"
+ERROR_DEPTH: Depth = "float32"
 MOST_GIGABYTES = 1e6  # gigabytes; upper limit of ``--memory``
 
 
@@ -148,16 +149,19 @@ def check_written(
     *,
     show: Path | None,
     map: Path | None,
+    error_map: Path | None,
     mask: Path | None,
     strokes: Path | None,
     preset: str | None,
 ) -> None:
     """Raise ValueError if a file that a command writes is one that it reads, or its type holds no map."""
     check_apart("OUT", target, mask=mask, strokes=strokes, preset=preset)
-    for option, path in (("--show", show), ("--map", map)):
+    for option, path in (("--show", show), ("--map", map), ("--error-map", error_map)):
         check_apart(option, path, photograph=source, output=target, mask=mask, strokes=strokes, preset=preset)
-    if map is not None:
-        check_type(map, MAP_DEPTH, alpha=False)
+    check_apart("--error-map", error_map, map=map)
+    for path, depth in ((map, MAP_DEPTH), (error_map, ERROR_DEPTH)):
+        if path is not None:
+            check_type(path, depth, alpha=False)
 
 
 @dataclass
@@ -338,8 +342,10 @@ class FileEdit(ABC):
         """Edit all pages of a TIFF file, and write them as they are edited."""
         source, target = Path(self.source), Path(self.target)
         if type_of(target) != "TIFF" or self.writes_aside:
-            got = "--show or --map" if self.writes_aside else target
-            raise ValueError(f"--pages must be used with a TIFF file as OUT and without --show and --map, got {got}")
+            got = "one of these" if self.writes_aside else target
+            raise ValueError(
+                f"--pages must be used with a TIFF file as OUT and without --show, --map and --error-map, got {got}"
+            )
         count, memory = 1 if is_zarr(source) else count_pages(source), allowed_memory(self.files.memory)
         with steps(count) as begin:
             pages = (

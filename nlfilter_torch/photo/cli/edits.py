@@ -112,6 +112,8 @@ def scribble_options(edit: Edit) -> dict[str, object]:
         annotations["show"] = options.Show
     if edit.map_help:
         annotations["map"] = options.file("--map", edit.map_help)
+    if edit.error_help:
+        annotations["error_map"] = options.file("--error-map", edit.error_help)
     return annotations
 
 
@@ -271,7 +273,7 @@ def edit_photograph(
     # Of the options for scribbles only "colour" may also be the name of a parameter.
     colour = values.pop("colour", None) if "colour" in scribble_options(edit) else None
     source_colour = values.pop("source_colour", None)
-    show, map = values.pop("show", None), values.pop("map", None)
+    show, map, error_map = (values.pop(name, None) for name in ("show", "map", "error_map"))
     others = {option.name: values.pop(option.name.removeprefix("--"), None) for option in edit.with_options}
     step = step_of(edit, values)
     look = None if preset is None else preset_step(find_recipe(preset), edit)
@@ -291,9 +293,9 @@ def edit_photograph(
 
     rectangles = {name: texts for name, texts in others.items() if texts is not None}
     drawn = ScribbleOptions(region, strokes, mask, rectangles, colour, source_colour)
-    check_written(source, target, show=show, map=map, mask=mask, strokes=strokes, preset=preset)
+    check_written(source, target, show=show, map=map, error_map=error_map, mask=mask, strokes=strokes, preset=preset)
     notes = useless_options(step, typed, marked=drawn.marks_objects(edit))
-    EditJob(source, target, files, full, step, drawn, show, map, seed, notes).run()
+    EditJob(source, target, files, full, step, drawn, show, map, error_map, seed, notes).run()
 
 
 def check_usual(step: Step, typed: Collection[str], notes: Iterable[str] = ()) -> None:

@@ -18,6 +18,7 @@ from torch import Tensor
 from nlfilter_torch.core.workers import single_threaded
 from nlfilter_torch.photo.cli import options
 from nlfilter_torch.photo.cli.editing import (
+    ERROR_DEPTH,
     MAP_DEPTH,
     FileEdit,
     Job,
@@ -50,6 +51,7 @@ from nlfilter_torch.photo.picture.tiled import Tiled
 from nlfilter_torch.photo.picture.tiled_developed import developed_rows
 from nlfilter_torch.photo.picture.tiles import Tiling
 
+ERROR_BYTES = 250  # per pixel: averages of errors, of which standard errors are computed
 ROWS, AROUND = 256, 2  # rows of the photograph that are read at once, and additional rows on both sides
 
 
@@ -62,6 +64,7 @@ class EditJob(FileEdit):
         scribbles: options that mark parts of the photograph.
         show: file for the picture of scribbles and mask.
         map: file for the map of what the edit estimates.
+        error_map: file for the standard errors of the edited pixels.
         seed: of the random numbers.
         notes: what is to be said about the options, once the photograph has been read.
     """
@@ -70,6 +73,7 @@ class EditJob(FileEdit):
     scribbles: ScribbleOptions
     show: Path | None = None
     map: Path | None = None
+    error_map: Path | None = None
     seed: int = 0
     notes: Sequence[str] = ()
 
@@ -77,7 +81,8 @@ class EditJob(FileEdit):
     def bytes_per_pixel(self) -> int:
         """Memory that the edit needs per pixel of an image."""
         regional = self.step.declared.regional is not None
-        return self.step.bytes_per_pixel(masked=regional and self.scribbles.marks_objects(self.step.declared))
+        needed = self.step.bytes_per_pixel(masked=regional and self.scribbles.marks_objects(self.step.declared))
+        return needed + (0 if self.error_map is None else ERROR_BYTES)
 
     @property
     def coloured(self) -> bool:
@@ -87,7 +92,7 @@ class EditJob(FileEdit):
     @property
     def writes_aside(self) -> bool:
         """Whether it writes more pictures than the output."""
-        return self.show is not None or self.map is not None
+        return not (self.show is self.map is self.error_map is None)
 
     def edited(self, photograph: Photograph) -> Tensor:
         """The edited pixels of a photograph in memory, (1, C, H, W)."""
@@ -98,6 +103,9 @@ class EditJob(FileEdit):
             weights = photograph.weights
             edit = self._measured(InMemory(photograph.pixels, weights=weights), rows)
             pixels = edit_image(edit, photograph.pixels, marked.tensors(), weights=weights)
+        if self.error_map is not None:
+            errors = edit.standard_error(photograph.pixels, weights)
+            write_photograph(Photograph(errors, ERROR_DEPTH), self.error_map)
         if edit.reports_change:
             kind = options.DTYPES[self.files.depth] if self.files.depth else photograph.depth  # the files are compared
             planes = [photograph.pixels] if weights is None else [photograph.pixels, weights]
@@ -111,6 +119,11 @@ class EditJob(FileEdit):
     @contextmanager
     def tiling(self, job: Job) -> Iterator[Tiling]:
         """The edited rows of a photograph that does not fit in memory, which are computed within the block."""
+        if self.error_map is not None:
+            raise ValueError(
+                f"--error-map must be used with a photograph that fits in memory, got {self.source}, which is edited "
+                "in tiles; crop it, or allow more by --memory"
+            )
         passes = job.passes(self.full, Path(self.target).parent)
         tiled = Tiled(Picture(job.picture.marked, self.source), passes, self.scribbles.called)
         rows = rows_by_tiles(tiled.picture)

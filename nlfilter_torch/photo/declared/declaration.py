@@ -397,6 +397,7 @@ class Edit:
         scribbles: the kinds of scribbles that it takes, the one on the object first.
         coloured: whether the edit turns a grey photograph into a colour one.
         map_help: description of the option ``--map``, if the edit can draw a map of what it estimates.
+        error_help: description of the option ``--error-map``, if the edit can tell the errors of its pixels.
         presets: names of the edits, besides this one, of which the command takes a single step as a preset; without any
             it takes no presets.
         filter_condition: when the parameters of the filter have an effect; None is always.
@@ -410,6 +411,7 @@ class Edit:
     scribbles: tuple[Scribble, ...] = ()
     coloured: bool = False
     map_help: str = ""
+    error_help: str = ""
     presets: tuple[str, ...] = ()
     filter_condition: Condition | None = None
 

@@ -300,6 +300,8 @@ DENOISE = Edit(
     hint="Estimates the noise and removes as much of it as you choose.",
     map_help="Also write a picture of the noise at every pixel: blue is its standard deviation, green and red those of "
     "means of 2x2 and 4x4 pixels, times 2 and 4. White noise is grey, coarse noise red; 255 is 64 grey levels.",
+    error_help="Also write the standard error of every denoised pixel as a TIFF of 32 bits, in shares of white: 1.645 "
+    "times it to either side is meant to hold the true value of 90 % of the pixels. Takes five times as long.",
     filter_condition=Condition(
         "method", "rule", "has no effect on the network; add --method rule to denoise by the filter alone"
     ),

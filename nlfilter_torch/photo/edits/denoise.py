@@ -17,6 +17,7 @@ from nlfilter_torch.core.precision import per_image
 from nlfilter_torch.core.torch_internals import cached_constants
 from nlfilter_torch.filtering.filters import weigh_layers
 from nlfilter_torch.filtering.noise import is_noise_map
+from nlfilter_torch.nn.denoiser.error import standard_error
 from nlfilter_torch.nn.denoiser.estimate import white_profile
 from nlfilter_torch.nn.denoiser.network import NonlocalDenoiser, deviation_of, level_planes
 from nlfilter_torch.nn.denoiser.noise import Noise
@@ -29,7 +30,7 @@ from nlfilter_torch.photo.edits.noise import HotPixels, hot_pixels_of, noise_of,
 from nlfilter_torch.photo.picture.changes import change_in_parts, remainder
 from nlfilter_torch.photo.picture.drawn import Drawn
 from nlfilter_torch.photo.picture.edit import PhotoEdit, Rows
-from nlfilter_torch.photo.picture.in_memory import edited
+from nlfilter_torch.photo.picture.in_memory import InMemory, edited
 from nlfilter_torch.photo.picture.measuring import check_in_memory, range_of
 from nlfilter_torch.photo.picture.pixels import M, WorkingRange, whole_image
 from nlfilter_torch.photo.picture.source import Fitted, Guide, Operator, Pixels, Planes, Source
@@ -221,6 +222,19 @@ class Denoise(PhotoEdit):
         seen = image if self.working is None else self.working.seen(image)
         luminance, colour = self._noise.at(seen, (4, 2, 1)).square().unflatten(1, (3, 2)).unbind(2)
         return ((luminance + 2 / 3 * colour).sqrt() * (LEVELS / WHITE_LEVELS)).clamp(0, 1)
+
+    def standard_error(self, image: Tensor, weights: Tensor | None) -> Tensor:
+        """Standard errors (B, C, H, W) of the denoised pixels of an image, by an edit with a known noise level."""
+        seen = image if self.working is None else self.working.seen(image)
+        noise = self.noise_level.at(seen) if isinstance(self.noise_level, Noise) else self.noise_level
+        assert noise is not None
+        errors = standard_error(partial(self._denoised, weights), seen, noise)
+        return errors if self.working is None else errors * self.working.span
+
+    def _denoised(self, weights: Tensor | None, image: Tensor) -> Tensor:
+        """An image in the range in which the edit sees it."""
+        source = InMemory(image, weights=weights)
+        return source.all(self.fit(source, Drawn()))
 
     @property
     def _noise(self) -> NoiseProfile:

@@ -114,6 +114,10 @@ class PhotoEdit(ABC):
         """
         raise NotImplementedError(f"{self.declared.name} draws no map")
 
+    def standard_error(self, image: Tensor, weights: Tensor | None) -> Tensor:
+        """Standard errors (B, C, H, W) of the edited pixels of an image in memory, for those that declare them."""
+        raise NotImplementedError(f"{self.declared.name} estimates no errors")
+
     def selection(self) -> "PhotoEdit | None":
         """The edit that computes the mask of the scribbled objects; None if every pixel is changed."""
         return None

@@ -230,6 +230,7 @@ def test_transparency_must_be_finite(tmp_path: Path, capsys: pytest.CaptureFixtu
         (["recolor", "--region", "24,32:blue"], "--show"),
         (["mask", "--region", "24,32"], "--show"),
         (["denoise"], "--map"),
+        (["denoise"], "--error-map"),
     ],
 )
 def test_the_photograph_is_not_replaced(

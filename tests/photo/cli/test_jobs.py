@@ -1,6 +1,7 @@
 """Edits of single photographs by commands: the results of the functions, the same in tiles, and refusals."""
 
 import re
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ import tifffile
 import torch
 from PIL import Image
 
+from nlfilter_torch import standard_error
 from nlfilter_torch.photo import abstract, adjust_tone, colorize, defocus, denoise, enhance, recolor, sharpen
 from nlfilter_torch.photo.cli import main
 from nlfilter_torch.photo.cli.jobs import ChangeMeter, EditJob, squared_difference, write_map
@@ -439,3 +441,33 @@ def test_a_map_has_no_seams(tmp_path: Path) -> None:
     assert stored.depth == "uint16"
     assert (stored.pixels - neighbours(image)).abs().max() < 1e-5
     assert max(read) < 600 <= sum(read)
+
+
+def test_errors_of_denoised_pixels_in_units_of_the_picture(photo: Path, pixels: torch.Tensor, tmp_path: Path) -> None:
+    out, errors = tmp_path / "out.png", tmp_path / "errors.tif"
+    arguments = ["--noise-level", "8", "--brightness", "0.7"]
+    assert main(["denoise", str(photo), str(out), "--error-map", str(errors), *arguments]) == 0
+    stored = read_photograph(errors)
+    assert stored.depth == "float32"
+    edit = partial(denoise, noise_level=8 / 255, brightness=0.7)
+    torch.testing.assert_close(stored.pixels, standard_error(edit, pixels, 8 / 255), rtol=1e-3, atol=1e-6)
+    # A picture that uses another range is seen in that range, and its errors are in its own units.
+    wide, large = tmp_path / "wide.tif", tmp_path / "large.tif"
+    write_photograph(Photograph(100 * pixels, "float32"), wide)
+    for path, target in ((photo, errors), (wide, large)):
+        assert main(["denoise", str(path), str(tmp_path / "out.tif"), "--error-map", str(target)]) == 0
+    ratio = float(read_photograph(large).pixels.mean() / read_photograph(errors).pixels.mean())
+    assert 50 < ratio < 200
+
+
+def test_errors_are_of_pixels_in_memory(photo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out, errors = tmp_path / "out.tif", tmp_path / "errors.tif"
+    for options, sentence in (
+        (["--memory", "0.001"], f"--error-map must be used with a photograph that fits in memory, got {photo}, which"),
+        (["--pages"], "--pages must be used with a TIFF file as OUT and without --show, --map and --error-map, got"),
+        (["--map", str(errors)], "--error-map must be another file than the map"),
+    ):
+        assert main(["denoise", str(photo), str(out), "--error-map", str(errors), *options]) == 2
+        assert sentence in " ".join(capsys.readouterr().err.split())
+        assert not out.exists()
+        assert not errors.exists()

@@ -85,6 +85,14 @@ def test_only_declared_maps_are_drawn() -> None:
     ]
 
 
+def test_only_declared_errors_are_estimated() -> None:
+    with pytest.raises(NotImplementedError, match="tone estimates no errors"):
+        edit_of(Step("tone"), SIZE).standard_error(noise(1, 1, *SIZE), None)
+    assert [name for name, kind in EDIT_OF.items() if kind.standard_error is not PhotoEdit.standard_error] == [
+        name for name, kind in EDIT_OF.items() if kind.declared.error_help
+    ]
+
+
 def test_the_noise_of_a_picture_is_measured_once() -> None:
     image = colour("coffee", 60, 80) + 0.05 * torch.randn(1, 3, 60, 80, generator=torch.Generator().manual_seed(0))
     source = InMemory(image)
