@@ -466,12 +466,14 @@ def _assemble(
     factor, diagonal = matrix.factor, matrix.diagonal
     worst = balancing.worst if watched else 0.0
     remainder = scaling * (scaling * diagonal)  # in this order: without completion d^2 may overflow
-    gram = PixelMatrix(factor, scaling, remainder, weights, communicator).gram_below
-    allowed = slack(factor.dtype, worst)
-    if watched and is_bounded(options.landmarks, points, chosen.shape[2]) and exceeds(gram, balancing.moment, allowed):
-        limit = limiter(gram, matrix.moment(scaling), allowed)
-        factor, kernel = limit.to(factor) @ factor, replace(kernel, limiter=limit.to(factor))
-        before = tuple(torch.linalg.solve(limit.detach(), total) for total in before)  # preserves u . total
+    over, allowed = None, slack(factor.dtype, worst)
+    if watched and is_bounded(options.landmarks, points, chosen.shape[2]):
+        gram = PixelMatrix(factor, scaling, remainder, weights, communicator).gram_below
+        over = exceeds(gram, balancing.moment, allowed)
+    if over is not None and bool(over.any()):
+        factor, limit = _limited(matrix, scaling, remainder, over, allowed)
+        kernel = replace(kernel, limiter=limit)
+        before = tuple(torch.linalg.solve(limit.detach().double(), total) for total in before)  # preserves u . total
         matrix = replace(matrix, factor=factor)
         residual = _residual(matrix, scaling)
         warn_of_residual(float(residual.max()), tolerance, factor.dtype, completed=completed)
@@ -493,6 +495,27 @@ def _assemble(
         weights=weights,
         communicator=communicator,
     )
+
+
+def _limited(
+    matrix: KernelMatrix, scaling: Tensor, remainder: Tensor, over: Tensor, allowed: float
+) -> tuple[Tensor, Tensor]:
+    """The factor (B, M, N) with eigenvalues of at most 1, and by which matrices (B, M, M) it was multiplied.
+
+    Only images that are ``over``, (B,), change: their matrices need an eigen-decomposition.
+    """
+    factor, weights, communicator = matrix.factor, matrix.weights, matrix.communicator
+    if bool(over.all()):
+        gram = PixelMatrix(factor, scaling, remainder, weights, communicator).gram_below
+        limit = limiter(gram, matrix.moment(scaling), allowed).to(factor)
+        return limit @ factor, limit
+    index = over.nonzero().squeeze(1)
+    weights = weights if weights is None or len(weights) == 1 else weights[index]
+    part = KernelMatrix(factor[index], matrix.diagonal[index], weights, communicator)
+    columns, limit = _limited(part, scaling[index], remainder[index], over[index], allowed)
+    identity = torch.eye(factor.shape[1], dtype=factor.dtype, device=factor.device).expand(len(factor), -1, -1)
+    replaced = factor.index_copy if factor.requires_grad else factor.index_copy_  # nothing else holds this factor
+    return replaced(0, index, columns), identity.index_copy(0, index, limit)
 
 
 def _landmarks(

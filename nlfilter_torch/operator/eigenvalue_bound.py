@@ -41,11 +41,11 @@ def slack(dtype: torch.dtype, residual: float) -> float:
 
 
 @torch.no_grad()
-def exceeds(gram: ShiftedGram, moment: Tensor, slack: float) -> bool:
-    """Whether an eigenvalue of W exceeds 1 by more than ``slack``, for any image of a batch."""
+def exceeds(gram: ShiftedGram, moment: Tensor, slack: float) -> Tensor:
+    """Whether an eigenvalue of W exceeds 1 by more than ``slack``, of each image of a batch, (B,)."""
     matrix = gram(torch.full_like(moment[:, 0, 0], 1 + slack), 1)
     identity = torch.eye(matrix.shape[1], dtype=matrix.dtype, device=matrix.device)
-    return bool((torch.linalg.cholesky_ex(identity - matrix).info != 0).any())
+    return torch.linalg.cholesky_ex(identity - matrix).info != 0
 
 
 def limiter(gram: ShiftedGram, moment: Tensor, slack: float) -> Tensor:

@@ -263,7 +263,7 @@ def sinkhorn(
     if not is_hidden(factor) and (bound or factor.shape[1] * factor.shape[2] <= ALWAYS):
         remainder = result.scaling * (result.scaling * result.matrix.diagonal)
         balanced = PixelMatrix(result.matrix.factor, result.scaling, remainder)
-        if exceeds(balanced.gram_below, result.moment, slack(factor.dtype, result.worst)):
+        if bool(exceeds(balanced.gram_below, result.moment, slack(factor.dtype, result.worst)).any()):
             warn("eigenvalues exceed 1, which compiled programs do not correct; use landmarks='kmeans'")
     moments = [*result.before, *[result.moment] * (MOST_ROUNDS + 1 - len(result.before))]
     removed = torch.zeros_like(diagonal, dtype=torch.bool) if removed is None else removed

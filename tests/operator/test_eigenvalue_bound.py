@@ -88,6 +88,22 @@ def test_a_limited_operator_is_the_unlimited_one_below_one() -> None:
     assert powers.abs().max() <= image.norm()
 
 
+@pytest.mark.parametrize("recorded", [False, True])
+def test_only_images_whose_eigenvalues_exceed_one_are_limited(recorded: bool) -> None:
+    options: dict[str, object] = {"spatial_bandwidth": 3.0, "num_landmarks": 50, "landmarks": "random"}
+    images = [noise(1, 1, 40, 40, seed=1).float(), picture("camera", 40, 40).float(), noise(1, 1, 40, 40).float()]
+    alone = [nonlocal_operator(image, photometric_bandwidth=0.05, **options) for image in images]
+    assert [operator.kernel.limiter is None for operator in alone] == [True, False, True]
+    batch = torch.cat(images).requires_grad_(recorded)
+    together = nonlocal_operator(batch, photometric_bandwidth=0.05, **options)
+    assert together.kernel.limiter is not None
+    identity = torch.eye(50).expand(2, -1, -1)
+    assert torch.equal(together.kernel.limiter[[0, 2]], identity)
+    torch.testing.assert_close(together.factor, torch.cat([operator.factor for operator in alone]), rtol=0, atol=1e-5)
+    if recorded:
+        assert torch.autograd.grad(together.factor.square().sum(), batch)[0].abs().amax((1, 2, 3)).isfinite().all()
+
+
 def test_other_pixels_follow_a_limited_operator() -> None:
     image, operator = limited()
     fitted = fit_filter(operator, image)
