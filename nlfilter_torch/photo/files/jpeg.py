@@ -175,7 +175,7 @@ def _metadata(contents: list[tuple[int, bytes]], behind: bytes) -> tuple[int, Me
     parts, left_out = [], []
     for marker, content in contents:
         if marker == APP and content.startswith(b"JFIF\0"):
-            dpi = _density(content)
+            dpi = density(content)
         elif marker == APP + 1 and content.startswith(exif_tags.PREFIX):
             blocks.append(content.removeprefix(exif_tags.PREFIX))
         elif marker == APP + 1 and content.startswith(XMP_SEGMENT):
@@ -200,7 +200,7 @@ def _metadata(contents: list[tuple[int, bytes]], behind: bytes) -> tuple[int, Me
     return orientation, Metadata(icc, exif, extras)
 
 
-def _density(content: bytes) -> tuple[float, float] | None:
+def density(content: bytes) -> tuple[float, float] | None:
     """The pixels per inch in the header of JFIF, or None."""
     if len(content) < 12 or (scale := exif_tags.IN_INCHES.get(content[7] + 1)) is None:  # TIFF counts from 1
         return None
@@ -266,7 +266,7 @@ def write_jpeg(
 def _written(metadata: Metadata) -> Iterator[tuple[int, bytes]]:
     """The segments of metadata."""
     extras, icc = metadata.extras, metadata.icc or b""
-    yield APP, b"JFIF\0\1\1" + _stored_density(extras.dpi) + b"\0\0"
+    yield APP, jfif(extras.dpi)
     if metadata.exif is not None:
         yield APP + 1, exif_tags.PREFIX + metadata.exif.removeprefix(exif_tags.PREFIX)
     if extras.xmp is not None and len(extras.xmp) <= LONGEST_XMP:
@@ -279,16 +279,17 @@ def _written(metadata: Metadata) -> Iterator[tuple[int, bytes]]:
             yield part.data[1], part.data[4:]
 
 
-def _stored_density(dpi: tuple[float, float] | None) -> bytes:
-    """Unit and density of JFIF, whole numbers, in the unit that rounds less."""
+def jfif(dpi: tuple[float, float] | None) -> bytes:
+    """The header of JFIF, whose density is whole numbers, in the unit that rounds less; see :func:`density`."""
     if dpi is None:
-        return struct.pack(">BHH", 0, 1, 1)
+        return b"JFIF\0\1\1" + struct.pack(">BHHH", 0, 1, 1, 0)
     lost = {
         unit: sum(abs(value / scale - round(value / scale)) * scale for value in dpi)
         for unit, scale in exif_tags.IN_INCHES.items()
     }
     unit = min(lost, key=lost.__getitem__)
-    return struct.pack(">BHH", unit - 1, *(max(1, round(value / exif_tags.IN_INCHES[unit])) for value in dpi))
+    numbers = (max(1, round(value / exif_tags.IN_INCHES[unit])) for value in dpi)
+    return b"JFIF\0\1\1" + struct.pack(">BHHH", unit - 1, *numbers, 0)
 
 
 def _write_segment(stream: BinaryIO, marker: int, content: bytes) -> None:

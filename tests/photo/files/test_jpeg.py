@@ -1,6 +1,7 @@
 """JPEG: metadata, what follows the picture, strips, and damage."""
 
 import io
+import re
 from pathlib import Path
 
 import imagecodecs
@@ -9,6 +10,7 @@ import pytest
 from PIL import Image
 
 from nlfilter_torch.photo.files import rows
+from nlfilter_torch.photo.files.formats import fitting_jpeg
 from nlfilter_torch.photo.files.jpeg import open_jpeg, write_jpeg
 from nlfilter_torch.photo.files.metadata import Extras, Header, Metadata
 from nlfilter_torch.photo.picture.photographs import read_photograph, write_photograph
@@ -69,6 +71,16 @@ def test_the_density_is_in_the_unit_that_holds_it(dpi: tuple[float, float]) -> N
     stream = io.BytesIO()
     write_jpeg(stream, [cat()], Header(cat().shape, np.dtype("uint8"), False, Metadata(extras=Extras(dpi=dpi))))
     assert open_jpeg(Path(), stream.getvalue()).metadata.extras.dpi == pytest.approx(dpi, abs=0.001)
+
+
+def test_a_density_that_is_rounded_is_named() -> None:
+    """But for what PNG files hold in place of whole numbers."""
+    named = {(240.4, 300.0): "240 x 300", (9449 / 100 * 2.54, 7.62): "240 x 8"}
+    for dpi, stored in named.items():
+        (sentence,) = fitting_jpeg(Metadata(extras=Extras(dpi=dpi)))[1]
+        assert re.fullmatch(rf"the print resolution of .* dpi, of which JPEG holds {stored}", sentence)
+    for near in ((9449 * 0.0254, 11811 * 0.0254), (72.0, 72.0), (100 * 2.54, 50 * 2.54)):
+        assert fitting_jpeg(Metadata(extras=Extras(dpi=near)))[1] == []
 
 
 def test_profiles_in_several_segments(tmp_path: Path) -> None:
