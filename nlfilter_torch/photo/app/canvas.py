@@ -293,10 +293,12 @@ class Canvas:
             self._line.append((x, y))
         else:
             line, self._line = self._line, []
-            if self._brush.draws_box(self._step):
-                if min(abs(a - b) for a, b in zip(line[0], line[-1], strict=True)) >= LEAST_SIDE:
-                    corners = line[0], line[-1], self._brush.paint(self._step)
-                    self._draw(self._step, partial(self._session.add_box, self._step, *corners))
+            shape = self._brush.drags(self._step)
+            if shape is not None:
+                sides = [abs(a - b) for a, b in zip(line[0], line[-1], strict=True)]
+                if (max if shape == "linear" else min)(sides) >= LEAST_SIDE:
+                    ends = line[0], line[-1], self._brush.paint(self._step), shape
+                    self._draw(self._step, partial(self._session.add_box, self._step, *ends))
             else:
                 stroke = line, self._brush.radius[self._step], self._brush.paint(self._step)
                 self._draw(self._step, partial(self._session.add_stroke, self._step, *stroke))

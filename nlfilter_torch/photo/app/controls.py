@@ -84,7 +84,7 @@ class Control:
         ['2.0 %', '2']
         """
         if value == self.slider.none:
-            return "all"
+            return "all" if self.parameter.kind == "count" else "as it is"
         return f"{digits(value, self.slider.step)} {SYMBOLS.get(self.parameter.unit, '')}".rstrip()
 
 

@@ -1,6 +1,7 @@
 """Pictures as image files, strokes and curves as SVG, for the browser."""
 
 import io
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
@@ -11,7 +12,7 @@ from torch import Tensor
 
 from nlfilter_torch.filtering.filters import polynomial_response
 from nlfilter_torch.photo.declared.parameters import EDITS
-from nlfilter_torch.photo.declared.strokes import Mark, Region, ScribbleRole, Stroke
+from nlfilter_torch.photo.declared.strokes import Mark, Point, Region, ScribbleRole, Stroke
 from nlfilter_torch.photo.picture.colour import hundredths_of_lab
 
 JPEG_QUALITY = 95
@@ -30,6 +31,7 @@ ROLES: dict[ScribbleRole, str] = {
 }
 KEPT_STROKE = "#9ca3af"  # colour of strokes on what keeps its colour
 OUTLINE = 2  # width in pixels of a preview of the border of a region
+BAR = 0.15  # half the length of a bar across a gradient, as a share of the short side
 WHITE_TINT, BLACK_TINT = (255, 60, 60, 255), (60, 120, 255, 255)  # where a picture is clipped
 BINS = 64  # of a histogram
 
@@ -157,9 +159,22 @@ def strokes_svg(marks: Iterable[Mark], size: tuple[int, int], *, keeps: bool = F
             points = points if len(points) > 1 else points * 2  # a dot is a line of no length
             end, thickness = "", 2 * mark.radius * min(size)
         line = "L".join(f"{x * width:.1f} {y * height:.1f}" for x, y in points)
+        if isinstance(mark, Region) and mark.shape == "linear":
+            first, last = ((x * width, y * height) for x, y in points)
+            line, end = _axis(first, last, BAR * min(size)), ""
         colour = mark.colour or (KEPT_STROKE if keeps and mark.role == "background" else ROLES[mark.role])
         paths.append(f'<path d="M{line}{end}" stroke="{colour}" stroke-width="{thickness:.1f}" class="stroke" />')
     return "".join(paths)
+
+
+def _axis(start: Point, end: Point, bar: float) -> str:
+    """The axis of a linear gradient, with a bar across where it is 1, and half of one where it is 0."""
+    (x0, y0), (x1, y1) = start, end
+    length = math.hypot(x1 - x0, y1 - y0) or 1.0
+    across, down = (y0 - y1) * bar / length, (x1 - x0) * bar / length
+    bars = [(x0 - across, y0 - down), (x0 + across, y0 + down), start, end]
+    bars += [(x1 - across / 2, y1 - down / 2), (x1 + across / 2, y1 + down / 2)]
+    return "M".join("L".join(f"{x:.1f} {y:.1f}" for x, y in bars[i : i + 2]) for i in (0, 2, 4))
 
 
 @dataclass(frozen=True)

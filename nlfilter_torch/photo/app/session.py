@@ -19,7 +19,7 @@ from nlfilter_torch.photo.declared.json_values import Value
 from nlfilter_torch.photo.declared.parameters import EDITS
 from nlfilter_torch.photo.declared.presets import Recipe, on_frame
 from nlfilter_torch.photo.declared.steps import Step
-from nlfilter_torch.photo.declared.strokes import Mark, Region, thin
+from nlfilter_torch.photo.declared.strokes import Mark, Point, Region, Shape, thin
 from nlfilter_torch.photo.edits.parts import Parts, Rectangle
 from nlfilter_torch.photo.edits.recipe import apply_recipe, edit_rows
 from nlfilter_torch.photo.files.exif import read_upright
@@ -274,20 +274,20 @@ class Session:
         entries = {"points": [list(point) for point in shares], "radius": round(radius, 4), "paint": paint}
         self._add(step, entries)
 
-    def add_box(self, step: str, start: tuple[float, float], end: tuple[float, float], paint: str) -> None:
-        """Add a rectangle around an object of a step, in place of an earlier one around the same object.
+    def add_box(self, step: str, start: Point, end: Point, paint: str, shape: Shape = "rectangle") -> None:
+        """Add a rectangle around an object of a step, in place of an earlier one around the same object, or a gradient.
 
-        Corners (x, y) are in pixels of the preview; what lies outside it is left out.
+        Its ends (x, y) are in pixels of the preview; of a rectangle, what lies outside it is left out.
 
         Raises:
-            ValueError: if the step does not take boxes of that meaning.
+            ValueError: if the step does not take such marks of that meaning.
         """
-        sides = []
-        for a, b, length in zip(start, end, self.preview.size[::-1], strict=True):
-            first, last = sorted(round(min(max(place / length, 0.0), 1.0), 4) for place in (a, b))
-            sides.append((first, last - first))
-        (left, width), (top, height) = sides
-        self._add(step, {"rectangle": [left, top, width, height], "paint": paint})
+        low, high = (0.0, 1.0) if shape == "rectangle" else (-1.0, 2.0)
+        width, height = self.preview.size[::-1]
+        (x0, y0), (x1, y1) = (
+            [round(min(max(at, low), high), 4) for at in (x / width, y / height)] for x, y in (start, end)
+        )
+        self._add(step, Region.dragged((x0, y0), (x1, y1), shape, paint).entries())
 
     def _add(self, step: str, entries: dict[str, object]) -> None:
         """Add a mark, where it is in the preview, to a step."""

@@ -135,7 +135,9 @@ class EditTab:
         if hint:
             ui.label(hint).classes("hint")
         self._tools = ui.toggle(BRUSHES[edit], value=brush.word[edit])
-        self._tools.props('dense no-caps unelevated spread role="group" aria-label="Tools"').classes("w-full q-mt-xs")
+        self._tools.props('dense no-caps unelevated spread role="group" aria-label="Tools"').classes(
+            "tools w-full q-mt-xs"
+        )
         self._tools.on_value_change(lambda event: brush.word.update({edit: event.value}))
         self._choices += controls.choices(edit, self._page.recipe, self._page.change)
         if EDITS[edit].with_role("added"):

@@ -6,14 +6,15 @@ from dataclasses import dataclass, field
 
 from nicegui import ui
 
+from nlfilter_torch.photo.declared.declaration import GRADIENTS
 from nlfilter_torch.photo.declared.development import WHOLE_CROP, Crop
 from nlfilter_torch.photo.declared.parameters import EDITS
-from nlfilter_torch.photo.declared.strokes import WORDS, Mark, Region, Stroke
+from nlfilter_torch.photo.declared.strokes import WORDS, Mark, Region, Shape, Stroke
 
 PALETTE = ("#2f6fde", "#12a15f", "#e0b321", "#dd5c21", "#c8283c", "#8a46c8", "#8b5e3c", "#808080")
 BRUSH_RADIUS = 0.02  # of the brush at the start
 BRUSHES: dict[str, dict[str, str]] = {
-    edit.name: {scribble.word: scribble.label for scribble in edit.scribbles}
+    edit.name: {word: label for scribble in edit.scribbles for word, label in scribble.tools.items()}
     for edit in EDITS.values()
     if edit.scribbles
 }
@@ -43,18 +44,20 @@ class Brush:
 
     def paint(self, step: str) -> str:
         """The meaning or colour of a stroke for a step."""
-        return self.word[step].replace("colour", self.colour)
+        return self.word[step].split(": ")[-1].replace("colour", self.colour)
 
-    def draws_box(self, step: str) -> bool:
-        """Whether dragging draws a rectangle, from where it begins to where it ends."""
-        return self.word[step].startswith(WORDS["box"])
+    def drags(self, step: str) -> Shape | None:
+        """The shape that is drawn from where dragging begins to where it ends; None draws a stroke."""
+        if self.word[step].startswith(WORDS["box"]):
+            return "rectangle"
+        return next((shape for shape in GRADIENTS if self.word[step].startswith(f"{shape}: ")), None)
 
     def mark(self, step: str, points: Sequence[tuple[float, float]]) -> Mark:
         """What is drawn along points (x, y), in shares of the picture."""
-        if not self.draws_box(step):
+        shape = self.drags(step)
+        if shape is None:
             return Stroke(tuple(points), self.radius[step], self.paint(step))
-        (left, right), (top, bottom) = (sorted((points[0][axis], points[-1][axis])) for axis in (0, 1))
-        return Region.upright((left, top, right - left, bottom - top), "rectangle", self.paint(step))
+        return Region.dragged(points[0], points[-1], shape, self.paint(step))
 
     def choose_colour(self, value: object) -> None:
         """Set the colour, if the value is one, such as ``#2f6fde``; what is typed may be incomplete."""

@@ -44,14 +44,16 @@ Domain = Literal[
     "positive", "not negative", "share", "up to 10", "below 1", "signed share", "stops", "finite", "count", "choice"
 ]
 
-#: For each gradient: the placeholder of its option, and its help.
-GRADIENTS: dict[Shape, tuple[str, str]] = {
+#: For each gradient: the label of its tool in the editor, the placeholder of its option, and its help.
+GRADIENTS: dict[Shape, tuple[str, str, str]] = {
     "linear": (
+        "Gradient",
         "X,Y,X,Y",
         "A gradient to add to the mask: a point up to which all is selected, and one from which on nothing is, in "
         "pixels or in %. May be repeated.",
     ),
     "radial": (
+        "Oval",
         "X,Y,W,H[,SOFTNESS]",
         "An ellipse to add to the mask, in a rectangle in pixels or in %; it fades along a part of its radius, 50% "
         "unless another is given. May be repeated.",
@@ -338,7 +340,7 @@ class Scribble:
             not offer these scribbles.
         option_help: description of that option.
         advice: for objects that are needed, the error of the command if there are none.
-        gradients: the shapes of gradients for which the command has options, too.
+        gradients: the shapes of gradients for which the command has options, and the editor tools.
     """
 
     argument: str
@@ -363,10 +365,20 @@ class Scribble:
         return "colour" if self.role == "object" else f"{WORDS[self.role]} colour"
 
     @property
+    def tools(self) -> dict[str, str]:
+        """The labels of the tools of the editor that draw them, by the paint of their marks, after a gradient's shape.
+
+        >>> Scribble("added", "Brush", "colours", "added", gradients=("linear",)).tools
+        {'add colour': 'Brush', 'linear: add colour': 'Gradient'}
+        """
+        own = {self.word: self.label}
+        return own | {f"{shape}: {self.word}": GRADIENTS[shape][0] for shape in self.gradients}
+
+    @property
     def options(self) -> tuple[MarkOption, ...]:
         """The options of the command for these scribbles."""
         own = MarkOption(self.option or "--region", self, help=self.option_help)
-        return (own, *(MarkOption(f"--{shape}", self, *GRADIENTS[shape], shape) for shape in self.gradients))
+        return (own, *(MarkOption(f"--{shape}", self, *GRADIENTS[shape][1:], shape) for shape in self.gradients))
 
 
 @dataclass(frozen=True)

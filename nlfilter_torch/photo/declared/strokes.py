@@ -172,6 +172,14 @@ class Region(Marking):
         return Region(((left, top), (left + width, top), (left, top + height)), shape, paint, file)
 
     @staticmethod
+    def dragged(start: Point, end: Point, shape: Shape, paint: str) -> "Region":
+        """The region that is drawn by dragging from a point to another: the ends of a linear gradient, or corners."""
+        if shape == "linear":
+            return Region((start, end), shape, paint)
+        (left, right), (top, bottom) = (sorted(places) for places in zip(start, end, strict=True))
+        return Region.upright((left, top, right - left, bottom - top), shape, paint)
+
+    @staticmethod
     def of_file(path: str, shape: Shape, paint: str) -> "Region":
         """The region that a picture of the photograph marks."""
         return Region.upright((0.0, 0.0, 1.0, 1.0), shape, paint, path)

@@ -25,7 +25,7 @@ from nlfilter_torch.photo.picture.viewing import fit_change
 
 RADIUS = 1.5  # standard deviation in pixels of the blur of the unsharp mask
 UNIT = 2.0  # growth of the amount that adds the mask once
-FAINT = 5 / 255  # standard deviation of luminance around a pixel below which a clean picture is sharpened less
+FAINT = 10 / 255  # standard deviation of luminance around a pixel below which a clean picture is sharpened less: skin
 NOISE_RATIO = 2.0  # ratio of that deviation to the noise below which a noisy one is
 
 

@@ -119,6 +119,18 @@ def test_a_box(opened: Page, session: Session) -> None:
     assert box == Region.upright((0.2, 0.2, 0.6, 0.6), "rectangle", "box")
 
 
+def test_a_gradient(opened: Page, session: Session) -> None:
+    canvas = opened.canvas
+    canvas._step = "light"
+    canvas._brush.word["light"] = "linear: add"
+    canvas._pointer("pointerdown", 20, 20)
+    canvas._pointer("pointermove", 20, 80)
+    assert canvas._photo.content.count("M") == 3  # its axis and bars across it
+    canvas._pointer("pointerup", 20, 80)
+    (gradient,) = session.recipe.current("light").strokes
+    assert gradient == Region(((round(20 / 150, 4), 0.2), (round(20 / 150, 4), 0.8)), "linear", "add")
+
+
 def test_a_stroke_that_is_dropped(opened: Page, session: Session) -> None:
     opened.canvas._pointer("pointerdown", 20, 20)
     opened.canvas.drop_stroke()

@@ -22,8 +22,17 @@ def test_a_box_goes_from_where_a_drag_begins_to_where_it_ends() -> None:
     brush.word["defocus"], brush.word["recolor"] = "box", "box colour"
     box = brush.mark("defocus", [(0.5, 0.75), (0.9, 0.9), (0.25, 0.25)])
     assert box == Region.upright((0.25, 0.25, 0.25, 0.5), "rectangle", "box")
-    assert brush.draws_box("recolor")
+    assert brush.drags("recolor") == "rectangle"
     assert brush.mark("recolor", [(0.0, 0.0), (0.5, 0.5)]).colour == brush.colour
+
+
+def test_a_gradient_goes_from_one_point_to_another() -> None:
+    brush = Brush()
+    for word, shape in (("linear: add colour", "linear"), ("radial: add colour", "radial")):
+        brush.word["recolor"] = word
+        assert brush.drags("recolor") == shape
+        mark = brush.mark("recolor", [(0.5, 0.75), (0.9, 0.9), (0.25, 0.25)])
+        assert mark == Region.dragged((0.5, 0.75), (0.25, 0.25), shape, f"add {brush.colour}")
 
 
 def test_proportions_are_cut_from_what_a_person_has_made() -> None:

@@ -324,6 +324,22 @@ def test_a_rectangle_is_dragged_around_an_object(opened: Tab) -> None:
     expect(page.locator("path.stroke")).to_have_count(1)
 
 
+def test_a_gradient_is_dragged_and_light_changes_under_it(opened: Tab) -> None:
+    page = opened.page
+    page.get_by_role("tab", name="Light").click()
+    page.get_by_role("group", name="Tools").locator("visible=true").get_by_role("button", name="Gradient").click()
+    opened.paint((0.5, 0.1), (0.5, 0.5), (0.5, 0.9))
+    expect(page.locator("path.stroke")).to_have_count(1)
+    before = opened.source()
+    opened.drag(opened.slider("Exposure"), 0.5, 0.9)
+    opened.wait_for_picture(before)
+    stops = float(opened.slider("Exposure").get_attribute("aria-valuenow") or 0)
+    assert stops > 1
+    step = Step("light", (Region(((0.5, 0.1), (0.5, 0.9)), "linear", "add"),), exposure=stops)
+    opened.expect_picture(apply_step(step, cat()), most=5)
+    opened.expect_picture(cat(), least=20)
+
+
 def test_only_this_or_all_alike_is_a_click(opened: Tab) -> None:
     page = opened.page
     page.get_by_role("tab", name="Defocus").click()
