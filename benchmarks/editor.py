@@ -1,21 +1,20 @@
 """How long the editor takes from an input in the browser to its pixels: ``python -m benchmarks.editor [--quick]``.
 
 Starts ``nlfilter-torch app`` with a photograph of ``--megapixels`` as a JPEG, and a headless Chromium. Each row has the
-seconds until the picture has changed (and been decoded) on the page, and the processor time of the editor meanwhile,
-which other programs on the machine disturb less; of several moves, the median.
+seconds until another picture is decoded on the page, and the processor time of the editor meanwhile, which other
+programs disturb less; of several moves, the medians.
 """
 
 import re
 import statistics
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
 import psutil
 import torch
-from playwright.sync_api import Locator
 
 from benchmarks.harness import options
 from benchmarks.photographs import enlarged
@@ -24,91 +23,72 @@ from tests.browser import Editor, Tab, chromium
 
 SLIDERS = (("Photo", "Exposure"), ("Photo", "Highlights"), ("Tone", "Contrast"), ("Detail", "Texture"))
 MOVES = 5
-PAUSE = 400  # milliseconds between two moves, in which nothing else is computed
-VISIBLE = """(first) => { const box = document.querySelector('.canvas').getBoundingClientRect();
-  const shares = first ? [0.5] : [0.02, 0.25, 0.5, 0.75, 0.98];
-  const places = shares.flatMap((x) => shares.map((y) => [x, y]));
+PAUSE = 400  # milliseconds between two moves
+READING = 4000  # milliseconds that a person looks at a tab that is new
+VISIBLE = """(shares) => { const box = document.querySelector('.canvas').getBoundingClientRect();
   const pieces = [...document.querySelectorAll('.pieces img')].filter((image) => image.complete)
     .map((image) => image.getBoundingClientRect());
-  return places.every(([x, y]) => pieces.some((p) => p.left <= box.x + x * box.width && box.x + x * box.width <= p.right
-    && p.top <= box.y + y * box.height && box.y + y * box.height <= p.bottom)); }"""
+  return shares.every((share) => { const x = box.x + share * box.width, y = box.y + share * box.height;
+    return pieces.some((p) => p.left <= x && x <= p.right && p.top <= y && y <= p.bottom); }); }"""
 
 
 class Clock:
-    """Measures the editor, a process, from inputs to pixels."""
+    """The times of inputs to an editor and its page."""
 
-    def __init__(self, editor: Editor) -> None:
-        self._process = psutil.Process(editor.process.pid)
+    def __init__(self, editor: Editor, tab: Tab, begun: float) -> None:
+        self.tab, self._process, self._begun = tab, psutil.Process(editor.process.pid), begun
 
-    def used(self) -> float:
-        """Seconds of processors that the editor has used."""
+    def report(self, name: str, *inputs: Callable[[], object]) -> None:
+        """Print the times of inputs, each of which returns once its pixels are there; of none those since the start."""
+        rows = [(time.perf_counter() - self._begun, self._used())] if not inputs else []
+        for make in inputs:
+            begun, used = time.perf_counter(), self._used()
+            make()
+            rows.append((time.perf_counter() - begun, self._used() - used))
+            self.tab.page.wait_for_timeout(PAUSE)
+        wall, used = (statistics.median(column) for column in zip(*rows, strict=True))
+        print(f"{name:<44}{wall:>9.2f}{used:>12.2f}", flush=True)
+
+    def _used(self) -> float:
         times = self._process.cpu_times()
         return float(times.user + times.system)
 
-    def report(self, name: str, *inputs: Callable[[], object]) -> None:
-        """Make inputs, each of which returns once its pixels are there, and print their times."""
-        rows = []
-        for make in inputs:
-            begun, used = time.perf_counter(), self.used()
-            make()
-            rows.append((time.perf_counter() - begun, self.used() - used))
-            time.sleep(PAUSE / 1000)
-        show(name, [wall for wall, _ in rows], [used for _, used in rows])
+    def slide(self, edit: str, label: str) -> None:
+        """Report the first move of a slider, and the next ones."""
+        page, slider = self.tab.page, self.tab.slider(label)
+        page.get_by_role("tab", name=re.compile(f"^{edit}")).click()
+        page.wait_for_timeout(READING)
 
-
-def show(name: str, walls: Sequence[float], used: Sequence[float]) -> None:
-    """Print a row."""
-    print(f"{name:<44}{statistics.median(walls):>9.2f}{statistics.median(used):>12.2f}", flush=True)
-
-
-def moves(tab: Tab, slider: Locator) -> list[Callable[[], None]]:
-    """The inputs that move a slider, of which the first presses the pointer on it."""
-
-    def move(number: int) -> None:
-        before = tab.source()
-        if number == 0:
-            tab.drag(slider, 0.5, 0.54, release=False)
-        else:
-            box = slider.bounding_box()
+        def move(number: int) -> None:
+            before, box = self.tab.source(), slider.bounding_box()
             assert box is not None
-            tab.page.mouse.move(box["x"] + (0.54 + 0.07 * number) * box["width"], box["y"] + box["height"] / 2)
-        tab.wait_for_picture(before)
+            if number == 0:
+                self.tab.drag(slider, 0.5, 0.54, release=False)
+            else:
+                page.mouse.move(box["x"] + (0.54 + 0.07 * number) * box["width"], box["y"] + box["height"] / 2)
+            self.tab.wait_for_picture(before)
 
-    return [partial(move, number) for number in range(MOVES + 1)]
+        self.report(f"{edit}, {label}: first move", partial(move, 0))
+        self.report(f"{edit}, {label}: further moves", *(partial(move, number) for number in range(1, MOVES + 1)))
+        page.mouse.up()
+        page.get_by_role("button", name="Reset").click()
+        page.wait_for_timeout(READING)
 
+    def full_size(self, edit: str) -> None:
+        """Report how long pieces at 100 % take, of the middle and of the rest."""
+        page = self.tab.page
+        self.report(f"100 %, {edit}: the middle", lambda: (page.keyboard.press("1"), self._see(0.5)))
+        self.report(f"100 %, {edit}: the rest", lambda: self._see(0.02, 0.25, 0.5, 0.75, 0.98))
+        page.keyboard.press("0")
 
-def slide(tab: Tab, clock: Clock, edit: str, label: str) -> None:
-    """Report the first move of a slider, the next ones, and its release."""
-    tab.page.get_by_role("tab", name=re.compile(f"^{edit}")).click()
-    tab.page.wait_for_timeout(3 * PAUSE)
-    first, *others = moves(tab, tab.slider(label))
-    clock.report(f"{edit}, {label}: first move", first)
-    clock.report(f"{edit}, {label}: further moves", *others)
-    tab.page.mouse.up()
-    tab.page.get_by_role("button", name="Reset").click()
-    tab.page.wait_for_timeout(3 * PAUSE)
+    def _see(self, *shares: float) -> None:
+        self.tab.page.wait_for_function(VISIBLE, arg=shares)
 
-
-def full_size(tab: Tab, clock: Clock, edit: str) -> None:
-    """Report how long the pieces at 100 % take."""
-
-    def look(first: bool) -> None:
-        tab.page.wait_for_function(VISIBLE, arg=first)
-
-    def zoom() -> None:
-        tab.page.keyboard.press("1")
-        look(True)
-
-    clock.report(f"100 %, {edit}: the middle", zoom)
-    clock.report(f"100 %, {edit}: the rest", lambda: look(False))
-    tab.page.keyboard.press("0")
-
-
-def stroke(tab: Tab, y: float) -> None:
-    """Paint."""
-    before = tab.source()
-    tab.paint((0.4, y), (0.5, y))
-    tab.wait_for_picture(before)
+    def stroke(self, y: float) -> None:
+        """Paint."""
+        before = self.tab.source()
+        self.tab.paint((0.4, y), (0.5, y))
+        self.tab.wait_for_picture(before)
 
 
 def main() -> None:
@@ -123,27 +103,23 @@ def main() -> None:
         folder = Path(name) / "photographs"
         folder.mkdir()
         write_photograph(Photograph(enlarged("astronaut", side, round(1.5 * side))), folder / "photograph.jpg")
-        page = browser.new_page(viewport={"width": 1280, "height": 800})
-        page.goto("about:blank")
-        begun = time.perf_counter()
+        tab, begun = Tab(browser.new_page(viewport={"width": 1280, "height": 800})), time.perf_counter()
         editor = Editor(folder, "photograph.jpg", threads=torch.get_num_threads())
-        clock, tab = Clock(editor), Tab(page)
-        page.set_default_timeout(150_000)
+        clock = Clock(editor, tab, begun)
         try:
-            show("start to address", [time.perf_counter() - begun], [clock.used()])
-            page.goto(editor.with_token())
+            clock.report("start to address")
+            tab.page.goto(editor.with_token())
             tab.wait_for_picture()
-            show("start to picture", [time.perf_counter() - begun], [clock.used()])
+            clock.report("start to picture")
             tab.wait_until_ready()
-            page.wait_for_timeout(5 * PAUSE)
-            full_size(tab, clock, "no edit")
+            clock.full_size("no edit")
             for place in SLIDERS:
-                slide(tab, clock, *place)
-            page.get_by_role("tab", name="Recolor").click()
-            page.get_by_role("button", name="#8a46c8").first.click()
-            clock.report("first stroke of recolouring", lambda: stroke(tab, 0.4))
-            clock.report("second stroke", lambda: stroke(tab, 0.45))
-            full_size(tab, clock, "recoloured")
+                clock.slide(*place)
+            tab.page.get_by_role("tab", name="Recolor").click()
+            tab.page.get_by_role("button", name="#8a46c8").first.click()
+            clock.report("first stroke of recolouring", partial(clock.stroke, 0.4))
+            clock.report("second stroke", partial(clock.stroke, 0.45))
+            clock.full_size("recoloured")
         finally:
             editor.stop()
 

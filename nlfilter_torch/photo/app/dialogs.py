@@ -236,7 +236,7 @@ class Upload:
         largest: largest size in bytes.
         show_error: takes a sentence for the user.
         several: whether several files may be chosen at once, each of which is passed to the action.
-        begin: is called when files have been chosen, or None.
+        begin: is called with the names of files that have been chosen, or None.
     """
 
     def __init__(
@@ -247,13 +247,15 @@ class Upload:
         show_error: Callable[[str], None],
         *,
         several: bool = False,
-        begin: Callable[[], object] | None = None,
+        begin: Callable[[list[str]], object] | None = None,
     ) -> None:
         self._largest, self._show_error, self._accept = largest, show_error, accept
         self._upload = ui.upload(multiple=several, auto_upload=True, on_upload=action, max_file_size=largest)
         self._upload.on("finish", lambda: self._upload.run_method("reset"), args=[])
         if begin is not None:
-            self._upload.on("added", begin, args=[])
+            self._upload.on(
+                "added", lambda event: begin(event.args), js_handler="(files) => emit(files.map((file) => file.name))"
+            )
         self._upload.on(
             "rejected",
             lambda event: self._refuse(*event.args),

@@ -1,5 +1,6 @@
 """The editor's page: the canvas, the controls beside it, and the reactions to them."""
 
+import asyncio
 import secrets
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
@@ -59,7 +60,7 @@ class Editor:
         self._wanted: list[int | None] = []  # at most one picture to draw next: the place of a step that moves, or None
         self._drawing = self._completing = self._incomplete = False
         self._responding = self._response_wanted = False  # whether the response of the sliders is computed, and again
-        self._shows_next = False  # whether the next file that the browser sends is shown
+        self._awaited: list[str] = []  # names of the photographs that were chosen last
         self._framed: object = None  # what canvas and closeup show
         self.is_cropping = False
         self.proportions = Proportions()
@@ -553,7 +554,7 @@ class Editor:
     def _prepare(self) -> None:
         """Let the first move of a slider of the open tab be fast."""
         if self.session is not None:
-            self._tasks.start(self._tasks.run("Preparing", self.session.prepare, self._panel.tab))
+            self._tasks.start(asyncio.to_thread(self.session.prepare, self._panel.tab))
 
     def _remember(self) -> None:
         """Let the address of the page be that of its photographs and tab, for a reload."""
@@ -574,26 +575,33 @@ class Editor:
             self._tasks.start(self._open(self._photographs.open, image))
 
     async def _take_photograph(self, event: events.UploadEventArguments) -> None:
-        is_first, self._shows_next = self._shows_next or self.session is None, False
-        self._tasks.start(self._open_upload(event.file, is_first))
+        self._tasks.start(self._open_upload(event.file))
 
-    def _await_photographs(self) -> None:
-        """Show the first of the photographs that the browser is about to send."""
-        self._shows_next = True
+    def _await_photographs(self, names: list[str]) -> None:
+        """Know the names of the files that the browser is about to send, in any order."""
+        self._awaited = names
 
-    async def _open_upload(self, file: FileUpload, is_first: bool) -> None:
+    async def _open_upload(self, file: FileUpload) -> None:
         """Take a photograph into the strip, and show it if it is the first of those that were chosen together."""
         with tempfile.TemporaryDirectory(prefix="nlfilter-torch-") as folder:
             copy = Path(folder) / "photograph"
             await file.save(copy)
             shot = await self._tasks.run("Opening", self._photographs.shot_of_upload, copy, file.name)
-        if is_first:
+        if file.name in self._awaited[:1] or (self.session is None and not self._awaited):
             await self._open(self._photographs.session, shot)
         else:
-            self._shots.setdefault(shot.address, shot)
+            self._take_in(shot)
             self._follow_photographs()
             with self._client:
                 self._remember()
+
+    def _take_in(self, shot: Shot) -> None:
+        """Put a photograph into the strip, where those that were chosen together stand in their order."""
+        self._shots[shot.address] = shot
+        places = {name: place for place, name in enumerate(self._awaited)}
+        ordered = sorted(self._shots.items(), key=lambda item: places.get(item[1].name, -1))
+        self._shots.clear()
+        self._shots.update(ordered)
 
     def _follow_photographs(self) -> None:
         """Show the photographs that are open, in all tabs."""
@@ -609,7 +617,7 @@ class Editor:
             raise
         if self._client.is_deleted:
             return
-        self._shots[session.address] = self._photographs.shot_of(session)
+        self._take_in(self._photographs.shot_of(session))
         self._title.set_text(session.name)
         self._tasks.clear_error()
         self._closeup.open(session)

@@ -28,6 +28,7 @@ def editor(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Editor]:
 
 def defects(page: Page) -> list[tuple[str, str]]:
     """Rules that the page breaks seriously, and the first element that does."""
+    page.wait_for_function("() => !document.querySelector('.q-ripple__inner')")  # white, where a button was pressed
     # Together, since a page whose connection was lost loads itself again.
     run = "(axe) => { (0, eval)(axe); return window.axe.run(document, {resultTypes: ['violations']}); }"
     result: dict[str, Any] = page.evaluate(run, AXE.read_text(encoding="utf-8"))

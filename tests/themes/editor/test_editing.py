@@ -151,39 +151,6 @@ def test_other_steps_change_the_picture(opened: Tab, step: str, control: str) ->
     opened.expect_picture(cat(), least=5)
 
 
-def test_the_first_five_minutes_of_a_newcomer(opened: Tab, folder: Path) -> None:
-    """A look is chosen by its picture, a colour painted, a step turned down and moved, and undone; then it is saved."""
-    page = opened.page
-    before = opened.source()
-    page.get_by_role("tab", name="Look").click()
-    page.get_by_role("button", name="faded").click()
-    opened.wait_for_picture(before)
-    before = opened.source()
-    page.get_by_role("tab", name="Recolor").click()
-    page.get_by_role("button", name="#8a46c8").first.click()
-    opened.paint((0.37, 0.35), (0.4, 0.37))
-    opened.wait_for_picture(before)
-    expect(page.get_by_role("tab", name="Recolor, in use")).to_be_visible()
-    opened.drag(opened.slider("Look: opacity"), 1.0, 0.5)
-    switches = page.get_by_role("checkbox", name=re.compile(": on$"))
-    expect(switches.first).to_have_accessible_name("Recolor: on")
-    page.get_by_role("button", name="Look: up").click()
-    expect(switches.first).to_have_accessible_name("Look: on")  # the rows are those of the new order
-    page.get_by_role("button", name="Recolor: remove").click()
-    expect(page.get_by_role("checkbox", name="Recolor: on")).to_have_count(0)
-    page.get_by_role("button", name="Undo").click()
-    expect(page.get_by_role("checkbox", name="Recolor: on")).to_be_visible()
-    page.keyboard.press("Control+s")
-    page.get_by_label("Name").fill("mine.jpg")
-    page.get_by_label("Longest side in pixels").fill("75")
-    page.get_by_role("button", name="Save", exact=True).click()
-    page.get_by_text("Saved ").and_(page.get_by_text("mine.jpg")).wait_for()
-    assert read_photograph(folder / "mine.jpg").size == (50, 75)
-    kept = find_recipe(str(folder / "cat.png.edit.json"))
-    assert [step.edit for step in kept.steps] == ["look", "recolor"]
-    assert kept.steps[0].opacity == pytest.approx(0.5, abs=0.05)
-
-
 def test_preset_and_response(opened: Tab) -> None:
     curve = opened.page.locator(".response polyline")
     flat = curve.get_attribute("points")

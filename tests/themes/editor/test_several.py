@@ -24,9 +24,10 @@ def test_ten_photographs_are_dropped_and_share_an_edit(tab: Tab, folder: Path) -
     page.wait_for_function(
         "() => [...document.querySelectorAll('.shot img')].filter((image) => image.naturalWidth).length === 10"
     )
-    title = page.locator(".title")
-    first = title.text_content()
-    expect(shots.and_(page.locator("[aria-current=true]"))).to_have_accessible_name(first or "")
+    title, first = page.locator(".title"), TEN[0]
+    expect(title).to_have_text(first)
+    expect(shots.first).to_have_accessible_name(first)
+    expect(shots.and_(page.locator("[aria-current=true]"))).to_have_accessible_name(first)
 
     others = [name for name in TEN if name != first]
     tab.drag(tab.slider("Exposure"), 0.5, 0.8)
