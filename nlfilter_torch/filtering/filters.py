@@ -1,5 +1,7 @@
 """Polynomial filters: layers and sliders. Paper: Sec. III, eq. (11) to (14)."""
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
@@ -85,18 +87,25 @@ def weigh_layers(layers: Tensor, alpha: Tensor) -> Tensor:
     entries = alpha.shape[-1] if alpha.ndim <= 2 else alpha.shape[1]
     if entries != layers.shape[1]:
         raise ValueError(f"alpha must have one entry per layer, {layers.shape[1]}, got {entries}; add or drop some")
-    if alpha.ndim > 1 and alpha.shape[0] != layers.shape[0] and 1 not in (alpha.shape[0], layers.shape[0]):
+    _check_fit(alpha, layers.shape)
+    return _weighted_sum(layers, alpha.to(layers))
+
+
+def _check_fit(alpha: Tensor, shape: Sequence[int]) -> None:
+    """Raise unless batch and size of sliders fit those of layers of a shape (B, k, C, H, W)."""
+    if alpha.ndim > 1 and alpha.shape[0] != shape[0] and 1 not in (alpha.shape[0], shape[0]):
         raise ValueError(
-            f"alpha must have the batch size of the layers, {layers.shape[0]}, got {alpha.shape[0]}; "
-            "pass one row per image"
+            f"alpha must have the batch size of the layers, {shape[0]}, got {alpha.shape[0]}; pass one row per image"
         )
-    size = tuple(layers.shape[3:])
     if alpha.ndim > 2:
-        check_same_size(alpha, size, "alpha", "image")
-        weights = alpha.unsqueeze(2)
-    else:
-        weights = for_planes(alpha, 1 + len(size))
-    return (weights.to(layers) * layers).sum(-2 - len(size))
+        check_same_size(alpha, tuple(shape[3:]), "alpha", "image")
+
+
+def _weighted_sum(planes: Tensor, weights: Tensor) -> Tensor:
+    """Sum of planes (B, k, C, H, W) with weights (k,), (B, k) or (B, k, H, W)."""
+    dimensions = planes.ndim - 2
+    weights = weights.unsqueeze(2) if weights.ndim > 2 else for_planes(weights, dimensions)
+    return (weights * planes).sum(-1 - dimensions)
 
 
 @full_precision
@@ -142,7 +151,12 @@ def polynomial_filter(
         check_values(residual, "residual", "finite", batch)
     order = (alpha.shape[0] if alpha.ndim == 1 else alpha.shape[1]) - 1
     alpha = alpha if alpha.ndim > 2 else operator.communicator.copy_to_group(alpha)
-    filtered = weigh_layers(_layers(operator, image, order), alpha)
+    powers, axis = operator.powers(image, order), min(alpha.ndim, 2) - 1
+    _check_fit(alpha, powers.shape)
+    # Summed by powers of W, whose weights are differences of the sliders: the layers are never formed.
+    weights = alpha.to(powers)
+    own = _weighted_sum(image.to(powers).unsqueeze(1), weights.narrow(axis, 0, 1))
+    filtered = own + _weighted_sum(powers, weights.diff(dim=axis))
     if residual is not None and len(filtered):
         spectrum = operator.spectrum()
         captured = shaped_as(image, spectrum.synthesize(torch.ones_like, spectrum.coefficients(image.to(filtered))))

@@ -11,6 +11,7 @@ over all points.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import reduce
 from typing import Any, Protocol
 
 import torch
@@ -282,23 +283,23 @@ class _Powers(torch.autograd.Function):
         order = len(rest) // 2
         images, moments = rest[: order + 1], rest[order + 1 :]
         d, r = scaling.unsqueeze(1), remainder.unsqueeze(1)
-        grad_scaling, grad_remainder = torch.zeros_like(scaling), torch.zeros_like(remainder)
+        of_scaling, of_remainder = list[Tensor](), list[Tensor]()  # terms of the gradients
         left, right = [], []  # columns (B, M, C) and rows (B, C, N) whose product is the gradient of the factor
-        adjoint = torch.zeros_like(images[0])
+        adjoint = grad[:, order - 1]
         for i in range(order, 0, -1):
-            adjoint = adjoint + grad[:, i - 1]
             before = images[i - 1]
             total = ctx.communicator.sum(moment(factor, d * adjoint)).to(factor)
             affinity = spread(total.mT, factor)  # the image of the adjoint, before scaling
             summed = weighted(before, weights)
             # The scaling multiplies the factor on both sides; each side contributes a product with the other.
-            grad_scaling += (adjoint * spread(moments[i - 1].mT, factor) + summed * affinity).sum(1)
-            grad_remainder += (adjoint * before).sum(1)
+            of_scaling.append((adjoint * spread(moments[i - 1].mT, factor) + summed * affinity).sum(1))
+            of_remainder.append((adjoint * before).sum(1))
             left += [moments[i - 1], total]
             right += [d * adjoint, d * summed]
             adjoint = weighted(d * affinity, weights) + r * adjoint
+            adjoint = adjoint + grad[:, i - 2] if i > 1 else adjoint
         grad_factor = outer_product(torch.cat(left, dim=2), torch.cat(right, dim=1))
-        return grad_factor, grad_scaling, grad_remainder, None, None, adjoint, None
+        return grad_factor, reduce(torch.add, of_scaling), reduce(torch.add, of_remainder), None, None, adjoint, None
 
 
 def sums_exactly(dtype: torch.dtype, pixels: int) -> bool:
