@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from nlfilter_torch.core.blocks import fold_batch, root_weighted, unfold_batch, weighted
-from nlfilter_torch.core.checks import check_coefficients, check_fits, check_instance, checked_response
+from nlfilter_torch.core.checks import check_coefficients, check_fits, check_instance, checked_response, spelled
 from nlfilter_torch.core.communicator import ALONE, Communicator
 from nlfilter_torch.core.containers import Batch, loadable
 from nlfilter_torch.core.kernels.tall_skinny import compute_grams, moment, spread
@@ -119,9 +119,9 @@ class Spectrum(Batch, RitzPairs):
     remainder: Tensor | None = None
 
     def __repr__(self) -> str:
-        images, (height, width) = len(self), self.size
+        images = len(self)
         return (
-            f"Spectrum({images} image{'' if images == 1 else 's'} of {height}x{width}, "
+            f"Spectrum({images} image{'' if images == 1 else 's'} of {spelled(self.size)}, "
             f"{self.eigenvalues.shape[1]} eigenvalues, {self.dtype}, {self.device})"
         )
 

@@ -227,3 +227,10 @@ def test_eigenvectors_of_a_single_spike_are_orthonormal(side: int, bandwidth: fl
 def test_eigenvectors_of_photographs_are_orthonormal(name: str) -> None:
     image = picture(name, 96, 96, torch.float32)
     assert max(nonlocal_operator(image).diagnostics().orthogonality) < 1e-4
+
+
+def test_spectra_of_images_and_volumes_say_what_they_are() -> None:
+    for size, spelled in (((1, 1, 6, 7), "6x7"), ((2, 1, 4, 5, 6), "4x5x6")):
+        operator = nonlocal_operator(noise(*size), photometric_bandwidth=0.3, patch_size=3, num_landmarks=5)
+        images = "1 image" if size[0] == 1 else "2 images"
+        assert repr(operator.spectrum(rank=3)) == f"Spectrum({images} of {spelled}, 3 eigenvalues, torch.float64, cpu)"
