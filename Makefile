@@ -118,7 +118,8 @@ QUICK := \
 	'layers functions styles --quick' \
 	'prior --quick' \
 	'restoration --quick --methods prior' \
-	'fits --quick'
+	'fits --quick' \
+	'points --quick'
 
 # Trains the denoiser further, from the weights of the package, on the pictures of scikit-image and on all of a folder:
 # make train PICTURES=folder. A stopped training is resumed; out/denoiser holds its state, weights and curve.

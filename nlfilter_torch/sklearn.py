@@ -14,17 +14,21 @@ from sklearn.utils.multiclass import check_classification_targets
 from sklearn.utils.validation import check_is_fitted, check_random_state, validate_data
 from torch import Tensor
 
-from nlfilter_torch.filtering.labels import LABEL_STRENGTH, propagate_labels, shares
+from nlfilter_torch.core.warning import warn
+from nlfilter_torch.filtering.labels import LABEL_STRENGTH, NO_LABEL, propagate_labels, shares
 from nlfilter_torch.operator.build import operator_from_points
 from nlfilter_torch.operator.neighbours import NEIGHBOURS, bandwidth_of_points
 from nlfilter_torch.operator.operator import NonlocalOperator
 from nlfilter_torch.operator.options import FilterOptions
+from nlfilter_torch.operator.traps import LEAST_POINTS
 
 Array = NDArray[Any]
 
 # Of the estimated bandwidth, for labels: of 1, 0.75, 0.55, 0.4 the best in the mean of scikit-learn's tables of wines
 # and of breast cancer, with five labels a class.
 BANDWIDTH_SHARE = 0.55
+LEAST_LABELS, LEAST_FOUND = 4, 0.75  # of a class in the mean; share of the labels, below which there is a warning
+LABEL_LANDMARKS = 400  # more are right more often where classes have many shapes, and take a second for 10,000 points
 
 
 class _Linked(BaseEstimator):  # type: ignore[misc]
@@ -118,7 +122,7 @@ class LabelPropagation(ClassifierMixin, _Linked):  # type: ignore[misc]
     Points of unknown class have the label -1, as in scikit-learn.
 
     Args:
-        strength: how far labels extend.
+        strength: how far labels extend. Of 1,024 points or more, a warning tells if the labels do not find one another.
         bandwidth: h, in units of the features; None is 0.55 of that at which a point has ``n_neighbors``.
         n_neighbors: sum of the affinities of a point to all others, see :func:`~nlfilter_torch.bandwidth_of_points`.
         n_landmarks: M; all points where there are fewer.
@@ -137,7 +141,7 @@ class LabelPropagation(ClassifierMixin, _Linked):  # type: ignore[misc]
         strength: float = LABEL_STRENGTH,
         bandwidth: float | None = None,
         n_neighbors: int = NEIGHBOURS,
-        n_landmarks: int = FilterOptions.num_landmarks,
+        n_landmarks: int = LABEL_LANDMARKS,
         random_state: Any = None,
     ) -> None:
         self.strength = strength
@@ -154,11 +158,28 @@ class LabelPropagation(ClassifierMixin, _Linked):  # type: ignore[misc]
         self.classes_, numbers = np.unique(given[known], return_inverse=True)
         labels = torch.full((1, len(given)), -1)
         labels[0, torch.from_numpy(known)] = torch.from_numpy(numbers)
-        found = propagate_labels(self._link(table, BANDWIDTH_SHARE), labels, strength=self.strength)
+        operator = self._link(table, BANDWIDTH_SHARE)
+        found = propagate_labels(operator, labels, strength=self.strength)
         self.label_distributions_ = found[0].mT.numpy()
         self.transduction_ = self.classes_[self.label_distributions_.argmax(1)]
         self._sums = self.operator_.matrix.sums(found)
+        if len(table) >= LEAST_POINTS and known.sum() >= LEAST_LABELS * len(self.classes_):
+            self._warn_of_labels(labels)
         return self
+
+    def _warn_of_labels(self, labels: Tensor) -> None:
+        """Warn if many of the known labels (1, N) are not found from the others."""
+        places = (labels[0] >= 0).nonzero()[:, 0]
+        apart = places[labels[0, places].argsort(stable=True)][::2]  # half of each class
+        others = labels.clone()
+        others[0, apart] = NO_LABEL
+        found = propagate_labels(self.operator_, others, strength=self.strength)[0].argmax(0)
+        share = float((found[apart] == labels[0, apart]).double().mean())
+        if share < LEAST_FOUND:
+            warn(
+                f"y must be classes of which W links the points, got ones of which it finds {share:.0%} of the labels "
+                "from the other half; label more points, choose bandwidth, or take a graph of nearest neighbours"
+            )
 
     def predict_proba(self, X: Any) -> Array:
         """Probabilities (n, K) of the classes of the rows of X, fitted ones or new ones."""

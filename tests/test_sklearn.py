@@ -35,3 +35,14 @@ def test_labels_extend_to_clusters_and_new_points() -> None:
     assert (fitted.transduction_ == truth[:500]).mean() > 0.97
     assert (fitted.predict(points[500:]) == truth[500:]).mean() > 0.95
     np.testing.assert_allclose(fitted.predict_proba(points).sum(1), 1)
+
+
+def test_labels_that_do_not_find_one_another_cause_a_warning() -> None:
+    random = np.random.default_rng(0)
+    told = np.full(1200, -1)
+    told[:40] = np.arange(40) % 4
+    points = random.standard_normal((1200, 20))
+    with pytest.warns(UserWarning, match="^y must be classes of which W links the points, got ones of which it finds"):
+        LabelPropagation(random_state=0, n_landmarks=50).fit(points, told)
+    points[:, 0] += 30 * (np.arange(1200) % 4)
+    LabelPropagation(random_state=0, n_landmarks=50).fit(points, told)
