@@ -3,7 +3,8 @@
 A regression with the filter's covariance (:mod:`nlfilter_torch.filtering.scribbles`) says what is similar in colour,
 surrounding colour and texture. Points that an even area, such as a sky, links to a scribble count as scribbled, too. A
 model of the object (:mod:`nlfilter_torch.photo.selections.object_model`) joins this with mixtures of colours of both
-sides and distances along the picture, and cuts the object out, as a rough mask. Closed-form matting
+sides and distances along the picture, and cuts the object out, as a rough mask, with the help of a small network
+(:mod:`nlfilter_torch.photo.selections.object_network`) where only what is connected is meant. Closed-form matting
 (:mod:`nlfilter_torch.photo.selections.matting`) then aligns its borders with those of the picture. All
 run on a copy reduced to about :data:`SOLVED_PIXELS` pixels, so the cost hardly grows with
 the size of the picture. The result is a linear function of the colour for each place, which gives the mask of any pixel
@@ -69,7 +70,8 @@ def region_mask(
     """Soft object masks from foreground and background scribbles.
 
     A regression on colour and texture, mixtures of the colours of both sides, and distances along the picture to the
-    scribbles separate the two, and the cut between them follows borders of the picture. An even area with a scribble,
+    scribbles separate the two, and the cut between them follows borders of the picture. With the extent ``"object"``, a
+    small trained network corrects the odds of the cut, above all in boxes. An even area with a scribble,
     such as a sky, belongs to the region as a whole. Points along the borders of the picture also count as background
     unless they resemble the region or are part of such an area, so one scribble is enough. The borders of the mask are
     then aligned with those of the picture. Away from all that is selected by half or more, masks are 0 where they would

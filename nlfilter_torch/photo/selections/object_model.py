@@ -6,7 +6,8 @@ cut is the convex relaxation of a graph cut (Chan, Esedoglu and Nikolova, 2006),
 maximises ``sum_i c_i u_i - sum_ij w_ij |u_i - u_j| + H(u)`` over masks u in [0, 1], with log odds c, and weights w of
 neighbours that fall with their contrast. Its dual is smooth, so that accelerated projected gradients solve it (Beck and
 Teboulle, 2009). In a few damped rounds the mixtures are fitted to the cut and the strokes again, as in GrabCut (Rother,
-Kolmogorov and Blake, 2004).
+Kolmogorov and Blake, 2004). Where one object is meant, a small network
+(:mod:`nlfilter_torch.photo.selections.object_network`) then corrects the odds of a last cut.
 """
 
 import math
@@ -21,6 +22,7 @@ from nlfilter_torch.core.kernels.stencil import solve_stencil
 from nlfilter_torch.photo.picture.colour import hundredths_of_lab
 from nlfilter_torch.photo.picture.resizing import block_means, enlarged
 from nlfilter_torch.photo.selections.connected import Extent, unconnected
+from nlfilter_torch.photo.selections.object_network import corrected
 from nlfilter_torch.photo.selections.scribbled_colours import trimap_share
 
 CUT_PIXELS, DISTANCE_PIXELS = 1 << 15, 1 << 13  # of the reduced pictures in which the cut and distances are computed
@@ -276,29 +278,42 @@ def _object_mask(planes: list[Tensor], extent: Extent, trimap: Tensor) -> Tensor
     weights = CONTOUR * there * torch.exp(-squared / typical) / lab.new_tensor(LENGTHS).view(-1, 1, 1)
     likely, unlike = likely.squeeze(0), (1 - likely.squeeze(0)).square()
     beyond = torch.maximum(sides[1], (1 - free.squeeze(0)) * (strokes == 0))
-    odds = CERTAIN * (strokes - beyond) + likely.logit(LEAST_REGRESSION)
+    told = CERTAIN * (strokes - beyond)
+    odds = told + likely.logit(LEAST_REGRESSION)
     if without_box:
         frame = torch.ones_like(unlike)
         frame[1:-1, 1:-1] = 0.0
         beyond = torch.maximum(beyond, FRAME * frame * unlike * (sides[0] == 0))
+    near, away = torch.zeros_like(odds), torch.zeros_like(odds)
     if extent != "everywhere":
-        odds = odds + nearness(lab, torch.stack([sides[0], beyond]))
-        if without_box and extent == "object":
-            odds = odds - BEYOND * radii_beyond(sides[0])
+        near = nearness(lab, torch.stack([sides[0], beyond]))
+        odds = odds + near
+    if extent == "object" and bool((sides[0] > 0).any()):
+        away = radii_beyond(sides[0])
+        odds = odds - BEYOND * away * without_box
     points = Points.of(guide.flatten(1))
     rare = points.log_densities(points.moments(torch.ones_like(points.places[:1]))).squeeze(0) + RARE_COLOURS
     known = [sides[0].flatten(), beyond.flatten() if bool((beyond > 0).any()) else unlike.flatten() + EPSILON]
     fitted, flow, mask = known, torch.zeros_like(weights), torch.zeros_like(odds)
+    ratios = list[Tensor]()
     for number in range(ROUNDS + 1):
         inside, outside = (
             points.log_densities(points.mixture(side, count)).logsumexp(0).logaddexp(rare)
             for side, count in zip(fitted, PARTS, strict=True)
         )
-        by_colour = (inside - outside).clamp(-MOST_BY_COLOUR, MOST_BY_COLOUR).view(shape)
+        ratios.append((inside - outside).view(shape))
+        by_colour = ratios[-1].clamp(-MOST_BY_COLOUR, MOST_BY_COLOUR)
         solved, flow = cut(odds + by_colour, weights, flow, STEPS[number // ROUNDS])
         mask = torch.lerp(mask, solved, DAMPING if number else 1.0)
         if extent == "object" and bool((strokes > 0).any()):
             mask = mask * ~unconnected(mask, strokes)
         cut_off = [(2 * side.flatten() - 1).clamp(min=0.0) for side in (mask, 1 - mask)]
         fitted = [part + STROKES * side * (part.sum() / side.sum()) for part, side in zip(cut_off, known, strict=True)]
-    return torch.lerp(mask, (odds + by_colour).sigmoid(), trimap)
+    by_trimap = (odds + by_colour).sigmoid()
+    if extent == "object" and bool((strokes > 0).any()):
+        density = (inside.maximum(outside) - rare).view(shape)
+        known = [ratios[0], ratios[-1], density, likely, near, away, *sides, *drawn, free.squeeze(0), mask]
+        evidence = torch.cat([lab, guide[-3:], torch.stack(known)])
+        mask, _ = cut(corrected(evidence) + told, weights, torch.zeros_like(flow), STEPS[1])
+        mask = mask * ~unconnected(mask, strokes)
+    return torch.lerp(mask, by_trimap, trimap)
