@@ -438,6 +438,11 @@ FUNCTIONS = {
         | {name: _number(-1, 1) for name in ("exposure", "contrast", "shadows", "whites", "warmth", "vibrance")}
         | {"temperature": _plain(2000, 15000), "photometric_bandwidth": _plain(0.03, 0.5)},
     ),
+    "heal": Function(
+        photo.heal,
+        {"image": _image(1, 3), "spots": lambda scene: scene.mask(1)},
+        {"reach": _plain(1, 20)},
+    ),
     "defocus": Function(
         photo.defocus,
         {"image": _image(1, 3), "focus_region": lambda scene: scene.mask(1)},

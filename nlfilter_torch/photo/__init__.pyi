@@ -14,6 +14,7 @@ from .edits.detail import enhance as enhance
 from .edits.fit_look import FittedLook as FittedLook
 from .edits.fit_look import fit_look as fit_look
 from .edits.frames import filter_frames as filter_frames
+from .edits.heal import heal as heal
 from .edits.light import adjust_light as adjust_light
 from .edits.look import apply_look as apply_look
 from .edits.recipe import apply_recipe as apply_recipe

@@ -30,6 +30,7 @@ develop in.png turned.png --rotate 90 --crop 0,40,30,30
 develop in.png warm.png --temperature 5500
 develop in.png balanced.png --temperature auto
 develop in.png strong.png --saturation 0.2
+heal in.png spotless.png --region 20,20,6,6
 light in.png darker.png --exposure -1 --linear 0,0,0,50%
 recolor in.png blue.png --radial 30%,30%,20%,20%,100%:blue
 mask in.png mask.png --region 20,20

@@ -53,6 +53,7 @@ from nlfilter_torch.photo import (
     denoise,
     enhance,
     filter_frames,
+    heal,
     recolor,
     region_mask,
     sharpen,
@@ -858,6 +859,14 @@ EDITS: dict[str, list[Refusal]] = {
         ({"temperature": 100.0}, "^temperature must be a number from 2000 to 15000"),
         ({"curve": (0.0, 2.0)}, "^curve must be a list"),
         ({"image": RGB[:, :2]}, "^image must have 1 or 3 channels, got 2"),
+    ),
+    "heal": refusals(
+        heal,
+        {"image": RGB, "spots": SPOT},
+        ({"spots": 0 * SPOT}, "^spots must hold a painted pixel"),
+        ({"spots": SPOT[..., :9]}, "^spots must have the height and width of the image"),
+        ({"spots": 3 * SPOT}, r"^spots must be in \[0, 1\], got values from 0 to 3"),
+        ({"reach": 0.0}, "^reach must be positive"),
     ),
     "defocus": refusals(
         defocus,

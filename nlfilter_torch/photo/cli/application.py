@@ -117,6 +117,7 @@ OTHER_COMMANDS: Mapping[str, str] = {
     **dict.fromkeys(
         ("gradient", "vignette", "local", "dodge", "burn"), "light IN OUT --exposure STOPS --radial X,Y,W,H"
     ),
+    **dict.fromkeys(("retouch", "inpaint", "clone", "spot", "spots"), "heal IN OUT --region X,Y,W,H"),
     "contrast": "tone IN OUT --contrast FACTOR",
     "enhance": "detail IN OUT --preset crisp",
     "clarity": "detail IN OUT --preset crisp",

@@ -245,6 +245,34 @@ LIGHT = Edit(
     ),
 )
 
+HEAL = Edit(
+    "heal",
+    """Remove small blemishes, such as dust and pimples: paint over them, and similar patches nearby replace them.
+
+    Example: `nlfilter-torch heal in.jpg out.jpg --region 420,215,9,9 --region ellipse:60,80,12,10`
+    """,
+    (
+        number(
+            "reach",
+            6.0,
+            "How far similar patches are searched, in radii of the spot.",
+            (1, 20),
+            domain="positive",
+            slider=Slider("Search", 2, 20, 1),
+        ),
+    ),
+    hint="Paint over small blemishes; patches from nearby replace them.",
+    scribbles=(
+        Scribble(
+            "spots",
+            "Heal this",
+            needed=True,
+            advice="give --region X,Y,W,H, --strokes FILE or --mask FILE to mark the spots, such as "
+            "--region 190,60,9,9",
+        ),
+    ),
+)
+
 DENOISE = Edit(
     "denoise",
     """Remove noise from a photograph.
@@ -548,5 +576,6 @@ ABSTRACT = Edit(
 
 #: All edits, in the order in which the editor applies them.
 EDITS: dict[str, Edit] = {
-    edit.name: edit for edit in (DENOISE, LIGHT, DETAIL, TONE, SHARPEN, COLORIZE, RECOLOR, DEFOCUS, ABSTRACT, LOOK)
+    edit.name: edit
+    for edit in (HEAL, DENOISE, LIGHT, DETAIL, TONE, SHARPEN, COLORIZE, RECOLOR, DEFOCUS, ABSTRACT, LOOK)
 }

@@ -21,6 +21,7 @@ from nlfilter_torch.photo.picture.viewing import viewed_size
 
 #: The name of each edit, which is that of its module, and of its class. A new edit takes a line here.
 CLASSES = {
+    "heal": "Heal",
     "denoise": "Denoise",
     "light": "LightEdit",
     "detail": "Detail",

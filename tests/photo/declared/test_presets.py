@@ -175,7 +175,10 @@ NO_EDITS = [
     ),
     ('{"version": 1, "steps": {}}', "steps in edit.json must be a list"),
     ('{"version": 1, "steps": [], "detail": {}}', "no entries other than version, develop and steps, got detail"),
-    ('{"version": 1, "steps": [{}]}', "step 1 in edit.json must have an entry edit, one of denoise, light, detail"),
+    (
+        '{"version": 1, "steps": [{}]}',
+        "step 1 in edit.json must have an entry edit, one of heal, denoise, light, detail",
+    ),
     ('{"version": 1, "steps": [{"edit": ["tone"]}]}', "step 1 in edit.json must have an entry edit"),
     (
         '{"version": 1, "steps": [{"edit": "tone"}, {"edit": "tone", "clarity": "1"}]}',

@@ -133,6 +133,7 @@ READS: dict[str, Case] = {
     "recolor": lambda x: photo.recolor(x.image(), x.mask(3), x.mask()),
     "colorize": lambda x: photo.colorize(x.image(1), x.mask(3), x.mask()),
     "adjust_light": lambda x: photo.adjust_light(x.image(), x.mask(), exposure=1.0, shadows=0.5),
+    "heal": lambda x: photo.heal(x.image(), x.mask()),
     "defocus": lambda x: photo.defocus(x.image(), x.mask()),
     "region_mask": lambda x: photo.region_mask(x.image(), x.mask()),
     "enhance": lambda x: photo.enhance(x.image(), x.zeros(2, 4), x.mask(2), num_landmarks=LANDMARKS),
