@@ -33,6 +33,7 @@ RULE, PARTLY = (
 )  # shares of the denoisers: the filter alone up to the first, the network in part up to the second
 PER_PICTURE, EVERY_APART = 4000, 8  # values kept of a picture; every so many pictures are held out
 GRAINY, GRAIN = 0.6, (0.7, 5.0)  # share of the pictures with white noise that have grain, and its deviation in levels
+EVERY_WHITE = 3  # every so many pictures with white noise are among those with a profile, which may be white
 FAINT = 0.5 / 255  # deviation of the noise from which values count
 BATCH, RATE, DECAY = 4096, 1e-2, 1e-2
 # Steps, and noise of the inputs in their deviations: of those that differ within a picture, and of the others.
@@ -106,8 +107,10 @@ def fit(folder: Path, out: Path) -> None:
     """Train on the pictures in a folder, and write the weights."""
     torch.manual_seed(0)
     weights = {}
+    tables = {kind: [torch.load(path) for path in sorted(folder.glob(f"{kind}*.pt"))] for kind in KINDS}
+    tables["profile"] += tables["known"][::EVERY_WHITE]
     for kind in KINDS:
-        fitted = fit_kind([torch.load(path) for path in sorted(folder.glob(f"{kind}*.pt"))], kind)
+        fitted = fit_kind(tables[kind], kind)
         weights |= {f"{kind}.{name}": value.detach().contiguous() for name, value in fitted.items()}
     save_file({name: weights[name] for name in SHAPES}, out)
 
