@@ -23,7 +23,10 @@ from nlfilter_torch.photo.plotting import save_figure, show_images
 SIDE = 270  # of a panel
 FRONT = (432, 640)  # of a panel of the first picture
 GAP = 5  # around it
-SUBJECT = ((205, 60, 30, 110), (215, 185, 30, 60), (90, 290, 60, 12), (300, 300, 40, 12))  # a face, a collar, a suit
+SUBJECT = (  # a face, a collar and its ring, a suit
+    *((205, 60, 30, 110), (215, 185, 30, 60), (200, 270, 40, 12), (126, 185, 10, 40)),
+    *((90, 290, 60, 12), (300, 300, 40, 12)),
+)
 SIZE = 640  # of a photograph
 ALPHA = (3.0, 3.0, 4.0, 1.0)
 

@@ -172,10 +172,10 @@ def single_sliders() -> Figure:
 
 
 def edits() -> Figure:
-    """The edits, on one photograph of 300x200 pixels, with one scribble on the saucer and five on the cup."""
+    """The edits, on one photograph of 300x200 pixels, with two scribbles on the saucer and five on the cup."""
     image = photograph("coffee", 200, 300)
     saucer, cup = torch.zeros_like(image[:, :1]), torch.zeros_like(image[:, :1])
-    saucer[..., 106:122, 52:68], cup[..., 60:74, 92:98] = 1, 1
+    saucer[..., 106:122, 52:68], saucer[..., 112:124, 218:232], cup[..., 60:74, 92:98] = 1, 1, 1
     cup[..., 96:103, 120:150] = cup[..., 76:88, 120:150] = cup[..., 35:60, 110:116] = cup[..., 112:120, 112:150] = 1
     wood = torch.zeros_like(saucer)
     for top, left in ((20, 60), (5, 100), (50, 250), (130, 270), (185, 20), (54, 140), (75, 145)):
