@@ -63,6 +63,7 @@ class Closeup:
         self._pieces: dict[str, tuple[Rectangle, bytes]] = {}  # in the order in which they were made
         self._covered = torch.zeros(0, 0, dtype=torch.bool)  # cells
         self._near: tuple[str, bytes] | None = None  # what is shown approximately, by its name
+        self._approaching = False  # whether that is being computed
 
     def open(self, session: Session) -> None:
         """Show a photograph that was opened."""
@@ -83,9 +84,10 @@ class Closeup:
         self._wake()
 
     def hold(self) -> None:
-        """Show no pieces until :meth:`follow` is called."""
+        """Show no pieces until :meth:`follow` is called, only nearly what they will be."""
         self._held = True
-        self._forget()
+        if self._pieces:
+            self._forget()
 
     def stop(self) -> None:
         """Stop working, since the page is gone."""
@@ -99,7 +101,7 @@ class Closeup:
         self._wake()
 
     def file(self, name: str) -> bytes | None:
-        """A piece as a PNG file."""
+        """A piece as a PNG file, or what is nearly that as a JPEG."""
         if self._near is not None and name == self._near[0]:
             return self._near[1]
         return self._pieces[name][1] if name in self._pieces else None
@@ -158,14 +160,18 @@ class Closeup:
     def show_nearly(self) -> None:
         """Show at once what the visible part will nearly be, below the pieces, if there is none of the edit yet."""
         session, view = self.session, self._view
-        if session is None or view is None or self._held or bool(self._covered.any()):
+        if session is None or view is None or self._approaching or bool(self._covered.any()):
             return
         if session.recipe.acting and session.has_drawn(session.recipe):
+            self._approaching = True
             self._tasks.start(self._lay_below(session, view, session.recipe))
 
     async def _lay_below(self, session: Session, view: Rectangle, recipe: Recipe) -> None:
-        content = await self._tasks.run("Full size", _nearly, session, view, recipe)
-        is_late = view != self._view or self._is_outdated(session, recipe) or bool(self._covered.any())
+        try:
+            content = await self._tasks.run("Full size", _nearly, session, view, recipe)
+        finally:
+            self._approaching = False
+        is_late = view != self._view or session is not self.session or bool(self._covered.any())
         if content is not None and not is_late:
             self._begin(recipe)
             self._number += 1
@@ -228,9 +234,9 @@ def _piece(session: Session, part: Rectangle, recipe: Recipe, report: Report) ->
 
 
 def _nearly(session: Session, part: Rectangle, recipe: Recipe) -> bytes | None:
-    """The same at once, approximately; None if that is not possible."""
+    """The same at once, approximately, as a JPEG file; None if that is not possible."""
     picture = session.nearly(part, recipe)
-    return None if picture is None else drawing.lossless(picture)
+    return None if picture is None else drawing.picture(picture)
 
 
 def first_block(missing: Tensor, most: int) -> tuple[range, range] | None:

@@ -43,6 +43,7 @@ REPLACING = (
 )
 TURNING = {"n": 1, "p": -1}  # keys that show the next photograph, and the previous one
 INSIDE, OUTSIDE = "#4ade80", "#60a5fa"  # colours of the sliders' response in the region, and elsewhere
+REST = 0.5  # seconds after a sketch without a change, after which it is completed
 EDITORS: dict[str, "Editor"] = {}  # open pages by the token in the addresses of their pictures
 
 
@@ -60,6 +61,7 @@ class Editor:
         self._wanted: list[int | None] = []  # at most one picture to draw next: the place of a step that moves, or None
         self._drawing = self._completing = self._incomplete = False
         self._responding = self._response_wanted = False  # whether the response of the sliders is computed, and again
+        self._is_sketch = self._is_moving = False  # whether the picture shown is a sketch, and of a slider that moves
         self._awaited: list[str] = []  # names of the photographs that were chosen last
         self._framed: object = None  # what canvas and closeup show
         self.is_cropping = False
@@ -425,7 +427,9 @@ class Editor:
                     await self._show_crop()
                     if moving == DEVELOPING:
                         continue
-                if await self._tasks.run("Working", self._canvas.sketch, moving):
+                self._is_sketch = await self._tasks.run("Working", self._canvas.sketch, moving)
+                self._is_moving = moving is not None
+                if self._is_sketch:
                     self._show()
                     self._wait()
                     self._canvas.draw_mask(moving=True)
@@ -447,9 +451,15 @@ class Editor:
         try:
             while self._incomplete:
                 self._incomplete = False
+                if self._is_sketch:  # a person often goes on at once
+                    self._tasks.say(self._canvas, "Working\u2026")
+                    await asyncio.sleep(REST)
+                    if self._incomplete or self._is_moving:
+                        continue
                 await self._draw_completely(None)
         finally:
             self._completing = False
+            self._tasks.say(self._canvas)
             self._wait()
         if self.session is not None:
             self._at_rest.drawn(self.session)
@@ -714,13 +724,14 @@ class Pages:
     def picture(self, token: str, kind: str, at: str = "") -> Response:
         """A picture of the page with a token, by its kind, of the original at a place; or status 404.
 
-        The whole photograph is a JPEG file, and all else PNG files.
+        The whole photograph, thumbnails and what is only near are JPEG files, and all else PNG files.
         """
         editor = EDITORS.get(token)
         content = None if editor is None else editor.picture(kind, at)
         if not content:
             return Response(status_code=404)
-        media_type = "image/jpeg" if kind in ("before", "after") else "image/png"
+        is_jpeg = kind in ("before", "after") or kind.startswith(("near-", "shot-"))
+        media_type = "image/jpeg" if is_jpeg else "image/png"
         return Response(content, media_type=media_type, headers={"Cache-Control": "no-store"})
 
 

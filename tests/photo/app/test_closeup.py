@@ -194,10 +194,20 @@ def test_what_was_drawn_is_shown_below_the_pieces(page: Page, large: Session) ->
     page.closeup.show_nearly()
     page.finish()
     assert page.told == ["closeup.add('near-1', 20, 40, 84, 104)"]
-    assert page.closeup.file("near-1") == drawing.lossless(near)
+    assert page.closeup.file("near-1") == drawing.picture(near)
     assert page.look(20, 40, 84, 104) == ["closeup.add('piece-2', 0, 0, 128, 128)", "closeup.drop('near-1')"]
     assert page.closeup.file("near-1") is None
+    page.closeup.hold()  # a slider moves: the pieces go, and what is near follows
+    large.set("detail", alpha=(2.0, 1.0))
+    large.render(0)
+    page.told.clear()
+    page.closeup.show_nearly()
+    page.finish()
+    assert page.told == ["closeup.add('near-3', 20, 40, 84, 104)"]
+    page.closeup.hold()
+    assert page.closeup.file("near-3") is not None  # until the next one is there
+    moved = large.recipe
     large.load(Recipe())
-    assert large.nearly(Rectangle(range(4), range(4)), recipe) is not None
+    assert large.nearly(Rectangle(range(4), range(4)), moved) is not None
     large.render()
-    assert large.nearly(Rectangle(range(4), range(4)), recipe) is None
+    assert large.nearly(Rectangle(range(4), range(4)), moved) is None

@@ -1,6 +1,7 @@
 """The strip of photographs, and an edit for several at once."""
 
 import asyncio
+import gc
 from collections.abc import Awaitable, Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -104,6 +105,8 @@ def test_each_photograph_keeps_its_edit_and_its_history(page: Page) -> None:
         page.strip.turn(step)
         assert page.session.name == name
         assert page.session.recipe == (BRIGHT if name == "a.png" else Recipe())
+    gc.collect()
+    assert len(page.library._sessions) <= 2  # at full size in memory
     assert page.session.undo()
     assert page.session.recipe == Recipe()
 

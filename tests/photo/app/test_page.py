@@ -255,6 +255,24 @@ def test_a_change_is_shown_while_the_pointer_moves_and_can_then_be_undone(opened
     assert editor._undo_button.enabled
 
 
+def test_a_sketch_follows_a_slider_and_is_completed_at_rest(
+    page: Page, photo: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("nlfilter_torch.photo.app.developed.DRAFT_PIXELS", 5000)
+    monkeypatch.setattr("nlfilter_torch.photo.app.page.REST", 0.0)
+    page.open(photo)
+    page.editor.change("tone", {"contrast": 1.3}, False)
+    page.finish()
+    draft = page.session.draft(0)
+    assert draft is not None
+    assert page.picture("after") == drawing.picture(draft)
+    page.editor.change("tone", {"contrast": 1.3}, True)
+    asyncio.run(page.works.pop(0))  # type: ignore[arg-type]
+    assert page.picture("after") == drawing.picture(draft)
+    page.finish()
+    assert page.picture("after") == drawing.picture(page.session.render()) != drawing.picture(draft)
+
+
 def test_strokes_are_cleared(opened: Page) -> None:
     session = opened.session
     opened.editor._switch("detail")
