@@ -34,7 +34,7 @@ def parse_json(text: str | bytes, name: str, remedy: str) -> object:
 
 
 def shown(value: object) -> str:
-    """Format a JSON value for a message, shortened if it is long or deeply nested.
+    """Format a value for a message, as JSON if it is of such a type, and shortened if it is long or deeply nested.
 
     >>> shown({"a": None}), shown([0] * 100)
     ('{"a": null}', '[0, 0, 0, 0, 0, 0, ...]')
@@ -42,7 +42,7 @@ def shown(value: object) -> str:
     short = reprlib.repr(value)
     try:
         text = json.dumps(value)
-    except RecursionError:
+    except (RecursionError, TypeError):
         return short
     return text if len(text) <= 80 else short
 

@@ -19,6 +19,7 @@ from nlfilter_torch.photo.picture.in_memory import edited
 from nlfilter_torch.photo.picture.pixels import M, Pixels
 from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles
 from nlfilter_torch.photo.picture.source import Fitted, Source, at
+from nlfilter_torch.photo.selections.by_hand import check_drawn
 
 RING, MOST_RING = 4, 0.5  # pixels around a spot that are compared: at least so many, and this share of its radius
 OFFSET = 0.75  # share of a difference in mean colour that does not count, since the membrane takes it away
@@ -70,6 +71,7 @@ class Heal(PhotoEdit):
     def fit(self, source: Source[M], drawn: Drawn[M]) -> Fitted:
         """Fit the patches that replace the spots."""
         HEAL.check(reach=self.reach)
+        check_drawn(drawn.masks.get("spots"), None, "spots")
         marked = source.scribbles(drawn.masks["spots"], None, "spots")
         places, healed = marked.places, torch.zeros_like(marked.image)
         spots = [Spot.of(places[group], source.size, self.reach) for group in _groups(places, source.size[1])]

@@ -78,6 +78,8 @@ def test_what_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     image = colour("astronaut", 16, 16)
     with pytest.raises(ValueError, match=r"^spots must hold a painted pixel"):
         heal(image, torch.zeros(1, 1, 16, 16))
+    with pytest.raises(TypeError, match=r"^spots must be a torch\.Tensor, got NoneType"):
+        heal(image, None)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match=r"^reach must be positive"):
         heal(image, torch.ones(1, 1, 16, 16), reach=0.0)
     monkeypatch.setattr(module, "LARGEST", 9)

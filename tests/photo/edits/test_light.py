@@ -124,6 +124,7 @@ def test_values_out_of_range_are_refused() -> None:
         ({"contrast": torch.tensor(2.0)}, r"contrast must be in \[-1, 1\]"),
         ({"temperature": 500.0}, "temperature must be a number from 2000"),
         ({"curve": (0.0, 2.0)}, "curve must be"),
+        ({"temperature": torch.tensor(5000.0)}, r"temperature must be a number from 2000 .*, got tensor\(5000.\)"),
     ):
         with pytest.raises(ValueError, match=sentence):
             adjust_light(image, None, added=mask, **values)
