@@ -57,7 +57,7 @@ class Canvas:
         with ui.element("button").classes("welcome").props('type="button"') as self._welcome:
             ui.icon("photo", size="64px")
             ui.label("Open a photograph to begin").classes("text-h6 q-mt-sm")
-            ui.label("Click here, or drop one: PNG, JPEG, TIFF, WebP, AVIF or HEIC.").classes("hint")
+            ui.label("Click here, or drop one or more: PNG, JPEG, TIFF, WebP, AVIF or HEIC.").classes("hint")
             ui.label("It stays on this machine.").classes("hint")
         self._welcome.on("click", js_handler=choosing)
 

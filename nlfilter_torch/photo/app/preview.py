@@ -193,6 +193,10 @@ def _marks(step: Step, edit: PhotoEdit, size: tuple[int, int]) -> Drawn[Tensor]:
     return replace(marks, masks={n: mask[:, -1:] if n in coloured else mask for n, mask in marks.masks.items()})
 
 
+def _key_of_layers(detail: Step) -> Key:
+    return (*filter_key(detail), detail["viewing_size"], len(detail["alpha"]) - 1)
+
+
 class Preview:
     """A reduced photograph under any edit.
 
@@ -236,10 +240,14 @@ class Preview:
         self._pictures: list[StepPicture] = []
         self._selected, self._ignored = lru_cache(maxsize=1)(selected), lru_cache(maxsize=1)(ignored)
 
+    def has_layers(self, step: Step) -> bool:
+        """Whether a first step only weighs layers that are there."""
+        layers = self._layers
+        return layers is not None and self._is_of_layers(step) and layers.key == _key_of_layers(step)
+
     def layers(self, detail: Step) -> Layers:
         """The layers for the filter of a step; slow if its settings have changed."""
-        order = len(detail["alpha"]) - 1
-        key = (*filter_key(detail), detail["viewing_size"], order)
+        order, key = len(detail["alpha"]) - 1, _key_of_layers(detail)
         with self._layering:
             if self._layers is None or self._layers.key != key:
                 stride, shown = self._compared(detail)

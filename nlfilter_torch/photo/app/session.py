@@ -340,6 +340,8 @@ class Session:
             return None
         if any(step.declared.requires_strokes for step in recipe.acting):
             return None
+        if len(recipe.acting) == 1 and developed.preview.has_layers(recipe.acting[0]):
+            return None
         with self._drafting:
             draft = developed.draft
             if draft is None:

@@ -274,5 +274,7 @@ def test_a_draft_is_near_the_preview(session: Session, recipe: Recipe, monkeypat
     assert draft.shape == complete.shape
     assert not draft.equal(complete)
     assert (draft - complete).square().mean() < 0.25 * (complete - before).square().mean()
+    if recipe.steps[0].edit == "detail":
+        assert session.draft(0) is None  # the layers of the preview are there now, and only have to be weighed
     session.recipe = session.developing({"exposure": 1.0})
     assert session.draft() is None  # it has to be developed first
