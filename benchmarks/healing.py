@@ -9,6 +9,7 @@ texture  contrast finer than 1.5 pixels of the filling, relative to that of what
 """
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -29,15 +30,11 @@ AROUND = 8  # radii of the disc to the border of what the methods see
 FINE = 1.5  # pixels
 
 
-def by_opencv(method: int) -> Callable[[Tensor, Tensor], Tensor]:
+def by_opencv(method: int, image: Tensor, spot: Tensor) -> Tensor:
     """A method of OpenCV."""
-
-    def fill(image: Tensor, spot: Tensor) -> Tensor:
-        stored = (_array(image) * 255).round().astype(np.uint8)
-        filled = cv2.inpaint(stored, spot[0, 0].numpy().astype(np.uint8), 5, method)
-        return torch.from_numpy(filled).permute(2, 0, 1)[None] / 255
-
-    return fill
+    stored = (_array(image) * 255).round().astype(np.uint8)
+    filled = cv2.inpaint(stored, spot[0, 0].numpy().astype(np.uint8), 5, method)
+    return torch.from_numpy(filled).permute(2, 0, 1)[None] / 255
 
 
 def biharmonic(image: Tensor, spot: Tensor) -> Tensor:
@@ -49,8 +46,8 @@ def biharmonic(image: Tensor, spot: Tensor) -> Tensor:
 METHODS: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
     "heal": heal,
     "biharmonic": biharmonic,
-    "OpenCV, Telea": by_opencv(cv2.INPAINT_TELEA),
-    "OpenCV, Navier-Stokes": by_opencv(cv2.INPAINT_NS),
+    "OpenCV, Telea": partial(by_opencv, cv2.INPAINT_TELEA),
+    "OpenCV, Navier-Stokes": partial(by_opencv, cv2.INPAINT_NS),
 }
 
 

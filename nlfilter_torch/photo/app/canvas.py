@@ -156,7 +156,7 @@ class Canvas:
         if step != self._step:
             self.pictures.update(mask=b"", ignored=b"")
         self._step = step
-        self._show_mask.set_enabled(step in BRUSHES and not EDITS[step].coloured)  # others select nothing
+        self._show_mask.set_enabled(step in BRUSHES and bool(EDITS[step].with_role("added")))  # others select nothing
         self._lay()
         self.await_click(None)
         self.draw_strokes()

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import pairwise
-from typing import Any, Literal, NamedTuple, TypeGuard, cast, get_args
+from typing import Literal, NamedTuple, TypeGuard, cast, get_args
 
 from nlfilter_torch.photo.declared.json_values import is_within, shown
 
@@ -333,7 +333,7 @@ def _stroke_of(entries: dict[str, object], place: str) -> Stroke:
     return Stroke(tuple((float(x), float(y)) for x, y in points), float(radius), cast(str, entries["paint"]))
 
 
-def _region_of(entries: dict[str, Any], shape: Shape, place: str) -> Region:
+def _region_of(entries: dict[str, object], shape: Shape, place: str) -> Region:
     """Create a region from its entries, whose paint may have no meaning yet."""
     value, paint = entries[shape], cast(str, entries["paint"])
     if shape in ("mask", "layer"):
@@ -343,22 +343,22 @@ def _region_of(entries: dict[str, Any], shape: Shape, place: str) -> Region:
     softness = entries.get("softness", SOFTNESS)
     if not (is_within(softness, 0, 1) and softness > 0):
         raise ValueError(f"softness of a stroke in {place} must be in (0, 1], got {shown(softness)}; correct it")
-    upright = shape not in ("polygon", "linear") and isinstance(value, list) and len(value) == 4
-    if upright and all(is_within(v, -2, 2) for v in value):
-        box = [float(number) for number in value]
+    points = value if isinstance(value, list) else []
+    if shape not in ("polygon", "linear") and len(points) == 4 and all(is_within(v, -2, 2) for v in points):
+        box = [float(number) for number in points]
         if min(box[2:]) > 0:
             return replace(Region.upright(box, shape, paint), softness=float(softness))
     least, most, wanted = {
         "polygon": (3, math.inf, "three or more corners"),
         "linear": (2, 2, "two different points, where it is 1 and where it is 0"),
     }.get(shape, (3, 3, "left and upper edge, width and height"))
-    valid = isinstance(value, list) and least <= len(value) <= most and all(map(_is_point, value))
-    if not valid or (shape == "linear" and value[0] == value[1]):
+    valid = least <= len(points) <= most and all(map(_is_point, points))
+    if not valid or (shape == "linear" and points[0] == points[1]):
         raise ValueError(
             f"{shape} of a stroke in {place} must be {wanted}, in shares of width and height from -2 to 2, got "
             f"{shown(value)}; correct it"
         )
-    return Region(tuple((float(x), float(y)) for x, y in value), shape, paint, softness=float(softness))
+    return Region(tuple((float(x), float(y)) for x, y in points), shape, paint, softness=float(softness))
 
 
 def _holds(sides: Sequence[tuple[Point, Point]], point: Point) -> bool:
