@@ -27,16 +27,13 @@ SLICE = 0.4  # length of a slice, relative to the width of the stroke
 SLICES = 6, 48  # least and largest number of them
 BLUR = 1  # slices on either side of the border of a run that may hold colours of both sides
 LARGEST_STRAY = 0.3  # share of a stroke that may be stray
-BEGINNING_SLACK = 0.05  # what the beginning of a run may add to it
 # Distances in hundredths of Lab, from which on colours differ strongly: of an end from the nearest colours of the rest,
 # on average, and of a gap, likewise, or of the mean colours of two parts.
 END, GAP = 0.12, 0.18
 # The same, relative to how much colours vary: mean distance of slices of the rest from the nearest other ones, or the
 # sum of the mean distances of cells of both parts from their own mean.
 SPREADS = 2.0
-NARROWEST_GAP = 2  # slices of a gap that hold no other colours
 BEGINNING = 0.35  # share of a run's distance at which it begins
-ADJACENT = 3  # slices of the rest that are nearer to each other are not compared
 ROUNDS = 2  # so many runs may be stray
 
 Cells = NDArray[np.int64]
@@ -148,7 +145,7 @@ class Slices:
         runs = [
             SliceRun(first, last)
             for first in range(BLUR + 1, count - BLUR)
-            for last in range(first + 2 * BLUR + NARROWEST_GAP, count - BLUR)
+            for last in range(first + 2 * BLUR + 1, count - BLUR)
             if self.distances[first - BLUR - 1, last + BLUR] <= GAP / 2
         ]
         return [run for run in runs if self.share(run) <= LARGEST_STRAY]
@@ -177,7 +174,7 @@ class Slices:
         for _ in range(most):
             wider = SliceRun(run.first - before, run.last + after)
             end = run.first if before else run.last - 1
-            if self._nearest(run, end, end + 1)[0] <= least or self.share(wider) > LARGEST_STRAY + BEGINNING_SLACK:
+            if self._nearest(run, end, end + 1)[0] <= least or self.share(wider) > LARGEST_STRAY:
                 break
             run = wider
         return run
@@ -196,11 +193,11 @@ class Slices:
 def _spread(distances: Numbers) -> float:
     """Mean of the smallest distances, (n, n), of slices from those that are not beside them."""
     places = np.arange(len(distances))
-    nearest = np.where(np.abs(places[:, None] - places) < ADJACENT, np.inf, distances).min(1)
+    blurred = np.abs(places[:, None] - places) <= 2 * BLUR  # the colours at a border may be in both
+    nearest = np.where(blurred, np.inf, distances).min(1)
     return float(nearest[np.isfinite(nearest)].mean()) if np.isfinite(nearest).any() else 0.0
 
 
-FEWEST = 12  # cells of a stroke that may have stray parts
 LARGEST_AREA = 0.04  # of the picture that a stroke covers; larger areas are rough masks, which count as they are
 ELONGATED = 5.0  # least squared border of a stroke, relative to four times its area: three times as long as wide
 STRAY_LIGHTNESS = 0.5  # weight of differences in lightness, much of which is shading
@@ -239,8 +236,8 @@ def strays(scribbles: Scribbles, size: tuple[int, int], *, of_one_colour: bool =
 def _of_region(points: Numbers, at: Cells, shape: tuple[int, int], of_one_colour: bool) -> NDArray[np.bool_]:
     """Which pixels of a region with colours (n, 3), in cells (n,), are stray, (n,)."""
     cells, back, counts = np.unique(at, return_inverse=True, return_counts=True)
-    if len(cells) < FEWEST:
-        return np.zeros(len(at), dtype=bool)
+    if not len(cells):
+        return np.zeros(0, dtype=bool)
     means = np.stack([np.bincount(back, channel) for channel in points.T], axis=1) / counts[:, None]
     grid = Grid.of(cells, shape)
     strokes, ignored = grid.pieces(np.ones(len(cells), dtype=bool)), np.zeros(len(cells), dtype=bool)
