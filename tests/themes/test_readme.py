@@ -38,7 +38,7 @@ def test_commands_run(folder: Path) -> None:
     for arguments in ours:
         assert main(arguments) == 0
     made = {path.name for path in folder.iterdir()}
-    assert {"crisp.jpg", "calm.png", "soft.jpg", "looks", "look.json", "again.jpg"} <= made
+    assert {"crisp.jpg", "sky.jpg", "soft.jpg", "looks", "look.json", "again.jpg"} <= made
 
 
 def test_it_is_short_and_shows_pictures_installing_python_and_commands_in_this_order() -> None:
