@@ -20,7 +20,7 @@ from nlfilter_torch.core.checks import (
     check_unit_range,
     check_values,
 )
-from nlfilter_torch.core.precision import full_precision, per_image
+from nlfilter_torch.core.precision import full_precision, per_image, trainable
 from nlfilter_torch.core.torch_internals import in_format_of
 from nlfilter_torch.operator.operator import NonlocalOperator
 from nlfilter_torch.operator.pixel_matrix import Columns
@@ -154,8 +154,8 @@ def polynomial_filter(
     powers, axis = operator.powers(image, order), min(alpha.ndim, 2) - 1
     _check_fit(alpha, powers.shape)
     # Summed by powers of W, whose weights are differences of the sliders: the layers are never formed.
-    weights = alpha.to(powers)
-    own = _weighted_sum(image.to(powers).unsqueeze(1), weights.narrow(axis, 0, 1))
+    weights = trainable(alpha).to(powers)
+    own = _weighted_sum(trainable(image).to(powers).unsqueeze(1), weights.narrow(axis, 0, 1))
     filtered = own + _weighted_sum(powers, weights.diff(dim=axis))
     if residual is not None and len(filtered):
         spectrum = operator.spectrum()
