@@ -17,8 +17,8 @@ from nlfilter_torch.core.kernels.tall_skinny import spread
 from nlfilter_torch.operator.landmarks import (
     assign_landmarks,
     canonical_candidates,
+    cluster_draws,
     clustered,
-    drawn,
     drawn_candidates,
     orientations,
 )
@@ -93,7 +93,7 @@ def _in_canonical_order(
     order = (amounts[numbers] > 0).nonzero().squeeze(1)
     counted = _uneven(amounts[numbers[order]].unsqueeze(0))
     pixels = drawn_candidates((1, len(order)), count, "kmeans", generator, counted).to(order.device)
-    draws = None if len(pixels) == count else drawn(len(pixels), count, generator)
+    draws = None if len(pixels) == count else cluster_draws(len(pixels), count, generator)
     source = partial(source_pixels, orientation.numbers, box, order[pixels])
     candidates, _, chosen = canonical_candidates(inside, source, orientation, layout)
     assignment = Assignment(places[candidates], None, None, math.prod(size))

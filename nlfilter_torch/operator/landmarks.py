@@ -81,7 +81,7 @@ def assign_landmarks(
     else:
         generator = torch.Generator().manual_seed(0) if options.generator is None else options.generator
         pixels = drawn_candidates(size, count, sampling, generator, weights)
-        draws = None if len(pixels) == count else drawn(len(pixels), count, generator)
+        draws = None if len(pixels) == count else cluster_draws(len(pixels), count, generator)
     if layout is not None and sampling == "kmeans" and weights is None:
         orientation = orientations(features, size, layout, communicator)
         source = partial(_fixed_source, orientation.numbers, size, count)
@@ -97,7 +97,7 @@ def assign_landmarks(
     return clustered(subset, chosen, Assignment(candidates, None, None, points), count, draws, communicator)
 
 
-class Draws(NamedTuple):
+class ClusterDraws(NamedTuple):
     """What the initial centroids are chosen by.
 
     Attributes:
@@ -109,19 +109,21 @@ class Draws(NamedTuple):
     numbers: Tensor
 
 
-def drawn(candidates: int, count: int, generator: torch.Generator) -> Draws:
+def cluster_draws(candidates: int, count: int, generator: torch.Generator) -> ClusterDraws:
     """Draw which of up to half of the candidates are chosen as initial centroids."""
     few = torch.randperm(candidates, generator=generator, device=generator.device)
     few = few[: _bounded(STARTED_FROM * count, MOST_STARTED_FROM, count)]
-    return Draws(few, torch.rand(count, TRIALS, generator=generator, device=generator.device, dtype=torch.float64))
+    return ClusterDraws(
+        few, torch.rand(count, TRIALS, generator=generator, device=generator.device, dtype=torch.float64)
+    )
 
 
 @cached_constants
-def _fixed_draws(size: tuple[int, ...], count: int, sampling: Sampling) -> tuple[Tensor, Draws | None]:
+def _fixed_draws(size: tuple[int, ...], count: int, sampling: Sampling) -> tuple[Tensor, ClusterDraws | None]:
     """What a new generator draws: candidates, and what follows if there are more than ``count``."""
     generator = torch.Generator().manual_seed(0)
     pixels = candidate_pixels(size, count, sampling, generator)
-    return pixels, None if len(pixels) == count else drawn(len(pixels), count, generator)
+    return pixels, None if len(pixels) == count else cluster_draws(len(pixels), count, generator)
 
 
 def _fixed_source(orientation: Tensor, size: tuple[int, ...], count: int, *, flipped: bool = True) -> Tensor:
@@ -141,7 +143,7 @@ def clustered(
     canonical: Tensor,
     candidates: Assignment,
     count: int,
-    draws: Draws | None,
+    draws: ClusterDraws | None,
     communicator: Communicator = ALONE,
 ) -> tuple[Tensor, Assignment]:
     """The result of :func:`assign_landmarks` from candidates with features (B, D, S), and those by which they cluster.
@@ -264,11 +266,13 @@ def condense(subset: Tensor, count: int, generator: torch.Generator, points: Ten
     """
     if subset.shape[2] == count:
         return subset
-    draws = drawn(subset.shape[2], count, generator)
+    draws = cluster_draws(subset.shape[2], count, generator)
     return means_of_clusters(subset, *clusters(subset.detach() if points is None else points, count, draws))
 
 
-def clusters(points: Tensor, count: int, draws: Draws, communicator: Communicator = ALONE) -> tuple[Tensor, Tensor]:
+def clusters(
+    points: Tensor, count: int, draws: ClusterDraws, communicator: Communicator = ALONE
+) -> tuple[Tensor, Tensor]:
     """Cluster points (B, D, S) by k-means: indices (B, 1, M) of the initial centroids, and assignment (B, S)."""
     points = points - points.mean(dim=2, keepdim=True)  # small offsets keep ||x||^2 + ||z||^2 - 2xz accurate
     # Single precision suffices here, and the kernels in C take nothing else.

@@ -339,7 +339,7 @@ def sampled_newton(matrix: KernelMatrix, tolerance: float) -> Balancing:
         return _refined(matrix, tolerance)
     if matrix.communicator.size > 1:
         return _by_sweeps(matrix, tolerance)
-    *found, sweeps = balance(matrix.factor, matrix.diagonal, matrix.weights, tolerance)
+    *found, sweeps = balance_kernel(matrix.factor, matrix.diagonal, matrix.weights, tolerance)
     scaling, actual, residual, inverse = found
     return Balancing(matrix, scaling, actual, residual, ACCELERATOR_SWEEPS if hidden else int(sweeps.max()), inverse)
 
@@ -368,12 +368,12 @@ def _fake_balance(factor: Tensor, *others: object) -> tuple[Tensor, ...]:
 
 
 @register(
-    "balance(Tensor factor, Tensor diagonal, Tensor? weights, float tolerance) "
+    "balance_kernel(Tensor factor, Tensor diagonal, Tensor? weights, float tolerance) "
     "-> (Tensor, Tensor, Tensor, Tensor, Tensor)",
     kernel(_compiled_balance),
     _fake_balance,
 )
-def balance(factor: Tensor, diagonal: Tensor, weights: Tensor | None, tolerance: float) -> tuple[Tensor, ...]:
+def balance_kernel(factor: Tensor, diagonal: Tensor, weights: Tensor | None, tolerance: float) -> tuple[Tensor, ...]:
     """Scaling (B, N), moment (B, M, 1), residual (B,), inverse (B, M, M) and number of sweeps (B,) of a balancing.
 
     By :func:`sampled_newton`; images of a batch end together here, and by themselves in C.

@@ -12,7 +12,7 @@ from nlfilter_torch.operator.scaling import (
     LARGEST_ROOT,
     Balancing,
     KernelMatrix,
-    balance,
+    balance_kernel,
     conjugate,
     conjugate_gradients,
     damped,
@@ -137,7 +137,10 @@ def kernels(pixels: int, marks: int, batch: int = 1) -> tuple[Tensor, Tensor]:
 def test_kernels_in_c_balance_like_the_definition(level: int, pixels: int, marks: int, weighted: bool) -> None:
     factor, diagonal = kernels(pixels, marks, batch=2)
     weights = 3 * noise(2, pixels, seed=4).float() * (torch.arange(pixels) % 5 != 1) if weighted else None
-    found, expected = balance(factor, diagonal, weights, 1e-6), by_torch(balance, factor, diagonal, weights, 1e-6)
+    found, expected = (
+        balance_kernel(factor, diagonal, weights, 1e-6),
+        by_torch(balance_kernel, factor, diagonal, weights, 1e-6),
+    )
     for own, other in zip(found[:2], expected[:2], strict=True):
         torch.testing.assert_close(own, other, rtol=1e-5, atol=1e-6)
     scaling, moment, residual, inverse, sweeps = found
@@ -177,8 +180,8 @@ def test_kernels_in_c_solve_like_the_definition(
 def test_images_are_balanced_in_a_batch_as_alone(threads: Callable[[int], None]) -> None:
     """Also on two threads, where each has an image."""
     factor, diagonal = kernels(3000, 20, batch=3)
-    expected = [balance(*parts, None, 1e-6) for parts in zip(factor.split(1), diagonal.split(1), strict=True)]
+    expected = [balance_kernel(*parts, None, 1e-6) for parts in zip(factor.split(1), diagonal.split(1), strict=True)]
     for count in (1, 2):
         threads(count)
-        for whole, parts in zip(balance(factor, diagonal, None, 1e-6), zip(*expected, strict=True), strict=True):
+        for whole, parts in zip(balance_kernel(factor, diagonal, None, 1e-6), zip(*expected, strict=True), strict=True):
             torch.testing.assert_close(whole, torch.cat(parts), rtol=1e-6, atol=1e-6)

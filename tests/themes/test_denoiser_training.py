@@ -157,7 +157,7 @@ def test_half_precision_ends_before_the_last_steps(monkeypatch: pytest.MonkeyPat
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 def test_landmarks_are_chosen_by_graphs_on_a_gpu() -> None:
     points = torch.rand(2, 5, 64, generator=torch.Generator().manual_seed(0)).cuda()
-    draws = landmarks.drawn(9, 8, torch.Generator().manual_seed(1)).numbers.to(points)
+    draws = landmarks.cluster_draws(9, 8, torch.Generator().manual_seed(1)).numbers.to(points)
     expected = landmarks.pivots(points, draws, 1e-3)
     with graphed_pivots("cuda"):
         for _ in range(2):

@@ -71,9 +71,9 @@ class Thumbnail:
                 image.draft(image.mode, (2 * THUMBNAIL, 2 * THUMBNAIL))
                 upright = ImageOps.exif_transpose(image)
                 turned = (upright.width > upright.height) != (width > height)
-                return Thumbnail(_small(drawing.planes(upright)), (width, height) if turned else (height, width))
+                return Thumbnail(thumbnail(drawing.planes(upright)), (width, height) if turned else (height, width))
         photograph = read_photograph(shot.path)
-        return Thumbnail(_small(photograph.pixels.float()), photograph.size)
+        return Thumbnail(thumbnail(photograph.pixels.float()), photograph.size)
 
 
 def carried(recipe: Recipe, onto: Recipe) -> Recipe:
@@ -94,7 +94,8 @@ def carried(recipe: Recipe, onto: Recipe) -> Recipe:
     return given
 
 
-def _small(pixels: Tensor) -> Tensor:
+def thumbnail(pixels: Tensor) -> Tensor:
+    """A picture (1, C, H, W), reduced, with values in [0, 1]."""
     scale = min(1.0, THUMBNAIL / max(pixels.shape[-2:]))
     height, width = (max(1, round(length * scale)) for length in pixels.shape[-2:])
     return resize(pixels, (height, width)).clamp(0, 1)

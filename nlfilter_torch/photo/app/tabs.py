@@ -11,6 +11,7 @@ from torch import Tensor
 from nlfilter_torch.photo.app import controls, drawing
 from nlfilter_torch.photo.app.controls import Choice, Control, Slider, SteadySlider, digits, show_pressed
 from nlfilter_torch.photo.app.curve import CurveEditor
+from nlfilter_torch.photo.app.shots import thumbnail
 from nlfilter_torch.photo.app.tools import BRUSH_RADIUS, BRUSHES, FREE, PALETTE, PROPORTIONS, Brush, Proportions
 from nlfilter_torch.photo.declared.development import AUTO_BALANCE, DEVELOP, WHOLE_CROP
 from nlfilter_torch.photo.declared.json_values import Value
@@ -19,10 +20,8 @@ from nlfilter_torch.photo.declared.presets import LOOKS, PRESETS, PURPOSES, Reci
 from nlfilter_torch.photo.declared.steps import NONE, Step
 from nlfilter_torch.photo.declared.strokes import ScribbleRole
 from nlfilter_torch.photo.edits.applying import apply_step
-from nlfilter_torch.photo.picture.resizing import resize
 
 BANDWIDTH = 20.0  # grey levels, the start when the bandwidth is not automatic
-THUMBNAIL = 160  # pixels of the longest side, twice as many as on the page
 AMOUNT = "amount"
 UNITS_OF_DEVELOPMENT = {"exposure": " stops", "temperature": " K", "straighten": "\u00b0"}
 COLOURS, GEOMETRY = ("temperature", "warmth", "tint", "vibrance", "saturation"), ("straighten",)  # groups of sliders
@@ -372,9 +371,7 @@ def _equal_presets(detail: Step) -> list[str]:
 
 def thumbnails(picture: Tensor) -> dict[str, bytes]:
     """A picture (1, C, H, W) in [0, 1] under each look, small, as PNG files."""
-    scale = min(1.0, THUMBNAIL / max(picture.shape[-2:]))
-    size = (max(1, round(picture.shape[-2] * scale)), max(1, round(picture.shape[-1] * scale)))
-    small = resize(picture, size).clamp(0, 1)
+    small = thumbnail(picture)
     return {name: drawing.lossless(apply_step(look, small).clamp(0, 1)) for name, look in LOOKS.items()}
 
 

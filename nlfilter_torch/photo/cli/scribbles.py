@@ -380,22 +380,23 @@ def _colour_range(photograph: Rows, colour: str, name: str) -> Picture:
         ValueError: if there is none, or the photograph is grey.
     """
     wanted = rgb2hsv(np.array(ImageColor.getrgb(_colour(colour, "--from", colour)))[:3] / 255)
-
-    def read(rows: slice) -> NDArray[np.generic]:
-        hue, saturation, value = np.moveaxis(rgb2hsv(photograph.read(rows)[0].movedim(0, -1).numpy()), -1, 0)
-        if wanted[1] < NEUTRAL:
-            chosen = (saturation < NEUTRAL) & (abs(value - wanted[2]) < VALUE_RANGE)
-        else:
-            apart = abs((hue - wanted[0] + 0.5) % 1 - 0.5)
-            chosen = (apart < HUE_RANGE) & (saturation >= max(NEUTRAL, wanted[1] / 2)) & (value >= NEUTRAL)
-        return chosen.astype(np.float32)
-
     if photograph.channels != 3:
         raise ValueError(f"{name} must be used with a photograph in colour, got a grey one; mark parts by --region")
-    mask = LazyRows(photograph.size, read)
+    mask = LazyRows(photograph.size, lambda rows: _similar_in_hue(photograph.read(rows)[0], wanted))
     if not mask.any():
         raise ValueError(f"{name} must be a colour of the photograph, which has none like it; mark a part by --region")
     return Picture(mask, name, hides=False)
+
+
+def _similar_in_hue(pixels: Tensor, wanted: NDArray[np.generic]) -> NDArray[np.float32]:
+    """Which pixels (3, H, W) resemble a colour in hue, saturation and value, (H, W) of 0 and 1."""
+    hue, saturation, value = np.moveaxis(rgb2hsv(pixels.movedim(0, -1).numpy()), -1, 0)
+    if wanted[1] < NEUTRAL:
+        chosen = (saturation < NEUTRAL) & (abs(value - wanted[2]) < VALUE_RANGE)
+    else:
+        apart = abs((hue - wanted[0] + 0.5) % 1 - 0.5)
+        chosen = (apart < HUE_RANGE) & (saturation >= max(NEUTRAL, wanted[1] / 2)) & (value >= NEUTRAL)
+    return np.asarray(chosen, np.float32)
 
 
 def _any(region: Region, picture: Picture, holds: Callable[[NDArray[np.generic]], NDArray[np.bool_]]) -> bool:

@@ -24,7 +24,7 @@ from nlfilter_torch.photo.selections.by_hand import check_drawn
 RING, MOST_RING = 4, 0.5  # pixels around a spot that are compared: at least so many, and this share of its radius
 OFFSET = 0.75  # share of a difference in mean colour that does not count, since the membrane takes it away
 NEARER = 0.02  # growth of the cost of a patch per radius of its distance
-LARGEST = 256  # pixels, of the sides of a spot
+LARGEST_SPOT = 256  # pixels, of the sides of a spot
 
 
 def heal(image: Tensor, spots: Tensor, *, reach: float = HEAL.defaults["reach"]) -> Tensor:
@@ -126,8 +126,10 @@ class Spot:
         """The spot of the pixels at some places of a picture (H, W)."""
         ends = [(int(axis.min()), int(axis.max()) + 1) for axis in (places // size[1], places % size[1])]
         longest = max(last - first for first, last in ends)
-        if longest > LARGEST:
-            raise ValueError(f"spots must be at most {LARGEST} pixels wide and high, got {longest}; mark smaller ones")
+        if longest > LARGEST_SPOT:
+            raise ValueError(
+                f"spots must be at most {LARGEST_SPOT} pixels wide and high, got {longest}; mark smaller ones"
+            )
         ring = max(RING, round(MOST_RING * longest / 2))
         far = ring + max(1, round(reach * longest / 2))
         spans, frame = [], []

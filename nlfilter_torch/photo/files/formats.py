@@ -210,7 +210,7 @@ def fitting_jpeg(metadata: Metadata) -> tuple[Metadata, list[str]]:
     if packet is not None and len(packet) > jpeg.LONGEST_XMP:
         left_out.append(f"XMP of {len(packet)} bytes, as JPEG holds at most {jpeg.LONGEST_XMP}")
     if (dpi := metadata.extras.dpi) is not None:
-        stored = jpeg.density(jpeg.jfif(dpi)) or dpi
+        stored = jpeg.stored_dpi(jpeg.jfif(dpi)) or dpi
         if max(abs(a - b) for a, b in zip(dpi, stored, strict=True)) > png.INCH / 2:  # which other types round, too
             (x, y), (across, down) = dpi, stored
             left_out.append(

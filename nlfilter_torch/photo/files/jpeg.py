@@ -175,7 +175,7 @@ def _metadata(contents: list[tuple[int, bytes]], behind: bytes) -> tuple[int, Me
     parts, left_out = [], []
     for marker, content in contents:
         if marker == APP and content.startswith(b"JFIF\0"):
-            dpi = density(content)
+            dpi = stored_dpi(content)
         elif marker == APP + 1 and content.startswith(exif_tags.PREFIX):
             blocks.append(content.removeprefix(exif_tags.PREFIX))
         elif marker == APP + 1 and content.startswith(XMP_SEGMENT):
@@ -200,7 +200,7 @@ def _metadata(contents: list[tuple[int, bytes]], behind: bytes) -> tuple[int, Me
     return orientation, Metadata(icc, exif, extras)
 
 
-def density(content: bytes) -> tuple[float, float] | None:
+def stored_dpi(content: bytes) -> tuple[float, float] | None:
     """The pixels per inch in the header of JFIF, or None."""
     if len(content) < 12 or (scale := exif_tags.IN_INCHES.get(content[7] + 1)) is None:  # TIFF counts from 1
         return None
@@ -280,7 +280,7 @@ def _written(metadata: Metadata) -> Iterator[tuple[int, bytes]]:
 
 
 def jfif(dpi: tuple[float, float] | None) -> bytes:
-    """The header of JFIF, whose density is whole numbers, in the unit that rounds less; see :func:`density`."""
+    """The header of JFIF, whose density is whole numbers, in the unit that rounds less; see :func:`stored_dpi`."""
     if dpi is None:
         return b"JFIF\0\1\1" + struct.pack(">BHHH", 0, 1, 1, 0)
     lost = {

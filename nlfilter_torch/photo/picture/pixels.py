@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Protocol, TypeVar, TypeVarTuple
 
 import torch
@@ -75,12 +76,12 @@ class LessMean:
 
 def part_of(planes: Tensor) -> Planes:
     """Function that returns the part of planes (B, ..., H, W) of a picture at given pixels."""
+    return partial(_part, planes)
 
-    def part(pixels: Pixels) -> Tensor:
-        (top, left), (height, width) = corner(pixels), pixels.image.shape[-2:]
-        return planes[..., top : top + height, left : left + width]
 
-    return part
+def _part(planes: Tensor, pixels: Pixels) -> Tensor:
+    (top, left), (height, width) = corner(pixels), pixels.image.shape[-2:]
+    return planes[..., top : top + height, left : left + width]
 
 
 def ends_of(values: Tensor, weights: Tensor | None = None) -> tuple[Tensor, Tensor]:

@@ -82,6 +82,6 @@ def test_what_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
         heal(image, None)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match=r"^reach must be positive"):
         heal(image, torch.ones(1, 1, 16, 16), reach=0.0)
-    monkeypatch.setattr(module, "LARGEST", 9)
+    monkeypatch.setattr(module, "LARGEST_SPOT", 9)
     with pytest.raises(ValueError, match=r"^spots must be at most 9 pixels wide and high, got 10; mark smaller ones"):
         heal(image, box(3, 3, 4, 10, size=(16, 16)))
