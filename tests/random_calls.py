@@ -330,6 +330,11 @@ FUNCTIONS = {
     "captured_energy": Function(nlf.captured_energy, SPECTRUM | IMAGE, {}),
     "estimate_bandwidth": Function(nlf.estimate_bandwidth, {"guide": _image(1, 3, 2)}, GUIDED | {"weights": _weights}),
     "estimate_noise": Function(nlf.estimate_noise, IMAGE, {}),
+    "standard_error": Function(
+        lambda image, noise: nlf.standard_error(lambda values: 0.4 * values, image, noise),
+        {"image": _image(1, 3, 2), "noise": _number(0.01, 0.3)},
+        {},
+    ),
     "noise_profile": Function(lambda image: nlf.noise_profile(image).levels, IMAGE, {}),
     "profile_of_difference": Function(
         lambda noisy, clean: nlf.profile_of_difference(noisy, clean).levels,

@@ -25,7 +25,7 @@ FLOOR = 1e-3  # of variances in units of the noise, before the logarithm
 FAINTEST = 1e-3 / 255  # deviation below which there is no noise
 AGAIN, SLOPES, REST, STEIN = (0.7, 1.5, 3.0, 8.0), (0.7, 2.0, 5.0), (1.5, 4.0, 8.0), (4.0, 10.0)  # widths of averages
 OWN = 1.5  # width of the average of a channel by itself
-MOST = 10.0  # of squares in units of the noise
+MOST, LARGEST = 10.0, 1e6  # of squares, and of differences before they are squared, in units of the noise
 RATIOS, LEAST_RATIO = (-5.0, 20.0), 0.2  # of Stein's estimate to the errors on the result: limits, and what is added
 INPUTS = len(AGAIN) + len(SLOPES) + len(REST) + len(STEIN) + 6
 HIDDEN = 24
@@ -98,7 +98,8 @@ def standard_error(
     for first in range(0, image.shape[2], step):
         rows.append(log_ratio(weights, inputs.table(slice(first, first + step))).exp())
     errors = inputs.deviation * torch.cat(rows, dim=2)
-    return torch.where(inputs.deviation > FAINTEST, errors, 0.0).to(image.dtype)
+    errors = torch.where(inputs.deviation > FAINTEST, errors, 0.0)
+    return errors.clamp(max=torch.finfo(image.dtype).max).to(image.dtype)
 
 
 @dataclass(frozen=True)
@@ -130,17 +131,21 @@ def inputs_of(
 ) -> Inputs:
     """Call the denoiser, and average its errors in neighbourhoods, in units of the noise."""
     random = torch.Generator().manual_seed(0) if generator is None else generator
-    variance = variance_of(noise, image).to(image).expand_as(image).clamp(min=FAINTEST**2)
+    deviation = variance_of(noise, image).sqrt().to(image).clamp(min=FAINTEST).expand_as(image)
     result = _called(function, image)
+
+    def in_units(difference: Tensor) -> Tensor:
+        return (difference / deviation).clamp(-LARGEST, LARGEST)
+
     added = [sampled(noise, result, random) for _ in range(DRAWS)]
-    again = torch.stack([(_called(function, result + field) - result).square() for field in added]).mean(0) / variance
+    again = torch.stack([in_units(_called(function, result + field) - result).square() for field in added]).mean(0)
     probe = drawn(noise, image, random)
-    derivative = probe * (_called(function, image + STEP * probe) - result) / STEP
-    rest = (image - result).square()
-    stein = ((rest - variance + 2 * derivative) / variance).clamp(-MOST, MOST).mean(1, keepdim=True)
-    rest = (rest / variance).clamp(max=MOST).mean(1, keepdim=True)
-    slopes = (_squared_slopes(result) / variance).mean(1, keepdim=True)
-    coarse = torch.stack([blur(field / variance.sqrt(), OWN).square().mean((1, 2, 3)) for field in added]).mean(0)
+    derivative = in_units(probe) * in_units(_called(function, image + STEP * probe) - result) / STEP
+    rest = in_units(image - result).square()
+    stein = (rest - 1 + 2 * derivative).clamp(-MOST, MOST).mean(1, keepdim=True)
+    rest = rest.clamp(max=MOST).mean(1, keepdim=True)
+    slopes = torch.stack([in_units(slope).square() for slope in _slopes(result)]).sum(0).mean(1, keepdim=True) / 4
+    coarse = torch.stack([blur(in_units(field), OWN).square().mean((1, 2, 3)) for field in added]).mean(0)
     shared = again.mean(1, keepdim=True)
     mean, estimated = shared.mean((2, 3), keepdim=True) + FLOOR, stein.mean((2, 3), keepdim=True)
     trust = mean / (mean + math.sqrt(2 / image[0].numel()))  # the deviation of the estimate, for normal noise
@@ -158,7 +163,7 @@ def inputs_of(
         *(number.expand_as(shared) for number in overall),
     ]
     own = ((blur(again, OWN) + FLOOR) / (blur(shared, OWN) + FLOOR)).log()
-    return Inputs(torch.cat(planes, dim=1), own, variance.sqrt())
+    return Inputs(torch.cat(planes, dim=1), own, deviation)
 
 
 def log_ratio(weights: dict[str, Tensor], inputs: Tensor) -> Tensor:
@@ -181,12 +186,11 @@ def _called(function: Callable[[Tensor], Tensor], image: Tensor) -> Tensor:
     return output.to(image)
 
 
-def _squared_slopes(image: Tensor) -> Tensor:
-    """Squared gradient of each channel, by differences of the pixels on both sides."""
+def _slopes(image: Tensor) -> tuple[Tensor, Tensor]:
+    """Differences of the pixels on both sides of each, across and down."""
     padded = pad_border(image, 1)
     across = padded[..., 1:-1, 2:] - padded[..., 1:-1, :-2]
-    down = padded[..., 2:, 1:-1] - padded[..., :-2, 1:-1]
-    return (across.square() + down.square()) / 4
+    return across, padded[..., 2:, 1:-1] - padded[..., :-2, 1:-1]
 
 
 @cached_constants

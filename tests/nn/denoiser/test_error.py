@@ -86,5 +86,14 @@ def test_the_smallest_images() -> None:
         assert bool(standard_error(torch.Tensor.clone, torch.full((1, 3, *size), 0.5), 0.1).isfinite().all())
 
 
+@pytest.mark.parametrize("dtype", [torch.float16, torch.float32])
+def test_large_noise_and_values_give_finite_errors(dtype: torch.dtype) -> None:
+    image = noise(1, 3, 9, 8).to(dtype)
+    for scale, level in ((1.0, 1e20), (0.3 * torch.finfo(dtype).max, 0.1), (1e-3, 0.0)):
+        error = standard_error(lambda y: 0.4 * y, scale * image, level)
+        assert bool(error.isfinite().all())
+        assert bool((error > 0).all()) == (level > 0)
+
+
 def test_the_weights_of_the_package() -> None:
     assert read_weights(TRAINED, SHAPES).keys() == SHAPES.keys()
