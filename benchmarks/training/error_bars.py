@@ -22,7 +22,7 @@ from benchmarks.training.development import blurred
 from benchmarks.training.noise_profiles import Pairs
 from benchmarks.training.pictures import Draws
 from nlfilter_torch import NoiseProfile, NonlocalDenoiser, noise_profile
-from nlfilter_torch.nn.denoiser.error import INPUTS, KINDS, LAYERS, NORMAL, SHAPES, inputs_of, log_ratio
+from nlfilter_torch.nn.denoiser.error import ERROR_INPUTS, ERROR_LAYERS, KINDS, NORMAL, SHAPES, error_inputs, log_ratio
 from nlfilter_torch.photo import denoise
 
 SIDE, CAMERA_SIDE, LEVELS = 192, 256, (5, 60)
@@ -93,11 +93,11 @@ class Examples:
 
 
 def values_of(example: Example, seed: int) -> Tensor:
-    """Inputs and true error, in deviations of the noise, (PER_PICTURE, INPUTS + 1) of some values of a picture."""
+    """Inputs and true error, in deviations of the noise, (PER_PICTURE, ERROR_INPUTS + 1), of values of a picture."""
     function, noisy, clean, noise = example
     random = torch.Generator().manual_seed(seed)
     with torch.no_grad():
-        inputs = inputs_of(function, noisy, noise, random)
+        inputs = error_inputs(function, noisy, noise, random)
         error = (function(noisy) - clean).abs() / inputs.deviation
     table = torch.cat([inputs.table(slice(None)), error.unsqueeze(-1)], dim=-1).flatten(0, -2)
     return table[torch.randint(len(table), (PER_PICTURE,), generator=random)]
@@ -117,13 +117,13 @@ def fit(folder: Path, out: Path) -> None:
 
 def fit_kind(tables: Sequence[Tensor], kind: str) -> dict[str, Tensor]:
     """Train for a kind of noise, and print the score and the coverage of the pictures held out."""
-    counted = [rows[rows[:, INPUTS - 1] > math.log(FAINT)] for rows in tables]
+    counted = [rows[rows[:, ERROR_INPUTS - 1] > math.log(FAINT)] for rows in tables]
     counted = [rows for rows in counted if len(rows) > PER_PICTURE // 2]
     apart, others = counted[::EVERY_APART], [rows for n, rows in enumerate(counted) if n % EVERY_APART]
     table, (steps, blur, blur_of_overall) = torch.cat(others), TRAINING[kind]
-    inputs = table[:, :INPUTS]
+    inputs = table[:, :ERROR_INPUTS]
     weights = {"mean": inputs.mean(0), "scale": inputs.std(0).clamp(min=0.05)}
-    for name, size in LAYERS.items():
+    for name, size in ERROR_LAYERS.items():
         layer = torch.nn.Linear(size[1], size[0])
         weights |= {f"{name}.weight": layer.weight.detach(), f"{name}.bias": layer.bias.detach()}
     spread = weights["scale"] * torch.where((inputs.diff(dim=0) == 0).float().mean(0) > 0.5, blur_of_overall, blur)
@@ -150,13 +150,13 @@ def fit_kind(tables: Sequence[Tensor], kind: str) -> dict[str, Tensor]:
 
 
 def coverage(weights: dict[str, Tensor], table: Tensor) -> Tensor:
-    """Share of values (n, INPUTS + 1) within 1.645 standard errors."""
-    return (table[:, INPUTS] <= NORMAL * log_ratio(weights, table[:, :INPUTS]).exp()).float().mean()
+    """Share of values (n, ERROR_INPUTS + 1) within 1.645 standard errors."""
+    return (table[:, ERROR_INPUTS] <= NORMAL * log_ratio(weights, table[:, :ERROR_INPUTS]).exp()).float().mean()
 
 
 def score(weights: dict[str, Tensor], table: Tensor) -> Tensor:
-    """Interval score of values (..., INPUTS + 1), relative to the errors that are expected."""
-    width, error = NORMAL * log_ratio(weights, table[..., :INPUTS]).exp(), table[..., INPUTS]
+    """Interval score of values (..., ERROR_INPUTS + 1), relative to the errors that are expected."""
+    width, error = NORMAL * log_ratio(weights, table[..., :ERROR_INPUTS]).exp(), table[..., ERROR_INPUTS]
     expected = table[..., 2].exp().sqrt() + LEAST  # from the average over 3 pixels
     return (2 * width + 2 / ALPHA * (error - width).clamp(min=0)) / expected
 

@@ -8,7 +8,7 @@ import torch
 from benchmarks.training import error_bars
 from benchmarks.training.error_bars import Examples, main
 from nlfilter_torch import NoiseProfile
-from nlfilter_torch.nn.denoiser.error import INPUTS, SHAPES
+from nlfilter_torch.nn.denoiser.error import ERROR_INPUTS, SHAPES
 from nlfilter_torch.nn.denoiser.weights import read_weights
 from nlfilter_torch.photo.picture.photographs import Photograph, write_photograph
 
@@ -41,7 +41,7 @@ def test_values_are_continued_and_fitted(folder: Path, capsys: pytest.CaptureFix
     main([*arguments, "12"])
     assert len(list(out.iterdir())) == 12
     assert all((out / name).stat().st_mtime_ns == time for name, time in first.items())
-    assert torch.load(next(out.iterdir())).shape == (50, INPUTS + 1)
+    assert torch.load(next(out.iterdir())).shape == (50, ERROR_INPUTS + 1)
     main(["--out", str(out), "--fit", str(weights)])
     assert [line.split(",")[0] for line in capsys.readouterr().out.splitlines()] == ["known", "profile"]
     assert read_weights(weights, SHAPES).keys() == SHAPES.keys()

@@ -13,6 +13,7 @@ from nlfilter_torch.core.checks import check_image, check_shape, check_tensor
 from nlfilter_torch.core.precision import full_precision, working_dtype
 from nlfilter_torch.core.torch_internals import cached_constants
 from nlfilter_torch.filtering.noise import NoiseModel, drawn, sampled, variance_of
+from nlfilter_torch.filtering.sure import STEP
 from nlfilter_torch.nn.denoiser.weights import read_weights
 from nlfilter_torch.operator.features import blur, pad_border
 
@@ -20,25 +21,28 @@ TRAINED = Path(__file__).with_name("error.safetensors")
 
 NORMAL = 1.645  # standard errors to either side that hold 90 % of a normal distribution
 DRAWS = 2  # of noise that is added to the result
-STEP = 0.05  # of the derivative of the denoiser, in deviations of the noise
 FLOOR = 1e-3  # of variances in units of the noise, before the logarithm
-FAINTEST = 1e-3 / 255  # deviation below which there is no noise
+NOISELESS = 1e-3 / 255  # deviation below which there is no noise
 AGAIN, SLOPES, REST, STEIN = (0.7, 1.5, 3.0, 8.0), (0.7, 2.0, 5.0), (1.5, 4.0, 8.0), (4.0, 10.0)  # widths of averages
-OWN = 1.5  # width of the average of a channel by itself
-MOST, LARGEST = 10.0, 1e6  # of squares, and of differences before they are squared, in units of the noise
+OWN_WIDTH = 1.5  # width of the average of a channel by itself
+MOST, LARGEST_DIFFERENCE = 10.0, 1e6  # of squares, and of differences before they are squared, in units of the noise
 RATIOS, LEAST_RATIO = (-5.0, 20.0), 0.2  # of Stein's estimate to the errors on the result: limits, and what is added
-INPUTS = len(AGAIN) + len(SLOPES) + len(REST) + len(STEIN) + 6
-HIDDEN = 24
+ERROR_INPUTS = len(AGAIN) + len(SLOPES) + len(REST) + len(STEIN) + 6
+WIDTH = 24  # of both hidden layers
 KINDS = ("known", "profile")  # of noise: white noise of a known level, and a profile, which is estimated as a rule
-LAYERS = {"first": (HIDDEN, INPUTS), "second": (HIDDEN, HIDDEN), "last": (1, HIDDEN)}
+ERROR_LAYERS = {
+    "first": (WIDTH, ERROR_INPUTS),
+    "second": (WIDTH, WIDTH),
+    "last": (1, WIDTH),
+}
 SHAPES = {
     f"{kind}.{name}": shape
     for kind in KINDS
     for name, shape in {
-        "mean": (INPUTS,),
-        "scale": (INPUTS,),
-        **{f"{layer}.weight": size for layer, size in LAYERS.items()},
-        **{f"{layer}.bias": size[:1] for layer, size in LAYERS.items()},
+        "mean": (ERROR_INPUTS,),
+        "scale": (ERROR_INPUTS,),
+        **{f"{layer}.weight": size for layer, size in ERROR_LAYERS.items()},
+        **{f"{layer}.bias": size[:1] for layer, size in ERROR_LAYERS.items()},
     }.items()
 }
 STRIP = 1 << 18  # values whose standard errors are computed together
@@ -92,13 +96,13 @@ def standard_error(
     check_image(image, "image")
     if not callable(function):
         raise TypeError(f"function must be a function of an image, got {type(function).__name__}; pass a denoiser")
-    inputs, rows = inputs_of(function, image.to(working_dtype(image)), noise, generator), []
+    inputs, rows = error_inputs(function, image.to(working_dtype(image)), noise, generator), []
     weights = _trained(inputs.deviation.device, inputs.deviation.dtype, KINDS[isinstance(noise, NoiseModel)])
     step = max(1, STRIP // (image.numel() // image.shape[2]))
     for first in range(0, image.shape[2], step):
         rows.append(log_ratio(weights, inputs.table(slice(first, first + step))).exp())
     errors = inputs.deviation * torch.cat(rows, dim=2)
-    errors = torch.where(inputs.deviation > FAINTEST, errors, 0.0)
+    errors = torch.where(inputs.deviation > NOISELESS, errors, 0.0)
     return errors.clamp(max=torch.finfo(image.dtype).max).to(image.dtype)
 
 
@@ -107,7 +111,7 @@ class Inputs:
     """What the network is told of each value of an image.
 
     Attributes:
-        shared: (B, INPUTS - 2, H, W), the same for all channels of a pixel.
+        shared: (B, ERROR_INPUTS - 2, H, W), the same for all channels of a pixel.
         own: (B, C, H, W), logarithm of a channel's share in the errors nearby.
         deviation: (B, C, H, W), of the noise.
     """
@@ -117,13 +121,13 @@ class Inputs:
     deviation: Tensor
 
     def table(self, rows: slice) -> Tensor:
-        """The inputs (B, C, h, W, INPUTS) of some rows."""
+        """The inputs (B, C, h, W, ERROR_INPUTS) of some rows."""
         own, deviation = self.own[:, :, rows], self.deviation[:, :, rows]
         shared = self.shared[:, :, rows].movedim(1, -1).unsqueeze(1).expand(*own.shape, -1)
         return torch.cat([shared, own.unsqueeze(-1), deviation.log().unsqueeze(-1)], dim=-1)
 
 
-def inputs_of(
+def error_inputs(
     function: Callable[[Tensor], Tensor],
     image: Tensor,
     noise: float | Tensor | NoiseModel,
@@ -131,11 +135,11 @@ def inputs_of(
 ) -> Inputs:
     """Call the denoiser, and average its errors in neighbourhoods, in units of the noise."""
     random = torch.Generator().manual_seed(0) if generator is None else generator
-    deviation = variance_of(noise, image).sqrt().to(image).clamp(min=FAINTEST).expand_as(image)
+    deviation = variance_of(noise, image).sqrt().to(image).clamp(min=NOISELESS).expand_as(image)
     result = _called(function, image)
 
     def in_units(difference: Tensor) -> Tensor:
-        return (difference / deviation).clamp(-LARGEST, LARGEST)
+        return (difference / deviation).clamp(-LARGEST_DIFFERENCE, LARGEST_DIFFERENCE)
 
     added = [sampled(noise, result, random) for _ in range(DRAWS)]
     again = torch.stack([in_units(_called(function, result + field) - result).square() for field in added]).mean(0)
@@ -145,7 +149,7 @@ def inputs_of(
     stein = (rest - 1 + 2 * derivative).clamp(-MOST, MOST).mean(1, keepdim=True)
     rest = rest.clamp(max=MOST).mean(1, keepdim=True)
     slopes = torch.stack([in_units(slope).square() for slope in _slopes(result)]).sum(0).mean(1, keepdim=True) / 4
-    coarse = torch.stack([blur(in_units(field), OWN).square().mean((1, 2, 3)) for field in added]).mean(0)
+    coarse = torch.stack([blur(in_units(field), OWN_WIDTH).square().mean((1, 2, 3)) for field in added]).mean(0)
     shared = again.mean(1, keepdim=True)
     mean, estimated = shared.mean((2, 3), keepdim=True) + FLOOR, stein.mean((2, 3), keepdim=True)
     trust = mean / (mean + math.sqrt(2 / image[0].numel()))  # the deviation of the estimate, for normal noise
@@ -162,12 +166,12 @@ def inputs_of(
         *(_relative(blur(stein, width), blur(shared, near)) for width, near in zip(STEIN, AGAIN[-2:], strict=True)),
         *(number.expand_as(shared) for number in overall),
     ]
-    own = ((blur(again, OWN) + FLOOR) / (blur(shared, OWN) + FLOOR)).log()
+    own = ((blur(again, OWN_WIDTH) + FLOOR) / (blur(shared, OWN_WIDTH) + FLOOR)).log()
     return Inputs(torch.cat(planes, dim=1), own, deviation)
 
 
 def log_ratio(weights: dict[str, Tensor], inputs: Tensor) -> Tensor:
-    """The network: logarithm of the standard error in deviations of the noise, of ``inputs`` (..., INPUTS)."""
+    """The network: logarithm of the standard error in deviations of the noise, of ``inputs`` (..., ERROR_INPUTS)."""
     features = (inputs - weights["mean"]) / weights["scale"]
     for name in ("first", "second"):
         features = F.silu(F.linear(features, weights[f"{name}.weight"], weights[f"{name}.bias"]))

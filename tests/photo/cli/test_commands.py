@@ -19,7 +19,7 @@ from nlfilter_torch.photo.declared.strokes import Stroke
 from nlfilter_torch.photo.edits.recipe import apply_recipe
 from nlfilter_torch.photo.picture.photographs import Photograph, read_photograph, write_photograph
 from tests.pairwise import each_value
-from tests.problems import cat, colour, difference
+from tests.problems import cat, colour
 from tests.recipes import COLORIZE, DEFOCUS, DETAIL, RECOLOR
 
 
@@ -34,8 +34,11 @@ def test_the_command_line_goes_by_rows(tmp_path: Path, monkeypatch: pytest.Monke
     for name, options in zip(names, ([], ["--memory", "0.044", "--full"]), strict=True):
         assert main(["apply", str(photo), str(name), "--preset", str(preset), *options]) == 0
     whole, rows = (read_photograph(name).pixels for name in names)
-    # Rounding in the first step may change the k-means of the second: noise of 1e-7 changes pixels by 1.4 levels.
-    assert 0 < difference(whole, rows) < 8
+    # Rounding in the first step may change the k-means of the second: noise of 1e-7 changes pixels by 1.4 levels, and
+    # a pixel as near to another object as to the painted one may change sides.
+    changes = 255 * (whole - rows).abs().amax(1)
+    assert changes.max() > 0
+    assert (changes > 8).float().mean() < 1e-4
     assert 255 * (whole - rows).square().mean().sqrt() < 0.5
     assert sorted(path.name for path in tmp_path.iterdir()) == ["edit.json", "in.tif", "rows.tif", "whole.tif"]
 
