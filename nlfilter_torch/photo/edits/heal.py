@@ -47,7 +47,7 @@ def heal(image: Tensor, spots: Tensor, *, reach: float = HEAL.defaults["reach"])
 
     Raises:
         TypeError, ValueError: if a tensor has another size or leaves its range, nothing is marked, or a spot is too
-            large.
+            large or has no pixels beside it.
 
     Example:
         >>> image = torch.linspace(0, 1, 40).expand(1, 1, 40, 40).clone()
@@ -145,9 +145,11 @@ class Spot:
         """Its pixels (B, C, n), given an image (B, C, h, w) of the window, and which pixels of it are usable (h, w)."""
         marked = torch.isin(self.around, self.places).view(self.window)[self.frame]
         own, free = image[(..., *self.frame)], usable[self.frame]
+        if not bool(free.any()):
+            raise ValueError("spots must have visible pixels beside them, got one without; mark smaller ones")
         grown = F.max_pool2d(marked[None].float(), 2 * self.ring + 1, 1, self.ring)[0]
         patch = torch.stack([self._patch(one, usable, grown * free, marked) for one in image])
-        unknown = ~free if bool(free.any()) else marked
+        unknown = ~free
         inner = F.pad(torch.ones_like(own[:1, :1]), (1, 1, 1, 1))
         stencil = own.new_zeros(1, 3, 3, *marked.shape)
         for row, column in ((0, 1), (1, 0), (1, 2), (2, 1)):
