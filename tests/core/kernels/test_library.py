@@ -45,7 +45,7 @@ def arguments(dtype: torch.dtype) -> dict[str, tuple[Any, ...]]:
         "moment": (factor, images),
         "sweep": (factor, weights, vector, 2.0, weights),
         "weigh": (factor, weights, vector),
-        "balance": (factor, (1 - norms).clamp(min=0.0), weights, 1e-5),
+        "balance_kernel": (factor, (1 - norms).clamp(min=0.0), weights, 1e-5),
         "conjugate": (
             factor,
             weights,

@@ -87,6 +87,7 @@ CASES: dict[str, Case] = {
     "fit_alpha": lambda x: nlf.fit_alpha(x.operator(), x.image(), x.image(), mask=x.mask(), rounding=0.0),
     "NonlocalPrior": lambda x: nlf.NonlocalPrior(x.operator()).prox(x.image(), 0.5),
     "sure": lambda x: nlf.sure(x.operator(), x.image(), 0.1),
+    "standard_error": lambda x: nlf.standard_error(lambda y: 0.5 * y, x.image(), 0.1),
     "neighbour_distances": lambda x: nlf.neighbour_distances(x.zeros(1, 3, 50), k=4),
     "bandwidth_of_points": lambda x: nlf.bandwidth_of_points(x.zeros(1, 3, 50)),
     "fit_filter": lambda x: nlf.fit_filter(x.operator(), x.image())(x.image(), x.zeros(4)),
@@ -201,6 +202,7 @@ def test_backward_reads_no_value(case: str) -> None:
             "profile_of_difference",
             "segment_mask",
             "SegmentMask",
+            "standard_error",
         )
 
 
