@@ -3,6 +3,7 @@
 import shutil
 import tempfile
 import weakref
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 from threading import Lock, Thread
@@ -44,18 +45,18 @@ class Library:
         self._copies: Path | None = None  # the folder of files that the browser sent
 
     @staticmethod
-    def opening(folder: Path, image: Path | None) -> "Library":
-        """The library of a folder, which begins to open an image for the page that will ask for it, if there is one.
+    def opening(folder: Path, images: Sequence[Path]) -> "Library":
+        """The library of a folder, which begins to open the first image, if any, for the page that will ask for it.
 
         Only :meth:`open` says what is wrong with that.
         """
-        if image is None:
+        if not images:
             return Library(folder)
-        library = Library(folder, image.parent)
+        library = Library(folder, images[0].parent)
 
         def open_it() -> None:
             with suppress(Exception):
-                library.open(image)
+                library.open(images[0])
 
         Thread(target=open_it, daemon=True).start()
         return library

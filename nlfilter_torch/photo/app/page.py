@@ -67,13 +67,15 @@ class Editor:
         self.is_cropping = False
         self.proportions = Proportions()
 
-    def build(self, image: Path | None, address: str = "", tab: str = "", roll: str = "") -> None:
-        """Lay the page out, and open the photograph and tab of an address that the page had before, or an image.
+    def build(self, images: Sequence[Path], address: str = "", tab: str = "", roll: str = "") -> None:
+        """Lay the page out, and open the photograph and tab of an address that the page had before, or the first image.
 
-        ``roll`` names the photographs of its strip.
+        ``roll`` names the photographs of its strip, which are the images at first.
         """
+        image = images[0] if images else None
         self._roll = roll if roll in self._photographs.rolls else self._token
-        self._shots = self._photographs.rolls.setdefault(self._roll, {})
+        shots = () if address else map(self._photographs.shot, images)
+        self._shots = self._photographs.rolls.setdefault(self._roll, {shot.address: shot for shot in shots})
         EDITORS[self._token] = self
         self._client = ui.context.client
         self._client.on_delete(self._leave)
@@ -712,14 +714,14 @@ class Editor:
 
 @dataclass(frozen=True)
 class Pages:
-    """The pages of the editor, which begin with an image, if there is one."""
+    """The pages of the editor, which begin with some images, or with none."""
 
     photographs: Library
-    image: Path | None
+    images: Sequence[Path]
 
     def build(self, photo: str = "", tab: str = "", roll: str = "") -> None:
         """Build a page, for the photographs and tab of an address that a page had before, if there is one."""
-        Editor(self.photographs).build(self.image, photo, tab, roll)
+        Editor(self.photographs).build(self.images, photo, tab, roll)
 
     def picture(self, token: str, kind: str, at: str = "") -> Response:
         """A picture of the page with a token, by its kind, of the original at a place; or status 404.

@@ -170,10 +170,15 @@ def with_options(*names: str, more: Iterable[Edit] = ()) -> Callable[[Command], 
 
 
 def with_declared(edit: Edit) -> Callable[[Command], Command]:
-    """Replace the ``**values`` of a command by the options of an edit, and its help by that of the edit."""
+    """Replace the ``**values`` of a command by the options of an edit, and its help by that of the edit.
+
+    An edit without a filter has no seed.
+    """
 
     def decorate(function: Command) -> Command:
         source, target, *own = _own_parameters(function)
+        if not any(parameter.panel == FILTER_PANEL for parameter in edit):
+            own = [parameter for parameter in own if parameter.name != "seed"]
         marks = [_argument(name, annotation, None) for name, annotation in scribble_options(edit).items()]
         function.__name__, function.__doc__ = edit.name, edit.help
         return as_command(function, [source, target, *marks, *(_declared(p) for p in edit if p.is_option), *own])

@@ -16,13 +16,15 @@ def test_a_folder_that_is_missing(tmp_path: Path) -> None:
         app(None, tmp_path / "gone")
 
 
-def test_the_photograph_of_the_command_is_served(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_photographs_of_the_command_are_served(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     served: list[Any] = []
     monkeypatch.setattr(server, "serve", lambda build, picture, **options: served.append((build.__self__, options)))
-    write_photograph(Photograph(cat()), tmp_path / "cat.png")
-    app(tmp_path / "cat.png", None, port=0, open=False)
+    images = [tmp_path / "cat.png", tmp_path / "other.png"]
+    for image in images:
+        write_photograph(Photograph(cat()), image)
+    app(images, None, port=0, open=False)
     ((pages, options),) = served
-    assert pages.image == tmp_path / "cat.png"
+    assert pages.images == images
     assert pages.photographs.folder == tmp_path
     assert options == {"host": "127.0.0.1", "port": 0, "open_page": False}
-    assert pages.photographs.open(pages.image).name == "cat.png"
+    assert pages.photographs.open(images[0]).name == "cat.png"

@@ -175,13 +175,13 @@ def test_the_photograph_is_not_replaced_by_its_edited_version(shots: Path) -> No
 
 
 def test_an_image_is_opened_ahead(shots: Path) -> None:
-    library = Library.opening(shots, shots / "cat.png")
+    library = Library.opening(shots, [shots / "cat.png"])
     session = library.open(shots / "cat.png")  # waits for it
     assert library.reopen("cat.png") is session
     broken = shots / "notes.png"
     broken.write_text("dear diary")
     with pytest.raises(ValueError, match=r"notes\.png is not a PNG"):
-        Library.opening(shots, broken).open(broken)
+        Library.opening(shots, [broken]).open(broken)
 
 
 def test_what_the_browser_sent_is_opened_again(shots: Path, tmp_path: Path) -> None:

@@ -33,7 +33,7 @@ class Page:
     def __init__(self, client: Client, library: Library, works: list[Awaitable[None]]) -> None:
         self.client, self.works = client, works
         self.editor = Editor(library)
-        self.editor.build(None)
+        self.editor.build(())
 
     def finish(self) -> None:
         while self.works:
@@ -147,10 +147,22 @@ def test_proportions_of_the_crop_and_looks_of_what_it_leaves(opened: Page, scrip
     assert any(script.endswith(", null)") for script in scripts)
 
 
+def test_images_of_the_command_are_in_the_strip_in_their_order(page: Page, photo: Path) -> None:
+    other = photo.with_name("second.png")
+    write_photograph(Photograph(cat().flip(3)), other)
+    editor = Editor(page.editor._photographs)
+    editor.build((other, photo))
+    editor._begin(other, "")
+    page.finish()
+    assert [shot.name for shot in editor._shots.values()] == ["second.png", "cat.png"]
+    assert editor.session is not None
+    assert editor.session.name == "second.png"
+
+
 def test_proportions_end_with_a_crop_that_lacks_them(opened: Page) -> None:
     editor, session = opened.editor, opened.session
     other = Editor(editor._photographs)  # a second tab, which shows the same photograph
-    other.build(None)
+    other.build(())
     other.session = session
     changes: list[Callable[[], object]] = [
         lambda: (editor._undo(), editor._undo()),

@@ -18,7 +18,7 @@ from nlfilter_torch.photo.app.page import EDITORS, Pages
 @pytest.fixture
 def pages(client: Client, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Pages:
     monkeypatch.setattr(background_tasks, "create", lambda work: work.close())
-    return Pages(Library(tmp_path), None)
+    return Pages(Library(tmp_path), ())
 
 
 def test_pictures_are_for_those_who_know_their_address(pages: Pages) -> None:
