@@ -1,9 +1,9 @@
 """What denoising gains on photographs with the noise of cameras: ``python -m benchmarks.real_noise FOLDER``.
 
 The folder holds pairs of one shot and the mean of many, ``NAME_real.*`` and ``NAME_mean.*`` (or ``_noisy`` and
-``_clean``). The table shows, for each pair, PSNR of the shot, of ``denoise`` without being told anything, told the true
-profile and the true deviation, the gain over the shot, and the level and coarseness that were estimated. Then follow
-the means, the worst pair, and estimates over the truth by scale. ``--set`` selects the pairs that
+``_clean``). The table shows, for each pair, PSNR of the shot, of ``denoise(grain=0)`` without being told anything,
+told the true profile and the true deviation, the gain over the shot, and the level and coarseness that were estimated.
+Then follow the means, the worst pair, and estimates over the truth by scale. ``--set`` selects the pairs that
 ``benchmarks/camera_noise.txt`` lists for choosing or for reporting; ``--peers`` adds CBM3D and the non-local means of
 scikit-image and OpenCV, all told the true deviation, the latter with the best of four strengths for each picture.
 
@@ -98,7 +98,7 @@ def row_of(name: str, noisy: Tensor, clean: Tensor, peers: Sequence[str]) -> Row
     deviation = float(noise.std())
     results = {
         "noisy": noisy,
-        "ours": denoise(noisy),
+        "ours": denoise(noisy, grain=0),
         "told the profile": denoise(noisy, noise_level=truth),
         "told the deviation": denoise(noisy, noise_level=deviation),
     }
@@ -143,7 +143,7 @@ def clean_photographs(folder: Path, *, quick: bool) -> None:
     for name, picture in pictures(folder, UNREDUCED, ()).items():
         clean = picture[QUICK] if quick else picture
         levels.append(255 * float(noise_profile(clean).level))
-        kept.append(psnr(denoise(clean), clean))
+        kept.append(psnr(denoise(clean, grain=0), clean))
         print(f"{name:38} {levels[-1]:6.2f} levels {kept[-1]:7.1f} dB to itself", flush=True)
     print(f"median {statistics.median(levels):.2f} levels, {statistics.median(kept):.1f} dB; least {min(kept):.1f} dB")
 

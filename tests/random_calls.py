@@ -423,6 +423,7 @@ FUNCTIONS = {
             "strength": _number(0, 3),
             "brightness": _number(0, 1),
             "colour": _number(0, 1),
+            "grain": _number(0, 1),
             "method": _one_of("network", "rule"),
             "photometric_bandwidth": _plain(0.03, 0.5),
         },

@@ -90,7 +90,7 @@ METHODS: dict[str, Method] = {
     "noisy": lambda case: case.noisy,
     "ours": lambda case: network(None)(case),
     "ours, 4 turns": lambda case: network(None, turns=4)(case),
-    "ours, measured": lambda case: denoise(case.noisy),
+    "ours, measured": lambda case: denoise(case.noisy, grain=0),
     "rule": lambda case: denoise(case.noisy, method="rule", noise_level=case.noise),
     "BM3D": bm3d,
     "scikit-image NLM": nlm,

@@ -69,7 +69,8 @@ class Control:
         """The values of the step's parameters for a value of the slider."""
         name = self.parameter.name
         if self.slider.none is not None:
-            return {name: None if value == self.slider.none else round(value)}
+            number = round(value) if self.slider.step >= 1 else round(value, 4)
+            return {name: None if value == self.slider.none else number}
         value = round(value, 4)
         if self.index is None:
             return {name: value}
@@ -84,7 +85,7 @@ class Control:
         ['2.0 %', '2']
         """
         if value == self.slider.none:
-            return "all" if self.parameter.kind == "count" else "as it is"
+            return self.slider.none_text
         return f"{digits(value, self.slider.step)} {SYMBOLS.get(self.parameter.unit, '')}".rstrip()
 
 

@@ -82,6 +82,7 @@ class Slider:
         high: upper end of its range.
         step: difference between adjacent values.
         none: value that stands for None, if there is one.
+        none_text: what the editor shows for it.
         live: whether the picture is updated while the slider moves, not only when it is released.
         knots: ascending values at which the preview computes an edit that is too slow to follow the slider; between
             them it interpolates. Empty for other edits.
@@ -92,6 +93,7 @@ class Slider:
     high: float
     step: float
     none: float | None = None
+    none_text: str = "as it is"
     live: bool = True
     knots: tuple[float, ...] = ()
 

@@ -308,6 +308,18 @@ DENOISE = Edit(
             "In colour",
         ),
         number(
+            "grain",
+            None,
+            "Share of the finest grain of brightness that is kept. Default: up to 0.2 for estimated noise of more than "
+            "2 grey levels, else 0.",
+            (0, 1),
+            domain="share",
+            optional=True,
+            metavar="0...1",
+            slider=Slider("Grain", -0.05, 1, 0.05, none=-0.05, none_text="automatic", live=False),
+            per_image=True,
+        ),
+        number(
             "noise_level",
             None,
             "Standard deviation of the noise in grey levels of 255. Default: estimated from the photograph.",
@@ -566,7 +578,7 @@ ABSTRACT = Edit(
             optional=True,
             idle=None,
             metavar="N",
-            slider=Slider("Tones", 1, 16, 1, none=1),
+            slider=Slider("Tones", 1, 16, 1, none=1, none_text="all"),
         ),
         VIEWING_SIZE,
         *filter_parameters(bandwidth="auto", share=0.15, patch_size=3, landmarks=200, auto=True),

@@ -3,12 +3,13 @@
 Paper: Sec. III, Fig. 6(c), (d); Sec. V.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import ClassVar, Literal, Self
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from nlfilter_torch.core.blocks import Inner
@@ -23,6 +24,7 @@ from nlfilter_torch.nn.denoiser.network import NonlocalDenoiser, deviation_of, l
 from nlfilter_torch.nn.denoiser.noise import Noise
 from nlfilter_torch.nn.denoiser.profile import NoiseProfile
 from nlfilter_torch.nn.denoiser.tiles import STEP
+from nlfilter_torch.operator.features import reduce_channels
 from nlfilter_torch.operator.options import Completion, FilterOptions, GuideChannels, Sampling
 from nlfilter_torch.photo.declared.declaration import Edit
 from nlfilter_torch.photo.declared.parameters import DENOISE
@@ -45,6 +47,8 @@ WHITE_LEVELS = 64  # standard deviation in grey levels that is white in a map of
 COARSE = 1.2  # coarseness from which noise is called coarse
 EVEN = 0.02  # relative difference between the levels in black and white below which they are the same
 NO_ESTIMATE = ": too small, too few colours or too much black and white to estimate noise, which --noise-level sets"
+GRAIN = 0.2  # share of the finest grain that is kept by default, chosen by eye: at 0.5, traces of JPEG show in it
+GRAIN_LEVELS = (2.0, 4.0)  # grey levels of estimated noise between which that share rises from 0
 NEGLIGIBLE_NOISE = 0.1 / LEVELS  # noise level below what 8 bits resolve; the image is returned unchanged
 
 
@@ -55,6 +59,7 @@ def denoise(
     strength: float | Tensor = DENOISE.defaults["strength"],
     brightness: float | Tensor = DENOISE.defaults["brightness"],
     colour: float | Tensor = DENOISE.defaults["colour"],
+    grain: float | Tensor | None = DENOISE.defaults["grain"],
     method: Method = DENOISE.defaults["method"],
     photometric_bandwidth: float | Tensor | None = None,
     spatial_bandwidth: float | Tensor | None = None,
@@ -83,6 +88,10 @@ def denoise(
             (B,): 0 leaves luminance, and with it the grain, unchanged. Of images other than RGB it is the share of the
             whole change. Hot pixels count as noise.
         colour: the same for chroma, the difference between RGB and luminance.
+        grain: share of the finest grain that is kept, from 0 to 1, a number or a tensor of shape () or (B,): of the
+            luminance of the removed noise, less its mean over 3x3 pixels; of images other than RGB, of each channel.
+            None keeps a share that rises from 0 at an estimated level of 2 grey levels to 0.2 at 4 and more, and none
+            where the level is given or with the rule.
         method: ``"network"`` or ``"rule"``. All further arguments are for the rule.
         photometric_bandwidth: h_y; None is the noise level.
         spatial_bandwidth: h_x in pixels; None is 0.2 of the short side.
@@ -95,7 +104,7 @@ def denoise(
 
     Returns:
         (B, C, H, W), equal to ``image`` where the noise level is less than a tenth of a grey level. Differentiable in
-        image and noise level; an estimated level counts as a constant.
+        image, noise level and shares; an estimated level counts as a constant.
 
     Raises:
         TypeError, ValueError: if ``image`` is not a finite floating-point tensor, or ``noise_level`` is negative.
@@ -126,6 +135,7 @@ class Denoise(PhotoEdit):
     method: Method
     brightness: float | Tensor = DENOISE.defaults["brightness"]
     colour: float | Tensor = DENOISE.defaults["colour"]
+    grain: float | Tensor | None = DENOISE.defaults["grain"]
     working: WorkingRange | None = None
     hot_pixels: HotPixels | None = None
 
@@ -137,6 +147,7 @@ class Denoise(PhotoEdit):
     def fit(self, source: Source[M], drawn: Drawn[M]) -> Fitted:
         """Fit the network, or the sliders of the rule."""
         DENOISE.check(source.batch, strength=self.strength, brightness=self.brightness, colour=self.colour)
+        DENOISE.check(source.batch, grain=self.grain)
         DENOISE.check(method=self.method)
         fitted = self._fit(source)
         return fitted if _are(1, self.brightness, self.colour) else fitted.then(self.in_parts)
@@ -151,7 +162,9 @@ class Denoise(PhotoEdit):
         if not isinstance(self.noise_level, (Noise, NoiseProfile)) and not is_map:
             DENOISE.check(source.batch, noise_level=self.noise_level)
         hot_pixels = self._hot_pixels_of(source) if self.hot_pixels is None else self.hot_pixels
-        noise = self._estimated(source, hot_pixels) if self.noise_level is None else self.noise_level
+        edit = self._with(source, hot_pixels)
+        noise = edit.noise_level
+        assert noise is not None
         if isinstance(noise, NoiseProfile) and len(noise.levels) not in (1, source.batch):
             raise ValueError(
                 f"noise_level must be the profile of 1 or {source.batch} images, got {len(noise.levels)}; select some"
@@ -162,7 +175,7 @@ class Denoise(PhotoEdit):
                     source,
                     "noise_level must be a number for a picture processed in tiles, got a map; denoise it in memory",
                 )
-            denoising = NetworkDenoising(replace(self, hot_pixels=hot_pixels), noise)
+            denoising = NetworkDenoising(edit, noise)
             repaired = None if hot_pixels is None else denoising.repaired
             return Fitted(first_channel, denoising.finish, margin=2 * STEP, step=STEP, repaired=repaired)
         if is_map:
@@ -182,7 +195,11 @@ class Denoise(PhotoEdit):
         layers = operator.layers(whole_image, ORDER)  # (B, ORDER+1, C, H, W)
         energy = operator.layers(partial(_energy, layers), 1)  # of planes (B, ORDER, H, W)
         noise = assumed.square().reshape(-1, 1) * _noise_in_layers(operator, pixels)  # (B, ORDER)
-        return Fitted(RuleDenoising(layers, energy, noise, level))
+        denoising = RuleDenoising(layers, energy, noise, level)
+        return Fitted(denoising) if self.kept_grain is None else Fitted(denoising, self._finish_rule, margin=1)
+
+    def _finish_rule(self, image: Tensor, denoised: Tensor, _: Inner) -> Tensor:
+        return with_grain(image, denoised, self.kept_grain)
 
     def measured(self, source: Source[M]) -> Self:
         """Return the edit with hot pixels of the picture, and its noise if the level is not set, as it sees both."""
@@ -194,9 +211,21 @@ class Denoise(PhotoEdit):
     def _measured(self, source: Source[M]) -> Self:
         if self.noise_level is not None and self.hot_pixels is not None:
             return self
-        hot_pixels = self._hot_pixels_of(source)
-        noise = self._estimated(source, hot_pixels) if self.noise_level is None else self.noise_level
-        return replace(self, noise_level=noise, hot_pixels=hot_pixels)
+        return self._with(source, self._hot_pixels_of(source))
+
+    def _with(self, source: Source[M], hot_pixels: HotPixels | None) -> Self:
+        """The edit with the hot pixels of a picture and, if the level is not set, its noise and the grain to keep."""
+        if self.noise_level is not None:
+            return replace(self, hot_pixels=hot_pixels)
+        noise, grain, (least, full) = self._estimated(source, hot_pixels), self.grain, GRAIN_LEVELS
+        if grain is None and self.method == "network":
+            grain = GRAIN * ((LEVELS * noise.level - least) / (full - least)).clamp(0, 1)
+        return replace(self, noise_level=noise, hot_pixels=hot_pixels, grain=grain)
+
+    @property
+    def kept_grain(self) -> float | Tensor | None:
+        """The share of the finest grain that is kept, or None if it is 0 for all images."""
+        return None if _are(0, self.grain) else self.grain
 
     def _hot_pixels_of(self, source: Source[M]) -> HotPixels | None:
         """The hot pixels of a picture; None if nothing is to be changed, or for the rule."""
@@ -224,7 +253,7 @@ class Denoise(PhotoEdit):
         return ((luminance + 2 / 3 * colour).sqrt() * (LEVELS / WHITE_LEVELS)).clamp(0, 1)
 
     def standard_error(self, image: Tensor, weights: Tensor | None) -> Tensor:
-        """Standard errors (B, C, H, W) of the denoised pixels of an image, by an edit with a known noise level."""
+        """Standard errors (B, C, H, W) of the pixels as denoised, kept grain included, with a known noise level."""
         seen = image if self.working is None else self.working.seen(image)
         noise = self.noise_level.at(seen) if isinstance(self.noise_level, Noise) else self.noise_level
         assert noise is not None
@@ -254,6 +283,9 @@ class Denoise(PhotoEdit):
             size, changed = (self.working.described(share / LEVELS) for share in (level, change))
             changed, least = f"pixels changed by {changed} (RMS)", f"{100 * NEGLIGIBLE_NOISE:.2g} %"
         text = f"denoise: {'estimated' if estimated else 'given'} noise of {size}{_described(noise)}"
+        grain = 0.0 if self.grain is None else float(self.grain)
+        if round(grain, 2) and level >= LEVELS * NEGLIGIBLE_NOISE:
+            text += f"; {100 * grain:.0f} % of the finest grain kept (--grain)"
         replaced = 0 if self.hot_pixels is None else int(self.hot_pixels.count.sum())
         if replaced:
             return f"{text}; {replaced} hot or dead pixel{'' if replaced == 1 else 's'} replaced; {changed}"
@@ -330,7 +362,25 @@ class NetworkDenoising:
         strength = per_image(self.edit.strength, levels, 4).expand(len(image), -1, -1, -1)
         levels = levels * strength.repeat_interleave(len(levels) // len(image), dim=0)
         levels = torch.where(deviation_of(levels) < NEGLIGIBLE_NOISE, torch.zeros_like(levels), levels)
-        return image - _network(image.device, image.dtype).estimate_in_tiles(image, levels, turns=1, inner=inner)
+        grain, network = self.edit.kept_grain, _network(image.device, image.dtype)
+        needed = inner if grain is None else _with_neighbours(inner, image.shape[-2:])
+        denoised = image - network.estimate_in_tiles(image, levels, turns=1, inner=needed)
+        return with_grain(image, denoised, grain)
+
+
+def with_grain(image: Tensor, denoised: Tensor, grain: float | Tensor | None) -> Tensor:
+    """The denoised image with a share of the finest scale of the luminance of what was removed; None is no share."""
+    if grain is None:
+        return denoised
+    removed = reduce_channels(image - denoised, "luminance")
+    finest = removed - F.avg_pool2d(removed, 3, 1, padding=1, count_include_pad=False)
+    return denoised + per_image(grain, finest, 4) * finest
+
+
+def _with_neighbours(inner: Inner, size: Sequence[int]) -> Inner:
+    """A part of an image, and the pixels beside it."""
+    rows, columns = (part.indices(length) for part, length in zip(inner, size, strict=True))
+    return slice(max(rows[0] - 1, 0), rows[1] + 1), slice(max(columns[0] - 1, 0), columns[1] + 1)
 
 
 def _energy(layers: Planes, pixels: Pixels) -> Tensor:

@@ -41,6 +41,10 @@ def test_a_slider_can_stand_for_no_value() -> None:
     assert tones.entries(Recipe(), nothing) == {"tones": None}
     assert tones.entries(Recipe(), 6.4) == {"tones": 6}
     assert (tones.show(nothing), tones.show(6)) == ("all", "6")
+    (grain,) = [control for control in controls.OF_EDIT["denoise"] if control.parameter.name == "grain"]
+    assert grain.entries(Recipe(), grain.usual(Recipe())) == {"grain": None}
+    assert [grain.entries(Recipe(), value) for value in (0.0, 0.15)] == [{"grain": 0.0}, {"grain": 0.15}]
+    assert (grain.show(grain.usual(Recipe())), grain.show(0.15)) == ("automatic", "0.15")
 
 
 def test_a_slider_on_the_page(client: Client) -> None:

@@ -328,7 +328,8 @@ def test_estimated_noise_and_the_change_are_printed(
     photo, out = write(tmp_path / "in.tif", 10.0, alpha=alpha), tmp_path / "out.tif"
     assert main(["denoise", str(photo), str(out), "--landmarks", "40", *(["--full"] if tiled else [])]) == 0
     said = re.fullmatch(
-        r"denoise: estimated noise of ([\d.]+) grey levels; pixels changed by ([\d.]+) grey levels \(RMS\)\n",
+        r"denoise: estimated noise of ([\d.]+) grey levels; 20 % of the finest grain kept \(--grain\); "
+        r"pixels changed by ([\d.]+) grey levels \(RMS\)\n",
         capsys.readouterr().out,
     )
     assert said is not None

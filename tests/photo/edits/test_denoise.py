@@ -1,12 +1,13 @@
 """Denoising: photographs come closer to the originals, and noise is estimated."""
 
-from typing import Literal
+from typing import Any, Literal
 
+import numpy as np
 import pytest
 import torch
 
 from nlfilter_torch import NoiseProfile, estimate_noise
-from nlfilter_torch.photo import denoise
+from nlfilter_torch.photo import denoise, stream
 from nlfilter_torch.photo.declared.steps import Step
 from nlfilter_torch.photo.edits.applying import apply_step
 from nlfilter_torch.photo.picture.colour import split_luminance
@@ -100,3 +101,72 @@ def test_shares_of_noise_in_steps_and_for_each_image() -> None:
     torch.testing.assert_close(denoise(grey, colour=0.3), denoise(grey), atol=1e-6, rtol=0)
     with pytest.raises(ValueError, match="brightness must be in"):
         denoise(noisy, brightness=1.5)
+
+
+def finest(noise: torch.Tensor) -> torch.Tensor:
+    """What differs from the mean of the 3x3 pixels around it in the luminance of noise, but in the outermost pixels."""
+    luminance = split_luminance(noise)[0]
+    return luminance[..., 1:-1, 1:-1] - luminance.unfold(2, 3, 1).unfold(3, 3, 1).mean((-2, -1))
+
+
+def grainy(level: float, height: int = 40, width: int = 56) -> torch.Tensor:
+    """A photograph with white noise of so many grey levels."""
+    noise = torch.randn(1, 3, height, width, generator=torch.Generator().manual_seed(0))
+    return colour("chelsea", height, width) + level / 255 * noise
+
+
+@pytest.mark.parametrize("method", ["network", "rule"])
+@pytest.mark.parametrize("share", [1, 0.3])
+def test_grain_is_the_finest_scale_of_the_luminance_of_removed_noise(
+    method: Literal["network", "rule"], share: float
+) -> None:
+    noisy = grainy(12)
+    smooth, kept = (
+        denoise(noisy, noise_level=12 / 255, method=method, num_landmarks=40, grain=grain) for grain in (0, share)
+    )
+    assert torch.equal(smooth, denoise(noisy, noise_level=12 / 255, method=method, num_landmarks=40))
+    wanted = share * finest(noisy - smooth).expand(-1, 3, -1, -1)
+    assert wanted.std() > share * 3 / 255
+    torch.testing.assert_close((kept - smooth)[..., 1:-1, 1:-1], wanted, atol=1e-6, rtol=0)
+    assert torch.equal(denoise(noisy, strength=0.0, grain=share), noisy)
+    assert torch.equal(
+        denoise(noisy[..., :1, :1], noise_level=0.1, grain=share), denoise(noisy[..., :1, :1], noise_level=0.1)
+    )
+
+
+def test_a_little_grain_is_kept_where_much_noise_is_estimated() -> None:
+    noise = torch.randn(1, 3, 96, 96, generator=torch.Generator().manual_seed(0))
+    for level, least, most in ((8.0, 0.2, 0.2), (3.0, 0.05, 0.15), (1.0, 0.0, 0.0)):
+        noisy = torch.linspace(0.1, 0.9, 96) + level / 255 * noise
+        smooth, usual = denoise(noisy, grain=0), denoise(noisy)
+        grain = finest(noisy - smooth)
+        change = split_luminance(usual - smooth)[0][..., 1:-1, 1:-1]
+        share = float((change * grain).sum() / grain.square().sum())
+        assert least - 1e-3 <= share <= most + 1e-3
+    assert torch.equal(
+        denoise(noisy, method="rule", num_landmarks=40), denoise(noisy, method="rule", num_landmarks=40, grain=0)
+    )
+
+
+def test_grain_of_each_image_and_its_gradient() -> None:
+    noisy = grainy(12, 24, 32).double().expand(2, -1, -1, -1)
+    shares = torch.tensor([0.0, 0.6], dtype=torch.float64, requires_grad=True)
+    both = denoise(noisy, noise_level=12 / 255, grain=shares)
+    alone = [denoise(noisy[:1], noise_level=12 / 255, grain=share) for share in (0, 0.6)]
+    torch.testing.assert_close(both, torch.cat(alone), atol=1e-6, rtol=0)
+    (gradient,) = torch.autograd.grad(both.square().sum((1, 2, 3)).sum(), shares)
+    change = (alone[1] - alone[0]) / 0.6
+    wanted = torch.stack([2 * (result * change).sum() for result in alone])
+    torch.testing.assert_close(gradient, wanted, atol=1e-4, rtol=1e-4)
+
+
+@pytest.mark.parametrize(
+    "values", [{"noise_level": 12.0}, {}, {"method": "rule", "landmarks": 40, "sampling": "uniform"}]
+)
+def test_grain_in_tiles_is_that_in_memory(values: dict[str, Any]) -> None:
+    noisy = grainy(12, 420, 40)
+    step = Step("denoise", grain=1.0, **values)
+    tiled = np.empty((420, 40, 3), np.float32)
+    stream(step, noisy[0].movedim(0, 2).contiguous().numpy(), tiled, tile_rows=16)
+    wanted = apply_step(step, noisy)
+    torch.testing.assert_close(torch.from_numpy(tiled).movedim(2, 0)[None], wanted, atol=2e-5, rtol=0)
