@@ -1,8 +1,8 @@
 """How well the filter judges and tunes itself without the truth: ``python -m benchmarks.self_calibration FOLDER``.
 
 W compares patches of the noisy picture itself, slightly blurred, and three sliders are fitted by ``fit_alpha``. Printed
-are, for white noise of several levels, for noise of a sensor (its variance grows with the light) and for photographs of
-simulated cameras:
+are, for white noise of several levels, for noise of a sensor (its variance grows with the light), for photographs of
+simulated cameras, and for these with noise that is drawn from the profiles of the cameras' noise:
 
 - the squared error that ``sure`` estimates over the true one, of whole pictures, with sliders fitted to the noise;
 - on the middle of each picture, 256x256 pixels, how far bandwidth and sliders found by the gradient of the estimate lie
@@ -15,7 +15,7 @@ Nothing was chosen on the pictures of Kodak.
 import statistics
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -158,6 +158,14 @@ def of_cameras(images: dict[str, Tensor]) -> Iterator[Case]:
                 break
 
 
+def of_profiles(images: dict[str, Tensor]) -> Iterator[Case]:
+    """The photographs of :func:`of_cameras` with normal noise that their profiles describe in full."""
+    for number, case in enumerate(of_cameras(images)):
+        assert isinstance(case.noise, NoiseProfile)
+        noise = case.noise.draw(case.clean, torch.Generator().manual_seed(4000 + number))
+        yield replace(case, noisy=case.clean + noise)
+
+
 def judged(kind: str, cases: Iterator[Case]) -> Figure:
     """Share of the pictures whose estimated error is near the true one."""
     ratios, unexplained = [], []
@@ -205,6 +213,7 @@ def figures(images: dict[str, Tensor], parts: Sequence[str]) -> Iterator[Figure]
     """All figures, one after another."""
     kinds = {f"white noise of {level}": lambda level=level: white(images, level) for level in LEVELS}
     kinds |= {"sensors": lambda: of_sensors(images), "cameras": lambda: of_cameras(images)}
+    kinds |= {"profiles of cameras": lambda: of_profiles(images)}
     for kind, cases in kinds.items():
         if "judge" in parts:
             yield judged(kind, cases())

@@ -56,10 +56,15 @@ def variance_of(noise: float | Tensor | NoiseModel, image: Tensor) -> Tensor:
 def drawn(noise: float | Tensor | NoiseModel, image: Tensor, generator: torch.Generator) -> Tensor:
     """A random field (B, C, H, W) with the covariance of the noise of an image: random signs where it is white.
 
-    Signs estimate traces with the least variance (Hutchinson, 1990): they add no error on the diagonal.
+    Signs estimate traces with the least variance (Hutchinson, 1990): they add no error on the diagonal. Coarse noise
+    has few independent values, and the power of a field deviates: it is set to that of the noise.
     """
     if isinstance(noise, NoiseModel):
-        return noise.draw(image.detach(), generator)
+        field = noise.draw(image.detach(), generator)
+        wanted, power = (
+            values.double().flatten(1).mean(1) for values in (noise.variance(image.detach()), field.double().square())
+        )
+        return field * per_image(torch.where(power > 0, wanted / power, 0.0).sqrt(), field, field.ndim)
     return noise_map(noise, image).detach() * random_signs(tuple(image.shape), image, generator)
 
 

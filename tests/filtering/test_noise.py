@@ -27,7 +27,24 @@ def test_samples_are_normal_where_fields_are_signs() -> None:
     torch.testing.assert_close(field.std(), torch.tensor(0.1, dtype=field.dtype), rtol=0.02, atol=0)
     torch.testing.assert_close((field.abs() < 0.1).double().mean(), torch.tensor(0.6827).double(), rtol=0, atol=0.01)
     profile = NoiseProfile.white(torch.tensor([0.1]), channels=1)
-    assert torch.equal(sampled(profile, image, seeded(1)), drawn(profile, image, seeded(1)))
+    field = sampled(profile, image, seeded(1))
+    torch.testing.assert_close(field.std(), torch.tensor(0.1, dtype=field.dtype), rtol=0.02, atol=0)
+    probe = drawn(profile, image, seeded(1))
+    torch.testing.assert_close(probe / field, (probe / field).mean().expand_as(field))
+    torch.testing.assert_close(probe.square().mean(), variance_of(profile, image).mean().to(probe))
+
+
+def test_drawn_noise_of_cameras_has_its_power_at_every_brightness() -> None:
+    # Squared levels that fit badly: of smoothed and sharpened luminance, and of blotches of colour.
+    squares = torch.tensor([[16.5, 46.5, 98.3, 184.4, 359.2], [6.9, 24.7, 78.9, 175.6, 254.3]]) / 255**2
+    levels = squares.sqrt().mT[None, :, :, None] * torch.linspace(0.5, 1.5, 6)
+    profile = NoiseProfile(levels, torch.tensor([0.5]))
+    for light in (0.1, 0.9):
+        image = torch.full((8, 3, 96, 96), light)
+        field = sampled(profile, image, seeded(2))
+        torch.testing.assert_close(field.square().mean(), variance_of(profile, image).mean(), rtol=0.05, atol=0)
+    assert not sampled(profile.scaled(0.0), image, seeded()).any()
+    assert not drawn(profile.scaled(0.0), image, seeded()).any()
 
 
 def test_fields_of_a_profile_have_its_levels_at_every_scale() -> None:

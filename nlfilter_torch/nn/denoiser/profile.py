@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
+import numpy.typing as npt
 import torch
 import torch.nn.functional as F
 from scipy.optimize import nnls
@@ -18,6 +19,7 @@ from nlfilter_torch.filtering.noise import random_normal
 KNOTS = 6  # brightnesses at which levels are known: 0, 0.2, ... 1
 STIFFNESS = 4  # number of blocks that outweigh the assumption that variances at neighbouring knots are the same
 STIFFEST = 1e-4  # the same as a share of all blocks, which keeps the fit well-conditioned
+NEGLIGIBLE = 1e-3  # squared level, over the largest of all scales, below which errors count no more
 
 
 @dataclass(frozen=True)
@@ -109,27 +111,37 @@ class NoiseProfile:
     def draw(self, image: Tensor, generator: torch.Generator) -> Tensor:
         """A random field (B, C, H, W) with the levels of the noise of an image (B, C, H, W) at every scale.
 
-        It is a sum of means of white noise over blocks of 1, 2, ... 16 pixels around each, whose variances are fitted
-        to the squared levels at each brightness.
+        It is a sum of weighted means of white noise, with the smooth weights of :func:`_tent` for each scale. Their
+        variances are fitted to the squared levels at each brightness, and add up to that of a pixel.
         """
         channels, (height, width) = image.shape[1], image.shape[2:]
         deviations = replace(self, levels=self._parts().to(image)).at(image).unflatten(1, (-1, 2))  # (B, S, 2, H, W)
         total = torch.zeros_like(image)
         for scale, part in zip(self.SCALES, deviations.unbind(1), strict=True):
-            size = height + scale - 1, width + scale - 1
-            field = scale * F.avg_pool2d(random_normal((len(image), channels, *size), image, generator), scale, 1)
+            tent = torch.from_numpy(_tent(scale)).to(image).view(1, 1, -1, 1)
+            size = height + 2 * scale - 2, width + 2 * scale - 2
+            field = random_normal((len(image), channels, *size), image, generator).flatten(0, 1).unsqueeze(1)
+            field = F.conv2d(F.conv2d(field, tent), tent.mT).view_as(image)
             total = total + (part[:, (0, 1, 1)] if channels == 3 else part[:, :1]) * field
         return join_colours(total, 3) if channels == 3 else total
 
     def _parts(self) -> Tensor:
-        """Deviations (B, S, 2, K) of means over blocks of each scale, which together have the levels."""
-        scales = np.array(self.SCALES)
-        # Blocks of side t around two pixels at a distance d share 1 - d / t of their pixels along each axis.
-        distances = [np.abs(np.subtract.outer(np.arange(s), np.arange(s))) for s in scales]
-        together = np.array([[np.clip(1 - d / t, 0, None).mean() for t in scales] for d in distances])
-        gains = (scales[:, None] * together) ** 2  # squared level at scale s for a unit of variance on blocks of side t
+        """Deviations (B, S, 2, K) of weighted means of each scale, which together have the levels."""
+        gains = np.empty((len(self.SCALES), len(self.SCALES)))  # squared level at a scale for a unit of each variance
+        for row, scale in enumerate(self.SCALES):
+            distances = np.abs(np.subtract.outer(np.arange(scale), np.arange(scale)))
+            for column, side in enumerate(self.SCALES):
+                products = np.correlate(_tent(side), _tent(side), "full")[2 * side - 2 :]
+                products = np.pad(products, (0, max(self.SCALES)))
+                gains[row, column] = (products[distances].sum() / scale) ** 2
         squares = self.levels.detach().double().square().transpose(1, 3)  # (B, K, 2, S)
-        rows = [nnls(gains, row)[0] for row in squares.flatten(0, 2).cpu().numpy()]
+        rows = []
+        for levels in squares.flatten(0, 2).cpu().numpy():
+            # Coarse levels are often the largest: errors count as shares of each. The first is the power and holds.
+            relative = levels / max(levels.max(), np.finfo(float).tiny)
+            shares = 1 / np.maximum(relative, NEGLIGIBLE)
+            parts, _ = nnls(gains * shares[:, None], relative * shares)
+            rows.append(parts * levels[0] / max(parts.sum(), np.finfo(float).tiny))
         return torch.from_numpy(np.stack(rows)).sqrt().to(self.levels).view_as(squares).transpose(1, 3)
 
     def _deviation(self, scale: int) -> Tensor:
@@ -143,6 +155,12 @@ class NoiseProfile:
         luminance, colour = torch.lerp(ends[0], ends[1], share).unbind(1)
         # The differences have coefficients of unit norm: their variances are shared by the three channels.
         return (luminance + 2 / 3 * colour).sqrt()
+
+
+def _tent(side: int) -> npt.NDArray[np.float64]:
+    """Weights (2 side - 1,) of a mean of means over ``side`` values, whose squares add up to 1."""
+    weights = np.convolve(np.ones(side), np.ones(side))
+    return weights / np.linalg.norm(weights)
 
 
 @torch.no_grad()
