@@ -74,9 +74,9 @@ def standard_error(
         generator: of the noise that is added; None draws the same in every call.
 
     Returns:
-        (B, C, H, W), not negative, in the units and dtype of the image: ``function(image)`` plus and minus 1.645 times
-        it is meant to hold the true value of 90 % of the pixels, among flat and textured ones alike. Tails are heavier
-        than those of a normal distribution. 0 where there is no noise. No gradient is propagated.
+        (B, C, H, W), not negative, in the units and dtype of the image. The range of 1.645 times it to either side of
+        ``function(image)`` is meant to hold the true value of 90 % of the pixels, among flat and textured ones alike.
+        Tails are heavier than those of a normal distribution. 0 where there is no noise. No gradient is propagated.
 
     Raises:
         TypeError, ValueError: if ``image`` is not a finite floating-point (B, C, H, W) tensor, ``noise`` is negative or

@@ -111,8 +111,8 @@ class NoiseProfile:
     def draw(self, image: Tensor, generator: torch.Generator) -> Tensor:
         """A random field (B, C, H, W) with the levels of the noise of an image (B, C, H, W) at every scale.
 
-        It is a sum of weighted means of white noise, with the smooth weights of :func:`_tent` for each scale. Their
-        variances are fitted to the squared levels at each brightness, and add up to that of a pixel.
+        It is a sum of weighted means of white noise, with smooth weights for each scale. Their variances are fitted to
+        the squared levels at each brightness, and add up to that of a pixel.
         """
         channels, (height, width) = image.shape[1], image.shape[2:]
         deviations = replace(self, levels=self._parts().to(image)).at(image).unflatten(1, (-1, 2))  # (B, S, 2, H, W)

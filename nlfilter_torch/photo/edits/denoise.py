@@ -48,7 +48,7 @@ COARSE = 1.2  # coarseness from which noise is called coarse
 EVEN = 0.02  # relative difference between the levels in black and white below which they are the same
 NO_ESTIMATE = ": too small, too few colours or too much black and white to estimate noise, which --noise-level sets"
 GRAIN = 0.2  # share of the finest grain that is kept by default, chosen by eye: at 0.5, traces of JPEG show in it
-GRAIN_LEVELS = (2.0, 4.0)  # grey levels of estimated noise between which that share rises from 0
+GRAIN_LEVELS = (2.0, 4.0)  # grey levels of estimated noise between which that share rises from 0; it falls beyond them
 NEGLIGIBLE_NOISE = 0.1 / LEVELS  # noise level below what 8 bits resolve; the image is returned unchanged
 
 
@@ -90,8 +90,9 @@ def denoise(
         colour: the same for chroma, the difference between RGB and luminance.
         grain: share of the finest grain that is kept, from 0 to 1, a number or a tensor of shape () or (B,): of the
             luminance of the removed noise, less its mean over 3x3 pixels; of images other than RGB, of each channel.
-            None keeps a share that rises from 0 at an estimated level of 2 grey levels to 0.2 at 4 and more, and none
-            where the level is given or with the rule.
+            None keeps a share that rises from 0 at an estimated level of 2 grey levels to 0.2 at 4 and then falls as
+            the level rises, so that the same amount of grain is kept; and none where the level is given or with the
+            rule.
         method: ``"network"`` or ``"rule"``. All further arguments are for the rule.
         photometric_bandwidth: h_y; None is the noise level.
         spatial_bandwidth: h_x in pixels; None is 0.2 of the short side.
@@ -219,7 +220,8 @@ class Denoise(PhotoEdit):
             return replace(self, hot_pixels=hot_pixels)
         noise, grain, (least, full) = self._estimated(source, hot_pixels), self.grain, GRAIN_LEVELS
         if grain is None and self.method == "network":
-            grain = GRAIN * ((LEVELS * noise.level - least) / (full - least)).clamp(0, 1)
+            level = LEVELS * noise.level
+            grain = GRAIN * ((level - least) / (full - least)).clamp(0, 1) * full / level.clamp(min=full)
         return replace(self, noise_level=noise, hot_pixels=hot_pixels, grain=grain)
 
     @property

@@ -52,8 +52,7 @@ def adjust_light(
     """Change light, white balance, tones and colours of a part of a photograph.
 
     The part is that of :func:`region_mask`, of which any share may be given as it is by ``added``: a gradient, say, or
-    a mask. Each pixel is a mixture of itself and of what :func:`~nlfilter_torch.photo.picture.light.develop_image`
-    makes of it, by its mask.
+    a mask. Each pixel is a mixture of itself and of what ``develop`` makes of it, by its mask.
 
     Args:
         image: (B, C, H, W) in [0, 1], C = 1 or 3, with the tone curve of sRGB. White balance and strength of colours
