@@ -38,6 +38,7 @@ START = 1.2  # bandwidth over the noise level
 BOUNDS = (0.3, 4.0)  # of that ratio
 GRID = 13  # bandwidths of the grids
 MOST = 15  # evaluations
+LEAST = 1e-3  # error over the variance of the noise; estimates may be negative
 SIDE, CAMERA_SIDE = 256, 320
 GUIDE_BLUR, LANDMARKS, STEP = 0.7, 100, 0.05
 NEAR, SMALL_LOSS = 0.03, 0.1  # relative error of the estimate, and loss in dB
@@ -102,8 +103,10 @@ class Held:
             with torch.no_grad():
                 alpha = fit_alpha(build, case.noisy, noise=case.noise, order=2)
             value = sure(lambda y: polynomial_filter(build(y), y, alpha), case.noisy, case.noise, step=STEP)
-            (value.sum() / case.level**2).backward()
-            return float(value.detach()) / case.level**2, free.grad.double().numpy()[None]
+            # Decreases are judged as shares: the error may be a small part of the noise.
+            logarithm_of_error = (value.sum() / case.level**2).clamp(min=LEAST).log()
+            logarithm_of_error.backward()
+            return float(logarithm_of_error.detach()), free.grad.double().numpy()[None]
 
         chosen = {"maxfun": 9, "maxls": 4, "ftol": 1e-3}  # a line search ends after the limit
         limits = [tuple(np.log(BOUNDS))]
