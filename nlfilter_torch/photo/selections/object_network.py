@@ -21,6 +21,7 @@ from nlfilter_torch.photo.selections.scribbled_colours import EPSILON
 
 TRAINED = Path(__file__).with_name("object_network.safetensors")
 TRAINED_PIXELS = 1 << 13  # of the reduced picture in which it was trained
+BLOCK = 1024  # pixels along an axis of which means are computed together
 SIGMAS = (1.5, 4.0, 10.0, 25.0)  # of means, in pixels of that picture: from a thin part to most of an object
 STROKES_ALONE = (
     0.75  # share of its odds where strokes on the object are all that is told: it takes in what neither side explains
@@ -158,14 +159,19 @@ def nearby(pooled: Tensor, look: Tensor, shares: Tensor, means: Tensor, sigma: f
 
 def blurred(planes: Tensor, sigma: float) -> Tensor:
     """Gaussian means (C, h, w) of pixels in the picture; sigma is for :data:`TRAINED_PIXELS` in all."""
-    height, width = planes.shape[-2:]
-    sigma = sigma * math.sqrt(height * width / TRAINED_PIXELS)
-    down, along = (
-        torch.exp(-0.5 * ((places.unsqueeze(1) - places) / sigma).square())
-        for places in (torch.arange(length, device=planes.device).to(planes) for length in (height, width))
-    )
-    down, along = (kernel / kernel.sum(1, keepdim=True) for kernel in (down, along))
-    return down @ planes @ along.mT
+    sigma *= math.sqrt(planes.shape[-2] * planes.shape[-1] / TRAINED_PIXELS)
+    return _blurred_along(_blurred_along(planes.mT, sigma).mT, sigma)
+
+
+def _blurred_along(planes: Tensor, sigma: float) -> Tensor:
+    """:func:`blurred` of planes (C, h, w) along their rows, in blocks, as these may be long in a narrow picture."""
+    length, reach, blocks = planes.shape[-1], math.ceil(6 * sigma), []
+    at = torch.arange(length, device=planes.device).to(planes)
+    for first in range(0, length, BLOCK):
+        near = slice(max(first - reach, 0), first + BLOCK + reach)
+        kernel = torch.exp(-0.5 * ((at[first : first + BLOCK].unsqueeze(1) - at[near]) / sigma).square())
+        blocks.append(planes[..., near] @ (kernel / kernel.sum(1, keepdim=True)).mT)
+    return torch.cat(blocks, dim=-1)
 
 
 def places(share: Tensor, free: Tensor) -> list[Tensor]:

@@ -84,3 +84,10 @@ def test_means_are_of_pixels_in_the_picture() -> None:
     weights = torch.exp(-squared / (2 * 2.0**2))
     wanted = (planes * weights).sum((1, 2)) / weights.sum()
     torch.testing.assert_close(blurred(planes, sigma)[:, 3, 1], wanted)
+
+
+def test_means_in_blocks_are_those_of_the_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+    planes = noise(3, 40, 150)
+    whole = blurred(planes, 1.5)
+    monkeypatch.setattr(object_network, "BLOCK", 16)
+    torch.testing.assert_close(blurred(planes, 1.5), whole, rtol=0, atol=1e-7)
