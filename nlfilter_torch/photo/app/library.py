@@ -53,13 +53,12 @@ class Library:
         if not images:
             return Library(folder)
         library = Library(folder, images[0].parent)
-
-        def open_it() -> None:
-            with suppress(Exception):
-                library.open(images[0])
-
-        Thread(target=open_it, daemon=True).start()
+        Thread(target=library._open_ahead, args=(images[0],), daemon=True).start()
         return library
+
+    def _open_ahead(self, image: Path) -> None:
+        with suppress(Exception):
+            self.open(image)
 
     def open(self, path: Path) -> Session:
         """The session of a file; raises as :class:`Session`."""
