@@ -8,7 +8,8 @@ import torch
 from nicegui import Client, ui
 from PIL import Image
 
-from nlfilter_torch.photo.app.tabs import THUMBNAIL, LookTab, look_entries, thumbnails
+from nlfilter_torch.photo.app.shots import THUMBNAIL
+from nlfilter_torch.photo.app.tabs import LookTab, look_entries, thumbnails
 from nlfilter_torch.photo.declared.presets import LOOKS, Recipe
 from nlfilter_torch.photo.edits.applying import apply_step
 from tests.photo.app.page_controls import Controls
