@@ -34,7 +34,6 @@ from nlfilter_torch.photo.declared.shared_parameters import (
 )
 
 CRISP = (2.2, 2.2, 2.2, 1.0)
-BACKGROUND_HELP = "A rectangle of the background, where too much is selected. May be repeated."
 PAINT = Scribble(
     "stroke_mask",
     "Paint",
@@ -59,6 +58,14 @@ REMOVE = Scribble(
 )
 BOX_HELP = "A rectangle around the whole object, outside which nothing is selected; --region may be left out then."
 BOX = Scribble("box", "Around it", role="box", option="--box", option_help=BOX_HELP)
+BACKGROUND = Scribble(
+    "background",
+    "Not this",
+    role="background",
+    option="--background",
+    option_help="A rectangle of the background, where too much is selected. May be repeated.",
+)
+BESIDE_OBJECTS = (BACKGROUND, BOX, ADD, REMOVE)  # what masks of objects take beside scribbles on them
 
 DETAIL = Edit(
     "detail",
@@ -135,7 +142,7 @@ DETAIL = Edit(
     hint="Paint on an area to give it its own sliders; everything that resembles it is selected too.",
     scribbles=(
         Scribble("regions", "Edit this", "sliders"),
-        Scribble("negative", "Not this", role="background", option="--background", option_help=BACKGROUND_HELP),
+        replace(BACKGROUND, argument="negative"),
         replace(BOX, kind="sliders"),
         replace(ADD, kind="sliders"),
         REMOVE,
@@ -238,10 +245,7 @@ LIGHT = Edit(
             advice="give --linear X,Y,X,Y, --radial X,Y,W,H, --region X,Y,W,H, --box X,Y,W,H or --mask FILE to mark "
             "what changes, such as --linear 0,0,0,50%; nlfilter-torch develop changes all of the photograph",
         ),
-        Scribble("background", "Not this", role="background", option="--background", option_help=BACKGROUND_HELP),
-        BOX,
-        ADD,
-        REMOVE,
+        *BESIDE_OBJECTS,
     ),
 )
 
@@ -483,10 +487,8 @@ DEFOCUS = Edit(
             advice="give --region X,Y,W,H, --box X,Y,W,H or --mask FILE to mark what stays sharp, such as "
             "--region 190,60,60,60",
         ),
-        Scribble("background", "Blur this", role="background", option="--background", option_help=BACKGROUND_HELP),
-        BOX,
-        ADD,
-        REMOVE,
+        replace(BACKGROUND, label="Blur this"),
+        *BESIDE_OBJECTS[1:],
     ),
 )
 
@@ -519,10 +521,7 @@ MASK = Edit(
             advice="give --region X,Y,W,H, --box X,Y,W,H or --mask FILE to mark the object, such as "
             "--region 190,60,60,60",
         ),
-        Scribble("background", "Not this", role="background", option="--background", option_help=BACKGROUND_HELP),
-        BOX,
-        ADD,
-        REMOVE,
+        *BESIDE_OBJECTS,
     ),
 )
 

@@ -3,11 +3,8 @@
 from dataclasses import dataclass
 from typing import ClassVar
 
-import numpy as np
 import torch
 import torch.nn.functional as F
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
 from nlfilter_torch.core.kernels.stencil import solve_stencil
@@ -20,6 +17,7 @@ from nlfilter_torch.photo.picture.pixels import M, Pixels
 from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles
 from nlfilter_torch.photo.picture.source import Fitted, Source, at
 from nlfilter_torch.photo.selections.by_hand import check_drawn
+from nlfilter_torch.photo.selections.connected import connected_pieces
 
 RING, MOST_RING = 4, 0.5  # pixels around a spot that are compared: at least so many, and this share of its radius
 OFFSET = 0.75  # share of a difference in mean colour that does not count, since the membrane takes it away
@@ -74,7 +72,8 @@ class Heal(PhotoEdit):
         check_drawn(drawn.masks.get("spots"), None, "spots")
         marked = source.scribbles(drawn.masks["spots"], None, "spots")
         places, healed = marked.places, torch.zeros_like(marked.image)
-        spots = [Spot.of(places[group], source.size, self.reach) for group in _groups(places, source.size[1])]
+        pieces = torch.from_numpy(connected_pieces(places.cpu().numpy(), source.size[1])).to(places.device)
+        spots = [Spot.of(places[pieces == piece], source.size, self.reach) for piece in pieces.unique()]
         known = torch.cat([spot.around for spot in spots]).unique()
         image, counted = at(source, known)
         usable = ~torch.isin(known, places)
@@ -182,20 +181,3 @@ def _correlated(planes: Tensor, template: Tensor) -> Tensor:
     product = torch.fft.rfft2(planes) * torch.fft.rfft2(template, size).conj()
     rows, columns = (n - m + 1 for n, m in zip(size, template.shape[-2:], strict=True))
     return torch.fft.irfft2(product, size)[..., :rows, :columns]
-
-
-def _groups(places: Tensor, width: int) -> list[Tensor]:
-    """Which places, ascending row-major indices of a picture so many pixels wide, belong to each connected spot."""
-    index = places.cpu().numpy()
-    pairs = []
-    for down, right in ((0, 1), (1, -1), (1, 0), (1, 1)):
-        start = np.flatnonzero((index % width + right >= 0) & (index % width + right < width))
-        wanted = index[start] + down * width + right
-        found = np.searchsorted(index, wanted).clip(max=len(index) - 1)
-        same = index[found] == wanted
-        pairs.append((start[same], found[same]))
-    start, end = (np.concatenate(ends) for ends in zip(*pairs, strict=True))
-    links = coo_array((np.ones(len(start)), (start, end)), shape=(len(index), len(index)))
-    count, labels = connected_components(links, directed=False)
-    known = torch.from_numpy(labels).to(places.device)
-    return [(known == number).nonzero().squeeze(1) for number in range(count)]

@@ -11,6 +11,7 @@ from typing import Literal
 import numpy as np
 import torch
 import torch.nn.functional as F
+from numpy.typing import NDArray
 from torch import Tensor
 
 from nlfilter_torch.core.blocks import order_by
@@ -69,6 +70,26 @@ def _numbered(inside: Tensor) -> Tensor:
     from skimage.measure import label
 
     return torch.from_numpy(label(inside.cpu().numpy(), connectivity=1)).to(inside.device)
+
+
+def connected_pieces(places: NDArray[np.int64], width: int) -> NDArray[np.int64]:
+    """Number of the connected piece of each place, (m,), from 0 on, also by corners.
+
+    Places are row-major indices, ascending, of a picture so many pixels wide, of whose size the cost is independent.
+    """
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    pairs = []
+    for down, right in ((0, 1), (1, -1), (1, 0), (1, 1)):
+        start = np.flatnonzero((places % width + right >= 0) & (places % width + right < width))
+        wanted = places[start] + down * width + right
+        found = np.searchsorted(places, wanted).clip(max=len(places) - 1)
+        same = places[found] == wanted
+        pairs.append((start[same], found[same]))
+    start, end = (np.concatenate(ends) for ends in zip(*pairs, strict=True))
+    links = coo_array((np.ones(len(start)), (start, end)), shape=(len(places), len(places)))
+    return np.asarray(connected_components(links, directed=False)[1], np.int64)
 
 
 def _parts(masks: Tensor, scribbles: Tensor, least: Tensor | None = None) -> tuple[Tensor, Tensor]:

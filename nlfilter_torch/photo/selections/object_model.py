@@ -272,6 +272,7 @@ def _object_mask(planes: list[Tensor], extent: Extent, trimap: Tensor) -> Tensor
     """
     lab, guide, likely, sides, drawn, free = planes
     shape, without_box, strokes = (lab.shape[-2], lab.shape[-1]), bool((free == 1).all()), drawn[0]
+    is_object = extent == "object" and bool((strokes > 0).any())
     there = neighbours(lab)
     squared = differences(lab).square().sum(1) * there
     typical = 2 * squared.sum() / there.sum().clamp(min=1.0) + EPSILON
@@ -305,12 +306,12 @@ def _object_mask(planes: list[Tensor], extent: Extent, trimap: Tensor) -> Tensor
         by_colour = ratios[-1].clamp(-MOST_BY_COLOUR, MOST_BY_COLOUR)
         solved, flow = cut(odds + by_colour, weights, flow, STEPS[number // ROUNDS])
         mask = torch.lerp(mask, solved, DAMPING if number else 1.0)
-        if extent == "object" and bool((strokes > 0).any()):
+        if is_object:
             mask = mask * ~unconnected(mask, strokes)
         cut_off = [(2 * side.flatten() - 1).clamp(min=0.0) for side in (mask, 1 - mask)]
         fitted = [part + STROKES * side * (part.sum() / side.sum()) for part, side in zip(cut_off, known, strict=True)]
     by_trimap = (odds + by_colour).sigmoid()
-    if extent == "object" and bool((strokes > 0).any()):
+    if is_object:
         density = (inside.maximum(outside) - rare).view(shape)
         known = [ratios[0], ratios[-1], density, likely, near, away, *sides, *drawn, free.squeeze(0), mask]
         evidence = torch.cat([lab, guide[-3:], torch.stack(known)])

@@ -23,9 +23,7 @@ TRAINED = Path(__file__).with_name("object_network.safetensors")
 TRAINED_PIXELS = 1 << 13  # of the reduced picture in which it was trained
 BLOCK = 1024  # pixels along an axis of which means are computed together
 SIGMAS = (1.5, 4.0, 10.0, 25.0)  # of means, in pixels of that picture: from a thin part to most of an object
-STROKES_ALONE = (
-    0.75  # share of its odds where strokes on the object are all that is told: it takes in what neither side explains
-)
+STROKES_ALONE = 0.75  # share of its odds if only strokes on the object are given: it takes in what no side explains
 EVIDENCE_PLANES = (3, 3, 6, 2, 2, 2)  # of the evidence
 FEATURES, WIDTHS = 93, (64, 32)
 SHAPES = {

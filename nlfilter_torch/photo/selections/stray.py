@@ -20,6 +20,7 @@ from torch import Tensor
 from nlfilter_torch.core.torch_internals import is_unreadable
 from nlfilter_torch.photo.picture.scribbled_pixels import Scribbles, blocks_at
 from nlfilter_torch.photo.picture.source import Reduced
+from nlfilter_torch.photo.selections.connected import connected_pieces
 from nlfilter_torch.photo.selections.scribbled_colours import SOLVED_PIXELS, colours_in_lab
 
 # Chosen with benchmarks.scribbles on the choosing set.
@@ -240,7 +241,7 @@ def _of_region(points: Numbers, at: Cells, shape: tuple[int, int], of_one_colour
         return np.zeros(0, dtype=bool)
     means = np.stack([np.bincount(back, channel) for channel in points.T], axis=1) / counts[:, None]
     grid = Grid.of(cells, shape)
-    strokes, ignored = grid.pieces(np.ones(len(cells), dtype=bool)), np.zeros(len(cells), dtype=bool)
+    strokes, ignored = connected_pieces(cells, shape[1]) + 1, np.zeros(len(cells), dtype=bool)
     parts, middles = list[tuple[Cells, int]](), list[Numbers]()
     for stroke in range(1, strokes.max() + 1):
         own = np.flatnonzero(strokes == stroke)
@@ -292,15 +293,6 @@ class Grid:
         inner = plane[:-2, 1:-1] & plane[2:, 1:-1] & plane[1:-1, :-2] & plane[1:-1, 2:]
         border = int((plane[1:-1, 1:-1] & ~inner).sum())
         return border**2 / (4 * len(part))
-
-    def pieces(self, chosen: NDArray[np.bool_]) -> Cells:
-        """Number of the connected piece of chosen cells at each cell, (m,), from 1 on; 0 for others."""
-        from skimage.measure import label
-
-        plane = np.zeros((self.rows.max() + 1, self.columns.max() + 1), dtype=bool)
-        plane[self.rows[chosen], self.columns[chosen]] = True
-        numbers: Cells = label(plane, connectivity=2)[self.rows, self.columns]
-        return numbers
 
 
 def stray_parts(source: Reduced, painted: Tensor) -> Tensor:

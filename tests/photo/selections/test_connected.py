@@ -1,10 +1,12 @@
 """What is connected with a scribble, and masks of it."""
 
+import numpy as np
 import pytest
 import torch
+from skimage.measure import label
 
 from nlfilter_torch.photo import defocus, enhance, recolor, region_mask
-from nlfilter_torch.photo.selections.connected import SOFT_BORDER, connected, without_haze
+from nlfilter_torch.photo.selections.connected import SOFT_BORDER, connected, connected_pieces, without_haze
 from tests.problems import box, inverse, noise, oriented, paint
 from tests.strokes import SIZE as DOTTED
 from tests.strokes import dots, groups_of
@@ -140,3 +142,10 @@ def test_a_single_stroke_is_not_left_out_nor_are_all_strokes_of_an_image() -> No
     first, second = groups.weights_without_each(weights)
     assert first.squeeze(1).tolist() == [[0, 1], [0, 1]]
     assert second.squeeze(1).tolist() == [[1, 0], [0, 1]]
+
+
+def test_pieces_of_places_are_those_of_the_picture() -> None:
+    """Pixels at the end of a row and at the beginning of the next are not connected."""
+    painted = (noise(1, 1, 17, 23) > 0.3).numpy()[0, 0]
+    pieces = connected_pieces(np.flatnonzero(painted), 23)
+    assert (pieces + 1 == label(painted, connectivity=2)[painted]).all()
